@@ -142,12 +142,17 @@ def begin_windows(frames: Frames, renderer: Renderer, *, highlights: bool = Fals
     check_windows(frames.scene)
     spp = frames.scene.spec.image.spp
     jobs = (replace(render_job(frames, row), highlights=highlights) for row in range(len(frames)))
-    after = next(jobs, None)
-    for row in range(len(frames)):
-        assert after is not None
-        job, after = after, next(jobs, None)
-        made = renderer.begin(job, spp=spp, moments=moments(frames, row, job), after=after)
-        yield BegunImage(frames, row, job, made)
+    if frames.scene.spec.motion is not None:
+        for row, job in enumerate(jobs):
+            yield BegunImage(frames, row, job, renderer.begin(job, spp=spp, moments=moments(frames, row, job)))
+        return
+    groups, row = renderer.together(jobs, spp=spp), 0
+    after = next(groups, ())
+    while after:
+        group, after = after, next(groups, ())
+        for job, made in zip(group, renderer.begin_all(group, spp=spp, after=after), strict=True):
+            yield BegunImage(frames, row, job, made)
+            row += 1
 
 
 def render_job(frames: Frames, row: int) -> RenderJob:

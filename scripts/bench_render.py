@@ -79,7 +79,7 @@ class Bench:
         import mitsuba as mi
 
         from eyerender.arrays import frozen
-        from eyerender.rendering.film import pixels_of, window_of
+        from eyerender.rendering.film import Pixels
         from eyerender.rendering.sampling import camera_ray
         from eyerender.rendering.view import look
         from eyerender.rig.camera import Camera
@@ -112,7 +112,7 @@ class Bench:
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
         shown, surround = self.renderer.bind(job)
         values = shown.values
-        u, v = pixels_of(dr.arange(mi.UInt32, n * n), *window_of(job.window))
+        _, u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, n * n))
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
         view = look(values, shown.textures, surround.scene, o, d, True)
         inner = view.inner.numpy().T
@@ -516,10 +516,10 @@ class Bench:
                 place.show(turned.region, turned.globe)
             shown, place = self.renderer.bind(turned, lit=False)
             with timed("labels"):
-                _ = part_labels(shown, turned.window)(), shown.host.lid_margins_px
+                _ = part_labels(shown, [turned.window])(), shown.host.lid_margins_px
             with timed("glints"):
                 MirrorImages.of(turned, None).seen(place, shown.host.blur)
-            traced = self.renderer._traced(turned, 4, (), None)
+            (traced,) = self.renderer._traced([turned], 4, ())
             with timed("lens and sensor"):
                 done = traced.developed()
             assert done.labels is not None
@@ -678,15 +678,43 @@ class Bench:
         wall, cpu = 1e3 * np.median(times, axis=0)
         yield row("fixed cost of a frame, CPU (median of 60)", cpu, "ms", 15)
         yield row("fixed cost of a frame, wall (median of 60)", wall, "ms")
-        small = self._small_window()
+        yield from self._together()
 
-        def run() -> None:
-            for made in [self.renderer.begin(self._turned(small, k)) for k in range(count)]:
-                made.result()
+    def _together(self) -> Iterable[Row]:
+        """Small windows that share launches, against the same windows one by one; all of them in a run."""
+        import drjit as dr
 
-        count = 20 if self.small else 60
-        run()
-        yield row("bare windows 100x100, 1 LED, 16 spp, labels, in a run", count / cpu_of(run, 3)[0], "per CPU s")
+        small, count = self._small_window(), 20 if self.small else 60
+        jobs = [self._turned(small, k) for k in range(count)]
+        groups: dict[str, list[tuple[Any, ...]]] = {
+            "together": list(self.renderer.together(jobs)),
+            "one by one": [(job,) for job in jobs],
+        }
+
+        def run(name: str) -> float:
+            start = time.perf_counter()
+            made = [window for group in groups[name] for window in self.renderer.begin_all(group)]
+            for window in made:
+                window.result()
+            return time.perf_counter() - start
+
+        times: dict[str, list[tuple[float, float]]] = {name: [] for name in groups}
+        for turn in range(5 if self.small else 12):
+            for name, spent in times.items():
+                begun = time.process_time()
+                wall = run(name)
+                if turn > 1:  # recordings are made in the first two
+                    spent.append((time.process_time() - begun, wall))
+        each = {name: np.median(spent, axis=0) for name, spent in times.items()}
+        what = "bare windows 100x100, 1 LED, 16 spp, labels"
+        yield row(f"{what}, in a run", count / each["together"][0], "per CPU s")
+        for name, ratio in zip(("CPU", "wall"), each["together"] / each["one by one"], strict=True):
+            yield row(f"{what}: together / one by one, {name}", ratio, "")
+        for name in groups:
+            with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+                dr.kernel_history_clear()
+                run(name)
+                yield row(f"kernels and copies a window, {name}", len(dr.kernel_history()) / count, "")
 
     def _small_window(self) -> Any:
         """Job of a bare eye in a window of 100 x 100 px of a remote camera."""

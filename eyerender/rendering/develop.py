@@ -49,8 +49,10 @@ class Darkroom:
         self._counter = Counter()
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
-    def developed(self, job: RenderJob, films: Sequence[Film], shines: Sequence[Shine]) -> tuple[Developed, int]:
-        """Develop the picture of a job's window; returns the number of failed light paths, too.
+    def begun(
+        self, job: RenderJob, films: Sequence[Film], shines: Sequence[Shine]
+    ) -> Callable[[], tuple[Developed, int]]:
+        """Begin to develop the picture of a job's window; the result reads it, and the number of failed light paths.
 
         Args:
             job: the job, for which `takes` holds.
@@ -80,10 +82,14 @@ class Darkroom:
         codes = None
         if counted(job.sensor):
             codes = self._counter.codes(job.sensor, job.window, irradiance, job.wavelength_nm, job.seed)
-        failed = sum(int(film.failed.numpy()[0]) for film in films)
-        # Copies, because the memory of Dr.Jit's arrays must not be released by another thread.
-        taken = irradiance.numpy().reshape(height, width).copy()
-        return Developed(taken, None if codes is None else codes.numpy().reshape(height, width).copy()), failed
+
+        def read() -> tuple[Developed, int]:
+            failed = sum(int(film.failed.numpy()[0]) for film in films)
+            # Copies, because the memory of Dr.Jit's arrays must not be released by another thread.
+            taken = irradiance.numpy().reshape(height, width).copy()
+            return Developed(taken, None if codes is None else codes.numpy().reshape(height, width).copy()), failed
+
+        return read
 
     def _passing(self, job: RenderJob) -> tuple[mi.Float, mi.Float]:
         """Which share of the light passes to each pixel, and what openings add; single numbers without either."""

@@ -15,7 +15,7 @@ included.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -66,14 +66,13 @@ from .places import (
     skin_places,
 )
 from .recorded import recorded
-from .values import aligned, one_by_one
+from .values import aligned, one_by_one, split
 from .view import Textures, appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
     from .lampviews import LampViews
     from .prepared import Prepared
     from .region import RegionScene
-    from .surfaces import Surface
     from .surround import Surround
     from .values import Lights, Values
 
@@ -100,41 +99,55 @@ class Received:
 
     DRJIT_STRUCT = leaves(
         "on", "_between", "_columns", "_rows", "_centre", "_first", "_per_mm", "_root2", "_reach2", "_plane", "_ends",
-        "_globe", "_other", "_iris",
+        "_globe", "_other", "_iris", "_windows", "_starts",
     )  # fmt: skip
 
     def __init__(
-        self,
-        on: bool,
-        globe: GlobePlaces,
-        chamber: Chamber,
-        plane: tuple[float, float, float],
-        tables: tuple[Floats, Floats, Floats],
+        self, on: bool, chamber: Chamber, places: Sequence[tuple[GlobePlaces, tuple[float, float, float]]]
     ) -> None:
-        """Send the tables to the device.
+        """Send the places to the device; they receive nothing.
 
         Args:
             on: whether surfaces send light to each other.
-            globe: the places on the globe.
             chamber: the chamber of the eye.
-            plane: y and z of the middle of the surround's rings, and the radius of the first (mm).
-            tables: four numbers for each place of the globe, and for each place of the surround or vertex of the
-                region; one number for each place of the iris.
+            places: in each window the places on the globe, and y and z of the middle of the surround's rings, and the
+                radius of the first (mm).
         """
+        globe = places[0][0]
         self.on = dr.opaque(mi.Bool, on)
         self._between = globe.columns == GLOBE_COLUMNS
         self._columns, self._rows = globe.columns, globe.rows
-        numbers = np.concatenate([globe.table, [chamber.root_mm**2, chamber.reach_mm**2], plane])
-        n = one_by_one(np.append(numbers[:5], numbers[-5:]).astype(np.float32))
+        rim = [chamber.root_mm**2, chamber.reach_mm**2]
+        rows = np.array([[*one.table[:5], *rim, *plane] for one, plane in places], dtype=np.float32)
+        n = one_by_one(rows[0])
         self._centre, self._first, self._per_mm = mi.Vector3f(*n[:3]), n[3], n[4]
         self._root2, self._reach2, self._plane = n[5], n[6], n[7:]
         self._ends = _sent(globe.table[5:])
-        self._globe, self._other, self._iris = (_sent(t.ravel()) for t in tables)
+        self._globe, self._other, self._iris = _sent(np.zeros(4)), _sent(np.zeros(4)), _sent(np.zeros(1))
+        self._windows = _sent(rows.ravel()) if len(rows) > 1 else None
+        self._starts: tuple[mi.UInt32, ...] | None = None  # of the lanes' windows in the tables
 
-    def filled(self, globe: Floats, other: Floats, iris: Floats) -> Received:
-        """The same places with other tables."""
+    def filled(self, tables: Sequence[tuple[Floats, Floats, Floats]]) -> Received:
+        """The same places with what they receive.
+
+        tables: of each window, four numbers for each place of the globe, and for each place of the surround or vertex
+            of the region; one number for each place of the iris.
+        """
         made = copy(self)
-        made._globe, made._other, made._iris = (_sent(t.ravel()) for t in (globe, other, iris))
+        made._globe, made._other, made._iris = (
+            _sent(np.concatenate([part.ravel() for part in parts])) for parts in zip(*tables, strict=True)
+        )
+        return made
+
+    def of_window(self, window: mi.UInt32 | None) -> Received:
+        """What the places of one window for each lane receive, around a bare eye."""
+        if window is None:
+            return self
+        made = copy(self)
+        n = _row(self._windows, 10, window)
+        made._centre, made._plane = mi.Vector3f(*n[:3]), n[7:]
+        made._starts = tuple(window * count for count in (MAP_SIDE * MAP_SIDE, RINGS * TURNS, IRIS))
+        made._windows = None
         return made
 
     @property
@@ -145,7 +158,8 @@ class Received:
     def globe(self, x: mi.Vector3f) -> mi.Vector4f:
         """Numbers of points of the globe, given in the scene's frame."""
         beyond = 0.5 if self._between else 0.0  # the last rows are half a row from the lids, where light changes fast
-        return _bilinear(self._globe, *self.globe_place(x), self._columns, self._rows, beyond)
+        start = None if self._starts is None else self._starts[0]
+        return _bilinear(self._globe, *self.globe_place(x), self._columns, self._rows, beyond, start)
 
     def globe_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Column and row of points of the globe in the grid of its places."""
@@ -164,7 +178,8 @@ class Received:
 
     def iris(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance of points in the plane of the iris (eye frame), without the light straight from the lamps."""
-        return _around(self._iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float)
+        start = None if self._starts is None else self._starts[2]
+        return _around(self._iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float, start)
 
     def iris_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Ring and turn of points in the plane of the iris among the places of the chamber."""
@@ -176,7 +191,8 @@ class Received:
 
     def surround(self, x: mi.Vector3f) -> mi.Vector4f:
         """Numbers of points of the surround's plane, given in the scene's frame."""
-        return _around(self._other, *self.surround_place(x), RINGS, TURNS, mi.Vector4f)
+        start = None if self._starts is None else self._starts[1]
+        return _around(self._other, *self.surround_place(x), RINGS, TURNS, mi.Vector4f, start)
 
     def surround_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Ring and turn of points of the surround's plane among its places."""
@@ -194,22 +210,29 @@ def _sent(values: Reals) -> mi.Float:
     return mi.Float(aligned(np.ascontiguousarray(values, dtype=np.float32)))
 
 
-def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int, beyond: float) -> mi.Vector4f:
-    """Values between columns and rows, continued by so many rows beyond the last ones."""
+def _bilinear(
+    buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int, beyond: float, start: mi.UInt32 | None
+) -> mi.Vector4f:
+    """Values between columns and rows, continued by so many rows beyond the last ones, from the `start` of a table."""
     column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, -beyond, rows - 1.001 + beyond)
     i, j = mi.UInt32(column), mi.UInt32(dr.clip(row, 0, rows - 1.001))
     s, t = column - mi.Float(i), row - mi.Float(j)
-    a, b, c, d = (dr.gather(mi.Vector4f, buffer, j * columns + i + k) for k in (0, 1, columns, columns + 1))
+    place = j * columns + i if start is None else j * columns + i + start
+    a, b, c, d = (dr.gather(mi.Vector4f, buffer, place + k) for k in (0, 1, columns, columns + 1))
     low, high = a + s * (b - a), c + s * (d - c)
     return dr.maximum(low + t * (high - low), 0)
 
 
-def _around(buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any) -> Any:
-    """Values between rings and turns; the turns close."""
+def _around(
+    buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any, start: mi.UInt32 | None
+) -> Any:
+    """Values between rings and turns, from the `start` of a table; the turns close."""
     ring, turn = dr.clip(ring, 0, rings - 1.001), dr.clip(turn, 0, turns - 0.001)
     i, j = mi.UInt32(ring), mi.UInt32(turn)
     s, t = ring - mi.Float(i), turn - mi.Float(j)
     after = dr.select(j + 1 < turns, j + 1, 0)
+    if start is not None:
+        j, after = j + start, after + start
     a, b, c, d = (dr.gather(kind, buffer, p * turns + q) for p in (i, i + 1) for q in (j, after))
     near, far = a + t * (b - a), c + t * (d - c)
     return near + s * (far - near)
@@ -379,17 +402,19 @@ class Exchange:
         self._interiors: KeptForEye[_Interior] = KeptForEye()
 
     def begun(
-        self, host: Prepared, values: Values, lights: Lights, panels: Lights, textures: Textures,
+        self, hosts: Sequence[Prepared], values: Values, lights: Lights, panels: Lights, textures: Textures,
         place: Surround | RegionScene,
     ) -> Callable[[], Callable[[], Received]]:  # fmt: skip
         """Begin to find what the places of a frame receive straight from the lamps, and what they see of each other.
+
+        Several windows may be a frame if they show one bare eye without ambient light.
 
         Returns:
             What reads this. It returns what solves for all light, on the host; before that the device may be given
             other work.
 
         Args:
-            host: the frame's job, and the places on the globe.
+            hosts: the job of each window, and the places on the globe.
             values: its numbers.
             lights: its lamps.
             panels: parts of its panels, and the bright parts of its map, as lamps.
@@ -399,14 +424,12 @@ class Exchange:
         from .region import RegionScene
 
         region = place if isinstance(place, RegionScene) else None
-        job, grid, globe = host.job, host.places, host.job.globe
-        plan = self._plan(region, globe)
-        points, normals, plane = _others(job, globe, region, plan.skin)
-        frame = _Frame(job, grid, self._inside(job), plan, points, normals, plane)
+        frames = [self._frame(host, region) for host in hosts]
+        frame, job = frames[0], hosts[0].job
+        numbers = Received(job.interreflection, frame.chamber, [(one.grid, one.plane) for one in frames])
         if not job.interreflection and not values.structure.ambient:
-            return lambda: lambda: frame.dark(region)
-        numbers = frame.received((np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1)))
-        outer = _sent(frame.outer.ravel())
+            return lambda: lambda: numbers.filled([one.dark(region) for one in frames])
+        outer = _sent(np.concatenate([one.outer.ravel() for one in frames]))
         direct, ambient = _direct(values, lights, panels, place.scene, textures, frame, outer)
         mirrored = _mirrored(values, lights, place.scene, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.interior.rows) for some in (lights, panels))
@@ -414,10 +437,19 @@ class Exchange:
 
         def read() -> Callable[[], Received]:
             # Nothing is read before all is launched, because every read waits for all launches.
-            known = direct(), mirrored(), ambient(), lamps(), more(), seen()
-            return lambda: frame.solved(region, numbers, *known)
+            light, soft, parts = mirrored(), ambient(), list(zip(direct(), lamps(), more(), seen(), strict=True))
+            return lambda: numbers.filled(
+                [one.solved(region, light, soft, *known) for one, known in zip(frames, parts, strict=True)]
+            )
 
         return read
+
+    def _frame(self, host: Prepared, region: RegionScene | None) -> _Frame:
+        """The places of a job."""
+        job, globe = host.job, host.job.globe
+        plan = self._plan(region, globe)
+        points, normals, plane = _others(job, globe, region, plan.skin)
+        return _Frame(job, host.places, self._inside(job), plan, points, normals, plane)
 
     def _inside(self, job: RenderJob) -> _Interior:
         """The chamber of a job's eye."""
@@ -486,16 +518,12 @@ class _Frame:
             [np.concatenate(points), np.concatenate([self.grid.normals, self.normals, facing @ job.M.T])]
         )
 
-    def received(self, tables: tuple[Floats, Floats, Floats]) -> Received:
-        """Tables for the kernels."""
-        return Received(self.job.interreflection, self.grid, self.chamber, self.plane, tables)
-
-    def dark(self, region: RegionScene | None) -> Received:
-        """Nothing but light straight from the lamps."""
+    def dark(self, region: RegionScene | None) -> tuple[Floats, Floats, Floats]:
+        """Tables, as for `Received.filled`, of nothing but light straight from the lamps."""
         other = np.tile([0.0, 1.0, 0.0, 0.0], (len(self.points) if region is None else len(region.posed.vertices), 1))
         if region is not None:
             region.skin.shine(_sent(other.ravel()))
-        return self.received((np.tile([0.0, 1.0, 0.0, 0.0], (self.on_globe, 1)), other, np.zeros(IRIS)))
+        return np.tile([0.0, 1.0, 0.0, 0.0], (self.on_globe, 1)), other, np.zeros(IRIS)
 
     def _on_iris(self, values: Floats, along: float) -> Floats:
         """Values of the places in the plane of the iris, filled where it is outside the chamber and smooth in turn."""
@@ -515,10 +543,10 @@ class _Frame:
         return out
 
     def solved(
-        self, region: RegionScene | None, numbers: Received, direct: Floats, mirrored: Floats,
-        ambient: list[Floats], lamps: Floats, panels: Floats, seen: _Seen,
-    ) -> Received:  # fmt: skip
-        """Solve for the irradiance of all places, which `numbers` hold without their light."""
+        self, region: RegionScene | None, mirrored: Floats, ambient: list[Floats],
+        direct: Floats, lamps: Floats, panels: Floats, seen: _Seen,
+    ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+        """Solve for the irradiance of all places: tables as for `Received.filled`."""
         job, outside = self.job, self.outside
         # What is hidden of soft light is told by the rays, and of the rest by what stands before its parts.
         soft, hard, free, shaded = ambient
@@ -556,7 +584,7 @@ class _Frame:
         for part in (globe, other):
             part[:, 1], part[:, 3] = _over(part[:, 1], part[:, 3]), 0
         iris = self._on_iris((arrived + sky)[outside:], 1.0) + self._on_iris(within + panels, 0.0)
-        return numbers.filled(globe, other, iris)
+        return globe, other, iris
 
 
 def _over(part: Floats, whole: Floats) -> Floats:
@@ -593,13 +621,14 @@ def _direct(
 ) -> tuple[Callable[[], Floats], Callable[[], list[Floats]]]:
     """Irradiance of places outside the eye, whose points and normals are in `outer`, to be read later.
 
-    Straight from the lamps; from ambient light without shadows: what is soft, and the rest; this rest from its parts,
-    without and with shadows.
+    Straight from the lamps, in each window; from ambient light without shadows: what is soft, and the rest; this rest
+    from its parts, without and with shadows.
     """
     count = frame.outside
     kinds = tuple(dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.on_skin, count - IRIS_TURNS))
     ways = values, scene, outer, kinds
-    lit = _over_lamps(lights, count, lambda first: _onto_outer(*ways, lights, textures.lamp_views, first, count)[0])
+    views, lanes = textures.lamp_views, count * lights.windows
+    lit = _over_lamps(lights, count, lambda first: [_onto_outer(*ways, lights, views, first, lanes)[0]])
     soft = hard = free = shaded = None
     if values.structure.ambient:
         assert textures.ambience is not None
@@ -620,13 +649,15 @@ def _onto_outer(
 ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
     """Irradiance of places outside the eye from lamps, with and without shadows.
 
-    `kinds` are the numbers of places on the globe and on skin, and of those before the limbus. Places on the
-    lamps' discs begin with the number `first`; without it these are the discs' middles.
+    There are `count` of them, in all windows. `kinds` are the numbers of places on the globe and on skin, and of those
+    before the limbus. Places on the lamps' discs begin with the number `first`; without it these are their middles.
     """
     index = dr.arange(mi.UInt32, count)
     n = _row(outer, 6, index)
     x, normal = mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:])
     globe, skin, rim = kinds
+    window, index = split(index, rim + IRIS_TURNS, values.several)
+    values, lights = values.of_window(window), lights.of_window(window)
     away = (index >= globe) & (index < rim)
     start, facing = values.point_to_eye(x + _START_MM * normal), values.vector_to_eye(normal)
     u, v = (mi.Float(0), mi.Float(0)) if first is None else _spots(index + first)
@@ -650,10 +681,10 @@ def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) ->
     lanes = -(-len(places) // _MIRRORED) * _MIRRORED
     padded = np.append(places, np.full(lanes - len(places), places[0]))
     rows = _sent(np.column_stack([frame.points[padded], frame.normals[padded]]).ravel())
-    lit = _over_lamps(lights, lanes, lambda first: _off_cornea(values, lights, scene, rows, first, lanes))
+    lit = _over_lamps(lights, lanes, lambda first: [_off_cornea(values, lights, scene, rows, first, lanes)])
 
     def read() -> Floats:
-        total[frame.on_globe + places] = lit()[: len(places)]
+        total[frame.on_globe + places] = lit()[0, : len(places)]
         return total
 
     return read
@@ -674,35 +705,50 @@ def _off_cornea(
 
 
 def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float) -> Callable[[], Floats]:
-    """Irradiance (PLACES,) of the chamber's places straight from lamps; rows hold them as in `_Interior`."""
+    """Irradiance (windows, PLACES) of the chamber's places straight from lamps; rows hold them as in `_Interior`."""
     if len(lights) == 0:
-        return lambda: np.zeros(PLACES)
-    return _over_lamps(lights, PLACES, lambda first: _inside(values, lights, scene, rows, first))
+        return lambda: np.zeros((lights.windows, PLACES))
+    return _over_lamps(lights, PLACES, lambda first: _inside(values, lights, scene, rows, first, lights.windows))
 
 
 @recorded
-def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32) -> mi.Float:
-    """Irradiance of the chamber's places from lamps; places on their discs begin with the number `first`."""
+def _inside(
+    values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32, windows: int
+) -> list[mi.Float]:
+    """Irradiance of the chamber's places from lamps, some places of all windows after others.
 
-    def of(begin: int, end: int, surfaces: tuple[Surface, ...]) -> mi.Float:
-        index = dr.arange(mi.UInt32, end - begin)
+    Places on the lamps' discs begin with the number `first`.
+    """
+
+    def of(begin: int, end: int, inner: bool) -> mi.Float:
+        window, index = split(dr.arange(mi.UInt32, (end - begin) * windows), end - begin, values.several)
+        numbers, lamps = values.of_window(window), lights.of_window(window)
         n = _row(rows, 7, index + begin)
         x, inside, normal = mi.Vector3f(*n[:3]), n[6] > 0, mi.Vector3f(*n[3:6])
         u, v = _spots(index + first)
-        return through_cornea(values, lights, scene, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
+        surfaces = numbers.surfaces if inner else numbers.surfaces[:-1]
+        return through_cornea(numbers, lamps, scene, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
 
-    if len(values.surfaces) == 1:
-        return of(0, PLACES, values.surfaces)
-    # The wall is the rim of the cornea, in front of its back.
-    parts = of(0, IRIS, values.surfaces), of(IRIS, PLACES, values.surfaces[:-1])
+    # If there is a back of the cornea, the wall is the rim of the cornea, in front of it.
+    parts = [of(0, PLACES, True)] if len(values.surfaces) == 1 else [of(0, IRIS, True), of(IRIS, PLACES, False)]
     dr.eval(parts)
-    return dr.concat(parts)
+    return parts
 
 
-def _over_lamps(lights: Lights, width: int, light: Callable[[mi.UInt32], mi.Float]) -> Callable[[], Floats]:
-    """Mean (width,) of `light` over places on the lamps' discs, which begin with a number; small lamps need one."""
-    parts = [light(dr.opaque(mi.UInt32, k * width)) for k in range(1 if lights.widest < _SMALL else _SPOTS)]
-    return lambda: sum((part.numpy() for part in parts), np.zeros(width)) / len(parts)
+def _over_lamps(lights: Lights, width: int, light: Callable[[mi.UInt32], list[mi.Float]]) -> Callable[[], Floats]:
+    """Mean (windows, width) of `light` over places on the lamps' discs; small lamps need one.
+
+    Its argument is the number with which the places begin. It returns some of the columns after others.
+    """
+    found = [light(dr.opaque(mi.UInt32, k * width)) for k in range(1 if lights.widest < _SMALL else _SPOTS)]
+
+    def read() -> Floats:
+        total = np.zeros((lights.windows, width))
+        for parts in found:
+            total += np.concatenate([part.numpy().reshape(lights.windows, -1) for part in parts], axis=1)
+        return total / len(found)
+
+    return read
 
 
 def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
@@ -717,30 +763,32 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
 def _seen(
     values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame,
     outer: mi.Float,
-) -> Callable[[], _Seen]:  # fmt: skip
-    """What the rays of the places outside and of those in the chamber meet."""
+) -> Callable[[], list[_Seen]]:  # fmt: skip
+    """What the rays of the places outside and of those in the chamber meet, in each window."""
     plan, interior = frame.plan, frame.interior
     inside = interior.gain.shape[1]
     rays = plan.rays + inside
     outside, all_rays = (dr.opaque(mi.UInt32, n) for n in (plan.rays, rays))
     on_globe, of_outside, on_skin = (dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.outside, frame.on_skin))
     kinds = _Kinds(on_globe, of_outside, on_skin, plan.stands_for)
+    lanes = -(-rays // _LANES) * _LANES
     results, spot = _rays_of(
         values, textures, place.scene, numbers, plan.of_place, outer, interior.leaving, (outside, all_rays), kinds,
-        -(-rays // _LANES) * _LANES,
+        dr.opaque(mi.UInt32, lanes) if values.several else None, lanes * lights.windows,
     )  # fmt: skip
     globe, found = frame.on_globe * RAYS, None
     if plan.skin is not None and len(lights):
         views, ends = textures.lamp_views, (dr.opaque(mi.UInt32, globe), outside)
         found = _at_spots(values, lights, place.scene, views, spot, ends, globe + inside)
 
-    def read() -> _Seen:
+    def read() -> list[_Seen]:
         lit = np.full(rays, -1.0, np.float32)
         if found is not None:
             straight = found.numpy()
             lit[:globe], lit[plan.rays :] = straight[:globe], straight[globe:]
-        target, weight, close, sky, free = (r.numpy()[:rays] for r in results)
-        return _Seen(_shares(plan.count, interior.gain), target, weight, close, sky, free, lit)
+        shares = _shares(plan.count, interior.gain)
+        target, weight, close, sky, free = (r.numpy().reshape(-1, lanes)[:, :rays] for r in results)
+        return [_Seen(shares, target[k], weight[k], close[k], sky[k], free[k], lit) for k in range(lights.windows)]
 
     return read
 
@@ -759,25 +807,28 @@ class _Kinds:
 @recorded
 def _rays_of(
     values: Values, textures: Textures, scene: mi.Scene, numbers: Received, of_place: mi.UInt32, outer: mi.Float,
-    leaving: mi.Float, ends: tuple[mi.UInt32, mi.UInt32], kinds: _Kinds, lanes: int,
+    leaving: mi.Float, ends: tuple[mi.UInt32, mi.UInt32], kinds: _Kinds, each: mi.UInt32 | None, lanes: int,
 ) -> tuple[tuple[Any, ...], tuple[Any, ...]]:  # fmt: skip
     """What the rays of places meet: the columns of `_Seen` but for the last, and places on skin (see `_met`).
 
     The first rays belong to places outside the eye, whose numbers are in `of_place`. The `ends` are their number, and
-    that of all rays; there are more lanes.
+    that of all rays; there are more lanes, of several windows `each`.
     """
-    index = dr.arange(mi.UInt32, lanes)
-    split, count = ends
-    outside, inside = index < split, (index >= split) & (index < count)
+    window, index = split(dr.arange(mi.UInt32, lanes), lanes if each is None else each, values.several)
+    values, numbers = values.of_window(window), numbers.of_window(window)
+    first, count = ends
+    outside, inside = index < first, (index >= first) & (index < count)
     row = dr.gather(mi.UInt32, of_place, index, outside)
+    if window is not None:
+        row += window * kinds.outside
     n = _row(outer, 6, row, outside)
     normal = mi.Vector3f(*n[3:])
     o = mi.Vector3f(*n[:3]) + _START_MM * normal
     d = _pattern(normal, index)
-    rays = _row(leaving, 6, index - split, inside)
+    rays = _row(leaving, 6, index - first, inside)
     o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
     d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
-    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, index < count, kinds)
+    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, index, index < count, kinds)
     sky = mi.Float(0) * o.x
     if values.structure.ambient:
         assert textures.ambience is not None
@@ -817,9 +868,9 @@ def _at_spots(
 
 def _met(
     values: Values, textures: Textures, scene: mi.Scene, numbers: Received, o: mi.Vector3f, d: mi.Vector3f,
-    active: mi.Bool, kinds: _Kinds,
+    index: mi.UInt32, active: mi.Bool, kinds: _Kinds,
 ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float, tuple[mi.Bool, mi.Vector3f, mi.Vector3f]]:  # fmt: skip
-    """What is met along rays.
+    """What is met along rays with these numbers.
 
     The place, the share of its irradiance that is sent back, whether nothing is met, the distance, and for the outer
     side of the sheet of skin (a mark) point and normal in the eye frame.
@@ -828,7 +879,7 @@ def _met(
     view = appearance(values, textures, view, hit, d)
     albedo = outer_albedo(values, textures, view)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
-    s, t = _spots(dr.arange(mi.UInt32, dr.width(o)) * mi.UInt32(_SHUFFLED))
+    s, t = _spots(index * mi.UInt32(_SHUFFLED))
     first = kinds.on_globe
     at = values.point_to_scene(view.point)
     if textures.region is not None:

@@ -13,7 +13,7 @@ So have those at menisci, in which the mirror images of lamps are thinner still;
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
@@ -25,10 +25,11 @@ import numpy as np
 from ..arrays import Bools, Ints, Singles, frozen
 from ..rig.camera import Window
 from .groups import Group, shade_group
+from .parameters import traversed
 from .recorded import recorded
 from .sampling import Pattern, Samples, camera_ray, lattice_generator
 from .shading import shade
-from .values import SMALL, Lamp, Lights, Values, aligned, quotient
+from .values import SMALL, Lamp, Lights, Values, aligned, quotient, split
 from .view import RegionHit, Textures, View, meet, meet_globe, region_hit
 
 if TYPE_CHECKING:
@@ -47,13 +48,21 @@ _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and betw
 
 @dataclass(frozen=True, slots=True)
 class Exposed:
-    """A bound frame for rendering: its Mitsuba scene, numbers, lamps and textures, and what NumPy makes of its job."""
+    """A bound frame for rendering, which may be several windows of bare eyes.
+
+    Its Mitsuba scene, numbers, lamps and textures, and what NumPy makes of the job of each window.
+    """
 
     scene: mi.Scene
     values: Values
     lights: Lights
     textures: Textures
-    host: Prepared
+    hosts: tuple[Prepared, ...]
+
+    @property
+    def host(self) -> Prepared:
+        """What NumPy makes of the first job."""
+        return self.hosts[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,15 +83,40 @@ class _Grid:
     plain: tuple[mi.UInt32, ...]
 
 
-def window_of(window: Window) -> tuple[tuple[mi.Int32, mi.Int32], mi.UInt32]:
-    """A window on the device: its first pixel, and its width."""
-    return (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])), dr.opaque(mi.UInt32, window[2])
+@traversed
+@dataclass(frozen=True, slots=True)
+class Pixels:
+    """The pixels of windows of one size, row by row and window by window.
+
+    Attributes:
+        corner: first pixel of each window on the sensor.
+        width: of the windows.
+        each: pixels of a window; None if there is but one.
+    """
+
+    corner: tuple[mi.Int32, mi.Int32]
+    width: mi.UInt32
+    each: mi.UInt32 | None = None
+
+    @classmethod
+    def of(cls, *windows: Window) -> Pixels:
+        """The pixels of some windows."""
+        width, height = windows[0][2:]
+        if len(windows) == 1:
+            return cls(_opaque_pair(windows[0]), dr.opaque(mi.UInt32, width))
+        x, y = (mi.Int32(aligned(np.array([w[k] for w in windows], np.int32))) for k in (0, 1))
+        return cls((x, y), dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, width * height))
+
+    def at(self, pixel: mi.UInt32) -> tuple[mi.UInt32 | None, mi.Int32, mi.Int32]:
+        """Window (see `values.split`) and full-sensor coordinates, as signed integers, of pixels."""
+        window, pixel = split(pixel, 1 if self.each is None else self.each, self.each is not None)
+        corner = self.corner if window is None else tuple(dr.gather(mi.Int32, c, window) for c in self.corner)
+        row = pixel // self.width
+        return window, mi.Int32(pixel - row * self.width) + corner[0], mi.Int32(row) + corner[1]
 
 
-def pixels_of(pixel: mi.UInt32, corner: tuple[mi.Int32, mi.Int32], width: mi.UInt32) -> tuple[mi.Int32, mi.Int32]:
-    """Full-sensor pixel coordinates, as signed integers, of a window's pixels in row order."""
-    row = pixel // width
-    return mi.Int32(pixel - row * width) + corner[0], mi.Int32(row) + corner[1]
+def _opaque_pair(window: Window) -> tuple[mi.Int32, mi.Int32]:
+    return dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])
 
 
 def group_size(spp: int, soft: bool = False) -> int:
@@ -97,35 +131,46 @@ def group_size(spp: int, soft: bool = False) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """A window whose samples are being taken: the device may still be at work until `mean` reads the sums.
+    """Windows whose samples are being taken: the device may still be at work until `means` reads the sums.
 
     Attributes:
-        sums: over the samples of each pixel, in the order of `_sums`.
-        failed: number of failed light paths.
-        shape: height and width.
+        sums: over the samples of each pixel, in the order of `_sums`, window by window.
+        failed: number of failed light paths of each window.
+        shape: number, height and width of the windows.
         spp: samples per pixel.
         layered: whether there are sums of each part of the scene.
     """
 
     sums: list[mi.Float]
     failed: mi.UInt32
-    shape: tuple[int, int]
+    shape: tuple[int, int, int]
     spp: int
     layered: bool
 
-    def mean(self) -> tuple[Singles, int]:
-        """What `mean_parts` or `mean_radiance` returns."""
-        means = [total.numpy().reshape(self.shape) / np.float32(self.spp) for total in self.sums]
-        failed = int(self.failed.numpy()[0])
+    def means(self) -> list[tuple[Singles, int]]:
+        """What `mean_parts` or `mean_radiance` returns, for each window."""
+        means = np.stack([total.numpy().reshape(self.shape) / np.float32(self.spp) for total in self.sums], axis=1)
+        failed = self.failed.numpy().tolist()
         if self.layered:
-            return np.reshape(means, (-1, 3, *self.shape)), failed
+            return list(zip(means.reshape(len(means), -1, 3, *self.shape[1:]), failed, strict=True))
         # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
-        return np.maximum(means[0], 0), failed
+        return list(zip(np.maximum(means[:, 0], 0), failed, strict=True))
+
+    def of_window(self, k: int) -> Film:
+        """The film of one of the windows."""
+        count, height, width = self.shape
+        if count == 1:
+            return self
+        index = dr.arange(mi.UInt32, height * width) + dr.opaque(mi.UInt32, k * height * width)
+        sums = [dr.gather(mi.Float, total, index) for total in self.sums]
+        failed = dr.gather(mi.UInt32, self.failed, dr.opaque(mi.UInt32, k))
+        dr.eval(sums, failed)
+        return Film(sums, failed, (1, height, width), self.spp, self.layered)
 
 
 def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
-    return begun(shown, window, spp, seed, layered=False).mean()
+    return begun(shown, [window], spp, [seed], layered=False).means()[0]
 
 
 def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
@@ -134,34 +179,38 @@ def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Sin
     The array (parts, 3, height, width) holds the radiance of each part (their sum is that of `mean_radiance`), the
     share of the pixel's samples that show the part, and that share times their mean inverse depth (1/mm).
     """
-    return begun(shown, window, spp, seed, layered=True).mean()
+    return begun(shown, [window], spp, [seed], layered=True).means()[0]
 
 
-def begun(shown: Exposed, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
-    """Begin to take the samples of a window, for what `mean_radiance` returns, or if `layered`, `mean_parts`."""
-    width, height = window[2:]
+def begun(shown: Exposed, windows: Sequence[Window], spp: int, seeds: Sequence[int], *, layered: bool) -> Film:
+    """Begin to take the samples of windows, for what `mean_radiance` returns, or if `layered`, `mean_parts`.
+
+    There are as many windows as the frame has, all of one size.
+    """
+    width, height = windows[0][2:]
+    shape = len(windows), height, width
     grouped = shown.values.structure.region
     if not grouped and not layered and spp >= _MANY:
-        return Film(*_adaptive(shown, window, spp, seed), (height, width), spp, layered)
+        return Film(*_adaptive(shown, windows, spp, seeds), shape, spp, layered)
     size = group_size(spp, shown.values.structure.scattering) if grouped else 1
     sums: list[mi.Float] = []
     failed = mi.UInt32(0)
-    each = max(1, min(spp // size, _LANES // (width * height * size)))
-    plain = shown.host.plain(window) if grouped else None
+    each = max(1, min(spp // size, _LANES // (len(windows) * width * height * size)))
+    plain = shown.host.plain(windows[0]) if grouped else None
     for first in range(0, spp // size, each):
         count = min(each, spp // size - first)
         if sums:
             dr.sync_thread()  # else all passes would need memory at once
         if plain is not None:
             seen, failures = _groups(
-                shown, window, plain, spp=spp, seed=seed, first=first, count=count, size=size, layered=layered
+                shown, windows[0], plain, spp=spp, seed=seeds[0], first=first, count=count, size=size, layered=layered
             )
         else:
-            seen, failures = _singles(shown, window, spp=spp, seed=seed, first=first, count=count, layered=layered)
+            seen, failures = _singles(shown, windows, spp=spp, seeds=seeds, first=first, count=count, layered=layered)
         sums = [a + b for a, b in zip(sums, seen, strict=True)] if sums else seen
         failed += failures
         dr.eval(sums, failed)
-    return Film(sums, failed, (height, width), spp, layered)
+    return Film(sums, failed, shape, spp, layered)
 
 
 def _samples(u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = False) -> Samples:
@@ -169,17 +218,19 @@ def _samples(u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = 
     return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), pattern, fine)
 
 
-def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sums of radiance over the samples of each pixel, (height * width,); failed light paths.
+def _adaptive(
+    shown: Exposed, windows: Sequence[Window], spp: int, seeds: Sequence[int]
+) -> tuple[list[mi.Float], mi.UInt32]:
+    """Sums of radiance over the samples of each pixel, (windows * height * width,); failed light paths.
 
     Four samples of each pixel are taken first. Where they agree, and their mean is not far from those of the eight
     neighbours, no edge crosses the pixel, and they stand for all samples. The pixels around the window are looked at,
     too, so that no pixel depends on the window.
     """
-    width, height = window[2:]
-    wide = (window[0] - 1, window[1] - 1, width + 2, height + 2)
+    width, height = windows[0][2:]
+    wide = [(x - 1, y - 1, width + 2, height + 2) for x, y, _, _ in windows]
     first = _first_samples(spp)
-    failed, take = mi.UInt32(0), _taken_by(shown, wide, spp, seed)
+    failed, take = mi.UInt32(0), _taken_by(shown, wide, spp, seeds)
 
     def lanes(pixels: mi.UInt32, numbers: Ints) -> mi.Float:
         """Radiance of samples with these numbers, those of each pixel side by side."""
@@ -194,15 +245,14 @@ def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[list
         return radiance
 
     # Few pixels at a time, because there may be more than can be held.
-    count, stretch = (width + 2) * (height + 2), _LANES // len(first)
+    count, stretch = len(windows) * (width + 2) * (height + 2), _LANES // len(first)
     ends = [(start, min(start + stretch, count)) for start in range(0, count, stretch)]
     parts = [lanes(dr.arange(mi.UInt32, *span), first) for span in ends]
-    total, places = _with_uneven(parts[0] if len(parts) == 1 else dr.concat(parts), (width, height), spp)
+    radiance = parts[0] if len(parts) == 1 else dr.concat(parts)
+    total, places, pixels = _with_uneven(radiance, (width, height), spp, len(windows))
     if uneven := dr.width(places):
         rest = np.setdiff1d(np.arange(spp), first)
         at_once = int(np.clip(_LANES // uneven, 1, len(rest)))
-        pixels = places + 2 * (places // dr.opaque(mi.UInt32, width)) + dr.opaque(mi.UInt32, width + 3)
-        dr.eval(pixels)
         for start in range(0, len(rest), at_once):
             numbers = rest[start : start + at_once]
             more = dr.block_sum(lanes(pixels, numbers), len(numbers))
@@ -211,19 +261,30 @@ def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[list
     return [total], failed
 
 
-def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[mi.Float, mi.UInt32]:
-    """Sums of four samples in the pixels of a window, those of even pixels for all samples, and the uneven pixels.
+def _with_uneven(
+    radiance: mi.Float, size: tuple[int, int], spp: int, windows: int
+) -> tuple[mi.Float, mi.UInt32, mi.UInt32]:
+    """Sums of four samples in the pixels of windows, those of even pixels for all samples, and the uneven pixels.
 
-    `radiance` holds four samples of each pixel of the window and of a border of one pixel about it.
+    `radiance` holds four samples of each pixel of the windows and of borders of one pixel about them. The uneven pixels
+    are numbered without and with these borders.
     """
     width = dr.opaque(mi.UInt32, size[0])
-    four = dr.gather(mi.Vector4f, radiance, dr.arange(mi.UInt32, (size[0] + 2) * (size[1] + 2)))
+    wide = (size[0] + 2) * (size[1] + 2)
+    four = dr.gather(mi.Vector4f, radiance, dr.arange(mi.UInt32, windows * wide))
     total, most = dr.sum(four), dr.max(four)
     apart = most - dr.min(four) > _EVEN * most
     dr.eval(total, apart)
-    index = dr.arange(mi.UInt32, size[0] * size[1])
     across = width + 2
-    place = index + 2 * (index // width)  # of the upper left neighbour
+    each = dr.opaque(mi.UInt32, size[0] * size[1]), dr.opaque(mi.UInt32, wide)
+
+    def upper_left(index: mi.UInt32) -> mi.UInt32:
+        """Number of the upper left neighbour."""
+        window, pixel = split(index, each[0], windows > 1)
+        place = pixel + 2 * (pixel // width)
+        return place if window is None else place + window * each[1]
+
+    place = upper_left(dr.arange(mi.UInt32, windows * size[0] * size[1]))
     around = [dr.gather(mi.Float, total, place + i * across + j) for i in range(3) for j in range(3)]
     highest, lowest = around[0], around[0]
     for value in around[1:]:
@@ -231,7 +292,10 @@ def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[m
     uneven = dr.gather(mi.Bool, apart, place + across + 1) | (highest - lowest > _STEP * highest)
     sums = around[4] * dr.select(uneven, 1, dr.opaque(mi.Float, spp / 4))
     dr.eval(sums, uneven)
-    return sums, dr.compress(uneven)
+    places = dr.compress(uneven)
+    pixels = upper_left(places) + across + 1 if dr.width(places) else places
+    dr.eval(pixels)
+    return sums, places, pixels
 
 
 @lru_cache(maxsize=16)
@@ -248,33 +312,34 @@ def _first_samples(count: int) -> Ints:
 
 
 def _singles(
-    shown: Exposed, window: Window, *, spp: int, seed: int, first: int, count: int, layered: bool
+    shown: Exposed, windows: Sequence[Window], *, spp: int, seeds: Sequence[int], first: int, count: int, layered: bool
 ) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums over `count` samples of each pixel, one per lane."""
-    index = dr.arange(mi.UInt32, window[2] * window[3] * count)
+    index = dr.arange(mi.UInt32, len(windows) * windows[0][2] * windows[0][3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
     k = index - pixel * n + dr.opaque(mi.UInt32, first)
-    lanes, failed = _taken_by(shown, window, spp, seed)(pixel, k, layered)
+    lanes, failed = _taken_by(shown, windows, spp, seeds)(pixel, k, layered)
     return [dr.block_sum(x, count) for x in lanes], failed
 
 
 def _taken_by(
-    shown: Exposed, window: Window, spp: int, seed: int
+    shown: Exposed, windows: Sequence[Window], spp: int, seeds: Sequence[int]
 ) -> Callable[[mi.UInt32, mi.UInt32, bool], tuple[list[mi.Float], mi.UInt32]]:
-    """The function that takes samples of a window's pixels."""
-    return partial(
-        _taken, shown.values, shown.lights, shown.textures, shown.scene, *window_of(window), Pattern.of(spp, seed)
-    )
+    """The function that takes samples of the windows' pixels."""
+    seen = shown.values, shown.lights, shown.textures, shown.scene
+    return partial(_taken, *seen, Pixels.of(*windows), Pattern.of(spp, *seeds), len(windows))
 
 
 @recorded
 def _taken(
-    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, corner: tuple[mi.Int32, mi.Int32],
-    width: mi.UInt32, pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32, layered: bool,
+    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, pixels: Pixels, pattern: Pattern, windows: int,
+    pixel: mi.UInt32, k: mi.UInt32, layered: bool,
 ) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
-    """What samples k of pixels show, and the number of their failed light paths."""
-    u, v = pixels_of(pixel, corner, width)
+    """What samples k of pixels show, and the number of failed light paths in each window."""
+    window, u, v = pixels.at(pixel)
+    values, lights, textures = values.of_window(window), lights.of_window(window), textures.of_window(window)
+    pattern = pattern.of_window(window)
     samples = _samples(u, v, pattern)
     spot, on_lamp = samples.in_pixel(k), samples.pair(k, 0)
     o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
@@ -287,7 +352,11 @@ def _taken(
         parts = (view.other, view.cornea | view.sclera)
         lanes = [dr.select(part, x, 0) for part in parts for x in (lanes[0], mi.Float(1), near)]
     dr.eval(lanes, seen.failures)  # together, because a separate reduction would trace everything again
-    failed = dr.sum(seen.failures)
+    if window is None:
+        failed = dr.sum(seen.failures)
+    else:
+        failed = dr.zeros(mi.UInt32, windows)
+        dr.scatter_reduce(dr.ReduceOp.Add, failed, seen.failures, window, seen.failures > 0)
     dr.eval(failed)
     return lanes, failed
 
@@ -310,10 +379,10 @@ def _groups(
     tiles, across = plain
     numbers = (columns, count, first, spp // size, size, times)
     grid = _Grid(
-        (dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])),
+        _opaque_pair(window),
         *(tuple(dr.opaque(mi.UInt32, n) for n in part) for part in (window[2:], numbers, (across, *tiles.shape))),
     )
-    pattern, (marks, chosen) = Pattern.of(spp, seed, times), shown.host.fine(window)
+    pattern, (marks, chosen) = Pattern.of(spp, seed, times=times), shown.host.fine(window)
     if times == 1:
         marks, chosen = aligned(marks & 3), chosen[:0]
     fine, seen = mi.UInt32(marks), mi.UInt8(aligned(tiles.ravel().astype(np.uint8)))
@@ -344,16 +413,16 @@ def _hits_of(
     pixel = dr.gather(mi.UInt32, mi.UInt32(aligned(chosen.astype(np.uint32))), place)
     k = index - place * each + dr.opaque(mi.UInt32, numbers[0])
     dr.eval(pixel, k)
-    return _hits(shown.values, shown.textures.region, shown.scene, *window_of(window), pattern, pixel, k)
+    return _hits(shown.values, shown.textures.region, shown.scene, Pixels.of(window), pattern, pixel, k)
 
 
 @recorded
 def _hits(
-    values: Values, skin: SkinGeometry, scene: mi.Scene, corner: tuple[mi.Int32, mi.Int32], width: mi.UInt32,
-    pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32,
+    values: Values, skin: SkinGeometry, scene: mi.Scene, pixels: Pixels, pattern: Pattern, pixel: mi.UInt32,
+    k: mi.UInt32,
 ) -> tuple[mi.Float, mi.UInt32, mi.Float, mi.Float]:  # fmt: skip
     """What samples k of fine pixels hit of the region: distance, triangle, and place on it."""
-    u, v = pixels_of(pixel, corner, width)
+    _, u, v = pixels.at(pixel)
     spot = _samples(u, v, pattern, mi.Bool(True)).in_pixel(k)
     o, d, _ = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
     hit = region_hit(skin, scene, meet_globe(values, o, d), o, d)

@@ -16,6 +16,7 @@ E'_l and t_l change slowly and are computed on a coarse grid.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +29,7 @@ from .kept import KeptForEye
 from .parameters import leaves, traversed
 from .recorded import recorded
 from .surfaces import Surface
-from .values import Lights, Values
+from .values import Lights, Values, split
 from .view import Textures, iris_height
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
@@ -65,7 +66,7 @@ class Shape:
 class IrisRelief:
     """Height of the iris above its plane and the lamps' light on it, on a grid over the plane."""
 
-    DRJIT_STRUCT = leaves("_stop", "_half", "_count", "_on", "_each", "_heights", "_shades")
+    DRJIT_STRUCT = leaves("_stop", "_half", "_count", "_on", "_each", "_heights", "_shades", "_first")
 
     def __init__(
         self, job: RenderJob, values: Values, lights: Lights, scene: mi.Scene, textures: Textures,
@@ -86,14 +87,22 @@ class IrisRelief:
         self._stop = values.stop
         self._half = values.iris.root_radius + _SPARE_MM
         self._half_mm = float(np.float32(job.eye.iris_root_radius_mm) + np.float32(_SPARE_MM))
-        across = 2 * self._half_mm * float(job.camera.scale_at(job.t)) / _CELL_PX
-        self._side = int(min(max(_STEP * np.ceil(across / _STEP), _LEAST), _MOST))
+        self._side = cells_across(job)
         self._count = dr.opaque(mi.UInt32, self._side)
         self._on = dr.opaque(mi.Bool, textures.raised)
         self._each = dr.opaque(mi.UInt32, lights.points)
         self._heights: mi.Float | None = None
         self._shades: mi.Float | None = None
+        self._first: mi.UInt32 | None = None  # cell of the lanes' windows
         self._fill()
+
+    def of_window(self, window: mi.UInt32 | None) -> IrisRelief:
+        """The relief of one window for each lane."""
+        if window is None:
+            return self
+        made = copy(self)
+        made._first = window * (self._count * self._count)
+        return made
 
     def hit(self, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Foot in the plane (eye frame) of the place that rays meet.
@@ -114,15 +123,15 @@ class IrisRelief:
         """The q of the module's docstring at feet `x`."""
         assert self._shades is not None
         active &= self._on
-        return dr.select(active, self._on_grid(self._shades, x, active), 1)
+        return dr.select(active, self._on_grid(self._shades, x, active, self._first), 1)
 
     def _fill(self) -> None:
         if not self._textures.raised:
             self._heights = self._shades = dr.zeros(mi.Float, 4)
             dr.make_opaque(self._heights)
             return
-        lanes = _COARSE * _COARSE * self._lights.points * max(len(self._lights), 1)
-        cells, job = self._side**2, self._job
+        windows, cells, job = self._lights.windows, self._side**2, self._job
+        lanes = _COARSE * _COARSE * self._lights.points * max(len(self._lights), 1) * windows
         # The iris' own heights do not depend on the pose.
         blocks = -(-self._side // _BLOCK)
         about = int(np.ceil((_REACH_MM * _SLANT * self._side / (2 * self._half_mm) + 2) / _BLOCK))
@@ -133,7 +142,7 @@ class IrisRelief:
                 *self._shape(self._values, self._textures.heights, cells, blocks, dr.opaque(mi.UInt32, about))
             ),
         )
-        self._shades = self._shaded(self._values, self._lights, self._scene, shape, cells, lanes)
+        self._shades = self._shaded(self._values, self._lights, self._scene, shape, cells * windows, lanes)
         self._heights = shape.corners
 
     @recorded
@@ -144,7 +153,7 @@ class IrisRelief:
 
         There are so many `blocks` across. Those up to `about` away from a block are near it.
         """
-        column, row = self._cells(cells)
+        _, column, row = self._cells(cells)
         heights = iris_height(values, pattern, self._place(mi.Float(column), mi.Float(row), self._count))
         dr.eval(heights)
         last = self._count - 1
@@ -187,19 +196,19 @@ class IrisRelief:
         self, values: Values, lights: Lights, scene: mi.Scene, shape: Shape, cells: int, lanes: int
     ) -> mi.Float:
         """The q of the module's docstring at so many cells, from so many paths of light."""
-        column, row = self._cells(cells)
+        window, column, row = self._cells(cells, values.several)
         lamps = self._lamps(values, lights, scene, lanes)
-        shades = self._lit(lights, lamps, shape, column, row)
+        shades = self._lit(lights, lamps, shape, column, row, window)
         dr.eval(shades)
-        shades = self._packed(shades, column, row)
+        shades = self._packed(shades, column, row, window)
         dr.eval(shades)
         return shades
 
-    def _cells(self, cells: int) -> tuple[mi.UInt32, mi.UInt32]:
-        """Columns and rows of all cells, row by row."""
-        index = dr.arange(mi.UInt32, cells)
+    def _cells(self, cells: int, several: bool = False) -> tuple[mi.UInt32 | None, mi.UInt32, mi.UInt32]:
+        """Windows, columns and rows of all cells, row by row."""
+        window, index = split(dr.arange(mi.UInt32, cells), self._count * self._count, several)
         row = index // self._count
-        return index - row * self._count, row
+        return window, index - row * self._count, row
 
     def _place(self, column: mi.Float, row: mi.Float, count: mi.UInt32) -> mi.Vector3f:
         """Point of the plane at a place of a grid with `count` places across."""
@@ -215,19 +224,24 @@ class IrisRelief:
         i, j = mi.UInt32(u), mi.UInt32(v)
         return i, j, u - mi.Float(i), v - mi.Float(j)
 
-    def _on_grid(self, packed: mi.Float, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    def _on_grid(self, packed: mi.Float, x: mi.Vector3f, active: mi.Bool, first: mi.UInt32 | None = None) -> mi.Float:
         i, j, s, t = self._cell(x, self._count)
-        c = dr.gather(mi.Vector4f, packed, j * self._count + i, active)
+        place = j * self._count + i
+        c = dr.gather(mi.Vector4f, packed, place if first is None else place + first, active)
         return dr.lerp(dr.lerp(c.x, c.y, s), dr.lerp(c.z, c.w, s), t)
 
-    def _packed(self, values: mi.Float, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
+    def _packed(self, values: mi.Float, column: mi.UInt32, row: mi.UInt32, window: mi.UInt32 | None = None) -> mi.Float:
         """The four corners of every cell, side by side."""
         last = self._count - 1
         right, below = dr.minimum(column + 1, last), dr.minimum(row + 1, last)
         corners = ((column, row), (right, row), (column, below), (right, below))
+        places = [j * self._count + i for i, j in corners]
+        if window is not None:
+            first = window * (self._count * self._count)
+            places = [place + first for place in places]
         out = dr.zeros(mi.Float, 4 * dr.width(values))
-        four = mi.Vector4f(*(dr.gather(mi.Float, values, j * self._count + i) for i, j in corners))
-        dr.scatter(out, four, row * self._count + column)
+        four = mi.Vector4f(*(dr.gather(mi.Float, values, place) for place in places))
+        dr.scatter(out, four, places[0])
         return out
 
     def _lamps(self, values: Values, lights: Lights, scene: mi.Scene, lanes: int) -> mi.Float:
@@ -236,8 +250,10 @@ class IrisRelief:
 
         each, count = self._each, mi.UInt32(_COARSE)
         index = dr.arange(mi.UInt32, lanes)
-        spot = index // (_COARSE * _COARSE)
-        place = index - spot * (_COARSE * _COARSE)
+        window, one = split(index, lights.count * each * (_COARSE * _COARSE), values.several)
+        values, lights = values.of_window(window), lights.of_window(window)
+        spot = one // (_COARSE * _COARSE)
+        place = one - spot * (_COARSE * _COARSE)
         row = place // count
         x = self._place(mi.Float(place - row * count), mi.Float(row), count)
         lamp = lights[spot // each]
@@ -256,7 +272,10 @@ class IrisRelief:
         dr.eval(out)
         return out
 
-    def _lit(self, lights: Lights, lamps: mi.Float, shape: Shape, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
+    def _lit(
+        self, lights: Lights, lamps: mi.Float, shape: Shape, column: mi.UInt32, row: mi.UInt32,
+        window: mi.UInt32 | None,
+    ) -> mi.Float:  # fmt: skip
         """The q of the module's docstring at cells of the grid."""
         stop, cell = self._stop, row * self._count + column
         x = self._place(mi.Float(column), mi.Float(row), self._count)
@@ -266,6 +285,8 @@ class IrisRelief:
         spots, coarse = lights.count * self._each, mi.UInt32(_COARSE)
         i, j, s, t = self._cell(x, coarse)
         place = j * coarse + i
+        if window is not None:
+            place += window * (spots * (_COARSE * _COARSE))
 
         def lamp(k: mi.UInt32, whole: mi.Float, seen: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
             first = k * (_COARSE * _COARSE) + place
@@ -307,6 +328,13 @@ class IrisRelief:
 
         state = (mi.UInt32(0), mi.Float(0) * h)
         return dr.while_loop(state, more, step, labels=("k", "hidden"), label="shadows of the relief")[1]
+
+
+def cells_across(job: RenderJob) -> int:
+    """Number of cells across of the grid for a job."""
+    half_mm = float(np.float32(job.eye.iris_root_radius_mm) + np.float32(_SPARE_MM))
+    across = 2 * half_mm * float(job.camera.scale_at(job.t)) / _CELL_PX
+    return int(min(max(_STEP * np.ceil(across / _STEP), _LEAST), _MOST))
 
 
 def _arrival(

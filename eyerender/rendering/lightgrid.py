@@ -6,44 +6,58 @@ interpolation is good: not at the edge of a shadow, nor where a lamp sets.
 
 from __future__ import annotations
 
+from copy import copy
+
 import drjit as dr
 import mitsuba as mi
 
 from .parameters import leaves
+from .values import split
 
 BENT = 0.004  # largest third difference of a cell over its irradiance
 
 
 class LightGrid:
-    """Irradiance at the nodes of a grid of `side` by `side`."""
+    """Irradiance at the nodes of a grid of `side` by `side`, or of one for each window."""
 
-    DRJIT_STRUCT = leaves("side", "rows")
+    DRJIT_STRUCT = leaves("side", "rows", "_first")
 
     def __init__(self, side: int, rows: mi.Float | None = None) -> None:
         """Make a grid from its rows (see `rows_of`); without them nothing is known."""
         self.side = side
+        self._first: mi.UInt32 | None = None
         if rows is None:
             rows = dr.full(mi.Float, -1, 4 * side * side)
             dr.make_opaque(rows)
         self.rows = rows
 
+    def of_window(self, window: mi.UInt32 | None) -> LightGrid:
+        """The grid of one window for each lane."""
+        if window is None:
+            return self
+        made = copy(self)
+        made._first = window * (self.side * self.side)
+        return made
+
     @staticmethod
-    def nodes(side: int) -> tuple[mi.UInt32, mi.UInt32]:
-        """Column and row of all nodes of a grid, in row order."""
-        index = dr.arange(mi.UInt32, side * side)
+    def nodes(side: int, windows: int = 1) -> tuple[mi.UInt32 | None, mi.UInt32, mi.UInt32]:
+        """Window, column and row of all nodes of grids, in row order."""
+        window, index = split(dr.arange(mi.UInt32, side * side * windows), side * side, windows > 1)
         row = index // side
-        return index - row * side, row
+        return window, index - row * side, row
 
     @classmethod
     def rows_of(cls, side: int, irradiance: mi.Float, more: mi.Float | None = None) -> mi.Float:
         """The numbers of a grid from the irradiance of its nodes, negative where it is not known.
 
         `more` is added. It is known to change slowly, so it does not decide which cells are used. Both must have been
-        evaluated.
+        evaluated, and hold one window after the other.
         """
-        column, row = cls.nodes(side)
+        count = dr.width(irradiance)
+        window, column, row = cls.nodes(side, count // (side * side))
         index = row * side + column
-        places = about(index, side)
+        first = None if window is None else window * (side * side)
+        places = about(index, side, first)
         near = [dr.gather(mi.Float, irradiance, place) for place in places]
         bent, least, most = unevenness(near)
         good = (least > 0) & (bent <= BENT * most)
@@ -51,9 +65,9 @@ class LightGrid:
         four = near[4:8]
         if more is not None:
             four = [value + dr.gather(mi.Float, more, place) for value, place in zip(four, places[4:8], strict=True)]
-        first = dr.abs(four[0])
-        rows = dr.zeros(mi.Float, 4 * side * side)
-        dr.scatter(rows, mi.Vector4f(dr.select(good, first, -first), *four[1:]), index)
+        low = dr.abs(four[0])
+        rows = dr.zeros(mi.Float, 4 * count)
+        dr.scatter(rows, mi.Vector4f(dr.select(good, low, -low), *four[1:]), index if first is None else index + first)
         return rows
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Bool]:
@@ -64,17 +78,19 @@ class LightGrid:
         wu, wv = weights(u - mi.Float(i)), weights(v - mi.Float(j))
         total, known = mi.Float(0), mi.Bool(inside)
         for k, weight in enumerate(wv):
-            row = dr.gather(mi.Vector4f, self.rows, (j + k - 1) * side + i, inside)
+            place = (j + k - 1) * side + i
+            row = dr.gather(mi.Vector4f, self.rows, place if self._first is None else place + self._first, inside)
             if k == 1:
                 known &= row.x > 0
             total += weight * (wu[0] * dr.abs(row.x) + wu[1] * row.y + wu[2] * row.z + wu[3] * row.w)
         return dr.select(known, dr.maximum(total, 0), 0), known
 
 
-def about(index: mi.UInt32, side: int) -> list[mi.UInt32]:
-    """The sixteen nodes about cells of a grid, row by row."""
+def about(index: mi.UInt32, side: int, first: mi.UInt32 | None = None) -> list[mi.UInt32]:
+    """The sixteen nodes about cells of grids, row by row, in which a grid begins with its `first` node."""
     places = (mi.Int32(index) + dv * side + du for dv in range(-1, 3) for du in range(-1, 3))
-    return [mi.UInt32(dr.clip(place, 0, side**2 - 1)) for place in places]
+    near = [mi.UInt32(dr.clip(place, 0, side**2 - 1)) for place in places]
+    return near if first is None else [place + first for place in near]
 
 
 def unevenness(near: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float]:

@@ -6,6 +6,9 @@ of its points sums over the lamps the irradiance of the stop times the return fa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,27 +16,36 @@ import numpy as np
 from ..eye.fundus import CELLS, EDGE, FundusLight
 from .parameters import leaves
 from .recorded import recorded
-from .values import Lights, Values, aligned
+from .values import Lights, Values, aligned, split
 
 
 class PupilLight:
     """Radiance in air (mW/mm^2/sr) that leaves the pupil, before the transmittance of the cornea."""
 
-    DRJIT_STRUCT = leaves("_cells")
+    DRJIT_STRUCT = leaves("_cells", "_first")
 
-    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, returned: FundusLight) -> None:
+    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, returned: Sequence[FundusLight]) -> None:
         """Fill the grid.
 
         Args:
             values: the scene's numbers.
             lights: the lamps.
             scene: what may stand in the way.
-            returned: the return factors of the lamps.
+            returned: the return factors of the lamps, for each window.
         """
         self._values, self._lights, self._scene = values, lights, scene
-        self._factors = aligned(np.ascontiguousarray(returned.factors, dtype=np.float32).reshape(-1))
+        self._factors = aligned(np.concatenate([one.factors.ravel() for one in returned]).astype(np.float32))
+        self._first: mi.UInt32 | None = None
         self._cells: mi.Float | None = None
         self._fill()
+
+    def of_window(self, window: mi.UInt32 | None) -> PupilLight:
+        """The light of one window for each lane."""
+        if window is None:
+            return self
+        made = copy(self)
+        made._first = window * (CELLS * CELLS)
+        return made
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> mi.Float:
         """Radiance at coordinates of the stop in units of its semi-axes, bilinearly."""
@@ -43,25 +55,29 @@ class PupilLight:
         s, t = x - mi.Float(i), y - mi.Float(j)
 
         def cell(di: int, dj: int) -> mi.Float:
-            return dr.gather(mi.Float, self._cells, (j + dj) * CELLS + i + di, active)
+            place = (j + dj) * CELLS + i + di
+            return dr.gather(mi.Float, self._cells, place if self._first is None else place + self._first, active)
 
         low, high = (dr.lerp(cell(0, k), cell(1, k), s) for k in (0, 1))
         return dr.lerp(low, high, t)
 
     def _fill(self) -> None:
+        cells = CELLS * CELLS * self._lights.windows
         if not len(self._lights) or not self._factors.any():
-            self._cells = dr.zeros(mi.Float, CELLS * CELLS)
+            self._cells = dr.zeros(mi.Float, cells)
             dr.make_opaque(self._cells)
             return
-        self._cells = _filled(self._values, self._lights, self._scene, mi.Float(self._factors))
+        self._cells = _filled(self._values, self._lights, self._scene, mi.Float(self._factors), cells)
 
 
 @recorded
-def _filled(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float) -> mi.Float:
+def _filled(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float, cells: int) -> mi.Float:
     """Numbers of the grid, from the return factors of the lamps."""
     from .lighting import LampPath
 
-    index = dr.arange(mi.UInt32, CELLS * CELLS)
+    window, index = split(dr.arange(mi.UInt32, cells), CELLS * CELLS, values.several)
+    factor_row = 0 if window is None else window * lights.count
+    values, lights = values.of_window(window), lights.of_window(window)
     row = index // CELLS
     u, v = ((mi.Float(k) + 0.5) * (2 * EDGE / CELLS) - EDGE for k in (index - row * CELLS, row))
     a, b = values.stop.axes
@@ -70,7 +86,7 @@ def _filled(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float) 
     x = values.stop.centre + (u * shrink * a) * values.stop.u + (v * shrink * b) * values.stop.v
 
     def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        factor = dr.gather(mi.Float, factors, i * (CELLS * CELLS) + index)
+        factor = dr.gather(mi.Float, factors, (i + factor_row) * (CELLS * CELLS) + index)
         lamp = lights[i]
         path = LampPath.to(values, scene, lamp, lamp.position, x, factor > 0)
         return i + 1, total + dr.select(path.blocked, 0, path.gain * factor)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -24,12 +24,16 @@ from .region import RegionScene
 from .splat import MirrorImages, Shine
 from .stage import Stage
 from .surround import Obstacle, Surround
+from .together import together
 from .window import Developed, RenderedWindow, Traced
 
 if TYPE_CHECKING:
     from ..backends.choose import Backend
 
 __all__ = ["BACKGROUND", "FRAME", "IRIS", "PUPIL", "SCLERA", "PartLabels", "RenderJob", "RenderedWindow", "Renderer"]
+
+
+LANES = {"llvm": 2**20, "cuda": 2**22}  # samples of windows that share launches
 
 
 class Renderer:
@@ -72,60 +76,101 @@ class Renderer:
         Raises:
             InputError: numbers so extreme that the image is not finite.
         """
-        return self._traced(job, spp, moments, None).developed()
+        traced = self._moving(job, spp, moments) if moments else self._traced([job], spp, ())[0]
+        return traced.developed()
 
     def begin(
-        self,
-        job: RenderJob,
-        *,
-        spp: int | None = None,
-        moments: Sequence[RenderJob] = (),
-        after: RenderJob | None = None,
+        self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()
     ) -> Future[RenderedWindow]:
-        """Trace one window now, and develop it in a second thread, beside the tracing of the next.
+        """Trace one window now, and develop it in a second thread. The arguments are those of `render`."""
+        traced = self._moving(job, spp, moments) if moments else self._traced([job], spp, ())[0]
+        return self._beside.submit(traced.developed)
 
-        The arguments are those of `render`. `after` is the very job that comes next, if it is known: what NumPy
-        alone makes of it is made in the second thread, too. The results do not depend on it.
+    def begin_all(
+        self, jobs: Sequence[RenderJob], *, spp: int | None = None, after: Sequence[RenderJob] = ()
+    ) -> list[Future[RenderedWindow]]:
+        """Trace windows that share launches now, and develop them in a second thread, beside the tracing of the next.
+
+        The results are those of `render`, whatever shares launches and comes next.
+
+        Args:
+            jobs: one job, or jobs that `together` puts together.
+            spp: samples per pixel; None: those of the renderer.
+            after: the very jobs that come next, if they are known: what NumPy alone makes of them is made in the second
+                thread, too.
         """
-        return self._beside.submit(self._traced(job, spp, moments, after).developed)
+        return [self._beside.submit(traced.developed) for traced in self._traced(jobs, spp, after)]
+
+    def together(self, jobs: Iterable[RenderJob], *, spp: int | None = None) -> Iterator[tuple[RenderJob, ...]]:
+        """Put jobs that follow each other together where they can share launches: small windows of one bare eye."""
+        if self._stage.obstructed:
+            return ((job,) for job in jobs)
+        return together(jobs, spp or self.spp, LANES["cuda" if self.backend.name == "cuda" else "llvm"])
 
     @uncollected
-    def _traced(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob], after: RenderJob | None) -> Traced:
-        shots = moments or (job,)
-        spp = max(1, (spp or self.spp) // len(shots))
+    def _traced(self, jobs: Sequence[RenderJob], spp: int | None, after: Sequence[RenderJob]) -> list[Traced]:
+        """Trace jobs that share launches."""
+        shown, place = self._stage.set(jobs, after=after)
+        blurs = [host.blur for host in shown.hosts]
+        windows, seeds = [blur.window for blur in blurs], [job.seed for job in jobs]
+        film = begun(shown, windows, spp or self.spp, seeds, layered=blurs[0].layered)
+        # The device is at work until something is read, so the host's own work comes first.
+        marks = _marks(shown)
+        self._stage.prepare()
+        images = [self._mirror_images(host).seen(place, blur) for host, blur in zip(shown.hosts, blurs, strict=True)]
+        read = self._pictures(jobs, blurs, film, [shines for _, shines in images])
+        return [
+            Traced(job, picture, tuple(shines), blur, mirrored, labels, failed, margins, bright)
+            for job, blur, (mirrored, shines), (picture, failed), (labels, margins, bright) in zip(
+                jobs, blurs, images, read(), marks(), strict=True
+            )
+        ]
+
+    def _pictures(
+        self, jobs: Sequence[RenderJob], blurs: Sequence[Blur], film: Film, shines: Sequence[Sequence[Shine]]
+    ) -> Callable[[], Sequence[tuple[Singles | Developed, int]]]:
+        """What reads the pictures of jobs, which the device develops if it can, and numbers of failed light paths."""
+        room = self._darkroom
+        if room is None or not all(map(takes, jobs, blurs)):
+            return film.means
+        begun = [room.begun(job, [film.of_window(k)], shines[k]) for k, job in enumerate(jobs)]
+        return lambda: [read() for read in begun]
+
+    @uncollected
+    def _moving(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob]) -> Traced:
+        """Trace the moments of a job: the mean of their pictures, with labels and glints of the job itself."""
+        spp = max(1, (spp or self.spp) // len(moments))
         blur: Blur | None = None
         films: list[Film] = []
         pictures: list[Singles] = []
         failed = 0
         glints: list[Shine] = []
         marks: tuple[Any, ...] | None = None
-        for shot in shots:
-            shown, place = self._stage.set(shot, after=None if moments else after)
-            blur = blur or (Blur.of(job, place.posed) if moments else shown.host.blur)
-            film = begun(shown, blur.window, spp, shot.seed, layered=blur.layered)
-            # The device is at work until something is read, so the host's own work comes first.
-            found = _marks(job, shown) if shot.M is job.M and shot.t is job.t else None
-            self._stage.prepare()
-            mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(shots))
+        for shot in moments:
+            shown, place = self._stage.set([shot])
+            blur = blur or Blur.of(job, place.posed)
+            film = begun(shown, [blur.window], spp, [shot.seed], layered=blur.layered)
+            found = _marks(shown, job) if shot.M is job.M and shot.t is job.t else None
+            mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(moments))
             glints += shines
             if self._darkroom is not None and takes(job, blur):
                 films.append(film)
             else:
-                mean, missed = film.mean()
+                ((mean, missed),) = film.means()
                 pictures.append(mean)
                 failed += missed
             if found is not None:
-                marks = mirrored, *found()
+                marks = mirrored, *found()[0]
         assert blur is not None
         if marks is None:  # no moment is the middle of the exposure
             shown, place = self.bind(job, lit=False)
-            marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(job, shown)()
+            marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(shown)()[0]
         mirrored, labels, margins, bright = marks
         picture: Singles | Developed
         if self._darkroom is not None and films:
-            picture, failed = self._darkroom.developed(job, films, glints)
+            picture, failed = self._darkroom.begun(job, films, glints)()
         else:
-            picture = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
+            picture = np.mean(pictures, axis=0)
         return Traced(job, picture, tuple(glints), blur, mirrored, labels, failed, margins, bright)
 
     def _mirror_images(self, host: Prepared) -> MirrorImages:
@@ -154,7 +199,7 @@ class Renderer:
 
     def labels(self, job: RenderJob) -> PartLabels:
         """Compute the labels of a window alone."""
-        return part_labels(self.bind(job, lit=False)[0], job.window)()
+        return part_labels(self.bind(job, lit=False)[0], [job.window])()[0]
 
     def depths_mm(self, job: RenderJob) -> Singles:
         """Distances (height, width) from the nodal point of what a window shows, infinite where that is nothing."""
@@ -165,14 +210,17 @@ class Renderer:
 
         It is valid until the next call. `lit`: whether radiance is wanted, not only what is seen where.
         """
-        return self._stage.set(job, lit=lit)
+        return self._stage.set([job], lit=lit)
 
 
-def _marks(job: RenderJob, shown: Exposed) -> Callable[[], tuple[Any, ...]]:
-    """Begin with labels, margins of the lids (px) and highlights of a window, as far as they are wanted."""
-    labels, margins = part_labels(shown, job.window) if job.labels else None, shown.host.lid_margins_px
-    return lambda: (
-        None if labels is None else labels(),
-        margins,
-        highlights(shown, job.window) if job.highlights else None,
-    )
+def _marks(shown: Exposed, middle: RenderJob | None = None) -> Callable[[], list[tuple[Any, ...]]]:
+    """Begin with labels, margins of the lids (px) and highlights of each window, as far as they are wanted.
+
+    middle: the job that says what is wanted, if it is not the frame's own.
+    """
+    jobs = [host.job for host in shown.hosts] if middle is None else [middle]
+    labels = part_labels(shown, [job.window for job in jobs]) if jobs[0].labels else lambda: [None] * len(jobs)
+    return lambda: [
+        (found, host.lid_margins_px, highlights(shown, job.window) if job.highlights else None)
+        for found, host, job in zip(labels(), shown.hosts, jobs, strict=True)
+    ]

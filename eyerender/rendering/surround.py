@@ -128,7 +128,18 @@ class Surround:
 
     def clear(self, a: Floats, b: Floats) -> Bools:
         """Whether nothing of the surround stands between points (n, 3) of the scene's frame; ends not included."""
-        return clear_between(self.scene, a, b)
+        return clear_between(self.scene, a, b) if self.obstructed else _beside_plane(self._vertices[0, 0], a, b)
+
+
+def _beside_plane(x: float, a: Floats, b: Floats) -> Bools:
+    """The same for the plane of the surround alone."""
+    table = _between(a, b).astype(float)
+    o, d, length = table[:, :3], table[:, 3:6], table[:, 6]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (x - o[:, 0]) / d[:, 0]
+        y, z = o[:, 1] + t * d[:, 1], o[:, 2] + t * d[:, 2]
+        met = (t > 0) & (t < length) & (np.maximum(np.abs(y), np.abs(z)) < HALF_MM)
+    return np.asarray(~met)
 
 
 def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:

@@ -7,6 +7,7 @@ What determines the kernel (the kinds of surfaces, whether the lens distorts) is
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .parameters import Kind, Parameters, leaves, packed, rebuilt
+from .parameters import CameraParameters, Kind, Parameters, PoseParameters, leaves, packed, rebuilt
 from .recorded import recorded
 from .surfaces import Surface
 
@@ -28,6 +29,7 @@ _ALIGNMENT = 64  # bytes; the widest vector of a processor
 _POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
 SMALL = 0.02  # the same of lamps whose shadows of hairs are finer than a pixel
 ALL, BITS = 0xFFFFFFFF, 32  # marks of lamps
+_WINDOW_ROW = 36  # pose 12, camera 21, 3 unused
 _LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
 
 
@@ -62,6 +64,14 @@ def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
     return mi.UInt32((mi.Float(a) + 0.5) / mi.Float(b))
 
 
+def split(index: mi.UInt32, each: int | mi.UInt32, several: bool) -> tuple[mi.UInt32 | None, mi.UInt32]:
+    """The window of each lane, None if there is but one, and the number of the lane among the `each` of its window."""
+    if not several:
+        return None, index
+    window = index // each
+    return window, index - window * each
+
+
 @dataclass(frozen=True, slots=True)
 class Structure:
     """What a kernel is compiled for.
@@ -84,7 +94,7 @@ class Values:
 
     DRJIT_STRUCT = leaves(
         "structure", "boundary", "surfaces", "stop", "iris", "limbus", "sclera", "image", "pose", "camera",
-        "inner_index", "pupil_albedo", "globe_reach", "backdrop_x", "ambient_irradiance",
+        "inner_index", "pupil_albedo", "globe_reach", "backdrop_x", "ambient_irradiance", "_windows",
     )  # fmt: skip
 
     def __init__(
@@ -93,7 +103,23 @@ class Values:
         parameters: Parameters,
         waves: np.ndarray[Any, np.dtype[np.float64]],
         tables: Sequence[NDArray[np.float32] | None],
+        windows: Sequence[Parameters] = (),
     ) -> None:
+        """Send the numbers to the device.
+
+        Args:
+            structure: what kernels are compiled for.
+            parameters: the numbers.
+            waves: the pupil's boundary.
+            tables: the cells of measured surfaces.
+            windows: the numbers of windows that share launches, if there are several: poses and cameras may differ.
+        """
+        self._windows: mi.Float | None = None
+        if windows:
+            rows = np.zeros((len(windows), _WINDOW_ROW), np.float32)
+            for row, one in zip(rows, windows, strict=True):
+                row[: _WINDOW_ROW - 3] = packed((one.pose, one.camera))
+            self._windows = mi.Float(aligned(rows.ravel()))
         left = iter(one_by_one(packed(parameters)))
 
         def leaf(size: int) -> mi.Float | mi.Vector3f | tuple[mi.Float, ...]:
@@ -113,6 +139,25 @@ class Values:
         self.inner_index, self.pupil_albedo = found.inner_index, found.pupil_albedo
         self.globe_reach, self.backdrop_x = found.globe_reach, found.backdrop_x
         self.ambient_irradiance = found.ambient_irradiance
+
+    @property
+    def several(self) -> bool:
+        """Whether there are several windows."""
+        return self._windows is not None
+
+    def of_window(self, window: mi.UInt32 | None) -> Values:
+        """The numbers of one window for each lane."""
+        if window is None:
+            return self
+        row = window * (_WINDOW_ROW // 4)
+        n = [x for k in range(_WINDOW_ROW // 4) for x in dr.gather(mi.Vector4f, self._windows, row + k)]
+        a, b, c, shift, *camera = (mi.Vector3f(*n[k : k + 3]) for k in range(0, 24, 3))
+        made = copy(self)
+        made.pose = PoseParameters((a, b, c), shift)
+        centre, right, down, forward = camera
+        made.camera = CameraParameters(centre, right, down, forward, (n[24], n[25]), (n[26], n[27]), tuple(n[28:33]))
+        made._windows = None
+        return made
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the scene's frame to the eye frame: M^T (x - t)."""
@@ -167,6 +212,17 @@ class PupilBoundary:
         return 1 + dr.while_loop(state, more, body, labels=("k", "re", "im"), label="margin")[1]
 
 
+def point_like(table: NDArray[np.float64]) -> bool:
+    """Whether all lamps of a table (see `frame.light_table`) are so small that their middles stand for them."""
+    return _widest(table) < _POINT_LIKE and not np.any(table[:, 9] > 0)
+
+
+def _widest(table: NDArray[np.float64]) -> float:
+    """Largest radius of lamps over their distance from the eye."""
+    away = np.linalg.norm(table[:, :3], axis=1)
+    return float(np.max(table[:, 6] / np.maximum(away, 1e-3), initial=0.0))
+
+
 class Lights:
     """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number.
 
@@ -174,21 +230,22 @@ class Lights:
     nodes of a grid, and `gridded` whether lamps of that size may have grids. `suns` is 1 if the last lamp is a sun with
     sharp shadows, else 0. `on_iris` and `on_matte` are their light
     in the plane of the iris and on matte surfaces where grids of it are used, and `relief` is the iris' relief in their
-    light.
+    light. Windows that share launches have as many lamps each, in rows of the table one window after the other.
     """
 
-    DRJIT_STRUCT = leaves("count", "suns", "_buffer", "on_iris", "on_matte", "relief")
+    DRJIT_STRUCT = leaves("count", "suns", "_buffer", "_first", "on_iris", "on_matte", "relief")
 
-    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]], suns: int = 0) -> None:
-        self._len = len(table)
+    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]], suns: int = 0, windows: int = 1) -> None:
+        self._len, self.windows = len(table) // windows, windows
+        self._first: mi.UInt32 | None = None
         self.on_iris: IrisLight | None = None
         self.on_matte: MatteLight | None = None
         self.relief: IrisRelief | None = None
         away = np.linalg.norm(table[:, :3], axis=1)
-        self.widest = float(np.max(table[:, 6] / np.maximum(away, 1e-3), initial=0.0))
-        self.points = 1 if self.widest < _POINT_LIKE and not np.any(table[:, 9] > 0) else 4
+        self.widest = _widest(table)
+        self.points = 1 if point_like(table) else 4
         self.gridded = self.widest < _LARGE
-        self.count = dr.opaque(mi.UInt32, len(table))
+        self.count = dr.opaque(mi.UInt32, self._len)
         self.suns = dr.opaque(mi.UInt32, suns if self._len and table[-1, 6] < SMALL * away[-1] else 0)
         rows = np.zeros((max(len(table), 1), _LIGHT_ROW), np.float32)
         rows[: len(table), : table.shape[1]] = table
@@ -197,9 +254,21 @@ class Lights:
     def __len__(self) -> int:
         return self._len
 
+    def of_window(self, window: mi.UInt32 | None) -> Lights:
+        """The lamps of one window for each lane."""
+        if window is None:
+            return self
+        made = copy(self)
+        made._first = window * self.count
+        for name in ("on_iris", "on_matte", "relief"):
+            part = getattr(self, name)
+            setattr(made, name, None if part is None else part.of_window(window))
+        return made
+
     def __getitem__(self, i: mi.UInt32) -> Lamp:
+        row = i if self._first is None else i + self._first
         # Four numbers are gathered at once.
-        a, b, c = (dr.gather(mi.Vector4f, self._buffer, i * (_LIGHT_ROW // 4) + k) for k in range(3))
+        a, b, c = (dr.gather(mi.Vector4f, self._buffer, row * (_LIGHT_ROW // 4) + k) for k in range(3))
         return Lamp(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(a.w, b.x, b.y), b.z, b.w, c.x, c.y, i)
 
 

@@ -103,7 +103,8 @@ def test_trees_built_beside_the_frame_before_give_the_same_bits(renderer, monkey
     run = [first[0], first[1], left[0], first[2], left[1], other[0], other[1], first[0]]
     threaded = dr.thread_count()
     dr.set_thread_count(2)  # with one, there is nothing to build trees beside
-    begun = [renderer.begin(job, spp=4, after=after) for job, after in zip(run, [*run[1:], first[2]], strict=True)]
+    nexts = [*run[1:], first[2]]
+    begun = [renderer.begin_all([job], spp=4, after=[after])[0] for job, after in zip(run, nexts, strict=True)]
     dr.set_thread_count(threaded)
     if renderer.backend.name == "llvm":
         # A subject or a side that comes, or comes back, has no scene before its frame.
@@ -113,13 +114,14 @@ def test_trees_built_beside_the_frame_before_give_the_same_bits(renderer, monkey
 
 
 def test_an_image_before_one_that_fails_is_still_given(renderer, monkeypatch):
-    frames, trace, traced = scene([(0.0, 0.0), (9.0, -4.0)]).frames(), renderer._traced, list[object]()
+    apart = scene([(0.0, 0.0), (9.0, -4.0)], lens={"focus_mm": 600.0})  # else both would be traced together
+    frames, trace, traced = apart.frames(), renderer._traced, list[object]()
 
-    def failing(job, *rest):
+    def failing(jobs, *rest):
         if traced:
             raise InputError("broken")
-        traced.append(job)
-        return trace(job, *rest)
+        traced.append(jobs)
+        return trace(jobs, *rest)
 
     monkeypatch.setattr(renderer, "_traced", failing)
     images = render_windows(frames, renderer=renderer)
