@@ -373,16 +373,21 @@ class _Strip:
         out: Singles = np.zeros_like(self.y)
         if np.min(self.out_mm) < 4:
             tongues = self.tiles.at(43, _places(self.y, self.out_mm / 3), (10, 60), (10, 60))
-            film = 1 - step(self.out_mm - 0.75 - 0.9 * tongues, -0.2, 0.2)
+            reach = np.where(self.upper > 0, 1.5, 0.75)  # the upper lashes hold more of it
+            film = 1 - step(self.out_mm - reach - 0.9 * tongues, -0.2, 0.2)
             out = film * np.clip(0.99 - 0.06 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
         return out
 
     def lumps(self) -> Singles:
         """Height (mm) of the lumps of the wet margins: mouths of glands, and water between the lashes."""
-        at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0) * (1 - step(self.out_mm, 1.0, 2.5))
+        at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
+        at = at * (1 - step(self.out_mm - np.where(self.upper > 0, 0.5, 0.0), 1.0, 2.5))
         out: Singles = np.zeros_like(self.y)
         if np.any(at > 0):
-            out = 0.06 * at * self.tiles.at(9, _places(self.y, self.out_mm), (4, 10), (12, 30))
+            places = _places(self.y, self.out_mm)
+            low = 0.06 * self.tiles.at(9, places, (4, 10), (12, 30))
+            high = 0.15 * self.tiles.at(10, places, (7, 16), (14, 36))
+            out = at * np.where(self.upper > 0, high, low)
         return out
 
     def cells(self) -> Singles:
