@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -139,20 +139,57 @@ def begin_windows(frames: Frames, renderer: Renderer, *, highlights: bool = Fals
     Raises:
         InputError: the scene's windows cannot be rendered.
     """
-    check_windows(frames.scene)
-    spp = frames.scene.spec.image.spp
-    jobs = (replace(render_job(frames, row), highlights=highlights) for row in range(len(frames)))
-    if frames.scene.spec.motion is not None:
-        for row, job in enumerate(jobs):
-            yield BegunImage(frames, row, job, renderer.begin(job, spp=spp, moments=moments(frames, row, job)))
-        return
-    groups, row = renderer.together(jobs, spp=spp), 0
-    after = next(groups, ())
-    while after:
-        group, after = after, next(groups, ())
-        for job, made in zip(group, renderer.begin_all(group, spp=spp, after=after), strict=True):
-            yield BegunImage(frames, row, job, made)
-            row += 1
+    return begin_each([frames], renderer, highlights=highlights)
+
+
+def begin_each(many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False) -> Iterator[BegunImage]:
+    """Do as `begin_windows` for the rows of many frames.
+
+    The next frames are fetched before the last of these are traced, because what NumPy alone makes of them is made
+    beside that. Where fetching fails, these are traced first.
+    """
+    steps = _steps(many, renderer, highlights)
+    step = next(steps, None)
+    while step is not None:
+        failed: Exception | None = None
+        try:
+            after = next(steps, None)
+        except Exception as error:
+            after, failed = None, error
+        spp = step.frames.scene.spec.image.spp
+        if step.moments:
+            made = [renderer.begin(step.jobs[0], spp=spp, moments=step.moments)]
+        else:
+            expected = () if after is None or after.moments else after.jobs
+            made = renderer.begin_all(step.jobs, spp=spp, after=expected)
+        for k, (job, image) in enumerate(zip(step.jobs, made, strict=True)):
+            yield BegunImage(step.frames, step.row + k, job, image)
+        if failed is not None:
+            raise failed
+        step = after
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """Jobs of rows of `frames`, from `row` on, that are traced together; the moments of the only one, if it moves."""
+
+    frames: Frames
+    row: int
+    jobs: tuple[RenderJob, ...]
+    moments: tuple[RenderJob, ...]
+
+
+def _steps(many: Iterable[Frames], renderer: Renderer, highlights: bool) -> Iterator[_Step]:
+    """What to trace, one after the other."""
+    for frames in many:
+        check_windows(frames.scene)
+        row = 0
+        jobs = (replace(render_job(frames, k), highlights=highlights) for k in range(len(frames)))
+        moving = frames.scene.spec.motion is not None
+        groups = ((job,) for job in jobs) if moving else renderer.together(jobs, spp=frames.scene.spec.image.spp)
+        for group in groups:
+            yield _Step(frames, row, group, moments(frames, row, group[0]) if moving else ())
+            row += len(group)
 
 
 def render_job(frames: Frames, row: int) -> RenderJob:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
-from ..capture import BegunImage, EyeImage, begin_windows, make_renderer, noiseless
+from ..capture import BegunImage, EyeImage, begin_each, make_renderer, noiseless
 from ..images import settled_exposure_ms
 from ..labels import image_labels
 from ..plausibility import is_saturated
@@ -23,6 +25,7 @@ from .realise import Realised, Rejection, realise
 
 if TYPE_CHECKING:
     from ..rendering.renderer import Renderer
+    from ..scene import Frames
 
 
 @dataclass(frozen=True)
@@ -69,21 +72,33 @@ class Maker:
 
     def make(self, index: int) -> MadeSample:
         """Make sample `index` with its images."""
-        return self._begun(index).result()
+        return next(self.make_all([index]))
 
     def make_all(self, indices: Iterable[int]) -> Iterator[MadeSample]:
         """Make samples in order. What is left to do for one besides tracing is done while the next is traced."""
-        for begun in one_behind(self._begun(index) for index in indices):
+        for begun in one_behind(self._begun(indices)):
             yield begun.result()
 
-    def _begun(self, index: int) -> Future[MadeSample]:
-        """Trace a sample's frames; a second thread makes the rest."""
-        found = self._exposed(realise(self.plan, index, self.frames))
-        highlights = self.plan.spec.labels.highlights
-        begun: tuple[BegunImage, ...] = ()
-        if found.frames is not None:
-            begun = tuple(begin_windows(found.frames, self.renderer, highlights=highlights))
-        return self._beside.submit(lambda: MadeSample(index, tuple(self._images(found, begun)), found.rejections))
+    def _begun(self, indices: Iterable[int]) -> Iterator[Future[MadeSample]]:
+        """Trace the frames of samples; a second thread makes the rest."""
+        waiting: deque[Realised] = deque()
+
+        def frames() -> Iterator[Frames]:
+            for index in indices:
+                waiting.append(self._exposed(realise(self.plan, index, self.frames)))
+                if found := waiting[-1].frames:
+                    yield found
+
+        images = begin_each(frames(), self.renderer, highlights=self.plan.spec.labels.highlights)
+        for first in images:
+            while not waiting[0].frames:
+                yield self._rest(waiting.popleft(), ())
+            yield self._rest(waiting.popleft(), (first, *islice(images, len(first.frames) - 1)))
+        for found in waiting:
+            yield self._rest(found, ())
+
+    def _rest(self, found: Realised, begun: tuple[BegunImage, ...]) -> Future[MadeSample]:
+        return self._beside.submit(lambda: MadeSample(found.index, tuple(self._images(found, begun)), found.rejections))
 
     def _exposed(self, found: Realised) -> Realised:
         """The sample with the exposure of its subject; that of the scene where the subject's pictures are dark."""
