@@ -81,7 +81,7 @@ class Counter:
         packed = mi.Float(aligned(np.array(numbers, np.float32)))
         pixels = window[2] * window[3]
         if not sensor.noise:
-            return _quiet(packed, irradiance, self._origin)
+            return _quiet(packed, irradiance, self._origin, pixels)
         generator: Any = np.random.default_rng((exposure.NOISE, seed)).bit_generator
         state = generator.state["state"]
         words = [word for n in (state["state"], state["inc"]) for word in (n & _WORD, n >> 64)]
@@ -90,7 +90,7 @@ class Counter:
         drawn = mi.UInt64(aligned(np.array(words, np.uint64)))
         raw = _raw(drawn, self._jumps, self._origin, -(-2 * pixels // 4))
         size = dr.opaque(mi.UInt32, window[2]), dr.opaque(mi.UInt32, pixels)
-        return _noisy(packed, drawn, size, raw, irradiance, self._normals, self._origin)
+        return _noisy(packed, drawn, size, raw, irradiance, self._normals, self._origin, pixels)
 
 
 @recorded
@@ -111,13 +111,13 @@ def _raw(words: mi.UInt64, jumps: mi.UInt64, origin: mi.UInt32, count: int) -> m
 @recorded
 def _noisy(
     numbers: mi.Float, words: mi.UInt64, size: tuple[mi.UInt32, mi.UInt32], raw: mi.UInt64, irradiance: mi.Float,
-    normals: mi.Float, origin: mi.UInt32,
+    normals: mi.Float, origin: mi.UInt32, count: int,
 ) -> mi.UInt32:  # fmt: skip
     """Codes of pixels with the noise of 16 bits each for photons and read-out, and with fixed patterns."""
     scale, well, most, gain, black, full, read_noise, prnu, dsnu, column = _numbers(numbers, origin)
     x0, y0 = (dr.gather(mi.UInt64, words, origin + k) for k in (7, 8))
     width, pixels = size
-    pixel = dr.arange(mi.UInt32, dr.width(irradiance))
+    pixel = dr.arange(mi.UInt32, count)
     row = pixel // width
     x, y = x0 + mi.UInt64(pixel - row * width), y0 + mi.UInt64(row)
 
@@ -142,7 +142,7 @@ def _noisy(
 
 
 @recorded
-def _quiet(numbers: mi.Float, irradiance: mi.Float, origin: mi.UInt32) -> mi.UInt32:
+def _quiet(numbers: mi.Float, irradiance: mi.Float, origin: mi.UInt32, count: int) -> mi.UInt32:
     """Codes of pixels without noise."""
     scale, well, _, gain, black, full, *_ = _numbers(numbers, origin)
     codes = _stored((_Single(irradiance) * scale).at_most(well), gain, black, full)

@@ -1,13 +1,14 @@
-"""Development of pictures on the device: point-spread function, vignetting, openings, glare, and the sensor's codes.
+"""Development of pictures on the device: defocus, point-spread function, vignetting, openings, glare, and counts.
 
 Backends whose device is a GPU use it. It is launched behind the samples, and the host reads the irradiance and the
 codes once. What NumPy draws in little time is sent: the mirror images of lamps with every frame, and what belongs to a
 lens and a window (which light passes, waves of the glare) once.
 
-The device develops pictures in focus, without a ghost, and with a glare that is wide, if any (`takes`). NumPy develops
-the others as a whole (`window.Traced`). The codes are the device's, too, unless charge spills from pixel to pixel or
-the sensor has a gamma (`counts.counted`). They equal those that NumPy computes of the returned irradiance, bit by bit.
-The irradiance differs from NumPy's in the last digits, because sums have other orders.
+NumPy develops pictures with a ghost or a narrow glare, and large ones out of focus, as a whole (`takes`,
+`window.Traced`). The codes are the device's unless charge spills from pixel to pixel or the sensor has a gamma
+(`counts.counted`). They equal those that NumPy computes of the returned irradiance, bit by bit. The irradiance differs
+from NumPy's in the last digits, because sums have other orders. Where layers of different depth meet, it may differ by
+a ten-thousandth of the brightest pixel (`depthblur`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ..arrays import Reals
 from ..rig import defocus, exposure, psf, stray
 from .blur import Blur
 from .counts import Counter, counted
+from .depthblur import Plane, Size, size_of, spread
 from .film import Film
 from .frame import RenderJob
 from .recorded import recorded
@@ -33,13 +35,13 @@ from .window import Developed
 
 _T = TypeVar("_T")
 _KEPT = 16  # kernels, maps and waves
-_Size = tuple[mi.UInt32, mi.UInt32]  # width and height, or numbers across and down
+_MOST_PIXELS = 2**22  # of a picture out of focus, whose transforms need some hundred bytes a pixel
 
 
 def takes(job: RenderJob, blur: Blur) -> bool:
     """Whether the device develops the pictures of a job."""
     wide = job.lens.glare == 0 or stray.is_wide(job.lens.glare_radius_px)
-    return blur.reach == 0 and not blur.layered and job.lens.ghost == 0 and wide
+    return job.lens.ghost == 0 and wide and (blur.reach == 0 or blur.window[2] * blur.window[3] <= _MOST_PIXELS)
 
 
 class Darkroom:
@@ -50,25 +52,32 @@ class Darkroom:
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
     def begun(
-        self, job: RenderJob, films: Sequence[Film], shines: Sequence[Shine]
+        self, job: RenderJob, blur: Blur, films: Sequence[Film], shines: Sequence[Shine]
     ) -> Callable[[], tuple[Developed, int]]:
         """Begin to develop the picture of a job's window; the result reads it, and the number of failed light paths.
 
         Args:
-            job: the job, for which `takes` holds.
-            films: the films of the moments of the exposure, with the border of the point-spread function.
+            job: the job.
+            blur: its defocus; `takes` holds for both.
+            films: the films of the moments of the exposure, with the border that lens and point-spread function need.
             shines: the mirror images to add.
         """
         width, height = job.window[2:]
-        size, sigma = _size(width, height), job.sensor.psf_sigma_px
+        size, sigma = size_of(width, height), job.sensor.psf_sigma_px
         weights = self._once(("psf", sigma), lambda: _sent(psf.kernel(sigma) if sigma else np.ones(1)))
         glints = np.zeros((height, width), np.float32)
         add_shines(shines, glints, job)
         share = dr.opaque(mi.Float, 1 / sum(film.spp for film in films))
         taps, wide = dr.opaque(mi.UInt32, dr.width(weights)), width + dr.width(weights) - 1
-        picture = _spread([film.sums[0] for film in films], share, weights, taps, size, height * wide, width * height)
+        means = _means([film.sums for film in films], share, blur.layered, dr.width(films[0].sums[0]))
+        picture = means[0]
+        if blur.reach:
+            across, down = blur.window[2:]
+            plane = self._once(("plane", across, down, blur.reach), lambda: Plane.of(across, down, blur.reach))
+            picture = spread(blur, means, (down, across), plane)
+        picture = _blurred(picture, weights, taps, size, height * wide, width * height)
         scale = dr.opaque(mi.Float, exposure.radiance_to_irradiance(job.sensor))
-        irradiance = _framed(picture, _sent(glints), *self._passing(job), scale)
+        irradiance = _framed(picture, _sent(glints), *self._passing(job), scale, width * height)
         if job.lens.glare > 0:
             radius = job.lens.glare_radius_px
             waves = self._once(
@@ -77,8 +86,8 @@ class Darkroom:
             )
             across, down = (dr.width(w) // n for w, n in zip(waves[1::-1], (width, height), strict=True))
             glare = dr.opaque(mi.Float, job.lens.glare)
-            counts = _size(across, down)
-            irradiance = _veiled(irradiance, glare, waves, size, counts, down * width, across * down)
+            counts = size_of(across, down)
+            irradiance = _veiled(irradiance, glare, waves, size, counts, down * width, across * down, width * height)
         codes = None
         if counted(job.sensor):
             codes = self._counter.codes(job.sensor, job.window, irradiance, job.wavelength_nm, job.seed)
@@ -124,24 +133,29 @@ def _sent(numbers: Reals) -> mi.Float:
     return mi.Float(aligned(numbers.astype(np.float32, copy=False).ravel()))
 
 
-def _size(across: int, down: int) -> _Size:
-    return dr.opaque(mi.UInt32, across), dr.opaque(mi.UInt32, down)
+@recorded
+def _means(sums: list[list[mi.Float]], share: mi.Float, layered: bool, pixels: int) -> list[mi.Float]:
+    """Means of films, of whose sums over samples each has a share."""
+
+    def mean(total: mi.Float) -> mi.Float:
+        # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
+        return total * share if layered else dr.maximum(total * share, 0)
+
+    found = []
+    for totals in zip(*sums, strict=True):
+        found.append(mean(totals[0]))
+        for total in totals[1:]:
+            found[-1] += mean(total)
+    dr.eval(found)
+    return found
 
 
 @recorded
-def _spread(
-    sums: list[mi.Float], share: mi.Float, weights: mi.Float, taps: mi.UInt32, size: _Size, between: int, pixels: int
-) -> mi.Float:
-    """Mean of films through the point-spread function: `between` numbers are blurred down, and `pixels` across."""
+def _blurred(picture: mi.Float, weights: mi.Float, taps: mi.UInt32, size: Size, between: int, pixels: int) -> mi.Float:
+    """A picture through the point-spread function: `between` numbers are blurred down, and `pixels` across."""
     width, _ = size
-    wide = width + taps - 1
-    # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
-    mean = dr.maximum(sums[0] * share, 0)
-    for total in sums[1:]:
-        mean += dr.maximum(total * share, 0)
-    dr.eval(mean)
-    none, one = mi.UInt32(0), mi.UInt32(1)
-    down = _dot((weights, none, one), (mean, dr.arange(mi.UInt32, between), wide), taps)
+    wide, none, one = width + taps - 1, mi.UInt32(0), mi.UInt32(1)
+    down = _dot((weights, none, one), (picture, dr.arange(mi.UInt32, between), wide), taps)
     dr.eval(down)
     row, column = _place(pixels, width)
     picture = _dot((weights, none, one), (down, row * wide + column, one), taps)
@@ -150,7 +164,9 @@ def _spread(
 
 
 @recorded
-def _framed(picture: mi.Float, glints: mi.Float, share: mi.Float, added: mi.Float, scale: mi.Float) -> mi.Float:
+def _framed(
+    picture: mi.Float, glints: mi.Float, share: mi.Float, added: mi.Float, scale: mi.Float, pixels: int
+) -> mi.Float:
     """Irradiance of a picture with glints behind what frames it."""
     found = ((picture + glints) * share + added) * scale
     dr.eval(found)
@@ -159,7 +175,14 @@ def _framed(picture: mi.Float, glints: mi.Float, share: mi.Float, added: mi.Floa
 
 @recorded
 def _veiled(
-    picture: mi.Float, glare: mi.Float, waves: list[mi.Float], size: _Size, counts: _Size, between: int, products: int
+    picture: mi.Float,
+    glare: mi.Float,
+    waves: list[mi.Float],
+    size: Size,
+    counts: Size,
+    between: int,
+    products: int,
+    pixels: int,
 ) -> mi.Float:
     """A picture with wide glare (`stray.veil`): `between` sums over columns, and `products` with waves of both axes."""
     (down, across, damping), (width, height), (few_across, few_down) = waves, size, counts
@@ -173,7 +196,7 @@ def _veiled(
     row, column = _place(between, width)
     columns = _dot((found, row * few_across, one), (across, column, width), few_across)
     dr.eval(columns)
-    row, column = _place(dr.width(picture), width)
+    row, column = _place(pixels, width)
     veil = _dot((down, row, height), (columns, column, width), few_down)
     picture = (1 - glare) * picture + glare * dr.maximum(veil, 0)
     dr.eval(picture)

@@ -37,11 +37,11 @@ from .sensor import Sensor
 MAX_CONFUSION_PX = 400
 _SHARP_PX = 0.1  # a smaller disc changes nothing
 _RIPPLES_PX = 4
-_LARGEST_PX = 64.0  # in a layer: what is blurred more shows no structure
+LARGEST_PX = 64.0  # in a layer: what is blurred more shows no structure
 _RATIO = 1.2  # between the diameters of neighbouring kernels
 _ALIKE = 0.03  # relative difference of blurs' widths that does not matter
 _PIXEL_VARIANCE = 1 / 12
-_LEAST_ROOM = 0.02
+LEAST_ROOM = 0.02
 
 
 def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: Floats | float) -> Floats:
@@ -60,8 +60,12 @@ def confusion_of(lens: Lens, camera: PinholeCamera, sensor: Sensor, nearness: Fl
     """The same of points whose inverse depths (1/mm) are given."""
     if lens.focus_mm is None:
         return np.zeros(np.shape(nearness))
-    strength = float(camera.K[0, 0]) ** 2 * sensor.pixel_pitch_um * 1e-3 / sensor.f_number
-    return np.asarray(strength * np.abs(nearness - 1 / lens.focus_mm))
+    return np.asarray(strength_px_mm(camera, sensor) * np.abs(nearness - 1 / lens.focus_mm))
+
+
+def strength_px_mm(camera: PinholeCamera, sensor: Sensor) -> float:
+    """Diameter of a circle of confusion (px) per difference from the inverse distance in focus (1/mm)."""
+    return float(camera.K[0, 0]) ** 2 * sensor.pixel_pitch_um * 1e-3 / sensor.f_number
 
 
 def checked(diameter_px: float) -> float:
@@ -129,7 +133,7 @@ def defocused(picture: Reals, diameter_px: float) -> Reals:
 
 def reach_px(diameter_px: float) -> int:
     """Pixels that must be rendered beyond a window's border for discs of at most this diameter."""
-    return 0 if diameter_px < _SHARP_PX else _margin(min(diameter_px, _LARGEST_PX))
+    return 0 if diameter_px < _SHARP_PX else _margin(min(diameter_px, LARGEST_PX))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,7 +167,7 @@ def blurred(layers: Sequence[Layer], reach: int) -> Floats:
         radiance, coverage, *rest = plan.spread(pictures, _continued(layer, covered))
         room = rest[0] if rest else np.ones(shape)
         foremost = False
-        room = np.maximum(room, _LEAST_ROOM)
+        room = np.maximum(room, LEAST_ROOM)
         alpha = coverage / room
         out += through * np.maximum(radiance, 0) / (room * np.maximum(alpha, 1))
         through *= 1 - np.clip(alpha, 0, 1)
@@ -174,11 +178,17 @@ def blurred(layers: Sequence[Layer], reach: int) -> Floats:
 
 def _continued(layer: Layer, covered: Bools) -> Floats:
     """Diameters of a layer, continued beyond it from the nearest pixel."""
-    size = np.clip(layer.confusion_px, 0, _LARGEST_PX)
+    size = np.clip(layer.confusion_px, 0, LARGEST_PX)
     if covered.all():
         return np.asarray(size)
     nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
     return np.asarray(size[tuple(nearest)])
+
+
+def padded(shape: tuple[int, ...], reach: int) -> tuple[int, int]:
+    """Height and width of the Fourier transforms of pictures; they have no factors but 2, 3 and 5."""
+    height, width = (fft.next_fast_len(n + reach, real=True) for n in shape)
+    return height, width
 
 
 class _Convolution:
@@ -186,8 +196,7 @@ class _Convolution:
 
     def __init__(self, shape: tuple[int, ...], reach: int) -> None:
         self._shape = shape
-        height, width = (fft.next_fast_len(n + reach, real=True) for n in shape)
-        self._size = (height, width)
+        self._size = padded(shape, reach)
 
     def of(self, picture: Reals, diameter_px: float) -> Floats:
         """Fourier transform of a picture convolved with a disc."""
@@ -199,7 +208,7 @@ class _Convolution:
 
     def spread(self, pictures: Sequence[Reals], diameters: Floats) -> list[Floats]:
         """Spread every pixel of some pictures over the disc of its own diameter, mixed from two kernels."""
-        sizes = _sizes(float(diameters.min()), float(diameters.max()))
+        sizes = kernel_diameters(float(diameters.min()), float(diameters.max()))
         totals: list[Floats | float] = [0.0] * len(pictures)
         for k, size in enumerate(sizes):
             weight = _weight(diameters, sizes, k)
@@ -210,7 +219,7 @@ class _Convolution:
         return [self.back(np.asarray(t)) for t in totals]
 
 
-def _sizes(low: float, high: float) -> list[float]:
+def kernel_diameters(low: float, high: float) -> list[float]:
     """Diameters of kernels that enclose a range; from a common list, so that kernels are made once."""
     sizes = [0.0, 0.4]
     while sizes[-1] < high:

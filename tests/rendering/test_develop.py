@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from eyerender.rig import exposure
 from eyerender.rig.imaging import Lens, Opening
 from eyerender.rig.sensor import Sensor
-from tests.support.render_rigs import eye_of, head_rig, job_of
+from tests.support.render_rigs import eye_of, head_rig, job_of, remote_rig
 
 pytestmark = pytest.mark.render
 
@@ -49,25 +50,47 @@ def test_the_device_counts_as_numpy_does(renderer, sensor, window):
 
 
 @pytest.mark.parametrize(
-    ("lens", "sensor"),
+    ("rig", "lens", "sensor"),
     [
-        (Lens(), Sensor(psf_sigma_px=0.0, noise=False)),
-        (FRAMED, Sensor(psf_sigma_px=1.5, prnu=0.01, border_px=(3, 0, 2, 5), border_dn=9)),
-        (Lens(glare=0.05), Sensor(blooming=0.5, gamma=2.2)),
+        (head_rig(count=2), Lens(), Sensor(psf_sigma_px=0.0, noise=False)),
+        (head_rig(count=2), FRAMED, Sensor(psf_sigma_px=1.5, prnu=0.01, border_px=(3, 0, 2, 5), border_dn=9)),
+        (head_rig(count=2), Lens(glare=0.05), Sensor(blooming=0.5, gamma=2.2)),
+        (head_rig(count=2), Lens(focus_mm=36.0), Sensor()),  # in layers
+        (remote_rig(), Lens(focus_mm=300.0, vignetting=0.2), Sensor(psf_sigma_px=1.0)),  # as a whole
     ],
 )
-def test_the_device_develops_what_numpy_does(renderer, lens, sensor):
+def test_the_device_develops_what_numpy_does(renderer, rig, lens, sensor):
     from eyerender.rendering.renderer import Renderer
 
     device = Renderer(renderer.backend, spp=4, develop="device")
-    rig = head_rig(count=2)
-    job = replace(job_of(eye_of("E2"), rig, rig.window(90, 71), (5.0, 3.0)), lens=lens, sensor=sensor)
-    moments = (replace(job, seed=1, labels=False), job)
-    for shots in ((), moments, ()):  # once more, because functions are recorded when they are called again
-        one, other = (r.render(job, spp=4, moments=shots) for r in (renderer, device))
-        # NumPy takes a bright rim away from single numbers and adds it again, which costs it the last digits.
-        assert np.max(np.abs(other.irradiance - one.irradiance)) < 5e-6 * one.irradiance.max()
-        expected = exposure.recorded(sensor, job.camera, job.window, other.irradiance, job.wavelength_nm, job.seed)
-        assert np.array_equal(other.dn, expected)
-        for name in ("labels", "glints", "failed_paths"):
-            assert getattr(other, name) == getattr(one, name)
+    for width in (90, 57):
+        job = job_of(eye_of("E2"), rig, rig.window(width, 71), (5.0, 3.0), lens=lens, sensor=sensor)
+        moments = (replace(job, seed=1, labels=False), job)
+        for shots in ((), moments, ()):  # once more, because functions are recorded when they are called again
+            one, other = (r.render(job, spp=4, moments=shots) for r in (renderer, device))
+            # NumPy takes a bright rim away from single numbers and adds it again, which costs it the last digits.
+            assert np.max(np.abs(other.irradiance - one.irradiance)) < 5e-6 * one.irradiance.max()
+            again = exposure.recorded(sensor, job.camera, job.window, other.irradiance, job.wavelength_nm, job.seed)
+            assert np.array_equal(other.dn, again)
+            for name in ("labels", "glints", "failed_paths"):
+                assert getattr(other, name) == getattr(one, name)
+
+
+def test_layers_are_continued_by_their_nearest_pixels(renderer):
+    import drjit as dr
+    import mitsuba as mi
+
+    from eyerender.rendering.depthblur import _continued, size_of
+
+    height, width = 60, 91
+    covered = np.random.default_rng(5).random((height, width)) < 0.02
+    place = np.arange(height * width)
+    jumps = [dr.opaque(mi.UInt32, 2**k) for k in range(6, -1, -1)]
+    numbers, mask = mi.Float(place.astype(np.float32)), mi.Bool(covered.ravel())
+    found = _continued(numbers, mask, size_of(width, height), jumps, place.size).numpy().astype(int)
+    assert np.all(covered.flat[found])
+    away = np.hypot(found // width - place // width, found % width - place % width)
+    expected = ndimage.distance_transform_edt(~covered).ravel()
+    # Jumps miss the nearest pixel now and then, and find one that is hardly farther.
+    assert np.mean(away > expected + 1e-9) < 2e-3
+    assert np.all(away < expected + 1)
