@@ -18,6 +18,9 @@ _HALF_MM, _HIGH_MM = 14.0, 8.0  # of the opening of a head mesh, whose margins a
 _FINE_MM, _NEAR_MM = 1.25, 12.0  # distance of places on skin this far from the middle of the fissure, and in proportion
 _NEIGHBOURS = 12
 _MARGIN_LEVEL = -2  # of the lids' margins: half the distance
+# Across the margins light changes fast: so many times as fast with the height above the globe as along them. They are
+# between these heights: the conjunctiva is lower, and the lids' outer sides are higher.
+_STEEP, _LOW_MM, _TOP_MM = 4.0, 0.04, 1.6
 _LID_MM = 4.0  # from the sclera's sphere to the outside of a lid over the cornea
 
 
@@ -45,6 +48,8 @@ class SkinPlaces(ArrayValue):
 def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
     """Choose places on a region's mesh: one for each cell of a grid that grows with the distance from the eye.
 
+    On the margins of the lids cells are smaller, above all from edge to edge.
+
     Args:
         mesh: the region with the eye straight ahead and open lids.
         globe: the globe there.
@@ -53,22 +58,23 @@ def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
     solid = np.arange(ends[0])
     if len(ends) > 4:  # a head mesh: what is neither hair nor tears
         solid = np.append(solid, np.arange(ends[3], ends[4]))
-    p, n = mesh.vertices[solid], mesh.normals[solid]
+    where = _where(mesh, globe)
+    p, n, w = mesh.vertices[solid], mesh.normals[solid], where[solid]
     level = np.maximum(np.round(2 * np.log2(np.maximum(np.linalg.norm(p, axis=1), 1e-3) / _NEAR_MM)), 0)
     out = _from_globe(globe, p)
     away = np.linalg.norm(out, axis=1)
-    # The margins of the lids, which do not face away from the globe: light changes fast there.
-    margin = (away < globe.radius_mm + _LID_MM) & (np.sum(out * n, axis=1) < 0.6 * away)
+    # The margins of the lids, which do not face away from the globe.
+    margin = (away < globe.radius_mm + _LID_MM) & (np.sum(out * n, axis=1) < 0.6 * away) & (w[:, 3] > 0)
     level = np.where(margin, _MARGIN_LEVEL, level)
     size = _FINE_MM * 2 ** (level / 2)
-    keys = np.column_stack([level, np.floor(p / size[:, None]), np.round(1.2 * n)]).astype(np.int64)
+    keys = np.column_stack([level, np.floor(w / size[:, None]), np.round(1.2 * n)]).astype(np.int64)
     _, first, group, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
     group = group.reshape(-1)
-    middle = np.stack([np.bincount(group, p[:, k]) for k in range(3)], axis=1) / count[:, None]
-    away = np.linalg.norm(p - middle[group], axis=1)
+    middle = np.stack([np.bincount(group, c) for c in w.T], axis=1) / count[:, None]
+    away = np.linalg.norm(w - middle[group], axis=1)
     order = np.lexsort((away, group))
     chosen = solid[order[np.searchsorted(group[order], np.arange(len(first)))]]
-    near, weight = _spread(mesh, chosen, size[first])
+    near, weight = _spread(mesh.normals, where, chosen, size[first])
     nearest = near[np.arange(len(near)), np.argmax(weight, axis=1)]
     out = _from_globe(globe, mesh.vertices[chosen])
     away = np.linalg.norm(out, axis=1)
@@ -84,16 +90,21 @@ def _from_globe(globe: Globe, points: Floats) -> Floats:
     return np.asarray(points - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
 
 
-def _spread(mesh: RegionMesh, chosen: Ints, size: Floats) -> tuple[Ints, Singles]:
+def _where(mesh: RegionMesh, globe: Globe) -> Floats:
+    """Where vertices are (n, 4): their points (mm), and a fourth coordinate that grows across the lids' margins."""
+    height = globe.clearance(mesh.vertices * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
+    return np.column_stack([mesh.vertices, _STEEP * (np.clip(height, _LOW_MM, _TOP_MM) - _LOW_MM)])
+
+
+def _spread(normals: Floats, where: Floats, chosen: Ints, size: Floats) -> tuple[Ints, Singles]:
     """The nearest places at every vertex, and their weights.
 
     A place has less weight with distance and where the skin faces another way.
     """
     k = min(_NEIGHBOURS, len(chosen))
-    at, normals = mesh.vertices[chosen], mesh.normals[chosen]
-    distance, index = cKDTree(at).query(mesh.vertices, k=k)
+    distance, index = cKDTree(where[chosen]).query(where, k=k)
     distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-    facing = np.einsum("vi,vki->vk", mesh.normals, normals[index])
+    facing = np.einsum("vi,vki->vk", normals, normals[chosen[index]])
     weight = np.exp(-np.square(distance / size[index])) * np.maximum(facing, 0.02) ** 3 + 1e-9
     weight /= weight.sum(axis=1, keepdims=True)
     return index.astype(np.int64), weight.astype(np.float32)
