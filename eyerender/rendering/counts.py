@@ -19,6 +19,7 @@ state is found from the first one with tables of jumps. The fixed patterns are t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -36,6 +37,7 @@ from .values import aligned
 LEFT = 0xFFFFFFFF  # a code that is left to NumPy
 _MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645  # of PCG64
 _JUMPS = 4096  # single steps, and as many of this length: enough for the noise of 33 million pixels
+_WORDS = 9  # of a window: the state of its generator and the increment, starts of the patterns, its first pixel
 _LOW, _WORD, _ALL = 0xFFFFFFFF, 2**64 - 1, 2**128 - 1
 
 
@@ -63,15 +65,22 @@ class Counter:
         self._jumps = mi.UInt64(aligned(_jumps()))
         self._origin = dr.opaque(mi.UInt32, 0)
 
-    def codes(self, sensor: Sensor, window: Window, irradiance: mi.Float, wavelength_nm: float, seed: int) -> mi.UInt32:
-        """Begin to compute the codes of a window in the order of its pixels; some are `LEFT` to NumPy.
+    def codes(
+        self,
+        sensor: Sensor,
+        windows: Sequence[Window],
+        irradiance: mi.Float,
+        wavelength_nm: float,
+        seeds: Sequence[int],
+    ) -> mi.UInt32:
+        """Begin to compute the codes of windows of one size, in the order of their pixels; some are `LEFT` to NumPy.
 
         Args:
             sensor: the sensor, for which `counted` holds. Its border is left out.
-            window: the window.
-            irradiance: irradiance of its pixels, W/m^2.
+            windows: the windows.
+            irradiance: irradiance of their pixels, W/m^2.
             wavelength_nm: wavelength of the light.
-            seed: seed of the noise.
+            seeds: seed of the noise of each window.
         """
         scale = exposure.electrons(sensor, np.ones(()), wavelength_nm)
         numbers = (
@@ -79,25 +88,32 @@ class Counter:
             sensor.full_scale_dn, sensor.read_noise_e, sensor.prnu, sensor.dsnu_e, sensor.column_e,
         )  # fmt: skip
         packed = mi.Float(aligned(np.array(numbers, np.float32)))
-        pixels = window[2] * window[3]
+        width, height = windows[0][2:]
+        pixels = width * height
         if not sensor.noise:
-            return _quiet(packed, irradiance, self._origin, pixels)
-        generator: Any = np.random.default_rng((exposure.NOISE, seed)).bit_generator
-        state = generator.state["state"]
-        words = [word for n in (state["state"], state["inc"]) for word in (n & _WORD, n >> 64)]
-        words += [int(exposure.pattern_start(sensor.pattern_seed, which)) for which in range(3)]
-        words += [n % 2**64 for n in window[:2]]
-        drawn = mi.UInt64(aligned(np.array(words, np.uint64)))
-        raw = _raw(drawn, self._jumps, self._origin, -(-2 * pixels // 4))
-        size = dr.opaque(mi.UInt32, window[2]), dr.opaque(mi.UInt32, pixels)
-        return _noisy(packed, drawn, size, raw, irradiance, self._normals, self._origin, pixels)
+            return _quiet(packed, irradiance, self._origin, len(windows) * pixels)
+        starts = [int(exposure.pattern_start(sensor.pattern_seed, which)) for which in range(3)]
+        words = []
+        for window, seed in zip(windows, seeds, strict=True):
+            generator: Any = np.random.default_rng((exposure.NOISE, seed)).bit_generator
+            state = generator.state["state"]
+            halves = [word for n in (state["state"], state["inc"]) for word in (n & _WORD, n >> 64)]
+            words.append([*halves, *starts, *(n % 2**64 for n in window[:2])])
+        each = -(-2 * pixels // 4)
+        drawn, drawn_each = mi.UInt64(aligned(np.array(words, np.uint64).ravel())), dr.opaque(mi.UInt32, each)
+        raw = _raw(drawn, drawn_each, self._jumps, len(windows) * each)
+        size = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, pixels), drawn_each
+        count = len(windows) * pixels
+        return _noisy(packed, drawn, size, raw, irradiance, self._normals, self._origin, count)
 
 
 @recorded
-def _raw(words: mi.UInt64, jumps: mi.UInt64, origin: mi.UInt32, count: int) -> mi.UInt64:
-    """The first `count` numbers of a generator whose state and increment are the first four of the words."""
-    state, increment = (tuple(dr.gather(mi.UInt64, words, origin + k + i) for i in range(2)) for k in (0, 2))
-    step = dr.arange(mi.UInt32, count) + 1
+def _raw(words: mi.UInt64, each: mi.UInt32, jumps: mi.UInt64, count: int) -> mi.UInt64:
+    """The first numbers of generators, `each` of one; the first of its words are its state and its increment."""
+    index = dr.arange(mi.UInt32, count)
+    window = index // each
+    first, step = _WORDS * window, index - window * each + 1
+    state, increment = (tuple(dr.gather(mi.UInt64, words, first + k + i) for i in range(2)) for k in (0, 2))
     for row in (step & (_JUMPS - 1), step // _JUMPS + _JUMPS):
         a, b, c, d = (dr.gather(mi.UInt64, jumps, 4 * row + k) for k in range(4))
         state = _sum(_product(state, (a, b)), _product(increment, (c, d)))
@@ -110,23 +126,25 @@ def _raw(words: mi.UInt64, jumps: mi.UInt64, origin: mi.UInt32, count: int) -> m
 
 @recorded
 def _noisy(
-    numbers: mi.Float, words: mi.UInt64, size: tuple[mi.UInt32, mi.UInt32], raw: mi.UInt64, irradiance: mi.Float,
-    normals: mi.Float, origin: mi.UInt32, count: int,
+    numbers: mi.Float, words: mi.UInt64, size: tuple[mi.UInt32, mi.UInt32, mi.UInt32], raw: mi.UInt64,
+    irradiance: mi.Float, normals: mi.Float, origin: mi.UInt32, count: int,
 ) -> mi.UInt32:  # fmt: skip
     """Codes of pixels with the noise of 16 bits each for photons and read-out, and with fixed patterns."""
     scale, well, most, gain, black, full, read_noise, prnu, dsnu, column = _numbers(numbers, origin)
-    x0, y0 = (dr.gather(mi.UInt64, words, origin + k) for k in (7, 8))
-    width, pixels = size
-    pixel = dr.arange(mi.UInt32, count)
+    width, pixels, drawn = size
+    index = dr.arange(mi.UInt32, count)
+    window = index // pixels
+    first, pixel = _WORDS * window, index - window * pixels
+    x0, y0 = (dr.gather(mi.UInt64, words, first + k) for k in (7, 8))
     row = pixel // width
     x, y = x0 + mi.UInt64(pixel - row * width), y0 + mi.UInt64(row)
 
     def normal(number: mi.UInt32) -> _Single:
-        bits = dr.gather(mi.UInt64, raw, number >> 2) >> mi.UInt64(16 * (number & 3))
+        bits = dr.gather(mi.UInt64, raw, window * drawn + (number >> 2)) >> mi.UInt64(16 * (number & 3))
         return _Single(dr.gather(mi.Float, normals, mi.UInt32(bits) & 0xFFFF))
 
     def fixed(which: int, y: mi.UInt64) -> _Single:
-        z = _mixed((x | (y << 32)) + dr.gather(mi.UInt64, words, origin + 4 + which))
+        z = _mixed((x | (y << 32)) + dr.gather(mi.UInt64, words, first + 4 + which))
         return _Single(dr.gather(mi.Float, normals, mi.UInt32(z >> 48)))
 
     mean = _Single(irradiance) * scale

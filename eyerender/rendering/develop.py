@@ -52,32 +52,40 @@ class Darkroom:
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
     def begun(
-        self, job: RenderJob, blur: Blur, films: Sequence[Film], shines: Sequence[Shine]
-    ) -> Callable[[], tuple[Developed, int]]:
-        """Begin to develop the picture of a job's window; the result reads it, and the number of failed light paths.
+        self, jobs: Sequence[RenderJob], blur: Blur, films: Sequence[Film], shines: Sequence[Sequence[Shine]]
+    ) -> Callable[[], list[tuple[Developed, int]]]:
+        """Begin to develop the pictures of jobs; the result reads each, and the numbers of failed light paths.
 
         Args:
-            job: the job.
-            blur: its defocus; `takes` holds for both.
+            jobs: one job, or jobs in focus that `together` puts together.
+            blur: the defocus of the first; `takes` holds for all.
             films: the films of the moments of the exposure, with the border that lens and point-spread function need.
-            shines: the mirror images to add.
+            shines: the mirror images to add to each picture.
         """
+        job, count = jobs[0], len(jobs)
         width, height = job.window[2:]
+        pixels = count * width * height
         size, sigma = size_of(width, height), job.sensor.psf_sigma_px
         weights = self._once(("psf", sigma), lambda: _sent(psf.kernel(sigma) if sigma else np.ones(1)))
-        glints = np.zeros((height, width), np.float32)
-        add_shines(shines, glints, job)
+        glints = np.zeros((count, height, width), np.float32)
+        for picture, shone, one in zip(glints, shines, jobs, strict=True):
+            add_shines(shone, picture, one)
         share = dr.opaque(mi.Float, 1 / sum(film.spp for film in films))
         taps, wide = dr.opaque(mi.UInt32, dr.width(weights)), width + dr.width(weights) - 1
         means = _means([film.sums for film in films], share, blur.layered, dr.width(films[0].sums[0]))
-        picture = means[0]
+        seen = means[0]
         if blur.reach:
             across, down = blur.window[2:]
             plane = self._once(("plane", across, down, blur.reach), lambda: Plane.of(across, down, blur.reach))
-            picture = spread(blur, means, (down, across), plane)
-        picture = _blurred(picture, weights, taps, size, height * wide, width * height)
+            seen = spread(blur, means, (down, across), plane)
+        seen = _blurred(seen, weights, taps, size, count * height * wide, pixels)
         scale = dr.opaque(mi.Float, exposure.radiance_to_irradiance(job.sensor))
-        irradiance = _framed(picture, _sent(glints), *self._passing(job), scale, width * height)
+        through, added = map(list, zip(*(self._passing(one) for one in jobs), strict=True))
+        if count == 1 or dr.width(through[0]) == 1:
+            passing = through[0], added[0]
+        else:
+            passing = dr.concat(through), dr.concat(added)
+        irradiance = _framed(seen, _sent(glints), passing, scale, pixels)
         if job.lens.glare > 0:
             radius = job.lens.glare_radius_px
             waves = self._once(
@@ -85,18 +93,20 @@ class Darkroom:
                 lambda: [_sent(w) for w in stray.long_waves((height, width), radius, np.dtype(np.float32))],
             )
             across, down = (dr.width(w) // n for w, n in zip(waves[1::-1], (width, height), strict=True))
+            lanes = count * down * width, count * across * down, pixels
             glare = dr.opaque(mi.Float, job.lens.glare)
-            counts = size_of(across, down)
-            irradiance = _veiled(irradiance, glare, waves, size, counts, down * width, across * down, width * height)
+            irradiance = _veiled(irradiance, glare, waves, size, size_of(across, down), lanes)
         codes = None
         if counted(job.sensor):
-            codes = self._counter.codes(job.sensor, job.window, irradiance, job.wavelength_nm, job.seed)
+            windows, seeds = [one.window for one in jobs], [one.seed for one in jobs]
+            codes = self._counter.codes(job.sensor, windows, irradiance, job.wavelength_nm, seeds)
 
-        def read() -> tuple[Developed, int]:
-            failed = sum(int(film.failed.numpy()[0]) for film in films)
+        def read() -> list[tuple[Developed, int]]:
+            failed = np.sum([film.failed.numpy() for film in films], axis=0)
             # Copies, because the memory of Dr.Jit's arrays must not be released by another thread.
-            taken = irradiance.numpy().reshape(height, width).copy()
-            return Developed(taken, None if codes is None else codes.numpy().reshape(height, width).copy()), failed
+            taken = irradiance.numpy().reshape(glints.shape).copy()
+            found = [None] * count if codes is None else codes.numpy().reshape(glints.shape).copy()
+            return [(Developed(*pair), int(n)) for *pair, n in zip(taken, found, failed, strict=True)]
 
         return read
 
@@ -152,22 +162,25 @@ def _means(sums: list[list[mi.Float]], share: mi.Float, layered: bool, pixels: i
 
 @recorded
 def _blurred(picture: mi.Float, weights: mi.Float, taps: mi.UInt32, size: Size, between: int, pixels: int) -> mi.Float:
-    """A picture through the point-spread function: `between` numbers are blurred down, and `pixels` across."""
-    width, _ = size
+    """Pictures through the point-spread function: `between` numbers are blurred down, and `pixels` across."""
+    width, height = size
     wide, none, one = width + taps - 1, mi.UInt32(0), mi.UInt32(1)
-    down = _dot((weights, none, one), (picture, dr.arange(mi.UInt32, between), wide), taps)
+    image, row, column = _place(between, wide, height)
+    first = (image * (height + taps - 1) + row) * wide + column
+    down = _dot((weights, none, one), (picture, first, wide), taps)
     dr.eval(down)
-    row, column = _place(pixels, width)
-    picture = _dot((weights, none, one), (down, row * wide + column, one), taps)
+    image, row, column = _place(pixels, width, height)
+    picture = _dot((weights, none, one), (down, (image * height + row) * wide + column, one), taps)
     dr.eval(picture)
     return picture
 
 
 @recorded
 def _framed(
-    picture: mi.Float, glints: mi.Float, share: mi.Float, added: mi.Float, scale: mi.Float, pixels: int
+    picture: mi.Float, glints: mi.Float, passing: tuple[mi.Float, mi.Float], scale: mi.Float, pixels: int
 ) -> mi.Float:
-    """Irradiance of a picture with glints behind what frames it."""
+    """Irradiance of pictures with glints behind what frames them."""
+    share, added = passing
     found = ((picture + glints) * share + added) * scale
     dr.eval(found)
     return found
@@ -175,39 +188,37 @@ def _framed(
 
 @recorded
 def _veiled(
-    picture: mi.Float,
-    glare: mi.Float,
-    waves: list[mi.Float],
-    size: Size,
-    counts: Size,
-    between: int,
-    products: int,
-    pixels: int,
+    picture: mi.Float, glare: mi.Float, waves: list[mi.Float], size: Size, counts: Size, lanes: tuple[int, int, int]
 ) -> mi.Float:
-    """A picture with wide glare (`stray.veil`): `between` sums over columns, and `products` with waves of both axes."""
+    """Pictures with wide glare (`stray.veil`).
+
+    There are so many `lanes` for waves down the columns, for products with those across, and for pixels.
+    """
     (down, across, damping), (width, height), (few_across, few_down) = waves, size, counts
     one = mi.UInt32(1)
-    row, column = _place(between, width)
-    columns = _dot((down, row * height, one), (picture, column, width), height)
+    image, row, column = _place(lanes[0], width, few_down)
+    columns = _dot((down, row * height, one), (picture, image * height * width + column, width), height)
     dr.eval(columns)
-    row, column = _place(products, few_across)
-    found = _dot((columns, row * width, one), (across, column * width, one), width) * damping
+    image, row, column = _place(lanes[1], few_across, few_down)
+    found = _dot((columns, (image * few_down + row) * width, one), (across, column * width, one), width)
+    found *= dr.gather(mi.Float, damping, row * few_across + column)
     dr.eval(found)
-    row, column = _place(between, width)
-    columns = _dot((found, row * few_across, one), (across, column, width), few_across)
+    image, row, column = _place(lanes[0], width, few_down)
+    columns = _dot((found, (image * few_down + row) * few_across, one), (across, column, width), few_across)
     dr.eval(columns)
-    row, column = _place(pixels, width)
-    veil = _dot((down, row, height), (columns, column, width), few_down)
+    image, row, column = _place(lanes[2], width, height)
+    veil = _dot((down, row, height), (columns, image * few_down * width + column, width), few_down)
     picture = (1 - glare) * picture + glare * dr.maximum(veil, 0)
     dr.eval(picture)
     return picture
 
 
-def _place(count: int, width: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-    """Row and column of each lane."""
+def _place(count: int, width: mi.UInt32, height: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    """Picture, row and column of each lane."""
     index = dr.arange(mi.UInt32, count)
-    row = index // width
-    return row, index - row * width
+    line = index // width
+    image = line // height
+    return image, line - image * height, index - line * width
 
 
 _Numbers = tuple[mi.Float, mi.UInt32, mi.UInt32]  # an array, the place of the first number, and the step to the next

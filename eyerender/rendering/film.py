@@ -156,17 +156,6 @@ class Film:
         # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
         return list(zip(np.maximum(means[:, 0], 0), failed, strict=True))
 
-    def of_window(self, k: int) -> Film:
-        """The film of one of the windows."""
-        count, height, width = self.shape
-        if count == 1:
-            return self
-        index = dr.arange(mi.UInt32, height * width) + dr.opaque(mi.UInt32, k * height * width)
-        sums = [dr.gather(mi.Float, total, index) for total in self.sums]
-        failed = dr.gather(mi.UInt32, self.failed, dr.opaque(mi.UInt32, k))
-        dr.eval(sums, failed)
-        return Film(sums, failed, (1, height, width), self.spp, self.layered)
-
 
 def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""

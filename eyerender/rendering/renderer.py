@@ -133,9 +133,7 @@ class Renderer:
         room = self._darkroom
         if room is None or not all(map(takes, jobs, blurs)):
             return film.means
-        each = enumerate(zip(jobs, blurs, shines, strict=True))
-        begun = [room.begun(job, blur, [film.of_window(k)], shone) for k, (job, blur, shone) in each]
-        return lambda: [read() for read in begun]
+        return room.begun(jobs, blurs[0], [film], shines)
 
     @uncollected
     def _moving(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob]) -> Traced:
@@ -169,7 +167,7 @@ class Renderer:
         mirrored, labels, margins, bright = marks
         picture: Singles | Developed
         if self._darkroom is not None and films:
-            picture, failed = self._darkroom.begun(job, blur, films, glints)()
+            ((picture, failed),) = self._darkroom.begun([job], blur, films, [glints])()
         else:
             picture = np.mean(pictures, axis=0)
         return Traced(job, picture, tuple(glints), blur, mirrored, labels, failed, margins, bright)

@@ -48,6 +48,6 @@ def _kind(job: RenderJob) -> tuple[Any, ...] | None:
     ):
         return None
     return (
-        id(job.eye), len(job.lights), job.window[2:], job.look, job.sensor, job.purkinje, job.labels, job.highlights,
-        job.interreflection, bool(np.any(job.camera.distortion)), cells_across(job),
+        id(job.eye), len(job.lights), job.window[2:], job.look, job.sensor, job.lens, job.purkinje, job.labels,
+        job.highlights, job.interreflection, bool(np.any(job.camera.distortion)), cells_across(job),
     )  # fmt: skip

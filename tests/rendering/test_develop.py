@@ -37,16 +37,21 @@ def test_the_device_counts_as_numpy_does(renderer, sensor, window):
     from eyerender.rendering.counts import LEFT, Counter, completed
 
     counter, shape = Counter(), window[3:1:-1]
-    for seed in (7, 2**64 - 1, 12):
+    seeds, pictures = [7, 2**64 - 1, 12], []
+    for seed in seeds:
         draw = np.random.default_rng(seed)
         # From darkness to several full wells, and pixels without light.
         mean = np.exp(draw.uniform(np.log(0.1), np.log(6 * sensor.full_well_e), shape))
         mean[draw.random(shape) < 0.05] = 0
-        irradiance = (mean / exposure.electrons(sensor, np.ones(()), 850.0)).astype(np.float32)
-        codes = counter.codes(sensor, window, mi.Float(irradiance.ravel()), 850.0, seed).numpy().reshape(shape)
+        pictures.append((mean / exposure.electrons(sensor, np.ones(()), 850.0)).astype(np.float32))
+    windows = [(window[0] + 5 * k, *window[1:]) for k in range(3)]
+    for some in (slice(1), slice(3), slice(1, 3)):
+        irradiance = mi.Float(np.ravel(pictures[some]))
+        codes = counter.codes(sensor, windows[some], irradiance, 850.0, seeds[some]).numpy().reshape(-1, *shape)
         assert np.mean(codes == LEFT) < (0.6 if sensor.noise else 1e-9)
-        expected = exposure.expose(sensor, irradiance, 850.0, seed, window[:2])
-        assert np.array_equal(completed(codes, sensor, window, irradiance, 850.0, seed), expected)
+        for found, place, picture, seed in zip(codes, windows[some], pictures[some], seeds[some], strict=True):
+            expected = exposure.expose(sensor, picture, 850.0, seed, place[:2])
+            assert np.array_equal(completed(found, sensor, place, picture, 850.0, seed), expected)
 
 
 @pytest.mark.parametrize(
@@ -74,6 +79,20 @@ def test_the_device_develops_what_numpy_does(renderer, rig, lens, sensor):
             assert np.array_equal(other.dn, again)
             for name in ("labels", "glints", "failed_paths"):
                 assert getattr(other, name) == getattr(one, name)
+
+
+def test_windows_that_share_launches_are_developed_as_alone(renderer):
+    from eyerender.rendering.renderer import Renderer
+
+    device, rig = Renderer(renderer.backend, spp=4, develop="device"), head_rig(count=2)
+    first = job_of(eye_of("E2"), rig, rig.window(70, 61), lens=FRAMED, sensor=Sensor(psf_sigma_px=1.2, dsnu_e=2.0))
+    # An edge of an opening lies in the windows.
+    jobs = [replace(first, window=(450 + k, *first.window[1:]), seed=k) for k in range(3)]
+    (group,) = device.together(jobs)
+    for job, begun in zip(jobs, device.begin_all(group), strict=True):
+        found, alone = begun.result(), device.render(job)
+        assert np.array_equal(found.irradiance, alone.irradiance)
+        assert np.array_equal(found.dn, alone.dn)
 
 
 def test_layers_are_continued_by_their_nearest_pixels(renderer):
