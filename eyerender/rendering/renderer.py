@@ -33,9 +33,6 @@ if TYPE_CHECKING:
 __all__ = ["BACKGROUND", "FRAME", "IRIS", "PUPIL", "SCLERA", "PartLabels", "RenderJob", "RenderedWindow", "Renderer"]
 
 
-LANES = {"llvm": 2**20, "cuda": 2**22}  # samples of windows that share launches
-
-
 class Renderer:
     """Renders jobs on one backend, which `choose_backend` must have set up before this module is imported.
 
@@ -105,7 +102,7 @@ class Renderer:
         """Put jobs that follow each other together where they can share launches: small windows of one bare eye."""
         if self._stage.obstructed:
             return ((job,) for job in jobs)
-        return together(jobs, spp or self.spp, LANES["cuda" if self.backend.name == "cuda" else "llvm"])
+        return together(jobs, spp or self.spp)
 
     @uncollected
     def _traced(self, jobs: Sequence[RenderJob], spp: int | None, after: Sequence[RenderJob]) -> list[Traced]:

@@ -12,24 +12,26 @@ from .frame import RenderJob, light_table
 from .irisrelief import cells_across
 from .values import point_like
 
+MOST, SAMPLES = 16, 2**22  # windows that share launches, with grids of 2.5 MB each; their samples
 _NO_LIGHT = Ambient()
 
 
-def together(jobs: Iterable[RenderJob], spp: int, lanes: int) -> Iterator[tuple[RenderJob, ...]]:
-    """Put jobs that follow each other together, as long as their windows have no more than so many `lanes`, or samples.
+def together(jobs: Iterable[RenderJob], spp: int) -> Iterator[tuple[RenderJob, ...]]:
+    """Put jobs that follow each other together, up to `MOST` windows that have no more than `SAMPLES`.
 
-    The frame of a window alone is one, too. Jobs are fetched only as far as that needs.
+    A window that stands alone is given alone. Jobs are fetched only as far as that needs.
     """
     group: list[RenderJob] = []
     kind: Any = None
     for job in jobs:
         found, width, height = _kind(job), *job.window[2:]
-        if group and (found is None or found != kind or (len(group) + 1) * width * height * spp > lanes):
+        most = 1 if found is None else min(MOST, SAMPLES // (width * height * spp))
+        if group and found != kind:
             yield tuple(group)
             group = []
         group.append(job)
         kind = found
-        if found is None or 2 * width * height * spp > lanes:
+        if len(group) >= most:
             yield tuple(group)  # nothing can join it, so the next job need not be fetched
             group = []
     if group:

@@ -110,15 +110,14 @@ def test_windows_go_together_up_to_a_number_of_samples(renderer):
             fetched.append(k)
             yield turned(remote_job(size=size), k)
 
-    from eyerender.rendering.renderer import LANES
+    from eyerender.rendering.together import MOST, SAMPLES
 
-    most = LANES["llvm"]
     eye = eye_of("E2")
-    small = (replace(job, eye=eye) for job in jobs((100, 100)))
-    groups = list(renderer.together(small, spp=most // 20_001))
-    assert [len(group) for group in groups] == [2, 2, 1]
+    small = [replace(job, eye=eye) for job in jobs((100, 100))]
+    assert [len(group) for group in renderer.together(small, spp=SAMPLES // 20_000)] == [2, 2, 1]
+    assert [len(group) for group in renderer.together(small * 7, spp=1)] == [MOST, MOST, 3]
     fetched.clear()
     large = (replace(job, eye=eye) for job in jobs((1000, 1000)))
-    groups = renderer.together(large, spp=1 + most // 2_000_000)
+    groups = renderer.together(large, spp=1 + SAMPLES // 2_000_000)
     assert len(next(groups)) == 1
     assert len(fetched) == 1  # a window that leaves no room is given before the next job is made
