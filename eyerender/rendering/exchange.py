@@ -47,7 +47,7 @@ from .chamber import (
 from .chamber import TURNS as IRIS_TURNS
 from .frame import RenderJob
 from .kept import KeptForEye
-from .lighting import off_cornea, onto_points, through_cornea
+from .lighting import irradiance, off_cornea, onto_points, through_cornea
 from .manifold import CORNEA_MM
 from .parameters import leaves, traversed
 from .places import (
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     from .prepared import Prepared
     from .region import RegionScene
     from .surround import Surround
-    from .values import Lights, Values
+    from .values import Lamp, Lights, Values
 
 RAYS = 24  # from each place on the globe or about it
 _SKIN_RAYS, _INNER_RAYS = 10, 2  # from places on the skin, and on the lids' inner sides, which lie in the dark
@@ -250,6 +250,7 @@ class _Seen:
         sky: irradiance from even light and the soft part of a map, where nothing is met.
         free: the same as if nothing were met.
         lit: irradiance straight from the lamps at the very point of the skin that is met, -1 where it is not known.
+        bare: the same if nothing stood in the way, -1 where no skin is met.
     """
 
     shares: csr_array
@@ -259,6 +260,7 @@ class _Seen:
     sky: Reals
     free: Reals
     lit: Reals
+    bare: Reals
 
     def mean(self, values: Reals) -> Floats:
         """Means (places,) over the rays of each place."""
@@ -272,12 +274,17 @@ class _Seen:
             shape=(part.shape[0],) * 2,
         )
 
-    def correction(self, direct: Floats) -> Floats:
-        """What the lamps' light at the points that are met adds to that of the places there, `direct`."""
-        if not np.any(self.lit >= 0):
+    def correction(self, direct: Floats, bare: Floats) -> Floats:
+        """What the lamps' light at the points that are met adds to that of the places there, `direct`.
+
+        `bare` is the lamps' light on the places if nothing stood in the way. Where that at the very point is not known,
+        the same share of it arrives there.
+        """
+        if not np.any(self.bare >= 0):
             return np.zeros(self.shares.shape[0])
-        more = self.lit - direct[np.minimum(self.target, len(direct) - 1)]
-        return self.mean(self.weight * np.where(self.lit >= 0, more, 0))
+        target = np.minimum(self.target, len(direct) - 1)
+        lit = np.where(self.lit >= 0, self.lit, _over(direct, bare)[target] * self.bare)
+        return self.mean(self.weight * np.where(self.bare >= 0, lit - direct[target], 0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -544,10 +551,11 @@ class _Frame:
 
     def solved(
         self, region: RegionScene | None, mirrored: Floats, ambient: list[Floats],
-        direct: Floats, lamps: Floats, panels: Floats, seen: _Seen,
+        straight: Floats, lamps: Floats, panels: Floats, seen: _Seen,
     ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
         """Solve for the irradiance of all places: tables as for `Received.filled`."""
         job, outside = self.job, self.outside
+        direct, bare = np.split(straight, 2)
         # What is hidden of soft light is told by the rays, and of the rest by what stands before its parts.
         soft, hard, free, shaded = ambient
         sky = seen.mean(seen.sky) if np.any(soft) else np.zeros(outside + PLACES)
@@ -561,7 +569,7 @@ class _Frame:
         total, arrived, within = start, np.zeros(outside + PLACES), np.zeros(PLACES)
         if job.interreflection:
             exchange, inner, limbus = seen.exchange(self._stand_in(valid)), self.interior.exchange, self.interior.limbus
-            more = seen.correction(direct)
+            more = seen.correction(direct, bare)
             more[:outside] += mirrored
             for _ in range(_ROUNDS):
                 arrived = exchange @ total + more
@@ -621,14 +629,14 @@ def _direct(
 ) -> tuple[Callable[[], Floats], Callable[[], list[Floats]]]:
     """Irradiance of places outside the eye, whose points and normals are in `outer`, to be read later.
 
-    Straight from the lamps, in each window; from ambient light without shadows: what is soft, and the rest; this rest
-    from its parts, without and with shadows.
+    Straight from the lamps, in each window, with shadows and then without; from ambient light without shadows: what is
+    soft, and the rest; this rest from its parts, without and with shadows.
     """
     count = frame.outside
     kinds = tuple(dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.on_skin, count - IRIS_TURNS))
     ways = values, scene, outer, kinds
     views, lanes = textures.lamp_views, count * lights.windows
-    lit = _over_lamps(lights, count, lambda first: [_onto_outer(*ways, lights, views, first, lanes)[0]])
+    lit = _over_lamps(lights, 2 * count, lambda first: list(_onto_outer(*ways, lights, views, first, lanes)))
     soft = hard = free = shaded = None
     if values.structure.ambient:
         assert textures.ambience is not None
@@ -773,8 +781,8 @@ def _seen(
     kinds = _Kinds(on_globe, of_outside, on_skin, plan.stands_for)
     lanes = -(-rays // _LANES) * _LANES
     results, spot = _rays_of(
-        values, textures, place.scene, numbers, plan.of_place, outer, interior.leaving, (outside, all_rays), kinds,
-        dr.opaque(mi.UInt32, lanes) if values.several else None, lanes * lights.windows,
+        values, lights, textures, place.scene, numbers, plan.of_place, outer, interior.leaving, (outside, all_rays),
+        kinds, dr.opaque(mi.UInt32, lanes) if values.several else None, lanes * lights.windows,
     )  # fmt: skip
     globe, found = frame.on_globe * RAYS, None
     if plan.skin is not None and len(lights):
@@ -787,8 +795,11 @@ def _seen(
             straight = found.numpy()
             lit[:globe], lit[plan.rays :] = straight[:globe], straight[globe:]
         shares = _shares(plan.count, interior.gain)
-        target, weight, close, sky, free = (r.numpy().reshape(-1, lanes)[:, :rays] for r in results)
-        return [_Seen(shares, target[k], weight[k], close[k], sky[k], free[k], lit) for k in range(lights.windows)]
+        bare = lit if plan.skin is None else results[-1].numpy()[:rays]
+        target, weight, close, sky, free = (r.numpy().reshape(-1, lanes)[:, :rays] for r in results[:-1])
+        return [
+            _Seen(shares, target[k], weight[k], close[k], sky[k], free[k], lit, bare) for k in range(lights.windows)
+        ]
 
     return read
 
@@ -806,10 +817,11 @@ class _Kinds:
 
 @recorded
 def _rays_of(
-    values: Values, textures: Textures, scene: mi.Scene, numbers: Received, of_place: mi.UInt32, outer: mi.Float,
-    leaving: mi.Float, ends: tuple[mi.UInt32, mi.UInt32], kinds: _Kinds, each: mi.UInt32 | None, lanes: int,
+    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, numbers: Received, of_place: mi.UInt32,
+    outer: mi.Float, leaving: mi.Float, ends: tuple[mi.UInt32, mi.UInt32], kinds: _Kinds, each: mi.UInt32 | None,
+    lanes: int,
 ) -> tuple[tuple[Any, ...], tuple[Any, ...]]:  # fmt: skip
-    """What the rays of places meet: the columns of `_Seen` but for the last, and places on skin (see `_met`).
+    """What the rays of places meet: the columns of `_Seen` but for `lit`, and places on skin (see `_met`).
 
     The first rays belong to places outside the eye, whose numbers are in `of_place`. The `ends` are their number, and
     that of all rays; there are more lanes, of several windows `each`.
@@ -833,9 +845,26 @@ def _rays_of(
     if values.structure.ambient:
         assert textures.ambience is not None
         sky = dr.pi * textures.ambience.soft(d, outside | open_)
-    results = (target, weight, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky)
+    bare = mi.Float(-1) if textures.region is None else _bare(lights, *spot)
+    results = (target, weight, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky, bare)
     dr.eval(results, spot)
     return results, spot
+
+
+def _bare(lights: Lights, on_skin: mi.Bool, x: mi.Vector3f, normal: mi.Vector3f) -> mi.Float:
+    """Irradiance straight from the lamps at points (eye frame) `on_skin` if nothing stood in the way, else -1."""
+    u, v = _spots(dr.arange(mi.UInt32, dr.width(x)) * mi.UInt32(_SHUFFLED))
+    sine, cosine = dr.sincos(v * (2 * dr.pi))
+
+    def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        lamp: Lamp = lights[i]
+        return i + 1, total + irradiance(lamp, lamp.point(u, sine, cosine), x, normal)
+
+    state, labels = (mi.UInt32(0), mi.Float(0) * x.x), ("i", "total")
+    _, total = dr.while_loop(
+        state, lambda i, _: on_skin & (i < lights.count), body, labels=labels, label="lamps on skin that is met"
+    )
+    return dr.select(on_skin, total, -1)
 
 
 @recorded
