@@ -5,10 +5,11 @@
 
 Every image is a pure function of (row, seed). Four seeds in a row share a face and an eye, whose maps are made once;
 pupil, gaze, blink, head and noise are their own. Rows: `headset`, `desktop`, `subjects` (as in dataset_region),
-`stress`, `webcam`, `both_lids` (both lids lie over a wide pupil), and eyes without lids: `eight` (the headset's eight
-glints on a textured iris) and `texture` (the desktop tracker's small pupils in a textured iris). Seeds below 10,000
-are for development, the others for reports. A file ROW-SEED.npz holds the image, its bit depth, the pupil, its
-visible share, and the glints with their visible shares. Files that are there already are kept.
+`stress`, `webcam`, `single` (one lamp and oily skin), `both_lids` (both lids lie over a wide pupil), and eyes without
+lids: `eight` (the headset's eight glints on a textured iris) and `texture` (the desktop tracker's small
+pupils in a textured iris). Seeds below 10,000 are for development, the others for reports. A file ROW-SEED.npz holds
+the image, its bit depth, the pupil, its visible share, and the glints with their visible shares. Files that are there
+already are kept.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ ROWS: dict[str, tuple[str, tuple[float, float], tuple[float, float], float]] = {
     "subjects": ("desktop_tracker", (2.2, 6.5), (0.0, 0.25), 18.0),
     "stress": ("stress", (3.0, 6.0), (0.0, 0.3), 15.0),
     "webcam": ("webcam", (2.5, 5.0), (0.0, 0.3), 15.0),
+    "single": ("quickstart", (2.5, 6.0), (0.0, 0.3), 18.0),
     "both_lids": ("desktop_tracker", (5.5, 7.5), (0.25, 0.5), 6.0),
     "eight": ("headset", (2.5, 6.0), (0.0, 0.0), 18.0),
     "texture": ("desktop_tracker", (2.5, 6.0), (0.0, 0.0), 18.0),

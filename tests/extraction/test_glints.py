@@ -9,6 +9,8 @@ from scipy.special import ndtr
 import make_ideal_images as ideal
 from eyerender.extraction import extract
 from eyerender.extraction.glints import deblending, fits, fitting, gaussian_model, windows
+from eyerender.extraction.glints.classification import compared
+from eyerender.extraction.preprocessing import DN
 from eyerender.status import Status
 
 SEEDS = range(20_000, 20_008)
@@ -56,6 +58,19 @@ def test_a_strongly_clipped_glint_hides_no_other():
     found = extract(np.clip(np.rint(image), 0, 255).astype(np.uint8)).glints
     assert len(found) == 2
     assert all(min(np.hypot(*(g.xy_px - xy)) for g in found) < 0.1 for xy in places)
+
+
+@pytest.mark.parametrize(("clipped", "top"), [(9, 8.0), (30, 2.5)])
+def test_the_height_of_a_clipped_glint_counts_while_its_flanks_are_seen(clipped, top):
+    """A highlight of two full scales is compared with a single glint of eight."""
+    two = {name: np.ones((2, *shape)) for name, shape in (("xy_px", (2,)), ("covariance", (2, 2)), ("sigma_px", (2,)))}
+    rest = {name: np.ones(2) for name in ("background_dn", "residual_dn")}
+    fit = fits.SpotFit(
+        amplitude_dn=DN * np.array([8.0, 2.0]), clipped=np.array([clipped, 0]), converged=np.ones(2, dtype=bool),
+        moments_px2=np.ones((2, 2, 2)), **two, **rest,
+    )  # fmt: skip
+    height = compared(fit, np.array([9.0, -1.0]), ())[1, 2]
+    assert height == pytest.approx(np.log(2.0 / top), rel=1e-3)
 
 
 def test_a_glint_before_bright_sclera_is_found():

@@ -24,8 +24,9 @@ from .bloomed import Patch
 from .detection import Spots, optics_sigma
 from .fits import SpotFit
 
-# Heights in full scales up to which that of a single clipped glint is trusted, and up to which heights are compared.
-TALL, HIGHEST = 2.5, 10.0
+# Heights in full scales up to which that of a single strongly clipped glint is trusted, and up to which heights are
+# compared; clipped pixels of a glint whose flanks still tell its height.
+TALL, HIGHEST, CLIPPED = 2.5, 10.0, 12
 # Steps by which the ground may be brighter than the iris; more is no worse, because the sclera is as bright.
 BRIGHTEST = 1.4
 # A large saturated patch is this many times as wide as the spots that are glints, at most.
@@ -161,8 +162,10 @@ def compared(fit: SpotFit, logit: Floats, heights: Sequence[float]) -> Floats:
     height, width = np.clip(fit.amplitude_dn / DN, 1e-3, HIGHEST), (fit.sigma_px**2 + _PIXEL).prod(axis=1) ** 0.25
     # The fitted height of a strongly clipped glint may be many times too large. So it counts as TALL only, unless the
     # next one is higher than that.
-    likely = sorted([*heights, *height[logit > 0.0].tolist()]) or [float(height[best])]
-    top = max(min(likely[-1], TALL), likely[-2] if len(likely) > 1 else 0.0)
+    sure = np.where(fit.clipped > CLIPPED, np.minimum(height, TALL), height)
+    glints = np.flatnonzero(logit > 0.0) if len(heights) or np.any(logit > 0.0) else np.array([best])
+    likely = sorted([*heights, *height[glints].tolist()])
+    top = max(likely[-2] if len(likely) > 1 else 0.0, *np.minimum(heights, TALL), *sure[glints])
     other = (np.arange(logit.size) != best) / (1.0 + math.exp(-float(np.clip(logit[best], -30.0, 30.0))))
     columns = (
         np.clip(logit, -LIKELIEST, LIKELIEST),
