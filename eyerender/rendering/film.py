@@ -149,12 +149,12 @@ class Film:
 
     def means(self) -> list[tuple[Singles, int]]:
         """What `mean_parts` or `mean_radiance` returns, for each window."""
-        means = np.stack([total.numpy().reshape(self.shape) / np.float32(self.spp) for total in self.sums], axis=1)
-        failed = self.failed.numpy().tolist()
+        means = [total.numpy().reshape(self.shape) / np.float32(self.spp) for total in self.sums]
+        failed, (count, *size) = self.failed.numpy().tolist(), self.shape
         if self.layered:
-            return list(zip(means.reshape(len(means), -1, 3, *self.shape[1:]), failed, strict=True))
+            return list(zip(np.stack(means, axis=1).reshape(count, -1, 3, *size), failed, strict=True))
         # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
-        return list(zip(np.maximum(means[:, 0], 0), failed, strict=True))
+        return list(zip(np.maximum(means[0], 0, out=means[0]), failed, strict=True))
 
 
 def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
