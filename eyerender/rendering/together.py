@@ -13,19 +13,21 @@ from .irisrelief import cells_across
 from .values import point_like
 
 MOST, SAMPLES = 16, 2**22  # windows that share launches, with grids of 2.5 MB each; their samples
+_LEAST = 4  # larger windows gain nothing
 _NO_LIGHT = Ambient()
 
 
 def together(jobs: Iterable[RenderJob], spp: int) -> Iterator[tuple[RenderJob, ...]]:
     """Put jobs that follow each other together, up to `MOST` windows that have no more than `SAMPLES`.
 
-    A window that stands alone is given alone. Jobs are fetched only as far as that needs.
+    Windows so large that fewer than four fit stand alone, and are given alone. Jobs are fetched only as far as needed.
     """
     group: list[RenderJob] = []
     kind: Any = None
     for job in jobs:
         found, width, height = _kind(job), *job.window[2:]
-        most = 1 if found is None else min(MOST, SAMPLES // (width * height * spp))
+        fit = SAMPLES // (width * height * spp)
+        most = 1 if found is None or fit < _LEAST else min(MOST, fit)
         if group and found != kind:
             yield tuple(group)
             group = []

@@ -114,7 +114,8 @@ def test_windows_go_together_up_to_a_number_of_samples(renderer):
 
     eye = eye_of("E2")
     small = [replace(job, eye=eye) for job in jobs((100, 100))]
-    assert [len(group) for group in renderer.together(small, spp=SAMPLES // 20_000)] == [2, 2, 1]
+    assert [len(group) for group in renderer.together(small, spp=SAMPLES // 40_000)] == [4, 1]
+    assert [len(group) for group in renderer.together(small, spp=SAMPLES // 30_000)] == [1] * 5
     assert [len(group) for group in renderer.together(small * 7, spp=1)] == [MOST, MOST, 3]
     fetched.clear()
     large = (replace(job, eye=eye) for job in jobs((1000, 1000)))
