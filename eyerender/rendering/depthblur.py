@@ -23,7 +23,7 @@ from scipy import special
 from ..rig import defocus
 from .blur import Blur
 from .recorded import recorded
-from .values import aligned
+from .values import sent
 
 _LARGEST_FACTOR = 6
 _FARTHEST, _NODES = 144.0, 2**16  # range of the table of a disc's transform, and its nodes
@@ -62,8 +62,8 @@ class _Axis:
             factor = next((n for n in range(_LARGEST_FACTOR, 1, -1) if left % n == 0), left)
             passes.append((dr.opaque(mi.UInt32, factor), dr.opaque(mi.UInt32, before)))
             before, left = before * factor, left // factor
-        cosines, sines = (mi.Float(aligned(wave(angle).astype(np.float32))) for wave in (np.cos, np.sin))
-        return cls(dr.opaque(mi.UInt32, length), dr.opaque(mi.UInt32, apart), (cosines, sines), passes)
+        waves = sent(np.cos(angle)), sent(np.sin(angle))
+        return cls(dr.opaque(mi.UInt32, length), dr.opaque(mi.UInt32, apart), waves, passes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +88,7 @@ class Plane:
         down, across = defocus.padded((height, width), reach)
         x = np.linspace(0, _FARTHEST, _NODES + 1)
         disc = np.divide(2 * special.j1(x), x, out=np.ones_like(x), where=x > 0)
-        table = mi.Float(aligned(disc.astype(np.float32)))
-        return cls(size_of(width, height), _Axis.of(across, 1), _Axis.of(down, across), table)
+        return cls(size_of(width, height), _Axis.of(across, 1), _Axis.of(down, across), sent(disc))
 
 
 def spread(blur: Blur, parts: Sequence[mi.Float], shape: tuple[int, int], plane: Plane) -> mi.Float:
@@ -201,7 +200,7 @@ def _added(
     The share of a pixel falls from 1 to 0 between the squared diameters in the middle and at the ends of `hat`.
     """
     low, middle, high = hat
-    image, row, column = _places(lanes, plane)
+    image, row, column = places(lanes, plane.across.length, plane.down.length)
     width, height = plane.size
     inside = (row < height) & (column < width)
     source = (image * height + row) * width + column
@@ -266,12 +265,12 @@ def _composed(
     return found
 
 
-def _places(lanes: int, plane: Plane) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-    """Picture, row and column of each lane of a transform."""
+def places(lanes: int, width: mi.UInt32, height: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    """Picture, row and column of each lane."""
     index = dr.arange(mi.UInt32, lanes)
-    line = index // plane.across.length
-    image = line // plane.down.length
-    return image, line - image * plane.down.length, index - line * plane.across.length
+    line = index // width
+    image = line // height
+    return image, line - image * height, index - line * width
 
 
 def _transformed(re: mi.Float, im: mi.Float, plane: Plane, lanes: int) -> tuple[mi.Float, mi.Float]:

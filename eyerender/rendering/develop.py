@@ -21,16 +21,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import Reals
 from ..rig import defocus, exposure, psf, stray
 from .blur import Blur
 from .counts import Counter, counted
-from .depthblur import Plane, Size, size_of, spread
+from .depthblur import Plane, Size, places, size_of, spread
 from .film import Film
 from .frame import RenderJob
 from .recorded import recorded
 from .splat import Shine, add_shines
-from .values import aligned
+from .values import sent
 from .window import Developed
 
 _T = TypeVar("_T")
@@ -66,7 +65,7 @@ class Darkroom:
         width, height = job.window[2:]
         pixels = count * width * height
         size, sigma = size_of(width, height), job.sensor.psf_sigma_px
-        weights = self._once(("psf", sigma), lambda: _sent(psf.kernel(sigma) if sigma else np.ones(1)))
+        weights = self._once(("psf", sigma), lambda: sent(psf.kernel(sigma) if sigma else np.ones(1)))
         glints = np.zeros((count, height, width), np.float32)
         for picture, shone, one in zip(glints, shines, jobs, strict=True):
             add_shines(shone, picture, one)
@@ -85,12 +84,12 @@ class Darkroom:
             passing = through[0], added[0]
         else:
             passing = dr.concat(through), dr.concat(added)
-        irradiance = _framed(seen, _sent(glints), passing, scale, pixels)
+        irradiance = _framed(seen, sent(glints), passing, scale, pixels)
         if job.lens.glare > 0:
             radius = job.lens.glare_radius_px
             waves = self._once(
                 ("glare", width, height, radius),
-                lambda: [_sent(w) for w in stray.long_waves((height, width), radius, np.dtype(np.float32))],
+                lambda: [sent(w) for w in stray.long_waves((height, width), radius, np.dtype(np.float32))],
             )
             across, down = (dr.width(w) // n for w, n in zip(waves[1::-1], (width, height), strict=True))
             lanes = count * down * width, count * across * down, pixels
@@ -122,7 +121,7 @@ class Darkroom:
             share = np.full(shape, defocus.vignette(lens, *seen))
             for opening in lens.openings:
                 share *= stray.transmission(opening, *seen)
-            return _sent(share), _sent(stray.framed(np.zeros(shape), lens, *seen))
+            return sent(share), sent(stray.framed(np.zeros(shape), lens, *seen))
 
         return self._once(key, maps)
 
@@ -136,11 +135,6 @@ class Darkroom:
                 self._kept.popitem(last=False)
         found: _T = self._kept[key]
         return found
-
-
-def _sent(numbers: Reals) -> mi.Float:
-    """Send numbers to the device, row by row."""
-    return mi.Float(aligned(numbers.astype(np.float32, copy=False).ravel()))
 
 
 @recorded
@@ -165,11 +159,11 @@ def _blurred(picture: mi.Float, weights: mi.Float, taps: mi.UInt32, size: Size, 
     """Pictures through the point-spread function: `between` numbers are blurred down, and `pixels` across."""
     width, height = size
     wide, none, one = width + taps - 1, mi.UInt32(0), mi.UInt32(1)
-    image, row, column = _place(between, wide, height)
+    image, row, column = places(between, wide, height)
     first = (image * (height + taps - 1) + row) * wide + column
     down = _dot((weights, none, one), (picture, first, wide), taps)
     dr.eval(down)
-    image, row, column = _place(pixels, width, height)
+    image, row, column = places(pixels, width, height)
     picture = _dot((weights, none, one), (down, (image * height + row) * wide + column, one), taps)
     dr.eval(picture)
     return picture
@@ -196,29 +190,21 @@ def _veiled(
     """
     (down, across, damping), (width, height), (few_across, few_down) = waves, size, counts
     one = mi.UInt32(1)
-    image, row, column = _place(lanes[0], width, few_down)
+    image, row, column = places(lanes[0], width, few_down)
     columns = _dot((down, row * height, one), (picture, image * height * width + column, width), height)
     dr.eval(columns)
-    image, row, column = _place(lanes[1], few_across, few_down)
+    image, row, column = places(lanes[1], few_across, few_down)
     found = _dot((columns, (image * few_down + row) * width, one), (across, column * width, one), width)
     found *= dr.gather(mi.Float, damping, row * few_across + column)
     dr.eval(found)
-    image, row, column = _place(lanes[0], width, few_down)
+    image, row, column = places(lanes[0], width, few_down)
     columns = _dot((found, (image * few_down + row) * few_across, one), (across, column, width), few_across)
     dr.eval(columns)
-    image, row, column = _place(lanes[2], width, height)
+    image, row, column = places(lanes[2], width, height)
     veil = _dot((down, row, height), (columns, image * few_down * width + column, width), few_down)
     picture = (1 - glare) * picture + glare * dr.maximum(veil, 0)
     dr.eval(picture)
     return picture
-
-
-def _place(count: int, width: mi.UInt32, height: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-    """Picture, row and column of each lane."""
-    index = dr.arange(mi.UInt32, count)
-    line = index // width
-    image = line // height
-    return image, line - image * height, index - line * width
 
 
 _Numbers = tuple[mi.Float, mi.UInt32, mi.UInt32]  # an array, the place of the first number, and the step to the next

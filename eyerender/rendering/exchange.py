@@ -66,7 +66,7 @@ from .places import (
     skin_places,
 )
 from .recorded import recorded
-from .values import aligned, one_by_one, split
+from .values import aligned, one_by_one, placed, sent, split
 from .view import Textures, appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
@@ -122,9 +122,9 @@ class Received:
         n = one_by_one(rows[0])
         self._centre, self._first, self._per_mm = mi.Vector3f(*n[:3]), n[3], n[4]
         self._root2, self._reach2, self._plane = n[5], n[6], n[7:]
-        self._ends = _sent(globe.table[5:])
-        self._globe, self._other, self._iris = _sent(np.zeros(4)), _sent(np.zeros(4)), _sent(np.zeros(1))
-        self._windows = _sent(rows.ravel()) if len(rows) > 1 else None
+        self._ends = sent(globe.table[5:])
+        self._globe, self._other, self._iris = sent(np.zeros(4)), sent(np.zeros(4)), sent(np.zeros(1))
+        self._windows = sent(rows) if len(rows) > 1 else None
         self._starts: tuple[mi.UInt32, ...] | None = None  # of the lanes' windows in the tables
 
     def filled(self, tables: Sequence[tuple[Floats, Floats, Floats]]) -> Received:
@@ -135,7 +135,7 @@ class Received:
         """
         made = copy(self)
         made._globe, made._other, made._iris = (
-            _sent(np.concatenate([part.ravel() for part in parts])) for parts in zip(*tables, strict=True)
+            sent(np.concatenate([part.ravel() for part in parts])) for parts in zip(*tables, strict=True)
         )
         return made
 
@@ -204,12 +204,6 @@ class Received:
         return ring, dr.select(turn < 0, turn + TURNS, turn)
 
 
-def _sent(values: Reals) -> mi.Float:
-    from .values import aligned
-
-    return mi.Float(aligned(np.ascontiguousarray(values, dtype=np.float32)))
-
-
 def _bilinear(
     buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int, beyond: float, start: mi.UInt32 | None
 ) -> mi.Vector4f:
@@ -217,7 +211,7 @@ def _bilinear(
     column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, -beyond, rows - 1.001 + beyond)
     i, j = mi.UInt32(column), mi.UInt32(dr.clip(row, 0, rows - 1.001))
     s, t = column - mi.Float(i), row - mi.Float(j)
-    place = j * columns + i if start is None else j * columns + i + start
+    place = placed(j * columns + i, start)
     a, b, c, d = (dr.gather(mi.Vector4f, buffer, place + k) for k in (0, 1, columns, columns + 1))
     low, high = a + s * (b - a), c + s * (d - c)
     return dr.maximum(low + t * (high - low), 0)
@@ -231,8 +225,7 @@ def _around(
     i, j = mi.UInt32(ring), mi.UInt32(turn)
     s, t = ring - mi.Float(i), turn - mi.Float(j)
     after = dr.select(j + 1 < turns, j + 1, 0)
-    if start is not None:
-        j, after = j + start, after + start
+    j, after = placed(j, start), placed(after, start)
     a, b, c, d = (dr.gather(kind, buffer, p * turns + q) for p in (i, i + 1) for q in (j, after))
     near, far = a + t * (b - a), c + t * (d - c)
     return near + s * (far - near)
@@ -315,7 +308,7 @@ class _Interior:
         limbus = through_limbus(eye, chamber, look.limbus_width_mm) * look.limbus_transmittance
         rows = np.column_stack([chamber.points, chamber.normals, chamber.valid])
         rays, gain = bundles(chamber, halvings)
-        return cls(chamber, chamber.exchange * albedo, limbus, _sent(rows.ravel()), _sent(rays.ravel()), gain)
+        return cls(chamber, chamber.exchange * albedo, limbus, sent(rows), sent(rays), gain)
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,7 +342,7 @@ class _Plan:
             count[on_globe + on_skin : on_globe + others] = _INNER_RAYS
             table = np.stack([skin.nearest, skin.behind + on_skin], axis=1)
             stands_for = mi.Int32(aligned(table.astype(np.int32).ravel()))
-            near, weight = mi.UInt32(aligned(skin.near.T.astype(np.uint32).ravel())), _sent(skin.weight.T.ravel())
+            near, weight = mi.UInt32(aligned(skin.near.T.astype(np.uint32).ravel())), sent(skin.weight.T.ravel())
         rays = int(count.sum())
         of_place = np.zeros(-(-rays // _LANES) * _LANES, np.uint32)
         of_place[:rays] = np.repeat(np.arange(len(count)), count)
@@ -365,7 +358,7 @@ class _Plan:
         assert self.skin is not None
         vertices, each = self.skin.near.shape
         count = dr.opaque(mi.UInt32, vertices)
-        return _at_vertices(_sent(places.ravel()), self.near, self.weight, count, vertices, each)
+        return _at_vertices(sent(places), self.near, self.weight, count, vertices, each)
 
 
 @recorded
@@ -436,7 +429,7 @@ class Exchange:
         numbers = Received(job.interreflection, frame.chamber, [(one.grid, one.plane) for one in frames])
         if not job.interreflection and not values.structure.ambient:
             return lambda: lambda: numbers.filled([one.dark(region) for one in frames])
-        outer = _sent(np.concatenate([one.outer.ravel() for one in frames]))
+        outer = sent(np.concatenate([one.outer.ravel() for one in frames]))
         direct, ambient = _direct(values, lights, panels, place.scene, textures, frame, outer)
         mirrored = _mirrored(values, lights, place.scene, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.interior.rows) for some in (lights, panels))
@@ -529,7 +522,7 @@ class _Frame:
         """Tables, as for `Received.filled`, of nothing but light straight from the lamps."""
         other = np.tile([0.0, 1.0, 0.0, 0.0], (len(self.points) if region is None else len(region.posed.vertices), 1))
         if region is not None:
-            region.skin.shine(_sent(other.ravel()))
+            region.skin.shine(sent(other))
         return np.tile([0.0, 1.0, 0.0, 0.0], (self.on_globe, 1)), other, np.zeros(IRIS)
 
     def _on_iris(self, values: Floats, along: float) -> Floats:
@@ -688,7 +681,7 @@ def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) ->
         return lambda: total
     lanes = -(-len(places) // _MIRRORED) * _MIRRORED
     padded = np.append(places, np.full(lanes - len(places), places[0]))
-    rows = _sent(np.column_stack([frame.points[padded], frame.normals[padded]]).ravel())
+    rows = sent(np.column_stack([frame.points[padded], frame.normals[padded]]).ravel())
     lit = _over_lamps(lights, lanes, lambda first: [_off_cornea(values, lights, scene, rows, first, lanes)])
 
     def read() -> Floats:

@@ -12,8 +12,6 @@ radius. Before lamps that are large and near, there is no grid.
 
 from __future__ import annotations
 
-from copy import copy
-
 import drjit as dr
 import mitsuba as mi
 
@@ -21,7 +19,7 @@ from .lampviews import LampViews
 from .lightgrid import BENT, about, unevenness, weights
 from .parameters import leaves
 from .recorded import recorded
-from .values import ALL, BITS, Lights, Values, split
+from .values import ALL, BITS, Lights, Values, placed, split, windowed
 from .view import STEEPEST, opacity
 
 _SIDE = 80
@@ -62,11 +60,7 @@ class IrisLight:
 
     def of_window(self, window: mi.UInt32 | None) -> IrisLight:
         """The light of one window for each lane."""
-        if window is None:
-            return self
-        made = copy(self)
-        made._first = window * _NODES
-        return made
+        return windowed(self, window, _NODES)
 
     def at(self, values: Values, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
         """Irradiance (mW/mm^2) at points of the plane of the iris (eye frame), and the lamps that it lacks.
@@ -80,9 +74,8 @@ class IrisLight:
         u, v = (dr.dot(q, axis) * scale + 0.5 * (_SIDE - 1) for axis in (stop.u, stop.v))
         inside = active & self._used & (u >= 0) & (v >= 0) & (u < _SIDE - 1) & (v < _SIDE - 1)
         i, j = mi.UInt32(u), mi.UInt32(v)
-        cell, wu, wv = j * _SIDE + i, mi.Vector4f(*weights(u - mi.Float(i))), weights(v - mi.Float(j))
-        if self._first is not None:
-            cell += self._first
+        cell = placed(j * _SIDE + i, self._first)
+        wu, wv = mi.Vector4f(*weights(u - mi.Float(i))), weights(v - mi.Float(j))
         total = mi.Float(0)
         for k, weight in enumerate(wv):
             total += weight * dr.dot(wu, dr.gather(mi.Vector4f, self._cells, 4 * cell + k, inside))

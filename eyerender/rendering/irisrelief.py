@@ -16,7 +16,6 @@ E'_l and t_l change slowly and are computed on a coarse grid.
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +28,7 @@ from .kept import KeptForEye
 from .parameters import leaves, traversed
 from .recorded import recorded
 from .surfaces import Surface
-from .values import Lights, Values, split
+from .values import Lights, Values, placed, split, windowed
 from .view import Textures, iris_height
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
@@ -98,11 +97,7 @@ class IrisRelief:
 
     def of_window(self, window: mi.UInt32 | None) -> IrisRelief:
         """The relief of one window for each lane."""
-        if window is None:
-            return self
-        made = copy(self)
-        made._first = window * (self._count * self._count)
-        return made
+        return windowed(self, window, self._count * self._count)
 
     def hit(self, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Foot in the plane (eye frame) of the place that rays meet.
@@ -226,8 +221,7 @@ class IrisRelief:
 
     def _on_grid(self, packed: mi.Float, x: mi.Vector3f, active: mi.Bool, first: mi.UInt32 | None = None) -> mi.Float:
         i, j, s, t = self._cell(x, self._count)
-        place = j * self._count + i
-        c = dr.gather(mi.Vector4f, packed, place if first is None else place + first, active)
+        c = dr.gather(mi.Vector4f, packed, placed(j * self._count + i, first), active)
         return dr.lerp(dr.lerp(c.x, c.y, s), dr.lerp(c.z, c.w, s), t)
 
     def _packed(self, values: mi.Float, column: mi.UInt32, row: mi.UInt32, window: mi.UInt32 | None = None) -> mi.Float:
@@ -235,10 +229,8 @@ class IrisRelief:
         last = self._count - 1
         right, below = dr.minimum(column + 1, last), dr.minimum(row + 1, last)
         corners = ((column, row), (right, row), (column, below), (right, below))
-        places = [j * self._count + i for i, j in corners]
-        if window is not None:
-            first = window * (self._count * self._count)
-            places = [place + first for place in places]
+        first = None if window is None else window * (self._count * self._count)
+        places = [placed(j * self._count + i, first) for i, j in corners]
         out = dr.zeros(mi.Float, 4 * dr.width(values))
         four = mi.Vector4f(*(dr.gather(mi.Float, values, place) for place in places))
         dr.scatter(out, four, places[0])

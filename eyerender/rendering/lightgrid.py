@@ -6,13 +6,11 @@ interpolation is good: not at the edge of a shadow, nor where a lamp sets.
 
 from __future__ import annotations
 
-from copy import copy
-
 import drjit as dr
 import mitsuba as mi
 
 from .parameters import leaves
-from .values import split
+from .values import placed, split, windowed
 
 BENT = 0.004  # largest third difference of a cell over its irradiance
 
@@ -33,11 +31,7 @@ class LightGrid:
 
     def of_window(self, window: mi.UInt32 | None) -> LightGrid:
         """The grid of one window for each lane."""
-        if window is None:
-            return self
-        made = copy(self)
-        made._first = window * (self.side * self.side)
-        return made
+        return windowed(self, window, self.side * self.side)
 
     @staticmethod
     def nodes(side: int, windows: int = 1) -> tuple[mi.UInt32 | None, mi.UInt32, mi.UInt32]:
@@ -67,7 +61,7 @@ class LightGrid:
             four = [value + dr.gather(mi.Float, more, place) for value, place in zip(four, places[4:8], strict=True)]
         low = dr.abs(four[0])
         rows = dr.zeros(mi.Float, 4 * count)
-        dr.scatter(rows, mi.Vector4f(dr.select(good, low, -low), *four[1:]), index if first is None else index + first)
+        dr.scatter(rows, mi.Vector4f(dr.select(good, low, -low), *four[1:]), placed(index, first))
         return rows
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Bool]:
@@ -78,8 +72,7 @@ class LightGrid:
         wu, wv = weights(u - mi.Float(i)), weights(v - mi.Float(j))
         total, known = mi.Float(0), mi.Bool(inside)
         for k, weight in enumerate(wv):
-            place = (j + k - 1) * side + i
-            row = dr.gather(mi.Vector4f, self.rows, place if self._first is None else place + self._first, inside)
+            row = dr.gather(mi.Vector4f, self.rows, placed((j + k - 1) * side + i, self._first), inside)
             if k == 1:
                 known &= row.x > 0
             total += weight * (wu[0] * dr.abs(row.x) + wu[1] * row.y + wu[2] * row.z + wu[3] * row.w)
@@ -89,8 +82,7 @@ class LightGrid:
 def about(index: mi.UInt32, side: int, first: mi.UInt32 | None = None) -> list[mi.UInt32]:
     """The sixteen nodes about cells of grids, row by row, in which a grid begins with its `first` node."""
     places = (mi.Int32(index) + dv * side + du for dv in range(-1, 3) for du in range(-1, 3))
-    near = [mi.UInt32(dr.clip(place, 0, side**2 - 1)) for place in places]
-    return near if first is None else [place + first for place in near]
+    return [placed(mi.UInt32(dr.clip(place, 0, side**2 - 1)), first) for place in places]
 
 
 def unevenness(near: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float]:

@@ -23,7 +23,7 @@ from .lightgrid import LightGrid
 from .lighting import irradiance, lamp_blocked
 from .parameters import leaves
 from .recorded import recorded
-from .values import Lights, Values, aligned
+from .values import Lights, Values, sent
 from .view import GLOBE_EDGE, View, globe_map
 
 if TYPE_CHECKING:
@@ -53,8 +53,7 @@ class MatteLight:
         self._values, self._lights, self._scene, self._received = values, lights, scene, received
         self._points = dr.opaque(mi.UInt32, lights.points)
         self._used = dr.opaque(mi.Bool, lights.gridded)
-        reach = np.array(reach_mm, np.float32)
-        self._reach = mi.Float(aligned(reach)) if values.several else dr.opaque(mi.Float, reach_mm[0])
+        self._reach = sent(np.array(reach_mm)) if values.several else dr.opaque(mi.Float, reach_mm[0])
         self._grids: tuple[LightGrid, LightGrid] | None = None
         self._fill()
 

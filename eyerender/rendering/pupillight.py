@@ -7,7 +7,6 @@ of its points sums over the lamps the irradiance of the stop times the return fa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +15,7 @@ import numpy as np
 from ..eye.fundus import CELLS, EDGE, FundusLight
 from .parameters import leaves
 from .recorded import recorded
-from .values import Lights, Values, aligned, split
+from .values import Lights, Values, placed, sent, split, windowed
 
 
 class PupilLight:
@@ -34,18 +33,14 @@ class PupilLight:
             returned: the return factors of the lamps, for each window.
         """
         self._values, self._lights, self._scene = values, lights, scene
-        self._factors = aligned(np.concatenate([one.factors.ravel() for one in returned]).astype(np.float32))
+        self._factors = np.concatenate([one.factors.ravel() for one in returned])
         self._first: mi.UInt32 | None = None
         self._cells: mi.Float | None = None
         self._fill()
 
     def of_window(self, window: mi.UInt32 | None) -> PupilLight:
         """The light of one window for each lane."""
-        if window is None:
-            return self
-        made = copy(self)
-        made._first = window * (CELLS * CELLS)
-        return made
+        return windowed(self, window, CELLS * CELLS)
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> mi.Float:
         """Radiance at coordinates of the stop in units of its semi-axes, bilinearly."""
@@ -55,8 +50,7 @@ class PupilLight:
         s, t = x - mi.Float(i), y - mi.Float(j)
 
         def cell(di: int, dj: int) -> mi.Float:
-            place = (j + dj) * CELLS + i + di
-            return dr.gather(mi.Float, self._cells, place if self._first is None else place + self._first, active)
+            return dr.gather(mi.Float, self._cells, placed((j + dj) * CELLS + i + di, self._first), active)
 
         low, high = (dr.lerp(cell(0, k), cell(1, k), s) for k in (0, 1))
         return dr.lerp(low, high, t)
@@ -67,7 +61,7 @@ class PupilLight:
             self._cells = dr.zeros(mi.Float, cells)
             dr.make_opaque(self._cells)
             return
-        self._cells = _filled(self._values, self._lights, self._scene, mi.Float(self._factors), cells)
+        self._cells = _filled(self._values, self._lights, self._scene, sent(self._factors), cells)
 
 
 @recorded

@@ -73,15 +73,16 @@ class Renderer:
         Raises:
             InputError: numbers so extreme that the image is not finite.
         """
-        traced = self._moving(job, spp, moments) if moments else self._traced([job], spp, ())[0]
-        return traced.developed()
+        return self._one(job, spp, moments).developed()
 
     def begin(
         self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()
     ) -> Future[RenderedWindow]:
         """Trace one window now, and develop it in a second thread. The arguments are those of `render`."""
-        traced = self._moving(job, spp, moments) if moments else self._traced([job], spp, ())[0]
-        return self._beside.submit(traced.developed)
+        return self._beside.submit(self._one(job, spp, moments).developed)
+
+    def _one(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob]) -> Traced:
+        return self._moving(job, spp, moments) if moments else self._traced([job], spp, ())[0]
 
     def begin_all(
         self, jobs: Sequence[RenderJob], *, spp: int | None = None, after: Sequence[RenderJob] = ()

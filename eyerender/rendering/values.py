@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Reals
 from .parameters import CameraParameters, Kind, Parameters, PoseParameters, leaves, packed, rebuilt
 from .recorded import recorded
 from .surfaces import Surface
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from .irisrelief import IrisRelief
     from .mattelight import MatteLight
 
+_Record = TypeVar("_Record")
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
 _POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
 SMALL = 0.02  # the same of lamps whose shadows of hairs are finer than a pixel
@@ -44,6 +46,11 @@ def aligned(values: NDArray[Any]) -> NDArray[Any]:
     copy = memory[start : start + values.nbytes].view(values.dtype).reshape(values.shape)
     copy[...] = values
     return copy
+
+
+def sent(numbers: Reals) -> mi.Float:
+    """Send numbers to the device, row by row."""
+    return mi.Float(aligned(np.asarray(numbers, dtype=np.float32).ravel()))
 
 
 def one_by_one(numbers: NDArray[np.float32]) -> list[mi.Float]:
@@ -70,6 +77,23 @@ def split(index: mi.UInt32, each: int | mi.UInt32, several: bool) -> tuple[mi.UI
         return None, index
     window = index // each
     return window, index - window * each
+
+
+def windowed(record: _Record, window: mi.UInt32 | None, each: int | mi.UInt32) -> _Record:
+    """A record for one window of each lane, if its tables hold several: those of a window have `each` numbers or rows.
+
+    The copy has the place at which they begin as `_first`; without several windows this is None.
+    """
+    if window is None:
+        return record
+    made: Any = copy(record)
+    made._first = window * each
+    return made  # type: ignore[no-any-return]
+
+
+def placed(place: mi.UInt32, first: mi.UInt32 | None) -> mi.UInt32:
+    """Place in a table whose numbers begin at `first`."""
+    return place if first is None else place + first
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +143,7 @@ class Values:
             rows = np.zeros((len(windows), _WINDOW_ROW), np.float32)
             for row, one in zip(rows, windows, strict=True):
                 row[: _WINDOW_ROW - 3] = packed((one.pose, one.camera))
-            self._windows = mi.Float(aligned(rows.ravel()))
+            self._windows = sent(rows)
         left = iter(one_by_one(packed(parameters)))
 
         def leaf(size: int) -> mi.Float | mi.Vector3f | tuple[mi.Float, ...]:
@@ -249,7 +273,7 @@ class Lights:
         self.suns = dr.opaque(mi.UInt32, suns if self._len and table[-1, 6] < SMALL * away[-1] else 0)
         rows = np.zeros((max(len(table), 1), _LIGHT_ROW), np.float32)
         rows[: len(table), : table.shape[1]] = table
-        self._buffer = mi.Float(aligned(rows.ravel()))
+        self._buffer = sent(rows)
 
     def __len__(self) -> int:
         return self._len
@@ -258,15 +282,14 @@ class Lights:
         """The lamps of one window for each lane."""
         if window is None:
             return self
-        made = copy(self)
-        made._first = window * self.count
+        made = windowed(self, window, self.count)
         for name in ("on_iris", "on_matte", "relief"):
             part = getattr(self, name)
             setattr(made, name, None if part is None else part.of_window(window))
         return made
 
     def __getitem__(self, i: mi.UInt32) -> Lamp:
-        row = i if self._first is None else i + self._first
+        row = placed(i, self._first)
         # Four numbers are gathered at once.
         a, b, c = (dr.gather(mi.Vector4f, self._buffer, row * (_LIGHT_ROW // 4) + k) for k in range(3))
         return Lamp(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(a.w, b.x, b.y), b.z, b.w, c.x, c.y, i)
