@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,8 +13,7 @@ import numpy as np
 from ..arrays import Floats, Singles
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from .blur import Blur
-from .develop import Darkroom, takes
-from .film import Exposed, Film, begun, mean_radiance
+from .film import Exposed, begun, mean_radiance
 from .frame import RenderJob
 from .labels import PartLabels, depths_mm, highlights, part_labels
 from .lighting import through_cornea
@@ -25,7 +24,7 @@ from .splat import MirrorImages, Shine
 from .stage import Stage
 from .surround import Obstacle, Surround
 from .together import together
-from .window import Developed, RenderedWindow, Traced
+from .window import RenderedWindow, Traced
 
 if TYPE_CHECKING:
     from ..backends.choose import Backend
@@ -42,8 +41,6 @@ class Renderer:
         backend: the backend.
         spp: samples per pixel.
         obstacles: bodies in the scene's frame that hide and shade the eye.
-        develop: what computes lens and sensor, "device" where it can (`develop.takes`), or "host", NumPy beside the
-            tracing. None: a GPU is the device, and a processor the host.
     """
 
     def __init__(
@@ -52,12 +49,9 @@ class Renderer:
         *,
         spp: int = 16,
         obstacles: Sequence[Obstacle] = (),
-        develop: Literal["device", "host"] | None = None,
     ) -> None:
         self.backend = backend
         self.spp = spp
-        develop = develop or ("device" if backend.name == "cuda" else "host")
-        self._darkroom = Darkroom() if develop == "device" else None
         self._beside = ThreadPoolExecutor(1, "develop")
         self._stage = Stage(self._beside, obstacles)
 
@@ -116,29 +110,18 @@ class Renderer:
         marks = _marks(shown)
         self._stage.prepare()
         images = [self._mirror_images(host).seen(place, blur) for host, blur in zip(shown.hosts, blurs, strict=True)]
-        read = self._pictures(jobs, blurs, film, [shines for _, shines in images])
         return [
             Traced(job, picture, tuple(shines), blur, mirrored, labels, failed, margins, bright)
             for job, blur, (mirrored, shines), (picture, failed), (labels, margins, bright) in zip(
-                jobs, blurs, images, read(), marks(), strict=True
+                jobs, blurs, images, film.means(), marks(), strict=True
             )
         ]
-
-    def _pictures(
-        self, jobs: Sequence[RenderJob], blurs: Sequence[Blur], film: Film, shines: Sequence[Sequence[Shine]]
-    ) -> Callable[[], Sequence[tuple[Singles | Developed, int]]]:
-        """What reads the pictures of jobs, which the device develops if it can, and numbers of failed light paths."""
-        room = self._darkroom
-        if room is None or not all(map(takes, jobs, blurs)):
-            return film.means
-        return room.begun(jobs, blurs[0], [film], shines)
 
     @uncollected
     def _moving(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob]) -> Traced:
         """Trace the moments of a job: the mean of their pictures, with labels and glints of the job itself."""
         spp = max(1, (spp or self.spp) // len(moments))
         blur: Blur | None = None
-        films: list[Film] = []
         pictures: list[Singles] = []
         failed = 0
         glints: list[Shine] = []
@@ -150,12 +133,9 @@ class Renderer:
             found = _marks(shown, job) if shot.M is job.M and shot.t is job.t else None
             mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(moments))
             glints += shines
-            if self._darkroom is not None and takes(job, blur):
-                films.append(film)
-            else:
-                ((mean, missed),) = film.means()
-                pictures.append(mean)
-                failed += missed
+            ((mean, missed),) = film.means()
+            pictures.append(mean)
+            failed += missed
             if found is not None:
                 marks = mirrored, *found()[0]
         assert blur is not None
@@ -163,12 +143,7 @@ class Renderer:
             shown, place = self.bind(job, lit=False)
             marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(shown)()[0]
         mirrored, labels, margins, bright = marks
-        picture: Singles | Developed
-        if self._darkroom is not None and films:
-            ((picture, failed),) = self._darkroom.begun([job], blur, films, [glints])()
-        else:
-            picture = np.mean(pictures, axis=0)
-        return Traced(job, picture, tuple(glints), blur, mirrored, labels, failed, margins, bright)
+        return Traced(job, np.mean(pictures, axis=0), tuple(glints), blur, mirrored, labels, failed, margins, bright)
 
     def _mirror_images(self, host: Prepared) -> MirrorImages:
         """The lamps' mirror images, in the closed form of the cornea or in a mesh of it."""

@@ -11,7 +11,6 @@ from ..arrays import ArrayValue, Bools, Singles, frozen, sealed
 from ..errors import InputError
 from ..rig import defocus, exposure, psf, stray
 from ..rig.camera import Window
-from . import counts
 from .blur import Blur
 from .frame import RenderJob
 from .glints import GlintTable
@@ -51,26 +50,12 @@ class RenderedWindow(ArrayValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Developed(ArrayValue):
-    """A picture that the device has developed.
-
-    Attributes:
-        irradiance: (height, width) W/m^2 of the sensor.
-        codes: (height, width) as of `counts.Counter`; None where NumPy computes them.
-    """
-
-    irradiance: Singles
-    codes: NDArray[np.uint32] | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Traced(ArrayValue):
-    """A frame before the lens and the sensor, unless the device has developed it.
+    """A frame before the lens and the sensor.
 
     Attributes:
         job: the frame's job.
-        picture: mean radiance of the pixels with the border that the lens needs, or its parts; or what the device made
-            of it.
+        picture: mean radiance of the pixels with the border that the lens needs, or its parts.
         glints: what the lamps' mirror images add.
         blur: the lens.
         mirrored: the glints' places and energies.
@@ -81,7 +66,7 @@ class Traced(ArrayValue):
     """
 
     job: RenderJob
-    picture: Singles | Developed
+    picture: Singles
     glints: tuple[Shine, ...]
     blur: Blur
     mirrored: Mirrored
@@ -97,19 +82,11 @@ class Traced(ArrayValue):
             InputError: numbers so extreme that the image is not finite.
         """
         job, labels, mirrored, highlights = self.job, self.labels, self.mirrored, self.highlights
-        codes = None
-        if isinstance(self.picture, Developed):
-            irradiance, codes = sealed(self.picture.irradiance), self.picture.codes
-        else:
-            irradiance = sealed(self._through_the_lens(self.picture))
+        irradiance = sealed(self._through_the_lens())
         if not np.all(np.isfinite(irradiance)):
             raise InputError("the numbers of the scene are too extreme: its image is not finite")
         # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
-        if codes is None:
-            dn = exposure.recorded(job.sensor, job.camera, job.window, irradiance, job.wavelength_nm, job.seed)
-        else:
-            dn = counts.completed(codes, job.sensor, job.window, irradiance, job.wavelength_nm, job.seed)
-            dn = exposure.bordered(job.sensor, job.camera, job.window, dn)
+        dn = exposure.recorded(job.sensor, job.camera, job.window, irradiance, job.wavelength_nm, job.seed)
         covered = stray.covered(job.lens, job.sensor, job.camera, job.window)
         if covered is not None:
             labels = labels.behind(covered) if labels is not None else None
@@ -129,12 +106,12 @@ class Traced(ArrayValue):
             highlights,
         )
 
-    def _through_the_lens(self, radiance: Singles) -> Singles:
-        """Irradiance (height, width) of the window, W/m^2, by NumPy."""
+    def _through_the_lens(self) -> Singles:
+        """Irradiance (height, width) of the window, W/m^2."""
         job = self.job
         seen = (job.lens, job.camera, job.window)
         # Single precision is finer than the samples' noise, and takes half the time.
-        picture = psf.blur(self.blur.of_pictures(radiance).astype(np.float32), job.sensor.psf_sigma_px)
+        picture = psf.blur(self.blur.of_pictures(self.picture).astype(np.float32), job.sensor.psf_sigma_px)
         add_shines(self.glints, picture, job)
         if job.lens.vignetting > 0:
             picture *= defocus.vignette(*seen)

@@ -55,15 +55,6 @@ def test_windows_together_have_the_bits_of_windows_alone(renderer, model, spp, e
     assert len({digest(seen) for seen in found}) == 4
 
 
-def test_the_device_develops_windows_together(renderer):
-    from eyerender.rendering.renderer import Renderer
-
-    job = remote_job(interreflection=False)
-    jobs, device = [turned(job, k) for k in range(2)], Renderer(renderer.backend, spp=4, develop="device")
-    found = [window.result() for window in device.begin_all(jobs)]
-    assert [digest(window) for window in found] == [digest(device.render(job)) for job in jobs]
-
-
 def test_windows_together_need_the_launches_of_one(renderer):
     import drjit as dr
 
