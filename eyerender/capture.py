@@ -148,7 +148,7 @@ def begin_each(many: Iterable[Frames], renderer: Renderer, *, highlights: bool =
     The next frames are fetched before the last of these are traced, because what NumPy alone makes of them is made
     beside that. Where fetching fails, these are traced first.
     """
-    steps = _steps(many, renderer, highlights)
+    steps = _steps(many, highlights)
     step = next(steps, None)
     while step is not None:
         failed: Exception | None = None
@@ -156,14 +156,9 @@ def begin_each(many: Iterable[Frames], renderer: Renderer, *, highlights: bool =
             after = next(steps, None)
         except Exception as error:
             after, failed = None, error
-        spp = step.frames.scene.spec.image.spp
-        if step.moments:
-            made = [renderer.begin(step.jobs[0], spp=spp, moments=step.moments)]
-        else:
-            expected = () if after is None or after.moments else after.jobs
-            made = renderer.begin_all(step.jobs, spp=spp, after=expected)
-        for k, (job, image) in enumerate(zip(step.jobs, made, strict=True)):
-            yield BegunImage(step.frames, step.row + k, job, image)
+        spp, expected = step.frames.scene.spec.image.spp, None if after is None or after.moments else after.job
+        made = renderer.begin(step.job, spp=spp, moments=step.moments, after=expected)
+        yield BegunImage(step.frames, step.row, step.job, made)
         if failed is not None:
             raise failed
         step = after
@@ -171,25 +166,21 @@ def begin_each(many: Iterable[Frames], renderer: Renderer, *, highlights: bool =
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """Jobs of rows of `frames`, from `row` on, that are traced together; the moments of the only one, if it moves."""
+    """The job of a row of `frames`, and its moments, if it moves."""
 
     frames: Frames
     row: int
-    jobs: tuple[RenderJob, ...]
+    job: RenderJob
     moments: tuple[RenderJob, ...]
 
 
-def _steps(many: Iterable[Frames], renderer: Renderer, highlights: bool) -> Iterator[_Step]:
+def _steps(many: Iterable[Frames], highlights: bool) -> Iterator[_Step]:
     """What to trace, one after the other."""
     for frames in many:
         check_windows(frames.scene)
-        row = 0
-        jobs = (replace(render_job(frames, k), highlights=highlights) for k in range(len(frames)))
-        moving = frames.scene.spec.motion is not None
-        groups = ((job,) for job in jobs) if moving else renderer.together(jobs, spp=frames.scene.spec.image.spp)
-        for group in groups:
-            yield _Step(frames, row, group, moments(frames, row, group[0]) if moving else ())
-            row += len(group)
+        for row in range(len(frames)):
+            job = replace(render_job(frames, row), highlights=highlights)
+            yield _Step(frames, row, job, moments(frames, row, job))
 
 
 def render_job(frames: Frames, row: int) -> RenderJob:

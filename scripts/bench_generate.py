@@ -157,19 +157,19 @@ class Bench:
         made = plan(count, count)
         maker = Maker(made, 1, backend=self.backend, threads=1)  # type: ignore[arg-type]
         maker.make(0)
-        traced, inside, begin = deque[Any](), 0.0, maker.renderer.begin_all
+        traced, inside, begin = deque[Any](), 0.0, maker.renderer.begin
 
         def kept(*arguments: Any, **options: Any) -> Any:
             traced.append(begin(*arguments, **options))
             return traced[-1]
 
-        maker.renderer.begin_all = kept  # type: ignore[method-assign]
+        maker.renderer.begin = kept  # type: ignore[method-assign]
         start = time.process_time()
         for sample in made.spec.shard_samples(0):
             maker.make(sample)
         inside = time.process_time() - start
         # The same samples again, with the windows that were rendered: what is left is everything else.
-        maker.renderer.begin_all = lambda *_, **__: traced.popleft()  # type: ignore[method-assign]
+        maker.renderer.begin = lambda *_, **__: traced.popleft()  # type: ignore[method-assign]
         with tempfile.TemporaryDirectory() as folder, syncing_timed() as syncing:
             start, clock = time.process_time(), time.perf_counter()
             staged = write_shard(maker, Path(folder), 0, lambda *_: None)

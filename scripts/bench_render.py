@@ -516,10 +516,10 @@ class Bench:
                 place.show(turned.region, turned.globe)
             shown, place = self.renderer.bind(turned, lit=False)
             with timed("labels"):
-                _ = part_labels(shown, [turned.window])(), shown.host.lid_margins_px
+                _ = part_labels(shown, turned.window)(), shown.host.lid_margins_px
             with timed("glints"):
                 MirrorImages.of(turned, None).seen(place, shown.host.blur)
-            (traced,) = self.renderer._traced([turned], 4, ())
+            traced = self.renderer._traced(turned, 4, None)
             with timed("lens and sensor"):
                 done = traced.developed()
             assert done.labels is not None
@@ -678,43 +678,6 @@ class Bench:
         wall, cpu = 1e3 * np.median(times, axis=0)
         yield row("fixed cost of a frame, CPU (median of 60)", cpu, "ms", 15)
         yield row("fixed cost of a frame, wall (median of 60)", wall, "ms")
-        yield from self._together()
-
-    def _together(self) -> Iterable[Row]:
-        """Small windows that share launches, against the same windows one by one; all of them in a run."""
-        import drjit as dr
-
-        small, count = self._small_window(), 20 if self.small else 60
-        jobs = [self._turned(small, k) for k in range(count)]
-        groups: dict[str, list[tuple[Any, ...]]] = {
-            "together": list(self.renderer.together(jobs)),
-            "one by one": [(job,) for job in jobs],
-        }
-
-        def run(name: str) -> float:
-            start = time.perf_counter()
-            made = [window for group in groups[name] for window in self.renderer.begin_all(group)]
-            for window in made:
-                window.result()
-            return time.perf_counter() - start
-
-        times: dict[str, list[tuple[float, float]]] = {name: [] for name in groups}
-        for turn in range(5 if self.small else 12):
-            for name, spent in times.items():
-                begun = time.process_time()
-                wall = run(name)
-                if turn > 1:  # recordings are made in the first two
-                    spent.append((time.process_time() - begun, wall))
-        each = {name: np.median(spent, axis=0) for name, spent in times.items()}
-        what = "bare windows 100x100, 1 LED, 16 spp, labels"
-        yield row(f"{what}, in a run", count / each["together"][0], "per CPU s")
-        for name, ratio in zip(("CPU", "wall"), each["together"] / each["one by one"], strict=True):
-            yield row(f"{what}: together / one by one, {name}", ratio, "")
-        for name in groups:
-            with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-                dr.kernel_history_clear()
-                run(name)
-                yield row(f"kernels and copies a window, {name}", len(dr.kernel_history()) / count, "")
 
     def _small_window(self) -> Any:
         """Job of a bare eye in a window of 100 x 100 px of a remote camera."""

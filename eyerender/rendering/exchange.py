@@ -15,7 +15,7 @@ included.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -66,7 +66,7 @@ from .places import (
     skin_places,
 )
 from .recorded import recorded
-from .values import aligned, one_by_one, placed, sent, split
+from .values import aligned, one_by_one, sent
 from .view import Textures, appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
@@ -99,55 +99,38 @@ class Received:
 
     DRJIT_STRUCT = leaves(
         "on", "_between", "_columns", "_rows", "_centre", "_first", "_per_mm", "_root2", "_reach2", "_plane", "_ends",
-        "_globe", "_other", "_iris", "_windows", "_starts",
+        "_globe", "_other", "_iris",
     )  # fmt: skip
 
-    def __init__(
-        self, on: bool, chamber: Chamber, places: Sequence[tuple[GlobePlaces, tuple[float, float, float]]]
-    ) -> None:
+    def __init__(self, on: bool, chamber: Chamber, globe: GlobePlaces, plane: tuple[float, float, float]) -> None:
         """Send the places to the device; they receive nothing.
 
         Args:
             on: whether surfaces send light to each other.
             chamber: the chamber of the eye.
-            places: in each window the places on the globe, and y and z of the middle of the surround's rings, and the
-                radius of the first (mm).
+            globe: the places on the globe.
+            plane: y and z of the middle of the surround's rings, and the radius of the first (mm).
         """
-        globe = places[0][0]
         self.on = dr.opaque(mi.Bool, on)
         self._between = globe.columns == GLOBE_COLUMNS
         self._columns, self._rows = globe.columns, globe.rows
         rim = [chamber.root_mm**2, chamber.reach_mm**2]
-        rows = np.array([[*one.table[:5], *rim, *plane] for one, plane in places], dtype=np.float32)
-        n = one_by_one(rows[0])
+        n = one_by_one(np.array([*globe.table[:5], *rim, *plane], dtype=np.float32))
         self._centre, self._first, self._per_mm = mi.Vector3f(*n[:3]), n[3], n[4]
         self._root2, self._reach2, self._plane = n[5], n[6], n[7:]
         self._ends = sent(globe.table[5:])
         self._globe, self._other, self._iris = sent(np.zeros(4)), sent(np.zeros(4)), sent(np.zeros(1))
-        self._windows = sent(rows) if len(rows) > 1 else None
-        self._starts: tuple[mi.UInt32, ...] | None = None  # of the lanes' windows in the tables
 
-    def filled(self, tables: Sequence[tuple[Floats, Floats, Floats]]) -> Received:
+    def filled(self, globe: Floats, other: Floats, iris: Floats) -> Received:
         """The same places with what they receive.
 
-        tables: of each window, four numbers for each place of the globe, and for each place of the surround or vertex
-            of the region; one number for each place of the iris.
+        Args:
+            globe: four numbers for each place of the globe.
+            other: four numbers for each place of the surround, or vertex of the region.
+            iris: one number for each place of the iris.
         """
         made = copy(self)
-        made._globe, made._other, made._iris = (
-            sent(np.concatenate([part.ravel() for part in parts])) for parts in zip(*tables, strict=True)
-        )
-        return made
-
-    def of_window(self, window: mi.UInt32 | None) -> Received:
-        """What the places of one window for each lane receive, around a bare eye."""
-        if window is None:
-            return self
-        made = copy(self)
-        n = _row(self._windows, 10, window)
-        made._centre, made._plane = mi.Vector3f(*n[:3]), n[7:]
-        made._starts = tuple(window * count for count in (MAP_SIDE * MAP_SIDE, RINGS * TURNS, IRIS))
-        made._windows = None
+        made._globe, made._other, made._iris = sent(globe), sent(other), sent(iris)
         return made
 
     @property
@@ -158,8 +141,7 @@ class Received:
     def globe(self, x: mi.Vector3f) -> mi.Vector4f:
         """Numbers of points of the globe, given in the scene's frame."""
         beyond = 0.5 if self._between else 0.0  # the last rows are half a row from the lids, where light changes fast
-        start = None if self._starts is None else self._starts[0]
-        return _bilinear(self._globe, *self.globe_place(x), self._columns, self._rows, beyond, start)
+        return _bilinear(self._globe, *self.globe_place(x), self._columns, self._rows, beyond)
 
     def globe_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Column and row of points of the globe in the grid of its places."""
@@ -178,8 +160,7 @@ class Received:
 
     def iris(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance of points in the plane of the iris (eye frame), without the light straight from the lamps."""
-        start = None if self._starts is None else self._starts[2]
-        return _around(self._iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float, start)
+        return _around(self._iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float)
 
     def iris_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Ring and turn of points in the plane of the iris among the places of the chamber."""
@@ -191,8 +172,7 @@ class Received:
 
     def surround(self, x: mi.Vector3f) -> mi.Vector4f:
         """Numbers of points of the surround's plane, given in the scene's frame."""
-        start = None if self._starts is None else self._starts[1]
-        return _around(self._other, *self.surround_place(x), RINGS, TURNS, mi.Vector4f, start)
+        return _around(self._other, *self.surround_place(x), RINGS, TURNS, mi.Vector4f)
 
     def surround_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Ring and turn of points of the surround's plane among its places."""
@@ -204,28 +184,23 @@ class Received:
         return ring, dr.select(turn < 0, turn + TURNS, turn)
 
 
-def _bilinear(
-    buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int, beyond: float, start: mi.UInt32 | None
-) -> mi.Vector4f:
-    """Values between columns and rows, continued by so many rows beyond the last ones, from the `start` of a table."""
+def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int, beyond: float) -> mi.Vector4f:
+    """Values between columns and rows, continued by so many rows beyond the last ones."""
     column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, -beyond, rows - 1.001 + beyond)
     i, j = mi.UInt32(column), mi.UInt32(dr.clip(row, 0, rows - 1.001))
     s, t = column - mi.Float(i), row - mi.Float(j)
-    place = placed(j * columns + i, start)
+    place = j * columns + i
     a, b, c, d = (dr.gather(mi.Vector4f, buffer, place + k) for k in (0, 1, columns, columns + 1))
     low, high = a + s * (b - a), c + s * (d - c)
     return dr.maximum(low + t * (high - low), 0)
 
 
-def _around(
-    buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any, start: mi.UInt32 | None
-) -> Any:
-    """Values between rings and turns, from the `start` of a table; the turns close."""
+def _around(buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any) -> Any:
+    """Values between rings and turns; the turns close."""
     ring, turn = dr.clip(ring, 0, rings - 1.001), dr.clip(turn, 0, turns - 0.001)
     i, j = mi.UInt32(ring), mi.UInt32(turn)
     s, t = ring - mi.Float(i), turn - mi.Float(j)
     after = dr.select(j + 1 < turns, j + 1, 0)
-    j, after = placed(j, start), placed(after, start)
     a, b, c, d = (dr.gather(kind, buffer, p * turns + q) for p in (i, i + 1) for q in (j, after))
     near, far = a + t * (b - a), c + t * (d - c)
     return near + s * (far - near)
@@ -402,19 +377,17 @@ class Exchange:
         self._interiors: KeptForEye[_Interior] = KeptForEye()
 
     def begun(
-        self, hosts: Sequence[Prepared], values: Values, lights: Lights, panels: Lights, textures: Textures,
+        self, host: Prepared, values: Values, lights: Lights, panels: Lights, textures: Textures,
         place: Surround | RegionScene,
     ) -> Callable[[], Callable[[], Received]]:  # fmt: skip
         """Begin to find what the places of a frame receive straight from the lamps, and what they see of each other.
-
-        Several windows may be a frame if they show one bare eye without ambient light.
 
         Returns:
             What reads this. It returns what solves for all light, on the host; before that the device may be given
             other work.
 
         Args:
-            hosts: the job of each window, and the places on the globe.
+            host: the job, and the places on the globe.
             values: its numbers.
             lights: its lamps.
             panels: parts of its panels, and the bright parts of its map, as lamps.
@@ -424,12 +397,11 @@ class Exchange:
         from .region import RegionScene
 
         region = place if isinstance(place, RegionScene) else None
-        frames = [self._frame(host, region) for host in hosts]
-        frame, job = frames[0], hosts[0].job
-        numbers = Received(job.interreflection, frame.chamber, [(one.grid, one.plane) for one in frames])
+        frame, job = self._frame(host, region), host.job
+        numbers = Received(job.interreflection, frame.chamber, frame.grid, frame.plane)
         if not job.interreflection and not values.structure.ambient:
-            return lambda: lambda: numbers.filled([one.dark(region) for one in frames])
-        outer = sent(np.concatenate([one.outer.ravel() for one in frames]))
+            return lambda: lambda: numbers.filled(*frame.dark(region))
+        outer = sent(frame.outer)
         direct, ambient = _direct(values, lights, panels, place.scene, textures, frame, outer)
         mirrored = _mirrored(values, lights, place.scene, frame)
         lamps, more = (_direct_inside(values, some, place.scene, frame.interior.rows) for some in (lights, panels))
@@ -437,10 +409,8 @@ class Exchange:
 
         def read() -> Callable[[], Received]:
             # Nothing is read before all is launched, because every read waits for all launches.
-            light, soft, parts = mirrored(), ambient(), list(zip(direct(), lamps(), more(), seen(), strict=True))
-            return lambda: numbers.filled(
-                [one.solved(region, light, soft, *known) for one, known in zip(frames, parts, strict=True)]
-            )
+            known = mirrored(), ambient(), direct(), lamps(), more(), seen()
+            return lambda: numbers.filled(*frame.solved(region, *known))
 
         return read
 
@@ -622,14 +592,14 @@ def _direct(
 ) -> tuple[Callable[[], Floats], Callable[[], list[Floats]]]:
     """Irradiance of places outside the eye, whose points and normals are in `outer`, to be read later.
 
-    Straight from the lamps, in each window, with shadows and then without; from ambient light without shadows: what is
+    Straight from the lamps, with shadows and then without; from ambient light without shadows: what is
     soft, and the rest; this rest from its parts, without and with shadows.
     """
     count = frame.outside
     kinds = tuple(dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.on_skin, count - IRIS_TURNS))
     ways = values, scene, outer, kinds
-    views, lanes = textures.lamp_views, count * lights.windows
-    lit = _over_lamps(lights, 2 * count, lambda first: list(_onto_outer(*ways, lights, views, first, lanes)))
+    views = textures.lamp_views
+    lit = _over_lamps(lights, 2 * count, lambda first: list(_onto_outer(*ways, lights, views, first, count)))
     soft = hard = free = shaded = None
     if values.structure.ambient:
         assert textures.ambience is not None
@@ -650,15 +620,13 @@ def _onto_outer(
 ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
     """Irradiance of places outside the eye from lamps, with and without shadows.
 
-    There are `count` of them, in all windows. `kinds` are the numbers of places on the globe and on skin, and of those
+    There are `count` of them. `kinds` are the numbers of places on the globe and on skin, and of those
     before the limbus. Places on the lamps' discs begin with the number `first`; without it these are their middles.
     """
     index = dr.arange(mi.UInt32, count)
     n = _row(outer, 6, index)
     x, normal = mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:])
     globe, skin, rim = kinds
-    window, index = split(index, rim + IRIS_TURNS, values.several)
-    values, lights = values.of_window(window), lights.of_window(window)
     away = (index >= globe) & (index < rim)
     start, facing = values.point_to_eye(x + _START_MM * normal), values.vector_to_eye(normal)
     u, v = (mi.Float(0), mi.Float(0)) if first is None else _spots(index + first)
@@ -685,7 +653,7 @@ def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) ->
     lit = _over_lamps(lights, lanes, lambda first: [_off_cornea(values, lights, scene, rows, first, lanes)])
 
     def read() -> Floats:
-        total[frame.on_globe + places] = lit()[0, : len(places)]
+        total[frame.on_globe + places] = lit()[: len(places)]
         return total
 
     return read
@@ -706,29 +674,23 @@ def _off_cornea(
 
 
 def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float) -> Callable[[], Floats]:
-    """Irradiance (windows, PLACES) of the chamber's places straight from lamps; rows hold them as in `_Interior`."""
+    """Irradiance (PLACES,) of the chamber's places straight from lamps; rows hold them as in `_Interior`."""
     if len(lights) == 0:
-        return lambda: np.zeros((lights.windows, PLACES))
-    return _over_lamps(lights, PLACES, lambda first: _inside(values, lights, scene, rows, first, lights.windows))
+        return lambda: np.zeros(PLACES)
+    return _over_lamps(lights, PLACES, lambda first: _inside(values, lights, scene, rows, first))
 
 
 @recorded
-def _inside(
-    values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32, windows: int
-) -> list[mi.Float]:
-    """Irradiance of the chamber's places from lamps, some places of all windows after others.
-
-    Places on the lamps' discs begin with the number `first`.
-    """
+def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
+    """Irradiance of the chamber's places from lamps; places on their discs begin with the number `first`."""
 
     def of(begin: int, end: int, inner: bool) -> mi.Float:
-        window, index = split(dr.arange(mi.UInt32, (end - begin) * windows), end - begin, values.several)
-        numbers, lamps = values.of_window(window), lights.of_window(window)
+        index = dr.arange(mi.UInt32, end - begin)
         n = _row(rows, 7, index + begin)
         x, inside, normal = mi.Vector3f(*n[:3]), n[6] > 0, mi.Vector3f(*n[3:6])
         u, v = _spots(index + first)
-        surfaces = numbers.surfaces if inner else numbers.surfaces[:-1]
-        return through_cornea(numbers, lamps, scene, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
+        surfaces = values.surfaces if inner else values.surfaces[:-1]
+        return through_cornea(values, lights, scene, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
 
     # If there is a back of the cornea, the wall is the rim of the cornea, in front of it.
     parts = [of(0, PLACES, True)] if len(values.surfaces) == 1 else [of(0, IRIS, True), of(IRIS, PLACES, False)]
@@ -737,16 +699,16 @@ def _inside(
 
 
 def _over_lamps(lights: Lights, width: int, light: Callable[[mi.UInt32], list[mi.Float]]) -> Callable[[], Floats]:
-    """Mean (windows, width) of `light` over places on the lamps' discs; small lamps need one.
+    """Mean (width,) of `light` over places on the lamps' discs; small lamps need one.
 
     Its argument is the number with which the places begin. It returns some of the columns after others.
     """
     found = [light(dr.opaque(mi.UInt32, k * width)) for k in range(1 if lights.widest < _SMALL else _SPOTS)]
 
     def read() -> Floats:
-        total = np.zeros((lights.windows, width))
+        total = np.zeros(width)
         for parts in found:
-            total += np.concatenate([part.numpy().reshape(lights.windows, -1) for part in parts], axis=1)
+            total += np.concatenate([part.numpy() for part in parts])
         return total / len(found)
 
     return read
@@ -764,8 +726,8 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
 def _seen(
     values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame,
     outer: mi.Float,
-) -> Callable[[], list[_Seen]]:  # fmt: skip
-    """What the rays of the places outside and of those in the chamber meet, in each window."""
+) -> Callable[[], _Seen]:  # fmt: skip
+    """What the rays of the places outside and of those in the chamber meet."""
     plan, interior = frame.plan, frame.interior
     inside = interior.gain.shape[1]
     rays = plan.rays + inside
@@ -775,24 +737,22 @@ def _seen(
     lanes = -(-rays // _LANES) * _LANES
     results, spot = _rays_of(
         values, lights, textures, place.scene, numbers, plan.of_place, outer, interior.leaving, (outside, all_rays),
-        kinds, dr.opaque(mi.UInt32, lanes) if values.several else None, lanes * lights.windows,
+        kinds, lanes,
     )  # fmt: skip
     globe, found = frame.on_globe * RAYS, None
     if plan.skin is not None and len(lights):
         views, ends = textures.lamp_views, (dr.opaque(mi.UInt32, globe), outside)
         found = _at_spots(values, lights, place.scene, views, spot, ends, globe + inside)
 
-    def read() -> list[_Seen]:
+    def read() -> _Seen:
         lit = np.full(rays, -1.0, np.float32)
         if found is not None:
             straight = found.numpy()
             lit[:globe], lit[plan.rays :] = straight[:globe], straight[globe:]
         shares = _shares(plan.count, interior.gain)
         bare = lit if plan.skin is None else results[-1].numpy()[:rays]
-        target, weight, close, sky, free = (r.numpy().reshape(-1, lanes)[:, :rays] for r in results[:-1])
-        return [
-            _Seen(shares, target[k], weight[k], close[k], sky[k], free[k], lit, bare) for k in range(lights.windows)
-        ]
+        target, weight, close, sky, free = (r.numpy()[:rays] for r in results[:-1])
+        return _Seen(shares, target, weight, close, sky, free, lit, bare)
 
     return read
 
@@ -811,21 +771,17 @@ class _Kinds:
 @recorded
 def _rays_of(
     values: Values, lights: Lights, textures: Textures, scene: mi.Scene, numbers: Received, of_place: mi.UInt32,
-    outer: mi.Float, leaving: mi.Float, ends: tuple[mi.UInt32, mi.UInt32], kinds: _Kinds, each: mi.UInt32 | None,
-    lanes: int,
+    outer: mi.Float, leaving: mi.Float, ends: tuple[mi.UInt32, mi.UInt32], kinds: _Kinds, lanes: int,
 ) -> tuple[tuple[Any, ...], tuple[Any, ...]]:  # fmt: skip
     """What the rays of places meet: the columns of `_Seen` but for `lit`, and places on skin (see `_met`).
 
     The first rays belong to places outside the eye, whose numbers are in `of_place`. The `ends` are their number, and
-    that of all rays; there are more lanes, of several windows `each`.
+    that of all rays; there are more lanes.
     """
-    window, index = split(dr.arange(mi.UInt32, lanes), lanes if each is None else each, values.several)
-    values, numbers = values.of_window(window), numbers.of_window(window)
+    index = dr.arange(mi.UInt32, lanes)
     first, count = ends
     outside, inside = index < first, (index >= first) & (index < count)
     row = dr.gather(mi.UInt32, of_place, index, outside)
-    if window is not None:
-        row += window * kinds.outside
     n = _row(outer, 6, row, outside)
     normal = mi.Vector3f(*n[3:])
     o = mi.Vector3f(*n[:3]) + _START_MM * normal

@@ -13,7 +13,7 @@ So have those at menisci, in which the mirror images of lamps are thinner still;
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
@@ -29,7 +29,7 @@ from .parameters import traversed
 from .recorded import recorded
 from .sampling import Pattern, Samples, camera_ray, lattice_generator
 from .shading import shade
-from .values import SMALL, Lamp, Lights, Values, aligned, quotient, split
+from .values import SMALL, Lamp, Lights, Values, aligned, quotient
 from .view import RegionHit, Textures, View, meet, meet_globe, region_hit
 
 if TYPE_CHECKING:
@@ -48,21 +48,13 @@ _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and betw
 
 @dataclass(frozen=True, slots=True)
 class Exposed:
-    """A bound frame for rendering, which may be several windows of bare eyes.
-
-    Its Mitsuba scene, numbers, lamps and textures, and what NumPy makes of the job of each window.
-    """
+    """A bound frame for rendering: its Mitsuba scene, numbers, lamps and textures, and what NumPy makes of its job."""
 
     scene: mi.Scene
     values: Values
     lights: Lights
     textures: Textures
-    hosts: tuple[Prepared, ...]
-
-    @property
-    def host(self) -> Prepared:
-        """What NumPy makes of the first job."""
-        return self.hosts[0]
+    host: Prepared
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,33 +78,20 @@ class _Grid:
 @traversed
 @dataclass(frozen=True, slots=True)
 class Pixels:
-    """The pixels of windows of one size, row by row and window by window.
-
-    Attributes:
-        corner: first pixel of each window on the sensor.
-        width: of the windows.
-        each: pixels of a window; None if there is but one.
-    """
+    """The pixels of a window, row by row: its first pixel on the sensor, and its width."""
 
     corner: tuple[mi.Int32, mi.Int32]
     width: mi.UInt32
-    each: mi.UInt32 | None = None
 
     @classmethod
-    def of(cls, *windows: Window) -> Pixels:
-        """The pixels of some windows."""
-        width, height = windows[0][2:]
-        if len(windows) == 1:
-            return cls(_opaque_pair(windows[0]), dr.opaque(mi.UInt32, width))
-        x, y = (mi.Int32(aligned(np.array([w[k] for w in windows], np.int32))) for k in (0, 1))
-        return cls((x, y), dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, width * height))
+    def of(cls, window: Window) -> Pixels:
+        """The pixels of a window."""
+        return cls(_opaque_pair(window), dr.opaque(mi.UInt32, window[2]))
 
-    def at(self, pixel: mi.UInt32) -> tuple[mi.UInt32 | None, mi.Int32, mi.Int32]:
-        """Window (see `values.split`) and full-sensor coordinates, as signed integers, of pixels."""
-        window, pixel = split(pixel, 1 if self.each is None else self.each, self.each is not None)
-        corner = self.corner if window is None else tuple(dr.gather(mi.Int32, c, window) for c in self.corner)
+    def at(self, pixel: mi.UInt32) -> tuple[mi.Int32, mi.Int32]:
+        """Full-sensor coordinates, as signed integers, of pixels."""
         row = pixel // self.width
-        return window, mi.Int32(pixel - row * self.width) + corner[0], mi.Int32(row) + corner[1]
+        return mi.Int32(pixel - row * self.width) + self.corner[0], mi.Int32(row) + self.corner[1]
 
 
 def _opaque_pair(window: Window) -> tuple[mi.Int32, mi.Int32]:
@@ -131,35 +110,35 @@ def group_size(spp: int, soft: bool = False) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """Windows whose samples are being taken: the device may still be at work until `means` reads the sums.
+    """A window whose samples are being taken: the device may still be at work until `means` reads the sums.
 
     Attributes:
-        sums: over the samples of each pixel, in the order of `_sums`, window by window.
-        failed: number of failed light paths of each window.
-        shape: number, height and width of the windows.
+        sums: over the samples of each pixel: the radiance, or for each part what `mean_parts` returns.
+        failed: number of failed light paths.
+        shape: height and width of the window.
         spp: samples per pixel.
         layered: whether there are sums of each part of the scene.
     """
 
     sums: list[mi.Float]
     failed: mi.UInt32
-    shape: tuple[int, int, int]
+    shape: tuple[int, int]
     spp: int
     layered: bool
 
-    def means(self) -> list[tuple[Singles, int]]:
-        """What `mean_parts` or `mean_radiance` returns, for each window."""
+    def means(self) -> tuple[Singles, int]:
+        """What `mean_parts` or `mean_radiance` returns."""
         means = [total.numpy().reshape(self.shape) / np.float32(self.spp) for total in self.sums]
-        failed, (count, *size) = self.failed.numpy().tolist(), self.shape
+        failed = int(self.failed.numpy()[0])
         if self.layered:
-            return list(zip(np.stack(means, axis=1).reshape(count, -1, 3, *size), failed, strict=True))
+            return np.stack(means).reshape(-1, 3, *self.shape), failed
         # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
-        return list(zip(np.maximum(means[0], 0, out=means[0]), failed, strict=True))
+        return np.maximum(means[0], 0, out=means[0]), failed
 
 
 def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
-    return begun(shown, [window], spp, [seed], layered=False).means()[0]
+    return begun(shown, window, spp, seed, layered=False).means()
 
 
 def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
@@ -168,34 +147,31 @@ def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Sin
     The array (parts, 3, height, width) holds the radiance of each part (their sum is that of `mean_radiance`), the
     share of the pixel's samples that show the part, and that share times their mean inverse depth (1/mm).
     """
-    return begun(shown, [window], spp, [seed], layered=True).means()[0]
+    return begun(shown, window, spp, seed, layered=True).means()
 
 
-def begun(shown: Exposed, windows: Sequence[Window], spp: int, seeds: Sequence[int], *, layered: bool) -> Film:
-    """Begin to take the samples of windows, for what `mean_radiance` returns, or if `layered`, `mean_parts`.
-
-    There are as many windows as the frame has, all of one size.
-    """
-    width, height = windows[0][2:]
-    shape = len(windows), height, width
+def begun(shown: Exposed, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
+    """Begin to take the samples of a window, for what `mean_radiance` returns, or if `layered`, `mean_parts`."""
+    width, height = window[2:]
+    shape = height, width
     grouped = shown.values.structure.region
     if not grouped and not layered and spp >= _MANY:
-        return Film(*_adaptive(shown, windows, spp, seeds), shape, spp, layered)
+        return Film(*_adaptive(shown, window, spp, seed), shape, spp, layered)
     size = group_size(spp, shown.values.structure.scattering) if grouped else 1
     sums: list[mi.Float] = []
     failed = mi.UInt32(0)
-    each = max(1, min(spp // size, _LANES // (len(windows) * width * height * size)))
-    plain = shown.host.plain(windows[0]) if grouped else None
+    each = max(1, min(spp // size, _LANES // (width * height * size)))
+    plain = shown.host.plain(window) if grouped else None
     for first in range(0, spp // size, each):
         count = min(each, spp // size - first)
         if sums:
             dr.sync_thread()  # else all passes would need memory at once
         if plain is not None:
             seen, failures = _groups(
-                shown, windows[0], plain, spp=spp, seed=seeds[0], first=first, count=count, size=size, layered=layered
+                shown, window, plain, spp=spp, seed=seed, first=first, count=count, size=size, layered=layered
             )
         else:
-            seen, failures = _singles(shown, windows, spp=spp, seeds=seeds, first=first, count=count, layered=layered)
+            seen, failures = _singles(shown, window, spp=spp, seed=seed, first=first, count=count, layered=layered)
         sums = [a + b for a, b in zip(sums, seen, strict=True)] if sums else seen
         failed += failures
         dr.eval(sums, failed)
@@ -207,19 +183,16 @@ def _samples(u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = 
     return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), pattern, fine)
 
 
-def _adaptive(
-    shown: Exposed, windows: Sequence[Window], spp: int, seeds: Sequence[int]
-) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sums of radiance over the samples of each pixel, (windows * height * width,); failed light paths.
+def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[list[mi.Float], mi.UInt32]:
+    """Sums of radiance over the samples of each pixel, (height * width,); failed light paths.
 
     Four samples of each pixel are taken first. Where they agree, and their mean is not far from those of the eight
     neighbours, no edge crosses the pixel, and they stand for all samples. The pixels around the window are looked at,
     too, so that no pixel depends on the window.
     """
-    width, height = windows[0][2:]
-    wide = [(x - 1, y - 1, width + 2, height + 2) for x, y, _, _ in windows]
+    x0, y0, width, height = window
     first = _first_samples(spp)
-    failed, take = mi.UInt32(0), _taken_by(shown, wide, spp, seeds)
+    failed, take = mi.UInt32(0), _taken_by(shown, (x0 - 1, y0 - 1, width + 2, height + 2), spp, seed)
 
     def lanes(pixels: mi.UInt32, numbers: Ints) -> mi.Float:
         """Radiance of samples with these numbers, those of each pixel side by side."""
@@ -234,11 +207,11 @@ def _adaptive(
         return radiance
 
     # Few pixels at a time, because there may be more than can be held.
-    count, stretch = len(windows) * (width + 2) * (height + 2), _LANES // len(first)
+    count, stretch = (width + 2) * (height + 2), _LANES // len(first)
     ends = [(start, min(start + stretch, count)) for start in range(0, count, stretch)]
     parts = [lanes(dr.arange(mi.UInt32, *span), first) for span in ends]
     radiance = parts[0] if len(parts) == 1 else dr.concat(parts)
-    total, places, pixels = _with_uneven(radiance, (width, height), spp, len(windows))
+    total, places, pixels = _with_uneven(radiance, (width, height), spp)
     if uneven := dr.width(places):
         rest = np.setdiff1d(np.arange(spp), first)
         at_once = int(np.clip(_LANES // uneven, 1, len(rest)))
@@ -250,30 +223,24 @@ def _adaptive(
     return [total], failed
 
 
-def _with_uneven(
-    radiance: mi.Float, size: tuple[int, int], spp: int, windows: int
-) -> tuple[mi.Float, mi.UInt32, mi.UInt32]:
-    """Sums of four samples in the pixels of windows, those of even pixels for all samples, and the uneven pixels.
+def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[mi.Float, mi.UInt32, mi.UInt32]:
+    """Sums of four samples in the pixels of a window, those of even pixels for all samples, and the uneven pixels.
 
-    `radiance` holds four samples of each pixel of the windows and of borders of one pixel about them. The uneven pixels
-    are numbered without and with these borders.
+    `radiance` holds four samples of each pixel of the window and of a border of one pixel about it. The uneven pixels
+    are numbered without and with this border.
     """
     width = dr.opaque(mi.UInt32, size[0])
-    wide = (size[0] + 2) * (size[1] + 2)
-    four = dr.gather(mi.Vector4f, radiance, dr.arange(mi.UInt32, windows * wide))
+    four = dr.gather(mi.Vector4f, radiance, dr.arange(mi.UInt32, (size[0] + 2) * (size[1] + 2)))
     total, most = dr.sum(four), dr.max(four)
     apart = most - dr.min(four) > _EVEN * most
     dr.eval(total, apart)
     across = width + 2
-    each = dr.opaque(mi.UInt32, size[0] * size[1]), dr.opaque(mi.UInt32, wide)
 
-    def upper_left(index: mi.UInt32) -> mi.UInt32:
+    def upper_left(pixel: mi.UInt32) -> mi.UInt32:
         """Number of the upper left neighbour."""
-        window, pixel = split(index, each[0], windows > 1)
-        place = pixel + 2 * (pixel // width)
-        return place if window is None else place + window * each[1]
+        return pixel + 2 * (pixel // width)
 
-    place = upper_left(dr.arange(mi.UInt32, windows * size[0] * size[1]))
+    place = upper_left(dr.arange(mi.UInt32, size[0] * size[1]))
     around = [dr.gather(mi.Float, total, place + i * across + j) for i in range(3) for j in range(3)]
     highest, lowest = around[0], around[0]
     for value in around[1:]:
@@ -301,34 +268,32 @@ def _first_samples(count: int) -> Ints:
 
 
 def _singles(
-    shown: Exposed, windows: Sequence[Window], *, spp: int, seeds: Sequence[int], first: int, count: int, layered: bool
+    shown: Exposed, window: Window, *, spp: int, seed: int, first: int, count: int, layered: bool
 ) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums over `count` samples of each pixel, one per lane."""
-    index = dr.arange(mi.UInt32, len(windows) * windows[0][2] * windows[0][3] * count)
+    index = dr.arange(mi.UInt32, window[2] * window[3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
     k = index - pixel * n + dr.opaque(mi.UInt32, first)
-    lanes, failed = _taken_by(shown, windows, spp, seeds)(pixel, k, layered)
+    lanes, failed = _taken_by(shown, window, spp, seed)(pixel, k, layered)
     return [dr.block_sum(x, count) for x in lanes], failed
 
 
 def _taken_by(
-    shown: Exposed, windows: Sequence[Window], spp: int, seeds: Sequence[int]
+    shown: Exposed, window: Window, spp: int, seed: int
 ) -> Callable[[mi.UInt32, mi.UInt32, bool], tuple[list[mi.Float], mi.UInt32]]:
-    """The function that takes samples of the windows' pixels."""
+    """The function that takes samples of a window's pixels."""
     seen = shown.values, shown.lights, shown.textures, shown.scene
-    return partial(_taken, *seen, Pixels.of(*windows), Pattern.of(spp, *seeds), len(windows))
+    return partial(_taken, *seen, Pixels.of(window), Pattern.of(spp, seed))
 
 
 @recorded
 def _taken(
-    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, pixels: Pixels, pattern: Pattern, windows: int,
+    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, pixels: Pixels, pattern: Pattern,
     pixel: mi.UInt32, k: mi.UInt32, layered: bool,
 ) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
-    """What samples k of pixels show, and the number of failed light paths in each window."""
-    window, u, v = pixels.at(pixel)
-    values, lights, textures = values.of_window(window), lights.of_window(window), textures.of_window(window)
-    pattern = pattern.of_window(window)
+    """What samples k of pixels show, and the number of failed light paths."""
+    u, v = pixels.at(pixel)
     samples = _samples(u, v, pattern)
     spot, on_lamp = samples.in_pixel(k), samples.pair(k, 0)
     o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
@@ -341,11 +306,7 @@ def _taken(
         parts = (view.other, view.cornea | view.sclera)
         lanes = [dr.select(part, x, 0) for part in parts for x in (lanes[0], mi.Float(1), near)]
     dr.eval(lanes, seen.failures)  # together, because a separate reduction would trace everything again
-    if window is None:
-        failed = dr.sum(seen.failures)
-    else:
-        failed = dr.zeros(mi.UInt32, windows)
-        dr.scatter_reduce(dr.ReduceOp.Add, failed, seen.failures, window, seen.failures > 0)
+    failed = dr.sum(seen.failures)
     dr.eval(failed)
     return lanes, failed
 
@@ -411,7 +372,7 @@ def _hits(
     k: mi.UInt32,
 ) -> tuple[mi.Float, mi.UInt32, mi.Float, mi.Float]:  # fmt: skip
     """What samples k of fine pixels hit of the region: distance, triangle, and place on it."""
-    _, u, v = pixels.at(pixel)
+    u, v = pixels.at(pixel)
     spot = _samples(u, v, pattern, mi.Bool(True)).in_pixel(k)
     o, d, _ = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
     hit = region_hit(skin, scene, meet_globe(values, o, d), o, d)

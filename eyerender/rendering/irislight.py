@@ -19,7 +19,7 @@ from .lampviews import LampViews
 from .lightgrid import BENT, about, unevenness, weights
 from .parameters import leaves
 from .recorded import recorded
-from .values import ALL, BITS, Lights, Values, placed, split, windowed
+from .values import ALL, BITS, Lights, Values
 from .view import STEEPEST, opacity
 
 _SIDE = 80
@@ -32,9 +32,7 @@ _AHEAD_MM = 1.0  # before the back of the cornea, where nodes continue the light
 class IrisLight:
     """The light of the lamps in the plane of the iris."""
 
-    DRJIT_STRUCT = leaves(
-        "_stop", "_points", "_used", "_half", "_cells", "_left", "_behind_rim", "_paths", "_first", "_all"
-    )
+    DRJIT_STRUCT = leaves("_stop", "_points", "_used", "_half", "_cells", "_left", "_behind_rim", "_paths")
 
     def __init__(self, values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None) -> None:
         """Fill the grid.
@@ -54,13 +52,7 @@ class IrisLight:
         self._left: mi.UInt32 | None = None
         self._behind_rim: mi.UInt32 | None = None  # lamps of cells whose light must pass the rim
         self._paths: mi.Float | None = None
-        self._first: mi.UInt32 | None = None  # node of the lanes' windows
-        self._all = dr.opaque(mi.UInt32, _NODES * lights.windows) if values.several else None
         self._fill()
-
-    def of_window(self, window: mi.UInt32 | None) -> IrisLight:
-        """The light of one window for each lane."""
-        return windowed(self, window, _NODES)
 
     def at(self, values: Values, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
         """Irradiance (mW/mm^2) at points of the plane of the iris (eye frame), and the lamps that it lacks.
@@ -74,7 +66,7 @@ class IrisLight:
         u, v = (dr.dot(q, axis) * scale + 0.5 * (_SIDE - 1) for axis in (stop.u, stop.v))
         inside = active & self._used & (u >= 0) & (v >= 0) & (u < _SIDE - 1) & (v < _SIDE - 1)
         i, j = mi.UInt32(u), mi.UInt32(v)
-        cell = placed(j * _SIDE + i, self._first)
+        cell = j * _SIDE + i
         wu, wv = mi.Vector4f(*weights(u - mi.Float(i))), weights(v - mi.Float(j))
         total = mi.Float(0)
         for k, weight in enumerate(wv):
@@ -85,7 +77,7 @@ class IrisLight:
 
         def add(lamps: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             whole, out = mi.Float(0), mi.Float(0)
-            first = dr.tzcnt(lamps) * (_NODES if self._all is None else self._all) + cell
+            first = dr.tzcnt(lamps) * _NODES + cell
             for k, weight in enumerate(wv):
                 a, b = _rows(self._paths, first + k * _SIDE - _SIDE)
                 whole += weight * dr.dot(wu, a)
@@ -99,14 +91,13 @@ class IrisLight:
 
     def _fill(self) -> None:
         lights = self._lights
-        nodes = _NODES * lights.windows
         if lights.gridded and len(lights):
-            found = self._filled(self._values, lights, self._scene, self._views, len(lights), nodes)
+            found = self._filled(self._values, lights, self._scene, self._views, len(lights))
         else:
             found = (
-                dr.zeros(mi.Float, 16 * nodes),
-                dr.full(mi.UInt32, ALL, nodes),
-                dr.zeros(mi.UInt32, nodes),
+                dr.zeros(mi.Float, 16 * _NODES),
+                dr.full(mi.UInt32, ALL, _NODES),
+                dr.zeros(mi.UInt32, _NODES),
                 dr.zeros(mi.Float, 8),
             )
             dr.make_opaque(*found)
@@ -114,34 +105,31 @@ class IrisLight:
 
     @recorded
     def _filled(
-        self, values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, lamps: int, nodes: int
+        self, values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, lamps: int
     ) -> tuple[mi.Float, mi.UInt32, mi.UInt32, mi.Float]:
         """Sixteen numbers of each cell, the lamps that they lack, those behind the rim, and the paths from these.
 
         The paths are rows of nodes: what passes a clear rim at four nodes, and the radii where it enters.
         """
-        everything = _NODES if self._all is None else self._all  # the nodes of all windows
-        index = dr.arange(mi.UInt32, nodes * lamps)
-        lamp = index // everything
-        window, node = split(index - lamp * everything, _NODES, values.several)
-        lit, *paths = self._at_nodes(values.of_window(window), lights.of_window(window), scene, views, lamp, node)
+        index = dr.arange(mi.UInt32, _NODES * lamps)
+        lamp = index // _NODES
+        lit, *paths = self._at_nodes(values, lights, scene, views, lamp, index - lamp * _NODES)
         dr.eval(lit, paths)
-        index = dr.arange(mi.UInt32, nodes * min(lamps, BITS))
-        rows = dr.zeros(mi.Float, 8 * nodes * min(lamps, BITS))
-        last = mi.Int32(dr.minimum(lights.count, BITS) * everything) - 1
+        index = dr.arange(mi.UInt32, _NODES * min(lamps, BITS))
+        rows = dr.zeros(mi.Float, 8 * _NODES * min(lamps, BITS))
+        last = mi.Int32(dr.minimum(lights.count, BITS) * _NODES) - 1
         for n, path in enumerate(paths):
             four = (dr.gather(mi.Float, path, mi.UInt32(dr.clip(mi.Int32(index) + k, 0, last))) for k in range(-1, 3))
             dr.scatter(rows, mi.Vector4f(*four), 2 * index + n)
         dr.eval(rows)
-        cell = dr.arange(mi.UInt32, nodes)
-        window, place = split(cell, _NODES, values.several)
-        row = place // _SIDE
-        column = place - row * _SIDE
-        places = about(place, _SIDE, None if window is None else window * _NODES)
+        cell = dr.arange(mi.UInt32, _NODES)
+        row = cell // _SIDE
+        column = cell - row * _SIDE
+        places = about(cell, _SIDE)
         many = lights.count > BITS
 
         def sum_up(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            return k + 1, total + dr.maximum(dr.gather(mi.Float, lit, k * everything + cell), 0)
+            return k + 1, total + dr.maximum(dr.gather(mi.Float, lit, k * _NODES + cell), 0)
 
         state = (mi.UInt32(0), mi.Float(0) * mi.Float(cell))
         _, total = dr.while_loop(state, lambda k, _: k < lights.count, sum_up, labels=("k", "total"), label="all lamps")
@@ -150,7 +138,7 @@ class IrisLight:
         within = (column > 0) & (row > 0) & (column < _SIDE - 2) & (row < _SIDE - 2)
 
         def even_behind_rim(k: mi.UInt32, allowed: mi.Float) -> mi.Bool:
-            four = [_rows(rows, k * everything + cell + n * _SIDE - _SIDE) for n in range(4)]
+            four = [_rows(rows, k * _NODES + cell + n * _SIDE - _SIDE) for n in range(4)]
             whole, out = ([value for row in four for value in row[m]] for m in (0, 1))
             bent, least, most = unevenness(whole)
             return (least > 0) & (
@@ -158,7 +146,7 @@ class IrisLight:
             )
 
         def add(k: mi.UInt32, left: mi.UInt32, behind: mi.UInt32, *sums: mi.Float) -> tuple[mi.UInt32 | mi.Float, ...]:
-            v = [dr.gather(mi.Float, lit, k * everything + place) for place in places]
+            v = [dr.gather(mi.Float, lit, k * _NODES + place) for place in places]
             bent, least, most = unevenness(v)
             allowed = BENT * dr.maximum(most, usual)
             good = (least >= 0) & (bent <= allowed)
@@ -179,7 +167,7 @@ class IrisLight:
         left = dr.select(within, left, ALL)
         sums = [dr.select(within & ~(many & (left != 0)), value, 0) for value in sums]
         dr.eval(sums, left, behind)
-        cells = dr.zeros(mi.Float, 16 * nodes)
+        cells = dr.zeros(mi.Float, 16 * _NODES)
         for k in range(4):
             dr.scatter(cells, mi.Vector4f(*sums[4 * k : 4 * k + 4]), 4 * cell + k)
         dr.eval(cells, left, behind)

@@ -28,7 +28,7 @@ from .kept import KeptForEye
 from .parameters import leaves, traversed
 from .recorded import recorded
 from .surfaces import Surface
-from .values import Lights, Values, placed, split, windowed
+from .values import Lights, Values
 from .view import Textures, iris_height
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
@@ -65,7 +65,7 @@ class Shape:
 class IrisRelief:
     """Height of the iris above its plane and the lamps' light on it, on a grid over the plane."""
 
-    DRJIT_STRUCT = leaves("_stop", "_half", "_count", "_on", "_each", "_heights", "_shades", "_first")
+    DRJIT_STRUCT = leaves("_stop", "_half", "_count", "_on", "_each", "_heights", "_shades")
 
     def __init__(
         self, job: RenderJob, values: Values, lights: Lights, scene: mi.Scene, textures: Textures,
@@ -92,12 +92,7 @@ class IrisRelief:
         self._each = dr.opaque(mi.UInt32, lights.points)
         self._heights: mi.Float | None = None
         self._shades: mi.Float | None = None
-        self._first: mi.UInt32 | None = None  # cell of the lanes' windows
         self._fill()
-
-    def of_window(self, window: mi.UInt32 | None) -> IrisRelief:
-        """The relief of one window for each lane."""
-        return windowed(self, window, self._count * self._count)
 
     def hit(self, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Foot in the plane (eye frame) of the place that rays meet.
@@ -118,15 +113,15 @@ class IrisRelief:
         """The q of the module's docstring at feet `x`."""
         assert self._shades is not None
         active &= self._on
-        return dr.select(active, self._on_grid(self._shades, x, active, self._first), 1)
+        return dr.select(active, self._on_grid(self._shades, x, active), 1)
 
     def _fill(self) -> None:
         if not self._textures.raised:
             self._heights = self._shades = dr.zeros(mi.Float, 4)
             dr.make_opaque(self._heights)
             return
-        windows, cells, job = self._lights.windows, self._side**2, self._job
-        lanes = _COARSE * _COARSE * self._lights.points * max(len(self._lights), 1) * windows
+        cells, job = self._side**2, self._job
+        lanes = _COARSE * _COARSE * self._lights.points * max(len(self._lights), 1)
         # The iris' own heights do not depend on the pose.
         blocks = -(-self._side // _BLOCK)
         about = int(np.ceil((_REACH_MM * _SLANT * self._side / (2 * self._half_mm) + 2) / _BLOCK))
@@ -137,7 +132,7 @@ class IrisRelief:
                 *self._shape(self._values, self._textures.heights, cells, blocks, dr.opaque(mi.UInt32, about))
             ),
         )
-        self._shades = self._shaded(self._values, self._lights, self._scene, shape, cells * windows, lanes)
+        self._shades = self._shaded(self._values, self._lights, self._scene, shape, cells, lanes)
         self._heights = shape.corners
 
     @recorded
@@ -148,7 +143,7 @@ class IrisRelief:
 
         There are so many `blocks` across. Those up to `about` away from a block are near it.
         """
-        _, column, row = self._cells(cells)
+        column, row = self._cells(cells)
         heights = iris_height(values, pattern, self._place(mi.Float(column), mi.Float(row), self._count))
         dr.eval(heights)
         last = self._count - 1
@@ -191,19 +186,19 @@ class IrisRelief:
         self, values: Values, lights: Lights, scene: mi.Scene, shape: Shape, cells: int, lanes: int
     ) -> mi.Float:
         """The q of the module's docstring at so many cells, from so many paths of light."""
-        window, column, row = self._cells(cells, values.several)
+        column, row = self._cells(cells)
         lamps = self._lamps(values, lights, scene, lanes)
-        shades = self._lit(lights, lamps, shape, column, row, window)
+        shades = self._lit(lights, lamps, shape, column, row)
         dr.eval(shades)
-        shades = self._packed(shades, column, row, window)
+        shades = self._packed(shades, column, row)
         dr.eval(shades)
         return shades
 
-    def _cells(self, cells: int, several: bool = False) -> tuple[mi.UInt32 | None, mi.UInt32, mi.UInt32]:
-        """Windows, columns and rows of all cells, row by row."""
-        window, index = split(dr.arange(mi.UInt32, cells), self._count * self._count, several)
+    def _cells(self, cells: int) -> tuple[mi.UInt32, mi.UInt32]:
+        """Columns and rows of all cells, row by row."""
+        index = dr.arange(mi.UInt32, cells)
         row = index // self._count
-        return window, index - row * self._count, row
+        return index - row * self._count, row
 
     def _place(self, column: mi.Float, row: mi.Float, count: mi.UInt32) -> mi.Vector3f:
         """Point of the plane at a place of a grid with `count` places across."""
@@ -219,18 +214,17 @@ class IrisRelief:
         i, j = mi.UInt32(u), mi.UInt32(v)
         return i, j, u - mi.Float(i), v - mi.Float(j)
 
-    def _on_grid(self, packed: mi.Float, x: mi.Vector3f, active: mi.Bool, first: mi.UInt32 | None = None) -> mi.Float:
+    def _on_grid(self, packed: mi.Float, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
         i, j, s, t = self._cell(x, self._count)
-        c = dr.gather(mi.Vector4f, packed, placed(j * self._count + i, first), active)
+        c = dr.gather(mi.Vector4f, packed, j * self._count + i, active)
         return dr.lerp(dr.lerp(c.x, c.y, s), dr.lerp(c.z, c.w, s), t)
 
-    def _packed(self, values: mi.Float, column: mi.UInt32, row: mi.UInt32, window: mi.UInt32 | None = None) -> mi.Float:
+    def _packed(self, values: mi.Float, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
         """The four corners of every cell, side by side."""
         last = self._count - 1
         right, below = dr.minimum(column + 1, last), dr.minimum(row + 1, last)
         corners = ((column, row), (right, row), (column, below), (right, below))
-        first = None if window is None else window * (self._count * self._count)
-        places = [placed(j * self._count + i, first) for i, j in corners]
+        places = [j * self._count + i for i, j in corners]
         out = dr.zeros(mi.Float, 4 * dr.width(values))
         four = mi.Vector4f(*(dr.gather(mi.Float, values, place) for place in places))
         dr.scatter(out, four, places[0])
@@ -242,10 +236,8 @@ class IrisRelief:
 
         each, count = self._each, mi.UInt32(_COARSE)
         index = dr.arange(mi.UInt32, lanes)
-        window, one = split(index, lights.count * each * (_COARSE * _COARSE), values.several)
-        values, lights = values.of_window(window), lights.of_window(window)
-        spot = one // (_COARSE * _COARSE)
-        place = one - spot * (_COARSE * _COARSE)
+        spot = index // (_COARSE * _COARSE)
+        place = index - spot * (_COARSE * _COARSE)
         row = place // count
         x = self._place(mi.Float(place - row * count), mi.Float(row), count)
         lamp = lights[spot // each]
@@ -264,10 +256,7 @@ class IrisRelief:
         dr.eval(out)
         return out
 
-    def _lit(
-        self, lights: Lights, lamps: mi.Float, shape: Shape, column: mi.UInt32, row: mi.UInt32,
-        window: mi.UInt32 | None,
-    ) -> mi.Float:  # fmt: skip
+    def _lit(self, lights: Lights, lamps: mi.Float, shape: Shape, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
         """The q of the module's docstring at cells of the grid."""
         stop, cell = self._stop, row * self._count + column
         x = self._place(mi.Float(column), mi.Float(row), self._count)
@@ -277,8 +266,6 @@ class IrisRelief:
         spots, coarse = lights.count * self._each, mi.UInt32(_COARSE)
         i, j, s, t = self._cell(x, coarse)
         place = j * coarse + i
-        if window is not None:
-            place += window * (spots * (_COARSE * _COARSE))
 
         def lamp(k: mi.UInt32, whole: mi.Float, seen: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
             first = k * (_COARSE * _COARSE) + place

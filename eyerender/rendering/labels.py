@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -51,24 +51,17 @@ class PartLabels(ArrayValue):
         return both / whole if whole else float("nan")
 
 
-def part_labels(shown: Exposed, windows: Sequence[Window]) -> Callable[[], list[PartLabels]]:
-    """Begin to compute the labels of the windows of a frame; the result waits for them.
-
-    Rays that miss the globe are not traced.
-    """
-    shape = (len(windows), windows[0][3], windows[0][2])
-    found = _parts(shown.values, shown.scene, Pixels.of(*windows), int(np.prod(shape)))
-    return lambda: [
-        PartLabels(*(frozen(part, np.uint8) for part in parts))
-        for parts in zip(*(x.numpy().reshape(shape) for x in found), strict=True)
-    ]
+def part_labels(shown: Exposed, window: Window) -> Callable[[], PartLabels]:
+    """Begin to compute the labels of a window; the result waits for them. Rays that miss the globe are not traced."""
+    _, _, width, height = window
+    found = _parts(shown.values, shown.scene, Pixels.of(window), width * height)
+    return lambda: PartLabels(*(frozen(part.numpy().reshape(height, width), np.uint8) for part in found))
 
 
 @recorded
 def _parts(values: Values, scene: mi.Scene, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8]:
     """What the centres of pixels show, with and without occluders."""
-    window, u, v = pixels.at(dr.arange(mi.UInt32, count))
-    values = values.of_window(window)
+    u, v = pixels.at(dr.arange(mi.UInt32, count))
     o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
     alone = meet_globe(values, o, d)
     clear = alone.cornea & (alone.opacity < 0.5)
@@ -128,6 +121,6 @@ def depths_mm(shown: Exposed, window: Window) -> Singles:
 
 def _rays(shown: Exposed, window: Window, right: mi.Float, down: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Camera rays through places beside the centres of a window's pixels (px)."""
-    _, u, v = Pixels.of(window).at(dr.arange(mi.UInt32, window[2] * window[3]))
+    u, v = Pixels.of(window).at(dr.arange(mi.UInt32, window[2] * window[3]))
     o, d, _ = camera_ray(shown.values, mi.Float(u) + right, mi.Float(v) + down)
     return o, d

@@ -10,48 +10,40 @@ import drjit as dr
 import mitsuba as mi
 
 from .parameters import leaves
-from .values import placed, split, windowed
 
 BENT = 0.004  # largest third difference of a cell over its irradiance
 
 
 class LightGrid:
-    """Irradiance at the nodes of a grid of `side` by `side`, or of one for each window."""
+    """Irradiance at the nodes of a grid of `side` by `side`."""
 
-    DRJIT_STRUCT = leaves("side", "rows", "_first")
+    DRJIT_STRUCT = leaves("side", "rows")
 
     def __init__(self, side: int, rows: mi.Float | None = None) -> None:
         """Make a grid from its rows (see `rows_of`); without them nothing is known."""
         self.side = side
-        self._first: mi.UInt32 | None = None
         if rows is None:
             rows = dr.full(mi.Float, -1, 4 * side * side)
             dr.make_opaque(rows)
         self.rows = rows
 
-    def of_window(self, window: mi.UInt32 | None) -> LightGrid:
-        """The grid of one window for each lane."""
-        return windowed(self, window, self.side * self.side)
-
     @staticmethod
-    def nodes(side: int, windows: int = 1) -> tuple[mi.UInt32 | None, mi.UInt32, mi.UInt32]:
-        """Window, column and row of all nodes of grids, in row order."""
-        window, index = split(dr.arange(mi.UInt32, side * side * windows), side * side, windows > 1)
+    def nodes(side: int) -> tuple[mi.UInt32, mi.UInt32]:
+        """Column and row of all nodes of a grid, in row order."""
+        index = dr.arange(mi.UInt32, side * side)
         row = index // side
-        return window, index - row * side, row
+        return index - row * side, row
 
     @classmethod
     def rows_of(cls, side: int, irradiance: mi.Float, more: mi.Float | None = None) -> mi.Float:
         """The numbers of a grid from the irradiance of its nodes, negative where it is not known.
 
         `more` is added. It is known to change slowly, so it does not decide which cells are used. Both must have been
-        evaluated, and hold one window after the other.
+        evaluated.
         """
-        count = dr.width(irradiance)
-        window, column, row = cls.nodes(side, count // (side * side))
+        column, row = cls.nodes(side)
         index = row * side + column
-        first = None if window is None else window * (side * side)
-        places = about(index, side, first)
+        places = about(index, side)
         near = [dr.gather(mi.Float, irradiance, place) for place in places]
         bent, least, most = unevenness(near)
         good = (least > 0) & (bent <= BENT * most)
@@ -60,8 +52,8 @@ class LightGrid:
         if more is not None:
             four = [value + dr.gather(mi.Float, more, place) for value, place in zip(four, places[4:8], strict=True)]
         low = dr.abs(four[0])
-        rows = dr.zeros(mi.Float, 4 * count)
-        dr.scatter(rows, mi.Vector4f(dr.select(good, low, -low), *four[1:]), placed(index, first))
+        rows = dr.zeros(mi.Float, 4 * side * side)
+        dr.scatter(rows, mi.Vector4f(dr.select(good, low, -low), *four[1:]), index)
         return rows
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Bool]:
@@ -72,17 +64,17 @@ class LightGrid:
         wu, wv = weights(u - mi.Float(i)), weights(v - mi.Float(j))
         total, known = mi.Float(0), mi.Bool(inside)
         for k, weight in enumerate(wv):
-            row = dr.gather(mi.Vector4f, self.rows, placed((j + k - 1) * side + i, self._first), inside)
+            row = dr.gather(mi.Vector4f, self.rows, (j + k - 1) * side + i, inside)
             if k == 1:
                 known &= row.x > 0
             total += weight * (wu[0] * dr.abs(row.x) + wu[1] * row.y + wu[2] * row.z + wu[3] * row.w)
         return dr.select(known, dr.maximum(total, 0), 0), known
 
 
-def about(index: mi.UInt32, side: int, first: mi.UInt32 | None = None) -> list[mi.UInt32]:
-    """The sixteen nodes about cells of grids, row by row, in which a grid begins with its `first` node."""
+def about(index: mi.UInt32, side: int) -> list[mi.UInt32]:
+    """The sixteen nodes about cells of a grid, row by row."""
     places = (mi.Int32(index) + dv * side + du for dv in range(-1, 3) for du in range(-1, 3))
-    return [placed(mi.UInt32(dr.clip(place, 0, side**2 - 1)), first) for place in places]
+    return [mi.UInt32(dr.clip(place, 0, side**2 - 1)) for place in places]
 
 
 def unevenness(near: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float]:

@@ -11,19 +11,16 @@ radius. Before lamps that are large and near, there is no grid.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from .lightgrid import LightGrid
 from .lighting import irradiance, lamp_blocked
 from .parameters import leaves
 from .recorded import recorded
-from .values import Lights, Values, sent
+from .values import Lights, Values
 from .view import GLOBE_EDGE, View, globe_map
 
 if TYPE_CHECKING:
@@ -38,9 +35,7 @@ class MatteLight:
 
     DRJIT_STRUCT = leaves("_used", "_reach", "_grids")
 
-    def __init__(
-        self, values: Values, lights: Lights, scene: mi.Scene, received: Received, reach_mm: Sequence[float]
-    ) -> None:
+    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, received: Received, reach_mm: float) -> None:
         """Fill the grids.
 
         Args:
@@ -48,24 +43,14 @@ class MatteLight:
             lights: the lamps.
             scene: what may stand in the way.
             received: the light of other surfaces.
-            reach_mm: distance from the axis of the unrotated eye within which the plane is seen, in each window.
+            reach_mm: distance from the axis of the unrotated eye within which the plane is seen.
         """
         self._values, self._lights, self._scene, self._received = values, lights, scene, received
         self._points = dr.opaque(mi.UInt32, lights.points)
         self._used = dr.opaque(mi.Bool, lights.gridded)
-        self._reach = sent(np.array(reach_mm)) if values.several else dr.opaque(mi.Float, reach_mm[0])
+        self._reach = dr.opaque(mi.Float, reach_mm)
         self._grids: tuple[LightGrid, LightGrid] | None = None
         self._fill()
-
-    def of_window(self, window: mi.UInt32 | None) -> MatteLight:
-        """The light of one window for each lane."""
-        if window is None:
-            return self
-        assert self._grids is not None
-        made, (globe, plane) = copy(self), self._grids
-        made._reach = dr.gather(mi.Float, self._reach, window)
-        made._grids = globe.of_window(window), plane.of_window(window)
-        return made
 
     def at(self, values: Values, view: View) -> tuple[mi.Float, mi.Bool]:
         """Irradiance (mW/mm^2) at points that are seen, and whether it is known: not on the rim of the cornea."""
@@ -89,21 +74,16 @@ class MatteLight:
         if not self._lights.gridded:
             self._grids = LightGrid(_SIDE), LightGrid(_SIDE)
             return
-        lights = self._lights
-        ways = self._values, lights, self._scene, self._received, self._points, self._reach
-        globe, plane = _filled(*ways, lights.windows)
+        globe, plane = _filled(self._values, self._lights, self._scene, self._received, self._points, self._reach)
         self._grids = LightGrid(_SIDE, globe), LightGrid(_SIDE, plane)
 
 
 @recorded
 def _filled(
-    values: Values, lights: Lights, scene: mi.Scene, received: Received, points: mi.UInt32, reach: mi.Float,
-    windows: int,
+    values: Values, lights: Lights, scene: mi.Scene, received: Received, points: mi.UInt32, reach: mi.Float
 ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
     """Numbers of the grids over the globe and over the plane."""
-    window, column, row = LightGrid.nodes(_SIDE, windows)
-    values, lights, received = values.of_window(window), lights.of_window(window), received.of_window(window)
-    reach = reach if window is None else dr.gather(mi.Float, reach, window)
+    column, row = LightGrid.nodes(_SIDE)
     a, b = (mi.Float(k) * (2 / (_SIDE - 1)) - 1 for k in (column, row))
     polar = dr.sqrt(a * a + b * b)
     sine, cosine = dr.sincos(polar * GLOBE_EDGE)

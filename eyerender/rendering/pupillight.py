@@ -6,41 +6,33 @@ of its points sums over the lamps the irradiance of the stop times the return fa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..eye.fundus import CELLS, EDGE, FundusLight
 from .parameters import leaves
 from .recorded import recorded
-from .values import Lights, Values, placed, sent, split, windowed
+from .values import Lights, Values, sent
 
 
 class PupilLight:
     """Radiance in air (mW/mm^2/sr) that leaves the pupil, before the transmittance of the cornea."""
 
-    DRJIT_STRUCT = leaves("_cells", "_first")
+    DRJIT_STRUCT = leaves("_cells")
 
-    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, returned: Sequence[FundusLight]) -> None:
+    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, returned: FundusLight) -> None:
         """Fill the grid.
 
         Args:
             values: the scene's numbers.
             lights: the lamps.
             scene: what may stand in the way.
-            returned: the return factors of the lamps, for each window.
+            returned: the return factors of the lamps.
         """
         self._values, self._lights, self._scene = values, lights, scene
-        self._factors = np.concatenate([one.factors.ravel() for one in returned])
-        self._first: mi.UInt32 | None = None
+        self._factors = returned.factors
         self._cells: mi.Float | None = None
         self._fill()
-
-    def of_window(self, window: mi.UInt32 | None) -> PupilLight:
-        """The light of one window for each lane."""
-        return windowed(self, window, CELLS * CELLS)
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> mi.Float:
         """Radiance at coordinates of the stop in units of its semi-axes, bilinearly."""
@@ -50,28 +42,25 @@ class PupilLight:
         s, t = x - mi.Float(i), y - mi.Float(j)
 
         def cell(di: int, dj: int) -> mi.Float:
-            return dr.gather(mi.Float, self._cells, placed((j + dj) * CELLS + i + di, self._first), active)
+            return dr.gather(mi.Float, self._cells, (j + dj) * CELLS + i + di, active)
 
         low, high = (dr.lerp(cell(0, k), cell(1, k), s) for k in (0, 1))
         return dr.lerp(low, high, t)
 
     def _fill(self) -> None:
-        cells = CELLS * CELLS * self._lights.windows
         if not len(self._lights) or not self._factors.any():
-            self._cells = dr.zeros(mi.Float, cells)
+            self._cells = dr.zeros(mi.Float, CELLS * CELLS)
             dr.make_opaque(self._cells)
             return
-        self._cells = _filled(self._values, self._lights, self._scene, sent(self._factors), cells)
+        self._cells = _filled(self._values, self._lights, self._scene, sent(self._factors))
 
 
 @recorded
-def _filled(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float, cells: int) -> mi.Float:
+def _filled(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float) -> mi.Float:
     """Numbers of the grid, from the return factors of the lamps."""
     from .lighting import LampPath
 
-    window, index = split(dr.arange(mi.UInt32, cells), CELLS * CELLS, values.several)
-    factor_row = 0 if window is None else window * lights.count
-    values, lights = values.of_window(window), lights.of_window(window)
+    index = dr.arange(mi.UInt32, CELLS * CELLS)
     row = index // CELLS
     u, v = ((mi.Float(k) + 0.5) * (2 * EDGE / CELLS) - EDGE for k in (index - row * CELLS, row))
     a, b = values.stop.axes
@@ -80,7 +69,7 @@ def _filled(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float, 
     x = values.stop.centre + (u * shrink * a) * values.stop.u + (v * shrink * b) * values.stop.v
 
     def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        factor = dr.gather(mi.Float, factors, (i + factor_row) * (CELLS * CELLS) + index)
+        factor = dr.gather(mi.Float, factors, i * (CELLS * CELLS) + index)
         lamp = lights[i]
         path = LampPath.to(values, scene, lamp, lamp.position, x, factor > 0)
         return i + 1, total + dr.select(path.blocked, 0, path.gain * factor)

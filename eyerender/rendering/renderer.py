@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import Floats, Singles
+from ..arrays import Bools, Floats, Singles
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from .blur import Blur
 from .film import Exposed, begun, mean_radiance
@@ -23,7 +23,6 @@ from .region import RegionScene
 from .splat import MirrorImages, Shine
 from .stage import Stage
 from .surround import Obstacle, Surround
-from .together import together
 from .window import RenderedWindow, Traced
 
 if TYPE_CHECKING:
@@ -67,55 +66,44 @@ class Renderer:
         Raises:
             InputError: numbers so extreme that the image is not finite.
         """
-        return self._one(job, spp, moments).developed()
+        traced = self._moving(job, spp, moments) if moments else self._traced(job, spp, None)
+        return traced.developed()
 
     def begin(
-        self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()
+        self,
+        job: RenderJob,
+        *,
+        spp: int | None = None,
+        moments: Sequence[RenderJob] = (),
+        after: RenderJob | None = None,
     ) -> Future[RenderedWindow]:
-        """Trace one window now, and develop it in a second thread. The arguments are those of `render`."""
-        return self._beside.submit(self._one(job, spp, moments).developed)
+        """Trace one window now, and develop it in a second thread, beside the tracing of the next.
 
-    def _one(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob]) -> Traced:
-        return self._moving(job, spp, moments) if moments else self._traced([job], spp, ())[0]
-
-    def begin_all(
-        self, jobs: Sequence[RenderJob], *, spp: int | None = None, after: Sequence[RenderJob] = ()
-    ) -> list[Future[RenderedWindow]]:
-        """Trace windows that share launches now, and develop them in a second thread, beside the tracing of the next.
-
-        The results are those of `render`, whatever shares launches and comes next.
+        The result is that of `render`, whatever comes next.
 
         Args:
-            jobs: one job, or jobs that `together` puts together.
-            spp: samples per pixel; None: those of the renderer.
-            after: the very jobs that come next, if they are known: what NumPy alone makes of them is made in the second
+            job: what to render.
+            spp: as in `render`.
+            moments: as in `render`.
+            after: the very job that comes next, if it is known: what NumPy alone makes of it is made in the second
                 thread, too.
         """
-        return [self._beside.submit(traced.developed) for traced in self._traced(jobs, spp, after)]
-
-    def together(self, jobs: Iterable[RenderJob], *, spp: int | None = None) -> Iterator[tuple[RenderJob, ...]]:
-        """Put jobs that follow each other together where they can share launches: small windows of one bare eye."""
-        if self._stage.obstructed:
-            return ((job,) for job in jobs)
-        return together(jobs, spp or self.spp)
+        traced = self._moving(job, spp, moments) if moments else self._traced(job, spp, after)
+        return self._beside.submit(traced.developed)
 
     @uncollected
-    def _traced(self, jobs: Sequence[RenderJob], spp: int | None, after: Sequence[RenderJob]) -> list[Traced]:
-        """Trace jobs that share launches."""
-        shown, place = self._stage.set(jobs, after=after)
-        blurs = [host.blur for host in shown.hosts]
-        windows, seeds = [blur.window for blur in blurs], [job.seed for job in jobs]
-        film = begun(shown, windows, spp or self.spp, seeds, layered=blurs[0].layered)
+    def _traced(self, job: RenderJob, spp: int | None, after: RenderJob | None) -> Traced:
+        """Trace a job."""
+        shown, place = self._stage.set(job, after=after)
+        blur = shown.host.blur
+        film = begun(shown, blur.window, spp or self.spp, job.seed, layered=blur.layered)
         # The device is at work until something is read, so the host's own work comes first.
-        marks = _marks(shown)
+        marks = _marks(shown, job)
         self._stage.prepare()
-        images = [self._mirror_images(host).seen(place, blur) for host, blur in zip(shown.hosts, blurs, strict=True)]
-        return [
-            Traced(job, picture, tuple(shines), blur, mirrored, labels, failed, margins, bright)
-            for job, blur, (mirrored, shines), (picture, failed), (labels, margins, bright) in zip(
-                jobs, blurs, images, film.means(), marks(), strict=True
-            )
-        ]
+        mirrored, shines = self._mirror_images(shown.host).seen(place, blur)
+        picture, failed = film.means()
+        labels, margins, bright = marks()
+        return Traced(job, picture, tuple(shines), blur, mirrored, labels, failed, margins, bright)
 
     @uncollected
     def _moving(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob]) -> Traced:
@@ -127,21 +115,21 @@ class Renderer:
         glints: list[Shine] = []
         marks: tuple[Any, ...] | None = None
         for shot in moments:
-            shown, place = self._stage.set([shot])
+            shown, place = self._stage.set(shot)
             blur = blur or Blur.of(job, place.posed)
-            film = begun(shown, [blur.window], spp, [shot.seed], layered=blur.layered)
+            film = begun(shown, blur.window, spp, shot.seed, layered=blur.layered)
             found = _marks(shown, job) if shot.M is job.M and shot.t is job.t else None
             mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(moments))
             glints += shines
-            ((mean, missed),) = film.means()
+            mean, missed = film.means()
             pictures.append(mean)
             failed += missed
             if found is not None:
-                marks = mirrored, *found()[0]
+                marks = mirrored, *found()
         assert blur is not None
         if marks is None:  # no moment is the middle of the exposure
             shown, place = self.bind(job, lit=False)
-            marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(shown)()[0]
+            marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(shown, job)()
         mirrored, labels, margins, bright = marks
         return Traced(job, np.mean(pictures, axis=0), tuple(glints), blur, mirrored, labels, failed, margins, bright)
 
@@ -171,7 +159,7 @@ class Renderer:
 
     def labels(self, job: RenderJob) -> PartLabels:
         """Compute the labels of a window alone."""
-        return part_labels(self.bind(job, lit=False)[0], [job.window])()[0]
+        return part_labels(self.bind(job, lit=False)[0], job.window)()
 
     def depths_mm(self, job: RenderJob) -> Singles:
         """Distances (height, width) from the nodal point of what a window shows, infinite where that is nothing."""
@@ -182,17 +170,12 @@ class Renderer:
 
         It is valid until the next call. `lit`: whether radiance is wanted, not only what is seen where.
         """
-        return self._stage.set([job], lit=lit)
+        return self._stage.set(job, lit=lit)
 
 
-def _marks(shown: Exposed, middle: RenderJob | None = None) -> Callable[[], list[tuple[Any, ...]]]:
-    """Begin with labels, margins of the lids (px) and highlights of each window, as far as they are wanted.
-
-    middle: the job that says what is wanted, if it is not the frame's own.
-    """
-    jobs = [host.job for host in shown.hosts] if middle is None else [middle]
-    labels = part_labels(shown, [job.window for job in jobs]) if jobs[0].labels else lambda: [None] * len(jobs)
-    return lambda: [
-        (found, host.lid_margins_px, highlights(shown, job.window) if job.highlights else None)
-        for found, host, job in zip(labels(), shown.hosts, jobs, strict=True)
-    ]
+def _marks(shown: Exposed, job: RenderJob) -> Callable[[], tuple[PartLabels | None, Any, Bools | None]]:
+    """Begin with labels, margins of the lids (px) and highlights, as far as the job wants them."""
+    labels = part_labels(shown, job.window) if job.labels else lambda: None
+    return lambda: (
+        labels(), shown.host.lid_margins_px, highlights(shown, job.window) if job.highlights else None
+    )  # fmt: skip

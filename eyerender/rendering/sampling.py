@@ -13,7 +13,7 @@ shadows show noise and no bands. Nothing depends on threads, on the window, or o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .values import Values, aligned
+from .values import Values
 
 _PHI = 1.324717957244746
 _ALPHA = tuple(round(_PHI ** -(k + 1) * 2**32) for k in range(2))
@@ -62,23 +62,14 @@ class Pattern:
     keys: tuple[mi.UInt32, ...]
 
     @classmethod
-    def of(cls, count: int, *seeds: int, times: int = 1) -> Pattern:
-        """Make the pattern of `count` samples, `times` as many in fine pixels, with keys for each seed."""
-        lattices = (
+    def of(cls, count: int, seed: int, *, times: int = 1) -> Pattern:
+        """Make the pattern of `count` samples, `times` as many in fine pixels, for a seed."""
+        few, many = (
             (dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, -(-(lattice_generator(n) << 32) // n) & 0xFFFFFFFF))
             for n in (count, count * times)
         )
-        states = ([np.random.SeedSequence([s, call]).generate_state(1)[0] for s in seeds] for call in range(_CALLS))
-        few, many = lattices
-        if len(seeds) == 1:
-            return cls((few, many), tuple(dr.opaque(mi.UInt32, int(state)) for (state,) in states))
-        return cls((few, many), tuple(mi.UInt32(aligned(np.array(keys, np.uint32))) for keys in states))
-
-    def of_window(self, window: mi.UInt32 | None) -> Pattern:
-        """The pattern of one window, with its own seed, for each lane."""
-        if window is None:
-            return self
-        return replace(self, keys=tuple(dr.gather(mi.UInt32, key, window) for key in self.keys))
+        keys = (np.random.SeedSequence([seed, call]).generate_state(1)[0] for call in range(_CALLS))
+        return cls((few, many), tuple(dr.opaque(mi.UInt32, int(key)) for key in keys))
 
 
 class Samples:

@@ -51,17 +51,17 @@ _FARTHEST_MM = 60.0  # of places in the plane of a surround that have a grid
 
 @dataclass(slots=True)
 class _Next:
-    """The jobs of the frame that comes next, and what other threads make of them: mesh, trees, and all the rest."""
+    """The job of the frame that comes next, and what other threads make of it: mesh, trees, and all the rest."""
 
-    jobs: tuple[RenderJob, ...]
+    job: RenderJob
     posed: Future[RegionMesh] | None = None
     trees: Trees | None = None
-    hosts: Future[tuple[Prepared, ...]] | None = None
+    host: Future[Prepared] | None = None
 
     @property
     def region(self) -> Region | None:
-        """The eye region of the jobs."""
-        return self.jobs[0].region
+        """The eye region of the job."""
+        return self.job.region
 
 
 class Stage:
@@ -91,22 +91,22 @@ class Stage:
         """Whether there are obstacles about eyes without a region."""
         return self._surround.obstructed
 
-    def _expect(self, jobs: Sequence[RenderJob]) -> None:
-        """Have the mesh of the next jobs made by another thread, but for a head mesh."""
-        self._next = _Next(tuple(jobs))
+    def _expect(self, job: RenderJob) -> None:
+        """Have the mesh of the next job made by another thread, but for a head mesh."""
+        self._next = _Next(job)
         region = self._next.region
         if region is not None and region.head is None:
-            self._next.posed = self._beside.submit(region_mesh, region, jobs[0].globe)
+            self._next.posed = self._beside.submit(region_mesh, region, job.globe)
 
     def prepare(self) -> None:
-        """Have what can be made of the next jobs without the device made by other threads, once all is launched."""
+        """Have what can be made of the next job without the device made by other threads, once all is launched."""
         after = self._next
         if after is None or (after.region is not None and after.posed is None):
             return
         if after.posed is not None and after.posed.exception():
             return  # its own frame shall raise the error
-        job, posed = after.jobs[0], None if after.posed is None else after.posed.result()
-        after.hosts = self._beside.submit(lambda: tuple(Prepared.made(one, posed) for one in after.jobs))
+        job, posed = after.job, None if after.posed is None else after.posed.result()
+        after.host = self._beside.submit(Prepared.made, job, posed)
         # With one thread, kernels run while they are launched, so nothing is left to build trees beside.
         if job.region is not None and posed is not None and dr.thread_count() > 1 and self._beside_frames < _BESIDE:
             place = self._regions.get(RegionScene.key(job.region, job.globe))
@@ -115,17 +115,16 @@ class Stage:
                 self._beside_frames += 1
 
     def set(
-        self, jobs: Sequence[RenderJob], *, lit: bool = True, after: Sequence[RenderJob] = ()
+        self, job: RenderJob, *, lit: bool = True, after: RenderJob | None = None
     ) -> tuple[Exposed, Surround | RegionScene]:
-        """Set up the frame of jobs and the surroundings of their eye, which keep their pose until the next call.
+        """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call.
 
         Args:
-            jobs: one job, or some that can share launches (see `together`).
+            job: the job.
             lit: whether radiance is wanted, not only what is seen where.
-            after: the jobs of the next frame, if they are known.
+            after: the job of the next frame, if it is known.
         """
-        hosts, place = self._prepared(tuple(jobs))
-        host, job = hosts[0], jobs[0]
+        host, place = self._prepared(job)
         region = place if isinstance(place, RegionScene) else None
         textures, views = self._textures_of(job), None
         # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
@@ -142,12 +141,10 @@ class Stage:
             job.ambient.model_copy(update={"sun": None}) != Ambient(),
             region is not None and region.skin.is_sheet and job.look.scattering is not None,
         )
-        windows = [one.parameters for one in hosts] if len(hosts) > 1 else []
-        values = Values(structure, host.parameters, boundary_waves(job.eye), tables(job.eye), windows)
+        values = Values(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
         if job.mesh_edge_mm is not None:
             values.surfaces = meshed(values.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
-        lamps = np.concatenate([one.lamps for one in hosts])
-        lights = Lights(lamps, len(host.lamps) - len(job.lights), len(hosts))
+        lights = Lights(host.lamps, len(host.lamps) - len(job.lights))
         if lit and structure.scattering and region is not None and views is not None:
             tissues = tissue_light(job, values, lights, region, views, host.tissue_cells)
             textures = replace(textures, tissues=tissues)
@@ -155,24 +152,23 @@ class Stage:
             even = job.ambient.irradiance_w_m2 * 1e-3
             ambience = Ambience(even, panel_table(job.ambient, job.anchor_mm), job.ambient.map, self._maps)
             textures = replace(textures, ambience=ambience)
-        returned = [one.returned for one in hosts]
-        textures = replace(textures, pupil=PupilLight(values, lights, place.scene, returned))
+        textures = replace(textures, pupil=PupilLight(values, lights, place.scene, host.returned))
         if lit:
-            textures = self._lit(hosts, values, lights, textures, place, after)
-        return Exposed(place.scene, values, lights, textures, hosts), place
+            textures = self._lit(host, values, lights, textures, place, after)
+        return Exposed(place.scene, values, lights, textures, host), place
 
     def _lit(
-        self, hosts: tuple[Prepared, ...], values: Values, lights: Lights, textures: Textures,
-        place: Surround | RegionScene, after: Sequence[RenderJob],
+        self, host: Prepared, values: Values, lights: Lights, textures: Textures,
+        place: Surround | RegionScene, after: RenderJob | None,
     ) -> Textures:  # fmt: skip
         """The textures with the light between surfaces; prepares the grids of the lamps' light that a frame can use."""
-        job = hosts[0].job
+        job = host.job
         parts = panel_lamps(job.ambient, job.anchor_mm)
         if textures.ambience is not None:
             parts += textures.ambience.bright(job.anchor_mm)
-        panels = Lights(light_table(parts, job.M, job.t), windows=len(hosts))
-        read = self._exchange.begun(hosts, values, lights, panels, textures, place)
-        if after:
+        panels = Lights(light_table(parts, job.M, job.t))
+        read = self._exchange.begun(host, values, lights, panels, textures, place)
+        if after is not None:
             self._expect(after)
         solved = read()
         if not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet):
@@ -180,23 +176,23 @@ class Stage:
         lights.relief = IrisRelief(job, values, lights, place.scene, textures, self._shapes)
         received = solved()
         if not place.obstructed:
-            reach = [min(one.reach_mm, _FARTHEST_MM) for one in hosts]
+            reach = min(host.reach_mm, _FARTHEST_MM)
             lights.on_matte = MatteLight(values, lights, place.scene, received, reach)
         return replace(textures, received=received)
 
-    def _prepared(self, jobs: tuple[RenderJob, ...]) -> tuple[tuple[Prepared, ...], Surround | RegionScene]:
-        """What NumPy makes of jobs, and their posed surroundings."""
+    def _prepared(self, job: RenderJob) -> tuple[Prepared, Surround | RegionScene]:
+        """What NumPy makes of a job, and its posed surroundings."""
         expected, self._next = self._next, None
-        hosts: tuple[Prepared, ...] = ()
+        host: Prepared | None = None
         trees: Trees | None = None
         if expected is not None:
             if expected.trees is not None:
                 wait([expected.trees.built])  # whatever comes now, because it changes the same shapes
-            if [id(job) for job in expected.jobs] == [id(job) for job in jobs]:
+            if expected.job is job:
                 trees = expected.trees
-                hosts = () if expected.hosts is None else expected.hosts.result()
-        place = self._place(jobs[0], hosts[0].posed if hosts else None, trees)
-        return hosts or tuple(Prepared(job, place.posed) for job in jobs), place
+                host = None if expected.host is None else expected.host.result()
+        place = self._place(job, None if host is None else host.posed, trees)
+        return host or Prepared(job, place.posed), place
 
     def _place(self, job: RenderJob, known: RegionMesh | None, trees: Trees | None) -> Surround | RegionScene:
         """Posed surroundings; the mesh of a region and its trees may be known."""

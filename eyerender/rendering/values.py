@@ -7,9 +7,8 @@ What determines the kernel (the kinds of surfaces, whether the lens distorts) is
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Reals
-from .parameters import CameraParameters, Kind, Parameters, PoseParameters, leaves, packed, rebuilt
+from .parameters import Kind, Parameters, leaves, packed, rebuilt
 from .recorded import recorded
 from .surfaces import Surface
 
@@ -26,12 +25,10 @@ if TYPE_CHECKING:
     from .irisrelief import IrisRelief
     from .mattelight import MatteLight
 
-_Record = TypeVar("_Record")
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
 _POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
 SMALL = 0.02  # the same of lamps whose shadows of hairs are finer than a pixel
 ALL, BITS = 0xFFFFFFFF, 32  # marks of lamps
-_WINDOW_ROW = 36  # pose 12, camera 21, 3 unused
 _LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
 
 
@@ -71,31 +68,6 @@ def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
     return mi.UInt32((mi.Float(a) + 0.5) / mi.Float(b))
 
 
-def split(index: mi.UInt32, each: int | mi.UInt32, several: bool) -> tuple[mi.UInt32 | None, mi.UInt32]:
-    """The window of each lane, None if there is but one, and the number of the lane among the `each` of its window."""
-    if not several:
-        return None, index
-    window = index // each
-    return window, index - window * each
-
-
-def windowed(record: _Record, window: mi.UInt32 | None, each: int | mi.UInt32) -> _Record:
-    """A record for one window of each lane, if its tables hold several: those of a window have `each` numbers or rows.
-
-    The copy has the place at which they begin as `_first`; without several windows this is None.
-    """
-    if window is None:
-        return record
-    made: Any = copy(record)
-    made._first = window * each
-    return made  # type: ignore[no-any-return]
-
-
-def placed(place: mi.UInt32, first: mi.UInt32 | None) -> mi.UInt32:
-    """Place in a table whose numbers begin at `first`."""
-    return place if first is None else place + first
-
-
 @dataclass(frozen=True, slots=True)
 class Structure:
     """What a kernel is compiled for.
@@ -118,7 +90,7 @@ class Values:
 
     DRJIT_STRUCT = leaves(
         "structure", "boundary", "surfaces", "stop", "iris", "limbus", "sclera", "image", "pose", "camera",
-        "inner_index", "pupil_albedo", "globe_reach", "backdrop_x", "ambient_irradiance", "_windows",
+        "inner_index", "pupil_albedo", "globe_reach", "backdrop_x", "ambient_irradiance",
     )  # fmt: skip
 
     def __init__(
@@ -127,7 +99,6 @@ class Values:
         parameters: Parameters,
         waves: np.ndarray[Any, np.dtype[np.float64]],
         tables: Sequence[NDArray[np.float32] | None],
-        windows: Sequence[Parameters] = (),
     ) -> None:
         """Send the numbers to the device.
 
@@ -136,14 +107,7 @@ class Values:
             parameters: the numbers.
             waves: the pupil's boundary.
             tables: the cells of measured surfaces.
-            windows: the numbers of windows that share launches, if there are several: poses and cameras may differ.
         """
-        self._windows: mi.Float | None = None
-        if windows:
-            rows = np.zeros((len(windows), _WINDOW_ROW), np.float32)
-            for row, one in zip(rows, windows, strict=True):
-                row[: _WINDOW_ROW - 3] = packed((one.pose, one.camera))
-            self._windows = sent(rows)
         left = iter(one_by_one(packed(parameters)))
 
         def leaf(size: int) -> mi.Float | mi.Vector3f | tuple[mi.Float, ...]:
@@ -163,25 +127,6 @@ class Values:
         self.inner_index, self.pupil_albedo = found.inner_index, found.pupil_albedo
         self.globe_reach, self.backdrop_x = found.globe_reach, found.backdrop_x
         self.ambient_irradiance = found.ambient_irradiance
-
-    @property
-    def several(self) -> bool:
-        """Whether there are several windows."""
-        return self._windows is not None
-
-    def of_window(self, window: mi.UInt32 | None) -> Values:
-        """The numbers of one window for each lane."""
-        if window is None:
-            return self
-        row = window * (_WINDOW_ROW // 4)
-        n = [x for k in range(_WINDOW_ROW // 4) for x in dr.gather(mi.Vector4f, self._windows, row + k)]
-        a, b, c, shift, *camera = (mi.Vector3f(*n[k : k + 3]) for k in range(0, 24, 3))
-        made = copy(self)
-        made.pose = PoseParameters((a, b, c), shift)
-        centre, right, down, forward = camera
-        made.camera = CameraParameters(centre, right, down, forward, (n[24], n[25]), (n[26], n[27]), tuple(n[28:33]))
-        made._windows = None
-        return made
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the scene's frame to the eye frame: M^T (x - t)."""
@@ -254,14 +199,13 @@ class Lights:
     nodes of a grid, and `gridded` whether lamps of that size may have grids. `suns` is 1 if the last lamp is a sun with
     sharp shadows, else 0. `on_iris` and `on_matte` are their light
     in the plane of the iris and on matte surfaces where grids of it are used, and `relief` is the iris' relief in their
-    light. Windows that share launches have as many lamps each, in rows of the table one window after the other.
+    light.
     """
 
-    DRJIT_STRUCT = leaves("count", "suns", "_buffer", "_first", "on_iris", "on_matte", "relief")
+    DRJIT_STRUCT = leaves("count", "suns", "_buffer", "on_iris", "on_matte", "relief")
 
-    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]], suns: int = 0, windows: int = 1) -> None:
-        self._len, self.windows = len(table) // windows, windows
-        self._first: mi.UInt32 | None = None
+    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]], suns: int = 0) -> None:
+        self._len = len(table)
         self.on_iris: IrisLight | None = None
         self.on_matte: MatteLight | None = None
         self.relief: IrisRelief | None = None
@@ -278,20 +222,9 @@ class Lights:
     def __len__(self) -> int:
         return self._len
 
-    def of_window(self, window: mi.UInt32 | None) -> Lights:
-        """The lamps of one window for each lane."""
-        if window is None:
-            return self
-        made = windowed(self, window, self.count)
-        for name in ("on_iris", "on_matte", "relief"):
-            part = getattr(self, name)
-            setattr(made, name, None if part is None else part.of_window(window))
-        return made
-
     def __getitem__(self, i: mi.UInt32) -> Lamp:
-        row = placed(i, self._first)
         # Four numbers are gathered at once.
-        a, b, c = (dr.gather(mi.Vector4f, self._buffer, row * (_LIGHT_ROW // 4) + k) for k in range(3))
+        a, b, c = (dr.gather(mi.Vector4f, self._buffer, i * (_LIGHT_ROW // 4) + k) for k in range(3))
         return Lamp(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(a.w, b.x, b.y), b.z, b.w, c.x, c.y, i)
 
 

@@ -134,14 +134,6 @@ class Textures:
     received: Received | None = None
     tissues: TissueLight | None = None
 
-    def of_window(self, window: mi.UInt32 | None) -> Textures:
-        """The textures with what differs from window to window, of one window for each lane."""
-        if window is None:
-            return self
-        assert self.pupil is not None
-        assert self.received is not None
-        return replace(self, pupil=self.pupil.of_window(window), received=self.received.of_window(window))
-
     @classmethod
     def of(cls, look: Look) -> Textures:
         """Make the textures of one eye."""

@@ -104,7 +104,7 @@ def test_trees_built_beside_the_frame_before_give_the_same_bits(renderer, monkey
     threaded = dr.thread_count()
     dr.set_thread_count(2)  # with one, there is nothing to build trees beside
     nexts = [*run[1:], first[2]]
-    begun = [renderer.begin_all([job], spp=4, after=[after])[0] for job, after in zip(run, nexts, strict=True)]
+    begun = [renderer.begin(job, spp=4, after=after) for job, after in zip(run, nexts, strict=True)]
     dr.set_thread_count(threaded)
     if renderer.backend.name == "llvm":
         # A subject or a side that comes, or comes back, has no scene before its frame.
