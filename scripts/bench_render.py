@@ -112,7 +112,7 @@ class Bench:
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
         shown, surround = self.renderer.bind(job)
         values = shown.values
-        _, u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, n * n))
+        u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, n * n))
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
         view = look(values, shown.textures, surround.scene, o, d, True)
         inner = view.inner.numpy().T
@@ -512,7 +512,7 @@ class Bench:
             turned = self._turned(job, k)
             _, place = self.renderer.bind(self._turned(job, k - 1), lit=False)
             assert isinstance(place, RegionScene)
-            with timed("mesh and trees of the pose"):
+            with timed("mesh and tree of the pose"):
                 place.show(turned.region, turned.globe)
             shown, place = self.renderer.bind(turned, lit=False)
             with timed("labels"):

@@ -14,7 +14,7 @@ from ..region.globe import Globe
 from ..region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
 from ..region.headspec import Head
 from ..region.mesh import RegionMesh
-from .region import RegionScene, Trees
+from .region import RegionScene
 
 _DEPTH_MM = 4.0
 _RINGS, _TURNS = 40, 240
@@ -39,12 +39,10 @@ class HeadScene(RegionScene):
         super().__init__(spec, globe, known)
         self._refuse_crossing(spec, globe)
 
-    def show(
-        self, spec: Region, globe: Globe, known: RegionMesh | None = None, trees: Trees | None = None
-    ) -> RegionMesh:
+    def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
         """Turn to an eye and its pose; the mesh itself moves only with the place of the globe at rest."""
         new = self._shown != (spec, globe)
-        posed = super().show(spec, globe, known, trees)
+        posed = super().show(spec, globe, known)
         if new:
             self._refuse_crossing(spec, globe)
         return posed

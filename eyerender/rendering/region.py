@@ -8,8 +8,6 @@ third of the time. The menisci are a scene of their own. The appearance of a hit
 
 from __future__ import annotations
 
-from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,19 +38,11 @@ _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much a
 _RIPPLES = ((0.13, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
 
 
-@dataclass(frozen=True, slots=True)
-class Trees:
-    """Trees of the next pose, which another thread builds."""
-
-    posed: RegionMesh
-    built: Future[None]
-
-
 class RegionScene:
     """The Mitsuba scene of an eye region; `show` moves it, and `fill` gives it to another subject.
 
-    On processors there are two of them with the same shapes: `begun` has the trees of the next pose built in the one
-    that is not shown, beside the kernels. Each keeps its tree until it is built again, whatever the shapes are then.
+    Attributes:
+        scene: the solid parts.
     """
 
     obstructed = True
@@ -63,35 +53,20 @@ class RegionScene:
         posed = known or self._posed(spec, globe)
         meshes = {name: _mesh(posed, *cut) for name, cut in self._cuts(posed.layout).items()}
         parts = {name: {"solid": mesh} if self.fixed else _instance(mesh) for name, mesh in meshes.items()}
-        self.double = not self.fixed and mi.variant().startswith("llvm")
-        self._pairs = [{name: self._loaded(name, part) for name, part in parts.items()} for _ in range(1 + self.double)]
-        self._instances = [part["shown"] for part in parts.values()] if self.double else []
-        self._arrays: deque[dict[str, mi.Float]] = deque(maxlen=2)  # of the trees, which share them
-        roots = meshes if self.double else self._pairs[0]
-        self._params = {name: mi.traverse(root) for name, root in roots.items()}
-        self._mark()
+        scenes = {name: self._loaded(name, part) for name, part in parts.items()}
+        self.scene: mi.Scene = scenes["solid"]
+        self._water: mi.Scene | None = scenes.get("film")
+        self._params = {name: mi.traverse(scene) for name, scene in scenes.items()}
         self._dress(spec, globe, posed)
 
-    @property
-    def scene(self) -> mi.Scene:
-        """The solid parts, as they are shown."""
-        return self._pairs[0]["solid"]
-
-    @property
-    def _water(self) -> mi.Scene | None:
-        return self._pairs[0].get("film")
-
-    def _loaded(self, name: str, parts: dict[str, Any]) -> mi.Scene:
+    @staticmethod
+    def _loaded(name: str, parts: dict[str, Any]) -> mi.Scene:
         """Make a scene and its tree."""
         scene: dict[str, Any] = {"type": "scene", **parts}
         if name == "solid":
             # Without robust intersections rays slip between the triangles of a large face on some processors. An
             # instance cannot have them, but its triangles are small.
             scene["embree_use_robust_intersections"] = True
-        if self.double:
-            # With a scene inside, Mitsuba builds all trees in the thread that asks for them. Else Dr.Jit's threads
-            # would build that of the instance, after all kernels that were launched before.
-            scene["inside"] = mi.load_dict({"type": "scene"})
         return mi.load_dict(scene)
 
     def _cuts(self, layout: RegionLayout) -> dict[str, tuple[slice, slice]]:
@@ -123,11 +98,6 @@ class RegionScene:
         for name, cut in self._cuts(posed.layout).items():
             self._set(name, "faces", _faces(posed.layout, *cut))
         self._send(posed)
-        if self.double:
-            for params in self._params.values():
-                params.update()  # tells the meshes their numbers of vertices and faces
-        self._update()
-        self._mark()
         self._dress(spec, globe, posed)
 
     @staticmethod
@@ -136,55 +106,21 @@ class RegionScene:
         files = () if spec.head is None else file_states(spec.head)
         return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
 
-    def show(
-        self, spec: Region, globe: Globe, known: RegionMesh | None = None, trees: Trees | None = None
-    ) -> RegionMesh:
-        """Move lids and lashes to a pose and a blink, whose mesh and trees may be known."""
-        if not self.shows(spec, globe):
+    def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
+        """Move lids and lashes to a pose and a blink, whose mesh may be known."""
+        if self._shown != (spec, globe):
             posed = known or self._posed(spec, globe)
             if posed is not self.posed:
-                self._move(posed, trees)
+                self.posed = posed
+                self._send(posed)
+                self.skin.pose(posed)
             self._shown = (spec, globe)
         return self.posed
-
-    def shows(self, spec: Region, globe: Globe) -> bool:
-        """Whether a pose and a blink are those of the scene."""
-        return self._shown == (spec, globe)
 
     def at_rest(self, globe: Globe) -> RegionMesh:
         """Mesh of the subject with open lids about a globe; the scene keeps its pose."""
         assert self._shown is not None
         return self._posed(self._shown[0].model_copy(update={"blink": 0.0}), globe)
-
-    def begun(self, posed: RegionMesh) -> Trees:
-        """Begin to build the trees of the next pose of the same subject, only if the scene is `double`.
-
-        The shapes may not change until the trees are there. Mitsuba waits for what its own thread has launched. So a
-        new thread, which has launched nothing, builds the trees beside all kernels. It keeps Python to itself.
-        """
-        self._send(posed)
-        waiting = list(self._pairs[1].values())
-        beside = ThreadPoolExecutor(1, "trees")
-        built = beside.submit(_built, waiting)
-        beside.shutdown(wait=False)
-        return Trees(posed, built)
-
-    def _move(self, posed: RegionMesh, trees: Trees | None) -> None:
-        self.posed = posed
-        if trees is None or trees.posed is not posed:
-            self._send(posed)
-            self._update()
-        else:
-            trees.built.result()
-            self._pairs.reverse()
-        self._mark()
-        self.skin.pose(posed)
-        self.skin.water = self._water
-
-    def _mark(self) -> None:
-        """Mark the instances, so that the scenes are built again. Mitsuba waits for what is launched before."""
-        for instance in self._instances:
-            instance.parameters_changed(["to_world"])
 
     def _set(self, name: str, array: str, values: mi.Float | mi.UInt32) -> None:
         """Set an array of a mesh."""
@@ -192,20 +128,10 @@ class RegionScene:
         params[next(key for key in params.keys() if key.endswith(array))] = values  # noqa: SIM118  # no dictionary
 
     def _send(self, posed: RegionMesh) -> None:
-        """Set the vertices."""
-        sent = {name: _floats(posed.vertices[cut]) for name, (cut, _) in self._cuts(posed.layout).items()}
-        for name, vertices in sent.items():
-            self._set(name, "vertex_positions", vertices)
-        self._arrays.append(sent)
-
-    def _update(self) -> None:
-        """Build the trees of what was sent."""
-        if self.double:
-            self._mark()  # again, because trees that nobody took may have been built since
-            _built(list(self._pairs[0].values()))
-        else:
-            for params in self._params.values():
-                params.update()  # does nothing where nothing was set
+        """Set the vertices, and build the trees of what was set."""
+        for name, (cut, _) in self._cuts(posed.layout).items():
+            self._set(name, "vertex_positions", _floats(posed.vertices[cut]))
+            self._params[name].update()
 
     def _posed(self, spec: Region, globe: Globe) -> RegionMesh:
         return region_mesh(spec, globe)
@@ -252,12 +178,6 @@ def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
     params["vertex_positions"] = _floats(corners)
     params.update()
     return mesh
-
-
-def _built(scenes: list[mi.Scene]) -> None:
-    """Build the trees of scenes whose shapes have changed."""
-    for scene in scenes:
-        scene.parameters_changed()
 
 
 def _instance(mesh: mi.Mesh) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Executor, Future, wait
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +12,6 @@ import drjit as dr
 import numpy as np
 
 from ..errors import InputError
-from ..region.anatomy import Region
 from ..region.mesh import RegionMesh, region_mesh
 from ..rig.imaging import Ambient
 from .environment import Ambience, Maps
@@ -37,7 +36,7 @@ from .meshed import Meshes, meshed
 from .prepared import Prepared
 from .pupillight import PupilLight
 from .recorded import forget
-from .region import RegionScene, Trees
+from .region import RegionScene
 from .subsurface import tissue_light
 from .surround import Obstacle, Surround
 from .values import Lights, Structure, Values
@@ -45,23 +44,16 @@ from .view import Textures
 
 _REGIONS, _TEXTURES = 4, 8  # kept
 _REMEMBERED = 32  # subjects; then recordings are made anew, because those of sizes that never come back take 3 MB each
-_BESIDE = 50_000  # trees built beside frames: Embree and Dr.Jit keep 2 kB of every thread that has built one
 _FARTHEST_MM = 60.0  # of places in the plane of a surround that have a grid
 
 
 @dataclass(slots=True)
 class _Next:
-    """The job of the frame that comes next, and what other threads make of it: mesh, trees, and all the rest."""
+    """The job of the frame that comes next, and what a second thread makes of it: the mesh, then all the rest."""
 
     job: RenderJob
     posed: Future[RegionMesh] | None = None
-    trees: Trees | None = None
     host: Future[Prepared] | None = None
-
-    @property
-    def region(self) -> Region | None:
-        """The eye region of the job."""
-        return self.job.region
 
 
 class Stage:
@@ -84,35 +76,23 @@ class Stage:
         self._exchange = Exchange()
         self._shapes: KeptForEye[Shape] = KeptForEye()
         self._next: _Next | None = None
-        self._beside_frames = 0
-
-    @property
-    def obstructed(self) -> bool:
-        """Whether there are obstacles about eyes without a region."""
-        return self._surround.obstructed
 
     def _expect(self, job: RenderJob) -> None:
-        """Have the mesh of the next job made by another thread, but for a head mesh."""
+        """Have the mesh of the next job made by the second thread, but for a head mesh."""
         self._next = _Next(job)
-        region = self._next.region
+        region = job.region
         if region is not None and region.head is None:
             self._next.posed = self._beside.submit(region_mesh, region, job.globe)
 
     def prepare(self) -> None:
-        """Have what can be made of the next job without the device made by other threads, once all is launched."""
+        """Have what can be made of the next job without the device made by the second thread, once all is launched."""
         after = self._next
-        if after is None or (after.region is not None and after.posed is None):
+        if after is None or (after.job.region is not None and after.posed is None):
             return
         if after.posed is not None and after.posed.exception():
             return  # its own frame shall raise the error
-        job, posed = after.job, None if after.posed is None else after.posed.result()
-        after.host = self._beside.submit(Prepared.made, job, posed)
-        # With one thread, kernels run while they are launched, so nothing is left to build trees beside.
-        if job.region is not None and posed is not None and dr.thread_count() > 1 and self._beside_frames < _BESIDE:
-            place = self._regions.get(RegionScene.key(job.region, job.globe))
-            if place is not None and place.double and not place.shows(job.region, job.globe):
-                after.trees = place.begun(posed)
-                self._beside_frames += 1
+        posed = None if after.posed is None else after.posed.result()
+        after.host = self._beside.submit(Prepared.made, after.job, posed)
 
     def set(
         self, job: RenderJob, *, lit: bool = True, after: RenderJob | None = None
@@ -183,26 +163,21 @@ class Stage:
     def _prepared(self, job: RenderJob) -> tuple[Prepared, Surround | RegionScene]:
         """What NumPy makes of a job, and its posed surroundings."""
         expected, self._next = self._next, None
-        host: Prepared | None = None
-        trees: Trees | None = None
-        if expected is not None:
-            if expected.trees is not None:
-                wait([expected.trees.built])  # whatever comes now, because it changes the same shapes
-            if expected.job is job:
-                trees = expected.trees
-                host = None if expected.host is None else expected.host.result()
-        place = self._place(job, None if host is None else host.posed, trees)
+        host = None
+        if expected is not None and expected.job is job and expected.host is not None:
+            host = expected.host.result()
+        place = self._place(job, None if host is None else host.posed)
         return host or Prepared(job, place.posed), place
 
-    def _place(self, job: RenderJob, known: RegionMesh | None, trees: Trees | None) -> Surround | RegionScene:
-        """Posed surroundings; the mesh of a region and its trees may be known."""
+    def _place(self, job: RenderJob, known: RegionMesh | None) -> Surround | RegionScene:
+        """Posed surroundings; the mesh of a region may be known."""
         if job.region is None:
             self._surround.show(job.look)
             return self._surround
         if self._surround.obstructed:
             raise InputError("obstacles cannot be combined with an eye region")
         place = self._region(job, known)
-        place.show(job.region, job.globe, known, trees)
+        place.show(job.region, job.globe, known)
         return place
 
     def _region(self, job: RenderJob, known: RegionMesh | None) -> RegionScene:

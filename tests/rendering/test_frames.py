@@ -78,50 +78,14 @@ def test_windows_that_overlap_are_those_rendered_one_by_one(renderer, monkeypatc
         np.testing.assert_array_equal(image.rendered.glints.xy_px, alone.glints.xy_px)
 
 
-def test_trees_built_beside_the_frame_before_give_the_same_bits(renderer, monkeypatch):
-    import drjit as dr
-
-    from eyerender.rendering import region
-
-    build, threads = region._built, list[threading.Thread]()
-
-    def built(scenes):
-        threads.append(threading.current_thread())
-        build(scenes)
-
-    def jobs(seed, eye):
-        y = -31.5 if eye == "right" else 31.5
-        camera = {"position_mm": [600, y, -60], "look_at_mm": [0, y, 0], "focal_length_px": 3000,
-                  "resolution_px": [200, 160]}  # fmt: skip
-        lamp = {"position_mm": [600, y + 300, 0], "radius_mm": 2.5, "intensity_mw_sr": 60}
-        subject, rig = {"eyes": [eye], "ipd_mm": 63.0}, {"cameras": [camera], "lights": [lamp]}
-        frames = scene([(9, -4), (-6, 5), (3, 2)], region={"seed": seed}, subject=subject, rig=rig).frames()
-        return [render_job(frames, row) for row in range(3)]
-
-    monkeypatch.setattr(region, "_built", built)
-    first, left, other = jobs(5, "right"), jobs(5, "left"), jobs(6, "right")
-    run = [first[0], first[1], left[0], first[2], left[1], other[0], other[1], first[0]]
-    threaded = dr.thread_count()
-    dr.set_thread_count(2)  # with one, there is nothing to build trees beside
-    nexts = [*run[1:], first[2]]
-    begun = [renderer.begin(job, spp=4, after=after) for job, after in zip(run, nexts, strict=True)]
-    dr.set_thread_count(threaded)
-    if renderer.backend.name == "llvm":
-        # A subject or a side that comes, or comes back, has no scene before its frame.
-        assert sum(thread is not threading.main_thread() for thread in threads) == 4
-    for job, window in zip(run, begun, strict=True):  # the first is not the one that was announced
-        assert np.array_equal(window.result().irradiance, renderer.render(job, spp=4).irradiance)
-
-
 def test_an_image_before_one_that_fails_is_still_given(renderer, monkeypatch):
-    apart = scene([(0.0, 0.0), (9.0, -4.0)], lens={"focus_mm": 600.0})  # else both would be traced together
-    frames, trace, traced = apart.frames(), renderer._traced, list[object]()
+    frames, trace, traced = scene([(0.0, 0.0), (9.0, -4.0)]).frames(), renderer._traced, list[object]()
 
-    def failing(jobs, *rest):
+    def failing(job, *rest):
         if traced:
             raise InputError("broken")
-        traced.append(jobs)
-        return trace(jobs, *rest)
+        traced.append(job)
+        return trace(job, *rest)
 
     monkeypatch.setattr(renderer, "_traced", failing)
     images = render_windows(frames, renderer=renderer)

@@ -183,7 +183,7 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
         shown.host.fine(job.window)[0] == 0
     )
     assert 0.3 < plain.mean() < 0.95
-    _, u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, width * height))
+    u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, width * height))
     for du, dv in ((-0.45, -0.45), (0.45, -0.1), (0.0, 0.45)):
         o, d, _ = camera_ray(shown.values, mi.Float(u) + du, mi.Float(v) + dv)
         _, hit = meet(shown.values, shown.scene, o, d, True)
