@@ -33,7 +33,7 @@ from ..rig.surroundings import paint
 from ..spec import file_digest
 from .exr import second_thread
 from .panels import Panels
-from .parameters import leaves
+from .values import one_by_one
 
 _WIDTH, _HEIGHT = 1024, 512
 _FINE, _BLOCKS, _NORMALS = 256, 32, 48  # rows from which blocks are summed, and of blocks and normals
@@ -51,7 +51,6 @@ _SIDES = {
     ".hdr": rb"[-+][XY] *([0-9]{1,20}) *[-+][XY] *([0-9]{1,20})",
     ".pfm": rb"^P[fF]\s+([0-9]{1,20})\s+([0-9]{1,20})",
 }
-_ENTRIES = 13  # even irradiance, 9 of the rotation, scale, rows, ceiling
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,19 +261,33 @@ def _texture(values: NDArray[np.float32]) -> Any:
     return texture(mi.TensorXf(rows), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
 
 
+@dataclass(kw_only=True)
 class Ambience:
-    """Even light, panels and surroundings for the integrator; kernels do not depend on the numbers."""
+    """Even light, panels and surroundings for the integrator; kernels do not depend on the numbers.
 
-    DRJIT_STRUCT = leaves("_panels", "_texture", "_table", "_even", "_scale", "_rows", "_ceiling", "_axes")
+    Attributes:
+        panels: the panels.
+        texture: radiance of the map.
+        table: irradiance of its soft part and of the rest, over the normals.
+        even: irradiance of even light, mW/mm^2.
+        scale: radiance (mW/mm^2/sr) per value of the map.
+        rows: number of rows of the map.
+        ceiling: largest value of its soft part.
+        axes: axes of the map's frame in the scene's frame.
+    """
 
-    def __init__(
-        self,
-        even_mw_mm2: float,
-        panels: np.ndarray[Any, np.dtype[np.float64]],
-        spec: RadianceMap | None,
-        maps: Maps,
-    ) -> None:
-        """Prepare the light.
+    panels: Panels
+    texture: Any
+    table: Any
+    even: mi.Float
+    scale: mi.Float
+    rows: mi.Float
+    ceiling: mi.Float
+    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]
+
+    @classmethod
+    def upload(cls, even_mw_mm2: float, panels: Floats, spec: RadianceMap | None, maps: Maps) -> Ambience:
+        """Send the light to the device.
 
         Args:
             even_mw_mm2: irradiance of even light.
@@ -282,51 +295,34 @@ class Ambience:
             spec: the map, whose rays are in the world's axes; None for none.
             maps: the maps that are kept.
         """
-        self._panels = Panels(panels)
-        self._texture, self._table, made = maps.of(spec)
+        texture, table, made = maps.of(spec)
         scale = 0.0 if spec is None else spec.scale_w_m2_sr * 1e-3
         M = np.eye(3) if spec is None else map_rotation(spec)
-        self._bright = made.bright @ M.T * scale
-        numbers = [even_mw_mm2, *M.T.ravel(), scale, len(made.values), made.ceiling]
-        buffer = mi.Float(np.array(numbers, dtype=np.float32))
-        n = [dr.gather(mi.Float, buffer, mi.UInt32(k)) for k in range(_ENTRIES)]
-        dr.eval(n)
-        self._even, self._scale, self._rows, self._ceiling = n[0], n[10], n[11], n[12]
-        self._axes = tuple(mi.Vector3f(*n[k : k + 3]) for k in (1, 4, 7))
+        n = one_by_one(np.array([even_mw_mm2, scale, len(made.values), made.ceiling, *M.T.ravel()], dtype=np.float32))
+        a, b, c = (mi.Vector3f(*n[k : k + 3]) for k in (4, 7, 10))
+        return cls(
+            panels=Panels.upload(panels), texture=texture, table=table, even=n[0], scale=n[1], rows=n[2], ceiling=n[3],
+            axes=(a, b, c),
+        )  # fmt: skip
 
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Radiance (mW/mm^2/sr) along rays of the scene's frame, without the even light.
 
         Overlapping panels add up, and they do not hide the map behind them.
         """
-        return self._panels.radiance(o, d, active) + self._mapped(d, active)
+        return self.panels.radiance(o, d, active) + self._mapped(d, active)
 
     def soft(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Radiance (mW/mm^2/sr) of even light and of the soft part of the map along directions of the scene's frame."""
-        value = self._texture.eval(self._place(d, self._rows), active)[0]
-        return self._even * dr.inv_pi + self._scale * dr.minimum(value, self._ceiling)
-
-    def bright(self, anchor_mm: Floats) -> tuple[Lamp, ...]:
-        """The rest of the map as far lamps; `anchor_mm` is the origin of the scene's frame in the world."""
-        size = np.linalg.norm(self._bright, axis=1)
-        return tuple(
-            Lamp(
-                position_mm=frozen(anchor_mm + _FAR_MM * flux / one),
-                axis=frozen(-flux / one),
-                radius_mm=0.0,
-                intensity_mw_sr=float(one * _FAR_MM**2),
-                lobe_exponent=0.0,
-            )
-            for flux, one in zip(self._bright, size, strict=True)
-            if one > 0
-        )
+        value = self.texture.eval(self._place(d, self.rows), active)[0]
+        return self.even * dr.inv_pi + self.scale * dr.minimum(value, self.ceiling)
 
     def _mapped(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        return self._scale * self._texture.eval(self._place(d, self._rows), active)[0]
+        return self.scale * self.texture.eval(self._place(d, self.rows), active)[0]
 
     def _place(self, v: mi.Vector3f, rows: mi.Float | float) -> mi.Point2f:
         """Place of directions (scene's frame) in a texture with so many rows, and one more at both ends."""
-        w = mi.Vector3f(*(dr.dot(axis, v) for axis in self._axes))
+        w = mi.Vector3f(*(dr.dot(axis, v) for axis in self.axes))
         polar = dr.acos(dr.clip(w.z, -1, 1)) * dr.inv_pi
         return mi.Point2f(0.5 - dr.atan2(w.y, w.x) * (0.5 * dr.inv_pi), (1 + polar * rows) / (rows + 2))
 
@@ -337,8 +333,33 @@ class Ambience:
 
     def irradiances(self, x: mi.Vector3f, n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """The same: of even light and of the soft part of the map; of the rest of the map and of panels."""
-        soft, rest = self._table.eval(self._place(n, float(_NORMALS)))
-        return self._even + self._scale * soft, self._scale * rest + self._panels.irradiance(x, n)
+        soft, rest = self.table.eval(self._place(n, float(_NORMALS)))
+        return self.even + self.scale * soft, self.scale * rest + self.panels.irradiance(x, n)
+
+
+def bright_lamps(spec: RadianceMap | None, maps: Maps, anchor_mm: Floats) -> tuple[Lamp, ...]:
+    """The light of a map that exceeds its soft part, as far lamps.
+
+    Args:
+        spec: the map.
+        maps: the maps that are kept.
+        anchor_mm: origin of the scene's frame in the world.
+    """
+    if spec is None:
+        return ()
+    bright = maps.of(spec)[2].bright @ map_rotation(spec).T * (spec.scale_w_m2_sr * 1e-3)
+    size = np.linalg.norm(bright, axis=1)
+    return tuple(
+        Lamp(
+            position_mm=frozen(anchor_mm + _FAR_MM * flux / one),
+            axis=frozen(-flux / one),
+            radius_mm=0.0,
+            intensity_mw_sr=float(one * _FAR_MM**2),
+            lobe_exponent=0.0,
+        )
+        for flux, one in zip(bright, size, strict=True)
+        if one > 0
+    )
 
 
 def _reduced(values: Floats) -> Floats:

@@ -15,9 +15,9 @@ included.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -45,11 +45,10 @@ from .chamber import (
     through_limbus,
 )
 from .chamber import TURNS as IRIS_TURNS
-from .frame import RenderJob
+from .frame import LampTable, RenderJob
 from .kept import KeptForEye
 from .lighting import irradiance, off_cornea, onto_points, through_cornea
 from .manifold import CORNEA_MM
-from .parameters import leaves, traversed
 from .places import (
     GLOBE_COLUMNS,
     GLOBE_ROWS,
@@ -66,7 +65,7 @@ from .places import (
     skin_places,
 )
 from .recorded import recorded
-from .values import aligned, one_by_one, sent
+from .values import Lights, Values, aligned, one_by_one, sent
 from .view import Textures, appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
@@ -74,13 +73,13 @@ if TYPE_CHECKING:
     from .prepared import Prepared
     from .region import RegionScene
     from .surround import Surround
-    from .values import Lamp, Lights, Values
+    from .values import Lamp
 
 RAYS = 24  # from each place on the globe or about it
 _SKIN_RAYS, _INNER_RAYS = 10, 2  # from places on the skin, and on the lids' inner sides, which lie in the dark
 _HALVINGS = 14, 15  # of the rays that leave the eye into bundles, without and with light from afar
 _LANES = 4096  # there are lanes for so many times as many rays, so that recordings serve many subjects
-_MIRRORED = 256  # and for places that the cornea mirrors lamps to, so that they serve many poses
+_PLACES = 256  # and for places, so that they serve many subjects and poses
 _ROUNDS = 6
 _START_MM = 0.02
 _SMALL, _SPOTS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
@@ -90,69 +89,83 @@ _ALPHA = (0.7548776662466927, 0.5698402909980532)
 _SHUFFLED = 0x9E3779B1
 
 
+@dataclass(kw_only=True)
 class Received:
     """What the places receive, for the kernels: irradiance by way of other surfaces, and the share of open sky.
 
     Every surface has four numbers a place: irradiance from other surfaces, share of the sky that is open, whole
     irradiance (what a mirror image of the place shows), and 0. Without exchange all of it is dark and open.
+
+    Attributes:
+        on: whether surfaces send light to each other.
+        between: whether the grid of places on the globe lies between lids.
+        columns: of that grid.
+        rows: of that grid.
+        centre: of the globe (scene's frame, mm).
+        first: y (mm) of the first column between lids.
+        per_mm: columns per mm.
+        root2: squared radius of the root of the iris, mm^2.
+        reach2: squared reach of the chamber, mm^2.
+        plane: y and z of the middle of the surround's rings, and the radius of the first (mm).
+        ends: lower and upper end of each column (mm).
+        on_globe: four numbers for each place of the globe.
+        on_other: four numbers for each place of the surround.
+        on_iris: one number for each place of the iris.
     """
 
-    DRJIT_STRUCT = leaves(
-        "on", "_between", "_columns", "_rows", "_centre", "_first", "_per_mm", "_root2", "_reach2", "_plane", "_ends",
-        "_globe", "_other", "_iris",
-    )  # fmt: skip
+    on: mi.Bool
+    between: bool
+    columns: int
+    rows: int
+    centre: mi.Vector3f
+    first: mi.Float
+    per_mm: mi.Float
+    root2: mi.Float
+    reach2: mi.Float
+    plane: tuple[mi.Float, mi.Float, mi.Float]
+    ends: mi.Float
+    on_globe: mi.Float
+    on_other: mi.Float
+    on_iris: mi.Float
 
-    def __init__(self, on: bool, chamber: Chamber, globe: GlobePlaces, plane: tuple[float, float, float]) -> None:
+    @classmethod
+    def dark(cls, on: bool, chamber: Chamber, globe: GlobePlaces, plane: tuple[float, float, float]) -> Received:
         """Send the places to the device; they receive nothing.
 
         Args:
             on: whether surfaces send light to each other.
             chamber: the chamber of the eye.
             globe: the places on the globe.
-            plane: y and z of the middle of the surround's rings, and the radius of the first (mm).
+            plane: as the attribute.
         """
-        self.on = dr.opaque(mi.Bool, on)
-        self._between = globe.columns == GLOBE_COLUMNS
-        self._columns, self._rows = globe.columns, globe.rows
         rim = [chamber.root_mm**2, chamber.reach_mm**2]
         n = one_by_one(np.array([*globe.table[:5], *rim, *plane], dtype=np.float32))
-        self._centre, self._first, self._per_mm = mi.Vector3f(*n[:3]), n[3], n[4]
-        self._root2, self._reach2, self._plane = n[5], n[6], n[7:]
-        self._ends = sent(globe.table[5:])
-        self._globe, self._other, self._iris = sent(np.zeros(4)), sent(np.zeros(4)), sent(np.zeros(1))
+        none = sent(np.zeros(4))
+        return cls(
+            on=dr.opaque(mi.Bool, on), between=globe.columns == GLOBE_COLUMNS, columns=globe.columns, rows=globe.rows,
+            centre=mi.Vector3f(*n[:3]), first=n[3], per_mm=n[4], root2=n[5], reach2=n[6], plane=(n[7], n[8], n[9]),
+            ends=sent(globe.table[5:]), on_globe=none, on_other=none, on_iris=none,
+        )  # fmt: skip
 
     def filled(self, globe: Floats, other: Floats, iris: Floats) -> Received:
-        """The same places with what they receive.
-
-        Args:
-            globe: four numbers for each place of the globe.
-            other: four numbers for each place of the surround, or vertex of the region.
-            iris: one number for each place of the iris.
-        """
-        made = copy(self)
-        made._globe, made._other, made._iris = sent(globe), sent(other), sent(iris)
-        return made
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Columns and rows of the grid of places on the globe."""
-        return self._columns, self._rows
+        """The same places with what they receive, in the order of the attributes `on_globe`, `on_other`, `on_iris`."""
+        return replace(self, on_globe=sent(globe), on_other=sent(other), on_iris=sent(iris))
 
     def globe(self, x: mi.Vector3f) -> mi.Vector4f:
         """Numbers of points of the globe, given in the scene's frame."""
-        beyond = 0.5 if self._between else 0.0  # the last rows are half a row from the lids, where light changes fast
-        return _bilinear(self._globe, *self.globe_place(x), self._columns, self._rows, beyond)
+        beyond = 0.5 if self.between else 0.0  # the last rows are half a row from the lids, where light changes fast
+        return _bilinear(self.on_globe, *self.globe_place(x), self.columns, self.rows, beyond)
 
     def globe_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Column and row of points of the globe in the grid of its places."""
-        if self._between:
-            column = dr.clip((x.y - self._first) * self._per_mm, 0, GLOBE_COLUMNS - 1)
+        if self.between:
+            column = dr.clip((x.y - self.first) * self.per_mm, 0, GLOBE_COLUMNS - 1)
             i = mi.UInt32(dr.minimum(column, GLOBE_COLUMNS - 1.001))
             w = column - mi.Float(i)
-            a, b = (dr.gather(mi.Vector2f, self._ends, i + k) for k in (0, 1))
+            a, b = (dr.gather(mi.Vector2f, self.ends, i + k) for k in (0, 1))
             low, high = a.x + w * (b.x - a.x), a.y + w * (b.y - a.y)
-            return column, (x.z - low) / (high - low) * self._rows - 0.5
-        r = dr.normalize(x - self._centre)
+            return column, (x.z - low) / (high - low) * self.rows - 0.5
+        r = dr.normalize(x - self.centre)
         polar = dr.acos(dr.clip(r.x, -1, 1)) / WIDEST
         inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
         middle = 0.5 * (MAP_SIDE - 1)
@@ -160,23 +173,23 @@ class Received:
 
     def iris(self, x: mi.Vector3f) -> mi.Float:
         """Irradiance of points in the plane of the iris (eye frame), without the light straight from the lamps."""
-        return _around(self._iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float)
+        return _around(self.on_iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float)
 
     def iris_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Ring and turn of points in the plane of the iris among the places of the chamber."""
         turn = dr.atan2(x.z, x.y) * (IRIS_TURNS * 0.5 * dr.inv_pi) - 0.5
         r2 = x.y * x.y + x.z * x.z
-        beyond = dr.maximum(r2 - self._root2, 0) * ((IRIS_RINGS - ROOT_RINGS) / (self._reach2 - self._root2))
-        ring = dr.minimum(r2 / self._root2, 1) * ROOT_RINGS + beyond - 0.5
+        beyond = dr.maximum(r2 - self.root2, 0) * ((IRIS_RINGS - ROOT_RINGS) / (self.reach2 - self.root2))
+        ring = dr.minimum(r2 / self.root2, 1) * ROOT_RINGS + beyond - 0.5
         return ring, dr.select(turn < 0, turn + IRIS_TURNS, turn)
 
     def surround(self, x: mi.Vector3f) -> mi.Vector4f:
         """Numbers of points of the surround's plane, given in the scene's frame."""
-        return _around(self._other, *self.surround_place(x), RINGS, TURNS, mi.Vector4f)
+        return _around(self.on_other, *self.surround_place(x), RINGS, TURNS, mi.Vector4f)
 
     def surround_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Ring and turn of points of the surround's plane among its places."""
-        y, z, inner = self._plane
+        y, z, inner = self.plane
         dy, dz = x.y - y, x.z - z
         out = dr.maximum(dr.sqrt(dy * dy + dz * dz) - inner, 0) / PLANE_FIRST_MM
         ring = dr.log(1 + out) * ((RINGS - 1) / float(np.log1p(PLANE_MM / PLANE_FIRST_MM)))
@@ -319,7 +332,7 @@ class _Plan:
             stands_for = mi.Int32(aligned(table.astype(np.int32).ravel()))
             near, weight = mi.UInt32(aligned(skin.near.T.astype(np.uint32).ravel())), sent(skin.weight.T.ravel())
         rays = int(count.sum())
-        of_place = np.zeros(-(-rays // _LANES) * _LANES, np.uint32)
+        of_place = np.zeros(_rounded(rays, _LANES), np.uint32)
         of_place[:rays] = np.repeat(np.arange(len(count)), count)
         return cls(skin, count, mi.UInt32(aligned(of_place)), stands_for, near, weight)
 
@@ -377,7 +390,7 @@ class Exchange:
         self._interiors: KeptForEye[_Interior] = KeptForEye()
 
     def begun(
-        self, host: Prepared, values: Values, lights: Lights, panels: Lights, textures: Textures,
+        self, host: Prepared, values: Values, lights: Lights, panels: LampTable, textures: Textures,
         place: Surround | RegionScene,
     ) -> Callable[[], Callable[[], Received]]:  # fmt: skip
         """Begin to find what the places of a frame receive straight from the lamps, and what they see of each other.
@@ -387,7 +400,7 @@ class Exchange:
             other work.
 
         Args:
-            host: the job, and the places on the globe.
+            host: the job, its lamps, and the places on the globe.
             values: its numbers.
             lights: its lamps.
             panels: parts of its panels, and the bright parts of its map, as lamps.
@@ -398,19 +411,17 @@ class Exchange:
 
         region = place if isinstance(place, RegionScene) else None
         frame, job = self._frame(host, region), host.job
-        numbers = Received(job.interreflection, frame.chamber, frame.grid, frame.plane)
+        numbers = Received.dark(job.interreflection, frame.chamber, frame.grid, frame.plane)
         if not job.interreflection and not values.structure.ambient:
             return lambda: lambda: numbers.filled(*frame.dark(region))
-        outer = sent(frame.outer)
-        direct, ambient = _direct(values, lights, panels, place.scene, textures, frame, outer)
-        mirrored = _mirrored(values, lights, place.scene, frame)
-        lamps, more = (_direct_inside(values, some, place.scene, frame.interior.rows) for some in (lights, panels))
-        seen = _seen(values, lights, textures, place, numbers, frame, outer)
+        tables, sizes = _tables(frame, host.lamps, panels)
+        found = _light_places(
+            values, lights, Lights.upload(panels), textures, place.scene, numbers, tables, sizes
+        )  # fmt: skip
 
         def read() -> Callable[[], Received]:
-            # Nothing is read before all is launched, because every read waits for all launches.
-            known = mirrored(), ambient(), direct(), lamps(), more(), seen()
-            return lambda: numbers.filled(*frame.solved(region, *known))
+            known = found.read(frame, sizes)
+            return lambda: numbers.filled(*frame.solved(region, known))
 
         return read
 
@@ -446,7 +457,7 @@ def _halvings(ambient: Ambient) -> int:
     return _HALVINGS[ambient.map is not None or ambient.irradiance_w_m2 > 0]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Frame:
     """The places of a frame: on the globe, on skin or surround (`points`, `normals`), on the limbus, in the chamber."""
 
@@ -478,6 +489,16 @@ class _Frame:
         """Number of places outside the chamber; the last ones are on the limbus."""
         return len(self.grid.points) + len(self.points) + IRIS_TURNS
 
+    @cached_property
+    def near_cornea(self) -> Ints:
+        """Places on skin and lids, by their numbers there, to which the cornea may mirror lamps."""
+        job = self.job
+        if self.plan.skin is None or not job.interreflection:
+            return np.zeros(0, int)
+        bulge = job.M @ (np.asarray(job.eye.front[0].origin_mm) - [CORNEA_MM, 0, 0]) + (job.t - job.anchor_mm)
+        way = bulge - self.points
+        return np.flatnonzero((lengths(way) < _CLOSE_MM) & (dots(way, self.normals) > -0.5 * CORNEA_MM))
+
     @property
     def outer(self) -> Floats:
         """Points and normals of the places outside the chamber, (n, 6)."""
@@ -492,7 +513,7 @@ class _Frame:
         """Tables, as for `Received.filled`, of nothing but light straight from the lamps."""
         other = np.tile([0.0, 1.0, 0.0, 0.0], (len(self.points) if region is None else len(region.posed.vertices), 1))
         if region is not None:
-            region.skin.shine(sent(other))
+            region.skin.received = sent(other)
         return np.tile([0.0, 1.0, 0.0, 0.0], (self.on_globe, 1)), other, np.zeros(IRIS)
 
     def _on_iris(self, values: Floats, along: float) -> Floats:
@@ -512,28 +533,24 @@ class _Frame:
             out[: len(points)][~valid] = np.flatnonzero(valid)[nearest]
         return out
 
-    def solved(
-        self, region: RegionScene | None, mirrored: Floats, ambient: list[Floats],
-        straight: Floats, lamps: Floats, panels: Floats, seen: _Seen,
-    ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+    def solved(self, region: RegionScene | None, known: _Known) -> tuple[Floats, Floats, Floats]:
         """Solve for the irradiance of all places: tables as for `Received.filled`."""
-        job, outside = self.job, self.outside
-        direct, bare = np.split(straight, 2)
+        job, outside, seen = self.job, self.outside, known.seen
         # What is hidden of soft light is told by the rays, and of the rest by what stands before its parts.
-        soft, hard, free, shaded = ambient
+        soft, hard = known.soft, known.hard
         sky = seen.mean(seen.sky) if np.any(soft) else np.zeros(outside + PLACES)
-        arriving = hard * _over(shaded, free)
+        arriving = hard * _over(known.shaded, known.free)
         if np.any(soft):
             arriving += soft * _over(sky[:outside], seen.mean(seen.free)[:outside])
         valid = seen.mean(seen.near)[: self.on_globe] < 0.5
         if region is None:
             valid &= self.grid.points[:, 0] > -job.look.backdrop_distance_mm
-        start = np.concatenate([direct + arriving, lamps + panels + sky[outside:]])
+        start = np.concatenate([known.direct + arriving, known.lamps + known.panels + sky[outside:]])
         total, arrived, within = start, np.zeros(outside + PLACES), np.zeros(PLACES)
         if job.interreflection:
             exchange, inner, limbus = seen.exchange(self._stand_in(valid)), self.interior.exchange, self.interior.limbus
-            more = seen.correction(direct, bare)
-            more[:outside] += mirrored
+            more = seen.correction(known.direct, known.bare)
+            more[:outside] += known.mirrored
             for _ in range(_ROUNDS):
                 arrived = exchange @ total + more
                 within = inner @ total[outside:] + limbus @ total[outside - IRIS_TURNS : outside]
@@ -550,11 +567,11 @@ class _Frame:
         globe = filled(table[: self.on_globe], valid, self.grid.rows, self.grid.columns, across)
         other = table[self.on_globe : outside - IRIS_TURNS]
         if region is not None:
-            region.skin.shine(self.plan.at_vertices(other[: self.on_skin]))
+            region.skin.received = self.plan.at_vertices(other[: self.on_skin])
             other = np.zeros((1, 4))
         for part in (globe, other):
             part[:, 1], part[:, 3] = _over(part[:, 1], part[:, 3]), 0
-        iris = self._on_iris((arrived + sky)[outside:], 1.0) + self._on_iris(within + panels, 0.0)
+        iris = self._on_iris((arrived + sky)[outside:], 1.0) + self._on_iris(within + known.panels, 0.0)
         return globe, other, iris
 
 
@@ -587,79 +604,229 @@ def _spots(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
     return u, v
 
 
-def _direct(
-    values: Values, lights: Lights, panels: Lights, scene: mi.Scene, textures: Textures, frame: _Frame, outer: mi.Float
-) -> tuple[Callable[[], Floats], Callable[[], list[Floats]]]:
-    """Irradiance of places outside the eye, whose points and normals are in `outer`, to be read later.
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """What is known of the light before it is solved for, on the host.
 
-    Straight from the lamps, with shadows and then without; from ambient light without shadows: what is
-    soft, and the rest; this rest from its parts, without and with shadows.
+    For the places outside the eye (n,): irradiance straight from the lamps with and without shadows, `direct` and
+    `bare`, and by way of the cornea, `mirrored`; of ambient light without shadows what is `soft` and what is `hard`;
+    this rest from its parts without and with shadows, `free` and `shaded`. For the places of the chamber: irradiance
+    straight from `lamps` and `panels`. `seen` is what the rays of all places meet.
     """
-    count = frame.outside
-    kinds = tuple(dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.on_skin, count - IRIS_TURNS))
-    ways = values, scene, outer, kinds
-    views = textures.lamp_views
-    lit = _over_lamps(lights, 2 * count, lambda first: list(_onto_outer(*ways, lights, views, first, count)))
-    soft = hard = free = shaded = None
-    if values.structure.ambient:
-        assert textures.ambience is not None
-        index = dr.arange(mi.UInt32, count)
-        n = _row(outer, 6, index)
-        soft, hard = textures.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
-        dr.eval(soft, hard)
-    if len(panels):
-        shaded, free = _onto_outer(*ways, panels, None, None, count)
-    parts = soft, hard, free, shaded
-    return lit, lambda: [np.zeros(count) if part is None else part.numpy().astype(float) for part in parts]
+
+    direct: Floats
+    bare: Floats
+    mirrored: Floats
+    soft: Floats
+    hard: Floats
+    free: Floats
+    shaded: Floats
+    lamps: Floats
+    panels: Floats
+    seen: _Seen
+
+
+@dataclass(kw_only=True)
+class _Tables:
+    """The places of a frame on the device.
+
+    Attributes:
+        outer: points and normals of those outside the eye (scene's frame).
+        inside: those of the chamber, as in `_Interior`.
+        near_cornea: places on skin to which the cornea mirrors lamps, and some more; None for none.
+        leaving: rays that leave the eye.
+        of_place: the place of each ray outside the eye.
+        stands_for: the places that stand for both sides of each vertex.
+        on_globe: number of places on the globe.
+        on_skin: number of places on skin.
+        before_limbus: number of places outside the eye that are not on the limbus.
+        outside: number of places outside the eye.
+        rays_outside: number of their rays.
+        rays: number of all rays.
+        spots: numbers with which the places on the lamps' discs begin: for places outside, near the cornea, and inside.
+    """
+
+    outer: mi.Float
+    inside: mi.Float
+    near_cornea: mi.Float | None
+    leaving: mi.Float
+    of_place: mi.UInt32
+    stands_for: mi.Int32
+    on_globe: mi.UInt32
+    on_skin: mi.UInt32
+    before_limbus: mi.UInt32
+    outside: mi.UInt32
+    rays_outside: mi.UInt32
+    rays: mi.UInt32
+    spots: tuple[tuple[mi.UInt32, ...], tuple[mi.UInt32, ...], tuple[mi.UInt32, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Sizes:
+    """Sizes of a frame's arrays.
+
+    Attributes:
+        outside: lanes for places outside the eye.
+        near_cornea: lanes for those to which the cornea mirrors lamps.
+        lanes: lanes for rays.
+        at_spots: number of rays that look for the light at the very point of the skin that they meet.
+        lamps: whether there are lamps.
+        panels: whether there are parts of panels or bright parts of a map.
+    """
+
+    outside: int
+    near_cornea: int
+    lanes: int
+    at_spots: int
+    lamps: bool
+    panels: bool
+
+
+def _tables(frame: _Frame, lamps: LampTable, panels: LampTable) -> tuple[_Tables, _Sizes]:
+    """Send the places of a frame to the device."""
+    plan, interior = frame.plan, frame.interior
+    inside = interior.gain.shape[1]
+    near = frame.near_cornea if len(lamps) else np.zeros(0, int)
+    sizes = _Sizes(
+        outside=_rounded(frame.outside, _PLACES),
+        near_cornea=_rounded(len(near), _PLACES),
+        lanes=_rounded(plan.rays + inside, _LANES),
+        at_spots=frame.on_globe * RAYS + inside if plan.skin is not None and len(lamps) else 0,
+        lamps=len(lamps) > 0,
+        panels=len(panels) > 0,
+    )
+    rows = None
+    if len(near):
+        padded = np.append(near, np.full(sizes.near_cornea - len(near), near[0]))
+        rows = sent(np.column_stack([frame.points[padded], frame.normals[padded]]))
+    counts = (
+        frame.on_globe, frame.on_skin, frame.outside - IRIS_TURNS, frame.outside, plan.rays, plan.rays + inside
+    )  # fmt: skip
+    on_globe, on_skin, before_limbus, outside, rays_outside, rays = (dr.opaque(mi.UInt32, n) for n in counts)
+    each = 1 if lamps.widest < _SMALL else _SPOTS
+    outer, mirrored, within = (
+        tuple(dr.opaque(mi.UInt32, k * width) for k in range(each))
+        for width in (2 * frame.outside, sizes.near_cornea, PLACES)
+    )
+    tables = _Tables(
+        outer=sent(np.resize(frame.outer, (sizes.outside, 6))), inside=interior.rows, near_cornea=rows,
+        leaving=interior.leaving, of_place=plan.of_place, stands_for=plan.stands_for, on_globe=on_globe,
+        on_skin=on_skin, before_limbus=before_limbus, outside=outside, rays_outside=rays_outside, rays=rays,
+        spots=(outer, mirrored, within),
+    )  # fmt: skip
+    return tables, sizes
+
+
+@dataclass(kw_only=True)
+class _Found:
+    """What the device finds out about the light of the places; the fields are those of `_Known`.
+
+    There is a number for each place on the lamps' discs. `met` and `lit` are the columns of `_Seen`.
+    """
+
+    direct: list[tuple[mi.Float, mi.Float]]
+    mirrored: list[mi.Float]
+    soft: mi.Float | None
+    hard: mi.Float | None
+    free: mi.Float | None
+    shaded: mi.Float | None
+    lamps: list[list[mi.Float]]
+    panels: list[list[mi.Float]]
+    met: tuple[mi.Float, ...]
+    lit: mi.Float | None
+
+    def read(self, frame: _Frame, sizes: _Sizes) -> _Known:
+        """Read it, which waits for all launches."""
+        count = frame.outside
+        direct, bare = (part[:count] for part in np.split(_mean(self.direct, 2 * sizes.outside), 2))
+        mirrored = np.zeros(count)
+        near = frame.near_cornea
+        if self.mirrored:
+            mirrored[frame.on_globe + near] = _mean([[one] for one in self.mirrored], sizes.near_cornea)[: len(near)]
+        soft, hard, free, shaded = (
+            np.zeros(count) if part is None else part.numpy()[:count].astype(float)
+            for part in (self.soft, self.hard, self.free, self.shaded)
+        )
+        lamps, panels = _mean(self.lamps, PLACES), _mean(self.panels, PLACES)
+        return _Known(direct, bare, mirrored, soft, hard, free, shaded, lamps, panels, self._seen(frame))
+
+    def _seen(self, frame: _Frame) -> _Seen:
+        plan, globe = frame.plan, frame.on_globe * RAYS
+        rays = plan.rays + frame.interior.gain.shape[1]
+        lit = np.full(rays, -1.0, np.float32)
+        if self.lit is not None:
+            straight = self.lit.numpy()
+            lit[:globe], lit[plan.rays :] = straight[:globe], straight[globe:]
+        target, weight, near, sky, free, bare = (column.numpy()[:rays] for column in self.met)
+        shares = _shares(plan.count, frame.interior.gain)
+        bare = lit if plan.skin is None else bare
+        return _Seen(shares, target, weight, near, sky, free, lit, bare)
+
+
+def _rounded(number: int, step: int) -> int:
+    """Round up to a multiple of a step."""
+    return -(-number // step) * step
+
+
+def _mean(found: Sequence[Sequence[mi.Float]], width: int) -> Floats:
+    """Mean (width,) over the places on the lamps' discs; each has some of the columns after others."""
+    total = np.zeros(width)
+    for parts in found:
+        total += np.concatenate([part.numpy() for part in parts])
+    return total / max(len(found), 1)
 
 
 @recorded
-def _onto_outer(
-    values: Values, scene: mi.Scene, outer: mi.Float, kinds: tuple[mi.UInt32, ...], lights: Lights,
-    views: LampViews | None, first: mi.UInt32 | None, count: int,
-) -> tuple[mi.Float, mi.Float]:  # fmt: skip
-    """Irradiance of places outside the eye from lamps, with and without shadows.
+def _light_places(
+    values: Values, lights: Lights, panels: Lights, textures: Textures, scene: mi.Scene, numbers: Received,
+    tables: _Tables, sizes: _Sizes,
+) -> _Found:  # fmt: skip
+    """Find the light that the places of a frame receive straight from all lamps, and what they see of each other."""
+    views = textures.lamp_views
+    outer, mirrored, within = tables.spots
+    direct = [_onto_outer(values, scene, tables, lights, views, first, sizes.outside) for first in outer]
+    soft = hard = free = shaded = None
+    if values.structure.ambient:
+        n = _row(tables.outer, 6, dr.arange(mi.UInt32, sizes.outside))
+        soft, hard = textures.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
+        dr.eval(soft, hard)
+    if sizes.panels:
+        shaded, free = _onto_outer(values, scene, tables, panels, None, None, sizes.outside)
+    off = []
+    if tables.near_cornea is not None:
+        off = [_off_cornea(values, lights, scene, tables.near_cornea, first, sizes.near_cornea) for first in mirrored]
+    inside = [_inside(values, lights, scene, tables.inside, first) for first in within] if sizes.lamps else []
+    parts = [_inside(values, panels, scene, tables.inside, within[0])] if sizes.panels else []
+    met, spot = _rays_of(values, lights, textures, scene, numbers, tables, sizes.lanes)
+    lit = None
+    if sizes.at_spots:
+        lit = _at_spots(values, lights, scene, views, spot, tables, sizes.at_spots)
+    return _Found(
+        direct=direct, mirrored=off, soft=soft, hard=hard, free=free, shaded=shaded, lamps=inside, panels=parts,
+        met=met, lit=lit,
+    )  # fmt: skip
 
-    There are `count` of them. `kinds` are the numbers of places on the globe and on skin, and of those
-    before the limbus. Places on the lamps' discs begin with the number `first`; without it these are their middles.
+
+def _onto_outer(
+    values: Values, scene: mi.Scene, tables: _Tables, lights: Lights, views: LampViews | None,
+    first: mi.UInt32 | None, count: int,
+) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+    """Irradiance of the places outside the eye from lamps, with and without shadows; `count` lanes.
+
+    Places on the lamps' discs begin with the number `first`; without it these are their middles.
     """
     index = dr.arange(mi.UInt32, count)
-    n = _row(outer, 6, index)
+    n = _row(tables.outer, 6, index)
     x, normal = mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:])
-    globe, skin, rim = kinds
-    away = (index >= globe) & (index < rim)
+    away = (index >= tables.on_globe) & (index < tables.before_limbus)
     start, facing = values.point_to_eye(x + _START_MM * normal), values.vector_to_eye(normal)
     u, v = (mi.Float(0), mi.Float(0)) if first is None else _spots(index + first)
-    sheet = away & (index < globe + skin)
+    sheet = away & (index < tables.on_globe + tables.on_skin)
     found = onto_points(values, lights, scene, start, facing, away, u, v, views, sheet)
     dr.eval(found)
     return found
 
 
-def _mirrored(values: Values, lights: Lights, scene: mi.Scene, frame: _Frame) -> Callable[[], Floats]:
-    """Irradiance of places outside the eye from the lamps by way of the cornea: of skin near it that may face it."""
-    total, job = np.zeros(frame.outside), frame.job
-    if frame.plan.skin is None or not len(lights) or not job.interreflection:
-        return lambda: total
-    bulge = job.M @ (np.asarray(job.eye.front[0].origin_mm) - [CORNEA_MM, 0, 0]) + (job.t - job.anchor_mm)
-    way = bulge - frame.points
-    near = (lengths(way) < _CLOSE_MM) & (dots(way, frame.normals) > -0.5 * CORNEA_MM)
-    places = np.flatnonzero(near)
-    if not len(places):
-        return lambda: total
-    lanes = -(-len(places) // _MIRRORED) * _MIRRORED
-    padded = np.append(places, np.full(lanes - len(places), places[0]))
-    rows = sent(np.column_stack([frame.points[padded], frame.normals[padded]]).ravel())
-    lit = _over_lamps(lights, lanes, lambda first: [_off_cornea(values, lights, scene, rows, first, lanes)])
-
-    def read() -> Floats:
-        total[frame.on_globe + places] = lit()[: len(places)]
-        return total
-
-    return read
-
-
-@recorded
 def _off_cornea(
     values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32, count: int
 ) -> mi.Float:
@@ -673,14 +840,6 @@ def _off_cornea(
     return lit
 
 
-def _direct_inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float) -> Callable[[], Floats]:
-    """Irradiance (PLACES,) of the chamber's places straight from lamps; rows hold them as in `_Interior`."""
-    if len(lights) == 0:
-        return lambda: np.zeros(PLACES)
-    return _over_lamps(lights, PLACES, lambda first: _inside(values, lights, scene, rows, first))
-
-
-@recorded
 def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
     """Irradiance of the chamber's places from lamps; places on their discs begin with the number `first`."""
 
@@ -698,22 +857,6 @@ def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, fir
     return parts
 
 
-def _over_lamps(lights: Lights, width: int, light: Callable[[mi.UInt32], list[mi.Float]]) -> Callable[[], Floats]:
-    """Mean (width,) of `light` over places on the lamps' discs; small lamps need one.
-
-    Its argument is the number with which the places begin. It returns some of the columns after others.
-    """
-    found = [light(dr.opaque(mi.UInt32, k * width)) for k in range(1 if lights.widest < _SMALL else _SPOTS)]
-
-    def read() -> Floats:
-        total = np.zeros(width)
-        for parts in found:
-            total += np.concatenate([part.numpy() for part in parts])
-        return total / len(found)
-
-    return read
-
-
 def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
     """Cosine-distributed directions about normals; rays of a place have consecutive numbers."""
     u, v = _spots(ray)
@@ -723,73 +866,25 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
     return (r * c) * e1 + (r * s) * e2 + dr.sqrt(1 - u) * normal
 
 
-def _seen(
-    values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene, numbers: Received, frame: _Frame,
-    outer: mi.Float,
-) -> Callable[[], _Seen]:  # fmt: skip
-    """What the rays of the places outside and of those in the chamber meet."""
-    plan, interior = frame.plan, frame.interior
-    inside = interior.gain.shape[1]
-    rays = plan.rays + inside
-    outside, all_rays = (dr.opaque(mi.UInt32, n) for n in (plan.rays, rays))
-    on_globe, of_outside, on_skin = (dr.opaque(mi.UInt32, n) for n in (frame.on_globe, frame.outside, frame.on_skin))
-    kinds = _Kinds(on_globe, of_outside, on_skin, plan.stands_for)
-    lanes = -(-rays // _LANES) * _LANES
-    results, spot = _rays_of(
-        values, lights, textures, place.scene, numbers, plan.of_place, outer, interior.leaving, (outside, all_rays),
-        kinds, lanes,
-    )  # fmt: skip
-    globe, found = frame.on_globe * RAYS, None
-    if plan.skin is not None and len(lights):
-        views, ends = textures.lamp_views, (dr.opaque(mi.UInt32, globe), outside)
-        found = _at_spots(values, lights, place.scene, views, spot, ends, globe + inside)
-
-    def read() -> _Seen:
-        lit = np.full(rays, -1.0, np.float32)
-        if found is not None:
-            straight = found.numpy()
-            lit[:globe], lit[plan.rays :] = straight[:globe], straight[globe:]
-        shares = _shares(plan.count, interior.gain)
-        bare = lit if plan.skin is None else results[-1].numpy()[:rays]
-        target, weight, close, sky, free = (r.numpy()[:rays] for r in results[:-1])
-        return _Seen(shares, target, weight, close, sky, free, lit, bare)
-
-    return read
-
-
-@traversed
-@dataclass(frozen=True, slots=True)
-class _Kinds:
-    """Numbers of places on the globe, outside the eye, and on skin, and the places for both sides of vertices."""
-
-    on_globe: mi.UInt32
-    outside: mi.UInt32
-    on_skin: mi.UInt32
-    stands_for: mi.Int32
-
-
-@recorded
 def _rays_of(
-    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, numbers: Received, of_place: mi.UInt32,
-    outer: mi.Float, leaving: mi.Float, ends: tuple[mi.UInt32, mi.UInt32], kinds: _Kinds, lanes: int,
-) -> tuple[tuple[Any, ...], tuple[Any, ...]]:  # fmt: skip
+    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, numbers: Received, tables: _Tables, lanes: int
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """What the rays of places meet: the columns of `_Seen` but for `lit`, and places on skin (see `_met`).
 
-    The first rays belong to places outside the eye, whose numbers are in `of_place`. The `ends` are their number, and
-    that of all rays; there are more lanes.
+    The first rays belong to places outside the eye. There are more lanes than rays.
     """
-    index = dr.arange(mi.UInt32, lanes)
-    first, count = ends
-    outside, inside = index < first, (index >= first) & (index < count)
-    row = dr.gather(mi.UInt32, of_place, index, outside)
-    n = _row(outer, 6, row, outside)
+    index, first = dr.arange(mi.UInt32, lanes), tables.rays_outside
+    outside, inside = index < first, (index >= first) & (index < tables.rays)
+    row = dr.gather(mi.UInt32, tables.of_place, index, outside)
+    n = _row(tables.outer, 6, row, outside)
     normal = mi.Vector3f(*n[3:])
     o = mi.Vector3f(*n[:3]) + _START_MM * normal
     d = _pattern(normal, index)
-    rays = _row(leaving, 6, index - first, inside)
+    rays = _row(tables.leaving, 6, index - first, inside)
     o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
     d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
-    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, index, index < count, kinds)
+    active = index < tables.rays
+    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, index, active, tables)
     sky = mi.Float(0) * o.x
     if values.structure.ambient:
         assert textures.ambience is not None
@@ -816,21 +911,18 @@ def _bare(lights: Lights, on_skin: mi.Bool, x: mi.Vector3f, normal: mi.Vector3f)
     return dr.select(on_skin, total, -1)
 
 
-@recorded
 def _at_spots(
-    values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, spot: tuple[Any, ...],
-    ends: tuple[mi.UInt32, mi.UInt32], lanes: int,
+    values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, spot: tuple[Any, ...], tables: _Tables,
+    lanes: int,
 ) -> mi.Float:  # fmt: skip
     """Irradiance straight from the lamps at points of the skin that rays of globe and chamber have met, else -1.
-
-    The `ends` are the numbers of rays of the globe and of all places outside the eye.
 
     What eye and lids send to each other in the narrow space between them comes from places close by, where the light
     changes within a fraction of the distance of the places.
     """
     index = dr.arange(mi.UInt32, lanes)
-    globe, outside = ends
-    number = dr.select(index < globe, index, index - globe + outside)
+    globe = tables.on_globe * RAYS
+    number = dr.select(index < globe, index, index - globe + tables.rays_outside)
     on_skin, x, normal = (dr.gather(type(part), part, number) for part in spot)
     state = (on_skin, x, normal, number)
 
@@ -846,7 +938,7 @@ def _at_spots(
 
 def _met(
     values: Values, textures: Textures, scene: mi.Scene, numbers: Received, o: mi.Vector3f, d: mi.Vector3f,
-    index: mi.UInt32, active: mi.Bool, kinds: _Kinds,
+    index: mi.UInt32, active: mi.Bool, tables: _Tables,
 ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float, tuple[mi.Bool, mi.Vector3f, mi.Vector3f]]:  # fmt: skip
     """What is met along rays with these numbers.
 
@@ -858,15 +950,15 @@ def _met(
     albedo = outer_albedo(values, textures, view)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
     s, t = _spots(index * mi.UInt32(_SHUFFLED))
-    first = kinds.on_globe
+    first = tables.on_globe
     at = values.point_to_scene(view.point)
     if textures.region is not None:
         face = textures.region.face(hit)
         inner = textures.region.from_behind(face, hit.prim_uv, d, view.other)
         corner = textures.region.corner(face, hit.prim_uv, s, view.other)
-        which = dr.gather(mi.Int32, kinds.stands_for, 2 * corner + dr.select(inner, 1, 0), view.other)
+        which = dr.gather(mi.Int32, tables.stands_for, 2 * corner + dr.select(inner, 1, 0), view.other)
         other = first + mi.UInt32(which)
-        matte = view.other & (~inner | (which >= mi.Int32(kinds.on_skin)))
+        matte = view.other & (~inner | (which >= mi.Int32(tables.on_skin)))
         on_skin = view.other & ~inner & textures.region.on_sheet(face)
     else:
         on_skin = mi.Bool(False)
@@ -876,7 +968,7 @@ def _met(
         other = first + ring * TURNS + dr.select(turn < TURNS, turn, 0)
         matte = view.other & (dr.abs(at.x - values.backdrop_x) < 1e-2)
     column, row = numbers.globe_place(at)
-    columns, rows = numbers.size
+    columns, rows = numbers.columns, numbers.rows
     on_globe = mi.UInt32(dr.clip(row + s, 0, rows - 1)) * columns + mi.UInt32(dr.clip(column + t, 0, columns - 1))
     through = view.cornea & (view.opacity < 0.5)
     depth, sector = numbers.iris_place(view.inner)
@@ -884,7 +976,7 @@ def _met(
     cell = mi.UInt32(dr.clip(depth + s, 0, IRIS_RINGS - 1)) * IRIS_TURNS + dr.select(sector < IRIS_TURNS, sector, 0)
     behind = dr.select(view.pupil, values.pupil_albedo, iris_albedo(values, textures, view.inner))
     inside = view.passed * behind / (values.inner_index * values.inner_index)
-    target = dr.select(through, kinds.outside + cell, dr.select(view.other, other, on_globe))
+    target = dr.select(through, tables.outside + cell, dr.select(view.other, other, on_globe))
     back = dr.select(through, inside, dr.select(view.other & ~matte, 0, albedo))
     back = dr.select(view.met, back, 0)
     distance = dr.select(view.met, view.distance, 1e9)

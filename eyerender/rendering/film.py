@@ -25,7 +25,6 @@ import numpy as np
 from ..arrays import Bools, Ints, Singles, frozen
 from ..rig.camera import Window
 from .groups import Group, shade_group
-from .parameters import traversed
 from .recorded import recorded
 from .sampling import Pattern, Samples, camera_ray, lattice_generator
 from .shading import shade
@@ -75,7 +74,6 @@ class _Grid:
     plain: tuple[mi.UInt32, ...]
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class Pixels:
     """The pixels of a window, row by row: its first pixel on the sensor, and its width."""
@@ -339,7 +337,7 @@ def _groups(
     hits = _hits_of(shown, window, pattern, chosen, (first * size * times, count * size * times))
     return _shaded(
         *(shown.values, shown.lights, shown.textures, shown.scene, grid, pattern, fine, hits, seen),
-        dr.opaque(mi.Bool, shown.lights.widest < SMALL),
+        dr.opaque(mi.Bool, shown.host.lamps.widest < SMALL),
         rows * columns * count, window[2] * window[3], layered,
     )  # fmt: skip
 

@@ -41,6 +41,7 @@ from .parameters import (
 
 _SENSOR, _LOOK, _LENS, _AMBIENT = Sensor(), Look(), Lens(), Ambient()
 _SUN_MM = 1e6
+_POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
 _PANEL_PARTS = 4  # along each side
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
@@ -310,14 +311,50 @@ def sun_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
     )
 
 
-def light_table(lights: Sequence[Lamp], M: Floats, t: Floats) -> Floats:
-    """Lamps in the eye frame, (n, 10): position, axis, radius, intensity, lobe exponent, inner radius."""
-    rows = [
-        [*(M.T @ (lamp.position_mm - t)), *(M.T @ lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
-         lamp.lobe_exponent, ring_radius_mm(lamp)]
-        for lamp in lights
-    ]  # fmt: skip
-    return np.reshape(rows, (-1, 10))
+@dataclass(frozen=True, slots=True, eq=False)
+class LampTable(ArrayValue):
+    """Lamps in the eye frame, on the host.
+
+    Attributes:
+        rows: (n, 10) position, axis, radius, intensity, lobe exponent, inner radius.
+        suns: 1 if the last lamp is the sun, else 0.
+    """
+
+    rows: Floats
+    suns: int = 0
+
+    @classmethod
+    def of(cls, lights: Sequence[Lamp], M: Floats, t: Floats, suns: int = 0) -> LampTable:
+        """Make the table of lamps of the world for an eye at x_world = M x + t."""
+        rows = [
+            [*(M.T @ (lamp.position_mm - t)), *(M.T @ lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
+             lamp.lobe_exponent, ring_radius_mm(lamp)]
+            for lamp in lights
+        ]  # fmt: skip
+        return cls(np.reshape(rows, (-1, 10)), suns)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def widths(self) -> Floats:
+        """Radii of the lamps over their distances from the apex of the eye, (n,)."""
+        return np.asarray(self.rows[:, 6] / np.maximum(np.linalg.norm(self.rows[:, :3], axis=1), 1e-3))
+
+    @property
+    def widest(self) -> float:
+        """Largest of these."""
+        return float(np.max(self.widths, initial=0.0))
+
+    @property
+    def points(self) -> int:
+        """Number of points that stand for each lamp at the nodes of a grid: its middle, or four about it."""
+        return 1 if self.widest < _POINT_LIKE and not np.any(self.rows[:, 9] > 0) else 4
+
+    @property
+    def gridded(self) -> bool:
+        """Whether the lamps are so small that their light may be interpolated on grids."""
+        return self.widest < _LARGE
 
 
 def returned_light(job: RenderJob) -> FundusLight:
@@ -330,7 +367,7 @@ def returned_light(job: RenderJob) -> FundusLight:
         blur_rad=float(np.radians(fundus.blur_deg)),
         disc_gain=fundus.disc_gain,
     )
-    lamps = light_table(job.lights, job.M, job.t)[:, :3]
+    lamps = LampTable.of(job.lights, job.M, job.t).rows[:, :3]
     return fundus_light(job.eye, lamps, job.M.T @ (job.camera.nodal_point_mm - job.t), job.focus_dpt, spread)
 
 

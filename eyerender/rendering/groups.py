@@ -231,7 +231,7 @@ class _GroupShading:
     def globe_radiance(self, view: View, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
         """Radiance of the globe along sample j's ray, and failed light paths."""
         values, lights, textures, scene, group = self.values, self.lights, self.textures, self.scene, self.group
-        seen = on_relief(lights, replace(view, other=mi.Bool(False)))
+        seen = on_relief(values, lights, replace(view, other=mi.Bool(False)))
         inner, missed = through_cornea(values, lights, scene, seen.inner, seen.lit_inside, *group.spot(j))
         albedo = outer_albedo(values, textures, seen)
         assert textures.received is not None
@@ -258,13 +258,13 @@ class _GroupShading:
             # What went through the tissue is known, and what remains is the film's highlight.
             tissues = self.textures.tissues
             assert tissues is not None
-            covered, share = ~seen.cornea | (seen.opacity > 0), tissues.globe_sees(seen.point)
+            covered, share = ~seen.cornea | (seen.opacity > 0), tissues.globe_sees(self.values, seen.point)
 
             def shine(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
                 lamp = lights[i]
                 return i + 1, total + lit_by(lamp, mi.Float(0))[1] * share(lamp.number)
 
-            state = (mi.UInt32(0), direct(seen, albedo, tissues.on_globe(seen.point), mi.Float(0)))
+            state = (mi.UInt32(0), direct(seen, albedo, tissues.on_globe(self.values, seen.point), mi.Float(0)))
             labels = ("i", "total")
             return dr.while_loop(state, lambda i, _: covered & (i < lights.count), shine, labels=labels, label="film")[
                 1

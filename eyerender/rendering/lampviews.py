@@ -24,9 +24,8 @@ from ..arrays import Floats, Singles
 from ..geometry.vectors import crosses
 from ..region.mesh import HAIRS, RegionMesh
 from ..rig.light import Lamp
-from .parameters import leaves
 from .recorded import recorded
-from .values import aligned, quotient
+from .values import quotient, sent
 
 if TYPE_CHECKING:
     from .region import RegionScene, SkinGeometry
@@ -38,36 +37,41 @@ _HAIR_MM = 0.06  # half the thickness of hairs at most, with some to spare
 _LARGEST = 0.85  # half the width of a map: tan of half the angle to the axis
 
 
+@dataclass(kw_only=True)
 class LampViews:
     """The maps of all lamps for one pose of a region, on the device.
 
-    Args:
+    Attributes:
         table: numbers of the lamps' views (see `view_table`).
-        region: the posed region. If its sheet is not known to be one surface, every cell is marked.
+        known: whether the sheet is known to be one surface; else every cell counts as marked.
+        marks: 1 for the marked cells of each map, else 0.
     """
 
-    DRJIT_STRUCT = leaves("_table", "_known", "_marks")
+    table: mi.Float
+    known: mi.Bool
+    marks: mi.UInt8
 
-    def __init__(self, table: Singles, region: RegionScene) -> None:
+    @classmethod
+    def of(cls, table: Singles, region: RegionScene) -> LampViews:
+        """Draw the maps of lamps, whose numbers are in a `view_table`, before a posed region."""
         # Without lamps nothing reads the table, but kernels cannot be compiled for an empty one.
-        self._table = mi.Float(aligned(table.ravel() if len(table) else np.zeros(_WIDTH, np.float32)))
-        self._known = dr.opaque(mi.Bool, region.skin.is_sheet)
-        if not region.skin.is_sheet:
-            self._marks = dr.zeros(mi.UInt8, 1)
-        else:
-            skin, pieces = region.skin, _pieces(region.posed)
-            counts = skin.of_sheet, len(pieces)
-            hairs = mi.Float(aligned(pieces.ravel() if len(pieces) else np.zeros(8, np.float32)))
-            on_device = dr.opaque(mi.UInt32, counts[0]), dr.opaque(mi.UInt32, counts[1])
-            self._marks = _marked(self._table, skin, hairs, on_device, counts, len(table))
+        views = sent(table if len(table) else np.zeros(_WIDTH))
+        skin, known = region.skin, dr.opaque(mi.Bool, region.skin.is_sheet)
+        if not skin.is_sheet:
+            return cls(table=views, known=known, marks=dr.zeros(mi.UInt8, 1))
+        pieces = _pieces(region.posed)
+        counts = region.sheet_faces, len(pieces)
+        on_device = dr.opaque(mi.UInt32, counts[0]), dr.opaque(mi.UInt32, counts[1])
+        hairs = sent(pieces if len(pieces) else np.zeros(8))
+        return cls(table=views, known=known, marks=_marked(views, skin, hairs, on_device, counts, len(table)))
 
     def clear(self, lamp: mi.UInt32, x: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         """Whether nothing of the region stands between points of the sheet (scene's frame) and any point of a lamp."""
-        place = _View.of(self._table, lamp).place(x)
+        place = _View.of(self.table, lamp).place(x)
         u, v = place.u, place.v
-        inside = active & self._known & (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
+        inside = active & self.known & (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
         cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
-        return inside & (dr.gather(mi.UInt8, self._marks, cell, inside) == 0)
+        return inside & (dr.gather(mi.UInt8, self.marks, cell, inside) == 0)
 
 
 @recorded

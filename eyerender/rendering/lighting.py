@@ -243,7 +243,7 @@ def through_cornea(
     state, labels = (first, left, bent, mi.UInt32(0)), ("i", "left", "bent", "failures")
     _, _, bent, failures = dr.while_loop(state, more, body, labels=labels, label="lamps")
     if normal is None and lights.relief is not None:
-        bent *= lights.relief.share(inner, inside)
+        bent *= lights.relief.share(values, inner, inside)
     return bent, failures
 
 
@@ -291,12 +291,12 @@ def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
     return met & (t < away + ahead_mm)
 
 
-def on_relief(lights: Lights, view: View) -> View:
+def on_relief(values: Values, lights: Lights, view: View) -> View:
     """The view with the places on the relief of the iris that the rays meet, as their feet in its plane."""
     if lights.relief is None:
         return view
     seen = view.cornea & ~view.pupil & (view.passed > 0)
-    return replace(view, inner=lights.relief.hit(view.inner, view.slant, seen))
+    return replace(view, inner=lights.relief.hit(values, view.inner, view.slant, seen))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,8 @@
-"""Light of all lamps on a bare globe and on the plane about it, once per frame instead of once per sample.
+"""Light of all lamps on a bare globe and on the plane about it, on grids that are filled once per frame.
 
-On matte surfaces in air the light of the lamps changes slowly from place to place, except at the edges of shadows and
-where a lamp sets. A grid over the globe's front (azimuthal equidistant about its axis) holds it with the light of other
-surfaces, and one over the plane without that, which has finer structure there. Where their cells are not good (see
-`lightgrid`), every sample has its own rays to the lamps, as if there were no grid.
+A grid over the globe's front (azimuthal equidistant about its axis) holds the light of the lamps with that of other
+surfaces, and one over the plane holds it without that, which has finer structure there. Where a cell is not good enough
+(see `irradiancegrid`), every sample has its own rays to the lamps, as if there were no grid.
 
 A lamp is represented by its middle if it is small, else by four points whose mean is exact to the third order of its
 radius. Before lamps that are large and near, there is no grid.
@@ -11,14 +10,14 @@ radius. Before lamps that are large and near, there is no grid.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
-from .lightgrid import LightGrid
+from .irradiancegrid import IrradianceGrid, grid_nodes
 from .lighting import irradiance, lamp_blocked
-from .parameters import leaves
 from .recorded import recorded
 from .values import Lights, Values
 from .view import GLOBE_EDGE, View, globe_map
@@ -27,64 +26,60 @@ if TYPE_CHECKING:
     from .exchange import Received
 
 _SIDE = 128
+_MIDDLE = 0.5 * (_SIDE - 1)
 _LOW, _SLOPE = 0.1, 0.6  # cosines: of a lamp about to set, and of one that the rim of the steepest cornea hides
 
 
+@dataclass(kw_only=True)
 class MatteLight:
-    """The light that matte surfaces of a bare eye receive from lamps, and the globe from other surfaces."""
+    """The light that matte surfaces of a bare eye receive from lamps, and the globe from other surfaces.
 
-    DRJIT_STRUCT = leaves("_used", "_reach", "_grids")
+    Attributes:
+        globe: over the globe's front.
+        plane: over the plane about it.
+        reach: half the width of the latter, mm.
+    """
 
-    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, received: Received, reach_mm: float) -> None:
-        """Fill the grids.
-
-        Args:
-            values: the scene's numbers.
-            lights: the lamps.
-            scene: what may stand in the way.
-            received: the light of other surfaces.
-            reach_mm: distance from the axis of the unrotated eye within which the plane is seen.
-        """
-        self._values, self._lights, self._scene, self._received = values, lights, scene, received
-        self._points = dr.opaque(mi.UInt32, lights.points)
-        self._used = dr.opaque(mi.Bool, lights.gridded)
-        self._reach = dr.opaque(mi.Float, reach_mm)
-        self._grids: tuple[LightGrid, LightGrid] | None = None
-        self._fill()
+    globe: IrradianceGrid
+    plane: IrradianceGrid
+    reach: mi.Float
 
     def at(self, values: Values, view: View) -> tuple[mi.Float, mi.Bool]:
         """Irradiance (mW/mm^2) at points that are seen, and whether it is known: not on the rim of the cornea."""
-        assert self._grids is not None
-        globe, plane = self._grids
-        middle = 0.5 * (_SIDE - 1)
 
-        def on_plane(point: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
-            x, scale = values.point_to_scene(point), middle / self._reach
-            before = self._used & (values.camera.centre.x > values.backdrop_x)
-            return plane.at(middle + scale * x.y, middle + scale * x.z, before & view.other)
+        def on_plane(point: mi.Vector3f) -> tuple[mi.Float, mi.UInt32]:
+            x, scale = values.point_to_scene(point), _MIDDLE / self.reach
+            before = view.other & (values.camera.centre.x > values.backdrop_x)
+            return self.plane.at(self.plane.place(_MIDDLE + scale * x.y, _MIDDLE + scale * x.z, before))
 
-        def on_globe(point: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
-            place = globe_map(values, point)
-            return globe.at((_SIDE - 1) * place.x, (_SIDE - 1) * place.y, self._used & view.sclera)
+        def on_globe(point: mi.Vector3f) -> tuple[mi.Float, mi.UInt32]:
+            at = globe_map(values, point)
+            return self.globe.at(self.globe.place((_SIDE - 1) * at.x, (_SIDE - 1) * at.y, view.sclera))
 
-        found: tuple[mi.Float, mi.Bool] = dr.if_stmt((view.point,), view.other, on_plane, on_globe)
-        return found
-
-    def _fill(self) -> None:
-        if not self._lights.gridded:
-            self._grids = LightGrid(_SIDE), LightGrid(_SIDE)
-            return
-        globe, plane = _filled(self._values, self._lights, self._scene, self._received, self._points, self._reach)
-        self._grids = LightGrid(_SIDE, globe), LightGrid(_SIDE, plane)
+        found, left = dr.if_stmt((view.point,), view.other, on_plane, on_globe)
+        known = left == 0
+        return dr.select(known, found, 0), known
 
 
 @recorded
-def _filled(
-    values: Values, lights: Lights, scene: mi.Scene, received: Received, points: mi.UInt32, reach: mi.Float
-) -> tuple[mi.Float, mi.Float]:  # fmt: skip
-    """Numbers of the grids over the globe and over the plane."""
-    column, row = LightGrid.nodes(_SIDE)
-    a, b = (mi.Float(k) * (2 / (_SIDE - 1)) - 1 for k in (column, row))
+def matte_light(
+    values: Values, lights: Lights, scene: mi.Scene, received: Received, reach: mi.Float, points: mi.UInt32,
+    gridded: bool,
+) -> MatteLight:  # fmt: skip
+    """Fill the grids.
+
+    Args:
+        values: the scene's numbers.
+        lights: the lamps.
+        scene: what may stand in the way.
+        received: the light of other surfaces.
+        reach: distance (mm) from the axis of the unrotated eye within which the plane is seen.
+        points: number of points that stand for a lamp.
+        gridded: whether the lamps may have grids.
+    """
+    if not gridded:
+        return MatteLight(globe=IrradianceGrid.unknown(_SIDE), plane=IrradianceGrid.unknown(_SIDE), reach=reach)
+    a, b = (mi.Float(k) * (2 / (_SIDE - 1)) - 1 for k in grid_nodes(_SIDE))
     polar = dr.sqrt(a * a + b * b)
     sine, cosine = dr.sincos(polar * GLOBE_EDGE)
     share = dr.select(polar > 0, sine / polar, 0)
@@ -99,9 +94,10 @@ def _filled(
     yes, normal = mi.Bool(True), values.vector_to_eye(mi.Vector3f(1, 0, 0))
     on_plane = _lit(values, lights, scene, points, seen, normal, yes, yes)
     dr.eval(on_globe, more, on_plane)
-    rows = LightGrid.rows_of(_SIDE, on_globe, more), LightGrid.rows_of(_SIDE, on_plane)
-    dr.eval(rows)
-    return rows
+    one = dr.opaque(mi.UInt32, 1)  # the sum over the lamps stands for a single one
+    globe, _ = IrradianceGrid.build(_SIDE, on_globe, one, more=more)
+    plane, _ = IrradianceGrid.build(_SIDE, on_plane, one)
+    return MatteLight(globe=globe, plane=plane, reach=reach)
 
 
 def _lit(

@@ -22,13 +22,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Ints
 from ..eye.meshes import Patch, cornea_patches
 from ..eye.model import EyeModel
 from ..geometry.surfaces import Surface as ExactSurface
-from .parameters import leaves
 from .surfaces import Bundle, NormalForm, Surface
-from .values import aligned
+from .values import aligned, sent
 
 _ABOVE_MM = 40.0  # beyond every cornea along its axis
 _STEPS = 12
@@ -56,28 +55,34 @@ class Mirror(NamedTuple):
     found: Bools
 
 
-class SurfaceMesh:
-    """One surface as a mesh, in its own frame (+x outward, mm), on host and device."""
+@dataclass(kw_only=True)
+class MeshGeometry:
+    """One surface as a mesh for the kernels, in the surface's own frame (+x outward, mm).
 
-    DRJIT_STRUCT = leaves("scene", "_corners", "_records")
+    Attributes:
+        scene: the mesh.
+        faces: four entries for each triangle, of which the first three are its vertices.
+        vertices: eight numbers for each vertex: place, 0, normal, 0.
+    """
 
-    def __init__(self, patch: Patch, surface: ExactSurface) -> None:
-        self.rotation, self.origin = np.asarray(surface.rotation), np.asarray(surface.origin_mm)
-        self.vertices = (patch.vertices - self.origin) @ self.rotation
-        self.normals = patch.normals @ self.rotation
-        self.faces = np.asarray(patch.faces)
-        mesh = mi.Mesh(patch.name, len(self.vertices), len(self.faces))
+    scene: mi.Scene
+    faces: mi.UInt32
+    vertices: mi.Float
+
+    @classmethod
+    def of(cls, name: str, vertices: Floats, normals: Floats, faces: Ints) -> MeshGeometry:
+        """Make a mesh of vertices (n, 3) with normals (n, 3), and triangles (m, 3)."""
+        mesh = mi.Mesh(name, len(vertices), len(faces))
         params = mi.traverse(mesh)
-        params["faces"] = mi.UInt32(self.faces.astype(np.uint32).ravel())
-        params["vertex_positions"] = mi.Float(self.vertices.astype(np.float32).ravel())
+        params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+        params["vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
         params.update()
-        self.scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
-        corners = np.zeros((len(self.faces), 4), np.uint32)
-        corners[:, :3] = self.faces
-        self._corners = mi.UInt32(aligned(corners.ravel()))
-        records = np.zeros((len(self.vertices), 8), np.float32)
-        records[:, 0:3], records[:, 4:7] = self.vertices, self.normals
-        self._records = mi.Float(aligned(records.ravel()))
+        scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
+        corners = np.zeros((len(faces), 4), np.uint32)
+        corners[:, :3] = faces
+        records = np.zeros((len(vertices), 8), np.float32)
+        records[:, 0:3], records[:, 4:7] = vertices, normals
+        return cls(scene=scene, faces=mi.UInt32(aligned(corners.ravel())), vertices=sent(records))
 
     def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> mi.PreliminaryIntersection3f:
         """First hit of rays of the surface's frame."""
@@ -90,8 +95,8 @@ class SurfaceMesh:
     def corners(self, hit: mi.PreliminaryIntersection3f) -> tuple[list[mi.Vector3f], list[mi.Vector3f]]:
         """Places and normals of the corners of the triangles that were hit."""
         met = hit.is_valid()
-        i = dr.gather(mi.Vector4u, self._corners, hit.prim_index, met)
-        rows = [[dr.gather(mi.Vector4f, self._records, 2 * k + part, met) for k in (i.x, i.y, i.z)] for part in (0, 1)]
+        i = dr.gather(mi.Vector4u, self.faces, hit.prim_index, met)
+        rows = [[dr.gather(mi.Vector4f, self.vertices, 2 * k + part, met) for k in (i.x, i.y, i.z)] for part in (0, 1)]
         places, normals = ([mi.Vector3f(r.x, r.y, r.z) for r in row] for row in rows)
         return places, normals
 
@@ -114,7 +119,20 @@ class SurfaceMesh:
 
         return _mixed(places, hit.prim_uv).x, NormalForm(n * inv, inv, slope)
 
-    # -- on the host, in float64 --------------------------------------------------------------------------------------
+
+class SurfaceMesh:
+    """One surface as a mesh, in its own frame (+x outward, mm), on the host in float64.
+
+    Attributes:
+        geometry: the same for the kernels.
+    """
+
+    def __init__(self, patch: Patch, surface: ExactSurface) -> None:
+        self.rotation, self.origin = np.asarray(surface.rotation), np.asarray(surface.origin_mm)
+        self.vertices = (patch.vertices - self.origin) @ self.rotation
+        self.normals = patch.normals @ self.rotation
+        self.faces = np.asarray(patch.faces)
+        self.geometry = MeshGeometry.of(patch.name, self.vertices, self.normals, self.faces)
 
     def mirrored(self, start: Floats, source: Floats, viewpoint: Floats) -> Mirror:
         """Mirror points of sources (n, 3) for viewpoints (n, 3), searched from points (n, 3) near them; eye frame."""
@@ -148,7 +166,7 @@ class SurfaceMesh:
             Points (n, 3) and normals (n, 3) (not unit), their derivatives by y and z (n, 3, 2), and whether the mesh
             reaches there.
         """
-        hit = self.above(*(mi.Float(aligned(c.astype(np.float32))) for c in q.T))
+        hit = self.geometry.above(*(mi.Float(aligned(c.astype(np.float32))) for c in q.T))
         valid, face = hit.is_valid(), hit.prim_index
         dr.eval(valid, face)
         there = np.asarray(valid.numpy(), dtype=bool)
@@ -176,9 +194,9 @@ def _either(which: mi.Bool, one: NormalForm, other: NormalForm) -> NormalForm:
 class MeshedSurface(Surface):
     """A refracting surface whose hits, normals and their slopes are those of a mesh."""
 
-    mesh: SurfaceMesh | None = None
+    mesh: MeshGeometry | None = None
 
-    def _mesh(self) -> SurfaceMesh:
+    def _mesh(self) -> MeshGeometry:
         assert self.mesh is not None
         return self.mesh
 
@@ -238,7 +256,7 @@ def resolution(radius_mm: float, edge_mm: float) -> tuple[int, int]:
 def meshed(surfaces: Sequence[Surface], meshes: Sequence[SurfaceMesh]) -> tuple[Surface, ...]:
     """Put meshes in the place of surfaces."""
     return tuple(
-        MeshedSurface(s.origin, s.axes, s.shape, s.eta, s.kind, s.table, s.film, mesh)
+        MeshedSurface(s.origin, s.axes, s.shape, s.eta, s.kind, s.table, s.film, mesh.geometry)
         for s, mesh in zip(surfaces, meshes, strict=True)
     )
 

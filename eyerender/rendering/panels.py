@@ -12,14 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .parameters import leaves
-from .values import aligned
+from ..arrays import Floats
+from .values import sent
 
 _WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
 
@@ -35,18 +34,25 @@ class Rectangle:
     radiance: mi.Float
 
 
+@dataclass(kw_only=True)
 class Panels:
-    """The rectangles of a frame, (n, 13) numbers in one buffer; kernels do not depend on their number."""
+    """The rectangles of a frame, in one buffer, so kernels do not depend on their number.
 
-    DRJIT_STRUCT = leaves("count", "_buffer")
+    Attributes:
+        count: number of rectangles.
+        rows: 13 numbers of each, as from `frame.panel_table`.
+    """
 
-    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]]) -> None:
-        self.count = dr.opaque(mi.UInt32, len(table))
-        data = np.ascontiguousarray(table, dtype=np.float32).reshape(-1)
-        self._buffer = mi.Float(aligned(data if data.size else np.zeros(_WIDTH, np.float32)))
+    count: mi.UInt32
+    rows: mi.Float
+
+    @classmethod
+    def upload(cls, table: Floats) -> Panels:
+        """Send rectangles (n, 13) to the device."""
+        return cls(count=dr.opaque(mi.UInt32, len(table)), rows=sent(table if len(table) else np.zeros(_WIDTH)))
 
     def __getitem__(self, i: mi.UInt32) -> Rectangle:
-        row = [dr.gather(mi.Float, self._buffer, i * _WIDTH + k) for k in range(_WIDTH)]
+        row = [dr.gather(mi.Float, self.rows, i * _WIDTH + k) for k in range(_WIDTH)]
         centre, normal, right, up = (mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9))
         return Rectangle(centre, normal, right, up, row[12])
 

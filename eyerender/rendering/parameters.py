@@ -9,30 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
-if TYPE_CHECKING:
-    import mitsuba as mi
+# Numbers and vectors of either side. Dr.Jit resolves these annotations, so they name nothing of Mitsuba.
+Number: TypeAlias = Any
+Vector: TypeAlias = Any
 
 Kind = Literal["quadric", "biconic", "measured"]
 _Tree = TypeVar("_Tree")
-_Record = TypeVar("_Record")
 
 
-def leaves(*names: str) -> dict[str, Any]:
-    """Names of the attributes that Dr.Jit finds in the objects of a class, which keeps them as its `DRJIT_STRUCT`."""
-    return dict.fromkeys(names, Any)
-
-
-def traversed(record: type[_Record]) -> type[_Record]:
-    """Let Dr.Jit find all fields of a dataclass whose annotations it cannot resolve."""
-    record.DRJIT_STRUCT = leaves(*(f.name for f in fields(record)))  # type: ignore[attr-defined, arg-type]
-    return record
-
-
-@traversed
 @dataclass(frozen=True, slots=True)
 class SurfaceParameters:
     """One refracting surface in the eye frame, lengths in mm.
@@ -46,26 +34,24 @@ class SurfaceParameters:
         film: index before the surface over that of a film on it; None where no film can be.
     """
 
-    origin: mi.Vector3f
-    shape: tuple[mi.Float, ...]
-    eta: mi.Float
-    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f] | None
-    film: mi.Float | None = None
+    origin: Vector
+    shape: tuple[Number, ...]
+    eta: Number
+    axes: tuple[Vector, Vector, Vector] | None
+    film: Number | None = None
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class StopParameters:
     """The aperture stop: centre, normal, directions u and v of its semi-axes (all (3,)), and the semi-axes (mm)."""
 
-    centre: mi.Vector3f
-    normal: mi.Vector3f
-    u: mi.Vector3f
-    v: mi.Vector3f
-    axes: tuple[mi.Float, mi.Float]
+    centre: Vector
+    normal: Vector
+    u: Vector
+    v: Vector
+    axes: tuple[Number, Number]
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class IrisParameters:
     """The iris.
@@ -74,15 +60,14 @@ class IrisParameters:
     convexity (mm).
     """
 
-    root_radius: mi.Float
-    albedo: mi.Float
-    contrast: mi.Float
-    ring: mi.Float
-    relief: mi.Float
-    convexity: mi.Float
+    root_radius: Number
+    albedo: Number
+    contrast: Number
+    ring: Number
+    relief: Number
+    convexity: Number
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class LimbusParameters:
     """The limbus and the cornea before it.
@@ -96,35 +81,32 @@ class LimbusParameters:
         bulge_radius: its radius, mm.
     """
 
-    radius: mi.Float
-    floor: mi.Float
-    gain: mi.Float
-    albedo: mi.Float
-    bulge: mi.Vector3f
-    bulge_radius: mi.Float
+    radius: Number
+    floor: Number
+    gain: Number
+    albedo: Number
+    bulge: Vector
+    bulge_radius: Number
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class ScleraParameters:
     """The sclera: centre (3,) and radius of the sphere (mm), mean albedo and contrast of the texture."""
 
-    centre: mi.Vector3f
-    radius: mi.Float
-    albedo: mi.Float
-    contrast: mi.Float
+    centre: Vector
+    radius: Number
+    albedo: Number
+    contrast: Number
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class PoseParameters:
     """The pose x_scene = columns x_eye + shift: three columns of the rotation (3,) each, and the shift (3,) mm."""
 
-    columns: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]
-    shift: mi.Vector3f
+    columns: tuple[Vector, Vector, Vector]
+    shift: Vector
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class CameraParameters:
     """Camera as the kernels use it.
@@ -133,25 +115,23 @@ class CameraParameters:
     (px), and the lens distortion (k1, k2, p1, p2, k3).
     """
 
-    centre: mi.Vector3f
-    right: mi.Vector3f
-    down: mi.Vector3f
-    forward: mi.Vector3f
-    focal: tuple[mi.Float, mi.Float]
-    principal: tuple[mi.Float, mi.Float]
-    distortion: tuple[mi.Float, ...]
+    centre: Vector
+    right: Vector
+    down: Vector
+    forward: Vector
+    focal: tuple[Number, Number]
+    principal: tuple[Number, Number]
+    distortion: tuple[Number, ...]
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class ImageParameters:
     """The stop's Gaussian image seen from outside: lateral magnification, and shift along x (mm)."""
 
-    scale: mi.Float
-    shift: mi.Float
+    scale: Number
+    shift: Number
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class Parameters:
     """All parameters of a frame; eye frame and scene's frame are in mm.
@@ -173,7 +153,7 @@ class Parameters:
     """
 
     surfaces: tuple[SurfaceParameters, ...]
-    inner_index: mi.Float
+    inner_index: Number
     stop: StopParameters
     iris: IrisParameters
     limbus: LimbusParameters
@@ -181,10 +161,10 @@ class Parameters:
     image: ImageParameters
     pose: PoseParameters
     camera: CameraParameters
-    pupil_albedo: mi.Float
-    globe_reach: mi.Float
-    backdrop_x: mi.Float
-    ambient_irradiance: mi.Float
+    pupil_albedo: Number
+    globe_reach: Number
+    backdrop_x: Number
+    ambient_irradiance: Number
 
 
 def packed(tree: Any) -> np.ndarray[Any, np.dtype[np.float32]]:

@@ -8,12 +8,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats, Ints, Singles, frozen
+from ..arrays import Bools, Ints, Singles, frozen
 from ..eye.fundus import FundusLight
 from ..region.mesh import RegionMesh
 from ..rig.camera import Window
 from .blur import Blur
-from .frame import RenderJob, light_table, parameters_of, returned_light, sun_lamps
+from .frame import LampTable, RenderJob, parameters_of, returned_light, sun_lamps
 from .lampviews import view_table
 from .occlusion import lid_margins_px
 from .parameters import Parameters
@@ -66,9 +66,10 @@ class Prepared:
         return parameters_of(self.job)
 
     @cached_property
-    def lamps(self) -> Floats:
-        """The lamps and the sun in the eye frame, as in `light_table`."""
-        return light_table(self.sunlit.lights, self.job.M, self.job.t)
+    def lamps(self) -> LampTable:
+        """The lamps and the sun in the eye frame."""
+        job, lights = self.job, self.sunlit.lights
+        return LampTable.of(lights, job.M, job.t, len(lights) - len(job.lights))
 
     @cached_property
     def returned(self) -> FundusLight:

@@ -1,4 +1,4 @@
-"""What the pupil shows: the light of the lamps that the fundus returns, once per frame on a grid over the stop.
+"""What the pupil shows: the light of the lamps that the fundus returns, on a grid over the stop, once per frame.
 
 The fundus mixes the light of the whole pupil and changes it slowly from place to place, so a small grid gives it. Each
 of its points sums over the lamps the irradiance of the stop times the return factor of `eye.fundus`.
@@ -6,60 +6,48 @@ of its points sums over the lamps the irradiance of the stop times the return fa
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
-from ..eye.fundus import CELLS, EDGE, FundusLight
-from .parameters import leaves
-from .recorded import recorded
-from .values import Lights, Values, sent
+from ..eye.fundus import CELLS, EDGE
+from .lighting import LampPath
+from .values import Lights, Values
 
 
+@dataclass(kw_only=True)
 class PupilLight:
-    """Radiance in air (mW/mm^2/sr) that leaves the pupil, before the transmittance of the cornea."""
+    """Radiance in air (mW/mm^2/sr) that leaves the pupil, before the transmittance of the cornea, on a square grid."""
 
-    DRJIT_STRUCT = leaves("_cells")
-
-    def __init__(self, values: Values, lights: Lights, scene: mi.Scene, returned: FundusLight) -> None:
-        """Fill the grid.
-
-        Args:
-            values: the scene's numbers.
-            lights: the lamps.
-            scene: what may stand in the way.
-            returned: the return factors of the lamps.
-        """
-        self._values, self._lights, self._scene = values, lights, scene
-        self._factors = returned.factors
-        self._cells: mi.Float | None = None
-        self._fill()
+    cells: mi.Float
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> mi.Float:
         """Radiance at coordinates of the stop in units of its semi-axes, bilinearly."""
-        assert self._cells is not None
         x, y = (dr.clip((c * (1 / EDGE) + 1) * (CELLS / 2) - 0.5, 0, CELLS - 1.001) for c in (u, v))
         i, j = mi.UInt32(x), mi.UInt32(y)
         s, t = x - mi.Float(i), y - mi.Float(j)
 
         def cell(di: int, dj: int) -> mi.Float:
-            return dr.gather(mi.Float, self._cells, (j + dj) * CELLS + i + di, active)
+            return dr.gather(mi.Float, self.cells, (j + dj) * CELLS + i + di, active)
 
         low, high = (dr.lerp(cell(0, k), cell(1, k), s) for k in (0, 1))
         return dr.lerp(low, high, t)
 
-    def _fill(self) -> None:
-        if not len(self._lights) or not self._factors.any():
-            self._cells = dr.zeros(mi.Float, CELLS * CELLS)
-            dr.make_opaque(self._cells)
-            return
-        self._cells = _filled(self._values, self._lights, self._scene, sent(self._factors))
 
+def pupil_light(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float | None) -> PupilLight:
+    """Fill the grid.
 
-@recorded
-def _filled(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float) -> mi.Float:
-    """Numbers of the grid, from the return factors of the lamps."""
-    from .lighting import LampPath
-
+    Args:
+        values: the scene's numbers.
+        lights: the lamps.
+        scene: what may stand in the way.
+        factors: the return factors of the lamps; None where nothing is returned.
+    """
+    if factors is None:
+        dark = dr.zeros(mi.Float, CELLS * CELLS)
+        dr.make_opaque(dark)
+        return PupilLight(cells=dark)
     index = dr.arange(mi.UInt32, CELLS * CELLS)
     row = index // CELLS
     u, v = ((mi.Float(k) + 0.5) * (2 * EDGE / CELLS) - EDGE for k in (index - row * CELLS, row))
@@ -78,4 +66,4 @@ def _filled(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float) 
     labels = ("i", "total")
     _, total = dr.while_loop(state, lambda i, _: i < lights.count, body, labels=labels, label="light of the fundus")
     dr.eval(total)
-    return total
+    return PupilLight(cells=total)

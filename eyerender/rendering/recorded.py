@@ -79,10 +79,7 @@ _PLAIN = {type(None), bool, int, float, str}
 @cache
 def _names(kind: type) -> tuple[str, ...]:
     """Names of what objects of a class hold that Dr.Jit finds."""
-    names = getattr(kind, "DRJIT_STRUCT", None)
-    if not names and is_dataclass(kind):
-        names = [field.name for field in fields(kind)]
-    return tuple(names or ())
+    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
 
 
 def forget() -> None:

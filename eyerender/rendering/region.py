@@ -25,7 +25,6 @@ from ..region.lids import FINE, ROWS
 from ..region.mapcache import kept
 from ..region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_ends
 from ..region.skin import SHEET_ROWS, skin_texels
-from .parameters import leaves
 from .surround import clear_between, rays_between
 from .tissuecells import GRID_COLUMNS, GRID_ROWS
 from .values import aligned
@@ -43,6 +42,11 @@ class RegionScene:
 
     Attributes:
         scene: the solid parts.
+        skin: the region for the kernels.
+        relief: mean slopes of the map over the cells of the grids on which light spreads, by their numbers of rows.
+        sheet_faces: number of triangles of the sheet of skin.
+        posed: the mesh in its pose.
+        subject: what the scene was made for.
     """
 
     obstructed = True
@@ -82,8 +86,13 @@ class RegionScene:
         pixels = aligned(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         mirror = -1.0 if globe.mirrored else 1.0
-        self.skin = SkinGeometry(look, pixels, posed.layout, mirror, self._inner(), self._water)
-        self.skin.pose(posed)
+        inner = self._inner()
+        self.skin = SkinGeometry.of(look, posed.layout, mirror, inner, self._water)
+        self.relief = {} if inner is None else _mean_slopes(pixels)
+        self.sheet_faces = int(posed.layout.face_ends[0])
+        self._records = np.zeros((len(posed.layout.uv), 8), np.float32)
+        self._records[:, 3], self._records[:, 7] = posed.layout.uv.T
+        self._pose_skin(posed)
         self._shown: tuple[Region, Globe] | None = (spec, globe)
         self.posed = posed
         self.subject = self.key(spec, globe)
@@ -113,7 +122,7 @@ class RegionScene:
             if posed is not self.posed:
                 self.posed = posed
                 self._send(posed)
-                self.skin.pose(posed)
+                self._pose_skin(posed)
             self._shown = (spec, globe)
         return self.posed
 
@@ -132,6 +141,11 @@ class RegionScene:
         for name, (cut, _) in self._cuts(posed.layout).items():
             self._set(name, "vertex_positions", _floats(posed.vertices[cut]))
             self._params[name].update()
+
+    def _pose_skin(self, posed: RegionMesh) -> None:
+        """Send places and normals of the vertices to the kernels."""
+        self._records[:, 0:3], self._records[:, 4:7] = posed.vertices, posed.normals
+        self.skin.vertices = mi.Float(aligned(self._records.ravel()))
 
     def _posed(self, spec: Region, globe: Globe) -> RegionMesh:
         return region_mesh(spec, globe)
@@ -198,46 +212,59 @@ class Surface:
     received: mi.Vector4f
 
 
+@dataclass(kw_only=True)
 class SkinGeometry:
     """A posed region for the kernels: the corners of its triangles, and the map.
 
-    `water` holds the menisci, which are not in the scene because light passes through them; None if they are opaque.
+    Attributes:
+        map: relative albedo, slopes and gloss over the coordinates of the map.
+        water: the menisci, which are not in the scene because light passes through them; None if they are opaque.
+        is_sheet: whether the skin is known to be one surface.
+        faces: four entries for each triangle: its vertices, and 1 unless it is a part inside the sheet of skin.
+        vertices: eight numbers for each vertex: place (scene's frame, mm), first coordinate of the map, normal, second
+            coordinate of the map.
+        received: four numbers for each vertex: the light of other surfaces, as in `exchange.Received`.
+        sheet: number of the triangles of the sheet, which come first.
+        film: number of the first triangle of the menisci.
+        mirror: -1 for a left eye, else 1.
     """
 
-    DRJIT_STRUCT = leaves("_map", "water", "is_sheet", "_corners", "_buffer", "_received", "_sheet", "_film", "_mirror")
+    map: Any
+    water: mi.Scene | None
+    is_sheet: bool
+    faces: mi.UInt32
+    vertices: mi.Float
+    received: mi.Float
+    sheet: mi.UInt32
+    film: mi.UInt32
+    mirror: mi.Float
 
-    def __init__(
-        self,
-        look: mi.Texture2f,
-        pixels: NDArray[np.float16],
-        layout: RegionLayout,
-        mirror: float,
-        inner: Bools | None,
-        water: mi.Scene | None,
-    ) -> None:
-        self._map, self.water = look, water
-        self.relief = {} if inner is None else _mean_slopes(pixels)
-        corners = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
-        corners[:, :3] = layout.faces
-        corners[: layout.face_ends[0], 3] = False if inner is None else ~inner
-        self.of_sheet, self.is_sheet = int(layout.face_ends[0]), inner is not None
-        self._corners = mi.UInt32(aligned(corners.ravel()))
-        self._records = np.zeros((len(layout.uv), 8), np.float32)
-        self._records[:, 3], self._records[:, 7] = layout.uv.T
-        self._buffer = self._received = mi.Float(0)
-        self._sheet, self._film = (mi.UInt32(int(layout.face_ends[k])) for k in (0, -2))
-        self._mirror = mi.Float(mirror)
-        dr.make_opaque(self._sheet, self._film, self._mirror)
+    @classmethod
+    def of(
+        cls, look: mi.Texture2f, layout: RegionLayout, mirror: float, inner: Bools | None, water: mi.Scene | None
+    ) -> SkinGeometry:
+        """Send the triangles of a region to the device.
 
-    def pose(self, posed: RegionMesh) -> None:
-        """Update the corners to a pose."""
-        self._records[:, 0:3], self._records[:, 4:7] = posed.vertices, posed.normals
-        self._buffer = mi.Float(aligned(self._records.ravel()))
+        Args:
+            look: the map.
+            layout: the triangles.
+            mirror: -1 for a left eye, else 1.
+            inner: which triangles of the sheet are not at its ends; None if it is not known to be one surface.
+            water: the menisci.
+        """
+        faces = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
+        faces[:, :3] = layout.faces
+        faces[: layout.face_ends[0], 3] = False if inner is None else ~inner
+        sheet, film = (dr.opaque(mi.UInt32, int(layout.face_ends[k])) for k in (0, -2))
+        return cls(
+            map=look, water=water, is_sheet=inner is not None, faces=mi.UInt32(aligned(faces.ravel())),
+            vertices=mi.Float(0), received=mi.Float(0), sheet=sheet, film=film, mirror=dr.opaque(mi.Float, mirror),
+        )  # fmt: skip
 
     def corners(self, face: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f, mi.Bool]:
         """Corners of triangles (scene's frame), and whether these are more than a part inside the sheet of skin."""
-        corner = dr.gather(mi.Vector4u, self._corners, face)
-        a, b, c = (dr.gather(mi.Vector4f, self._buffer, 2 * i) for i in (corner.x, corner.y, corner.z))
+        corner = dr.gather(mi.Vector4u, self.faces, face)
+        a, b, c = (dr.gather(mi.Vector4f, self.vertices, 2 * i) for i in (corner.x, corner.y, corner.z))
         return *(mi.Vector3f(p.x, p.y, p.z) for p in (a, b, c)), corner.w > 0
 
     def sheet_point(self, row: mi.Float, column: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -252,28 +279,24 @@ class SkinGeometry:
         place, turned = mi.Vector4f(0), mi.Vector4f(0)
         for weight, corner in zip(weights, corners, strict=True):
             vertex = _sheet_vertex(*corner)
-            place += weight * dr.gather(mi.Vector4f, self._buffer, 2 * vertex)
-            turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * vertex + 1)
+            place += weight * dr.gather(mi.Vector4f, self.vertices, 2 * vertex)
+            turned += weight * dr.gather(mi.Vector4f, self.vertices, 2 * vertex + 1)
         return mi.Vector3f(place.x, place.y, place.z), dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
 
     def map_place(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Coordinates of the map at barycentric coordinates `uv` of triangles."""
-        corner = dr.gather(mi.Vector4u, self._corners, face, active)
+        corner = dr.gather(mi.Vector4u, self.faces, face, active)
         u, v = mi.Float(0), mi.Float(0)
         for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), (corner.x, corner.y, corner.z), strict=True):
             # As in `surface`, so that Dr.Jit gathers them only once.
-            u += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i, active).w
-            v += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i + 1, active).w
+            u += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i, active).w
+            v += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active).w
         return u, v
 
     def tilted(self, normal: mi.Vector3f, slope_y: mi.Float, slope_z: mi.Float) -> mi.Vector3f:
         """Normals of a relief: n - (g - n (n . g)) for the slope g over the tangent plane of the normal n."""
-        g = mi.Vector3f(0, self._mirror * slope_y, slope_z)
+        g = mi.Vector3f(0, self.mirror * slope_y, slope_z)
         return dr.normalize(normal - (g - normal * dr.dot(normal, g)))
-
-    def shine(self, received: mi.Float) -> None:
-        """Set what every vertex receives from other surfaces, four numbers each as in `exchange.Received`."""
-        self._received = received
 
     def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
         """Index of the layout's triangle that was hit."""
@@ -281,41 +304,41 @@ class SkinGeometry:
 
     def on_water(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
         """Index of the layout's triangle of the menisci that was hit."""
-        return hit.prim_index + self._film
+        return hit.prim_index + self.film
 
     def on_sheet(self, face: mi.UInt32) -> mi.Bool:
         """Whether a triangle belongs to the sheet of skin, not to what is in front of it."""
-        return face < self._sheet
+        return face < self.sheet
 
     def corner(self, face: mi.UInt32, uv: mi.Point2f, u: mi.Float, active: mi.Bool) -> mi.UInt32:
         """Vertices of triangles, each as often as its barycentric weight for even u in [0, 1)."""
-        corner = dr.gather(mi.Vector4u, self._corners, face, active)
+        corner = dr.gather(mi.Vector4u, self.faces, face, active)
         return dr.select(u < uv.x, corner.y, dr.select(u < uv.x + uv.y, corner.z, corner.x))
 
     def from_behind(self, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         """Whether rays along d (scene's frame) meet triangles on their inner side, such as a lid's from within it."""
-        corner = dr.gather(mi.Vector4u, self._corners, face, active)
+        corner = dr.gather(mi.Vector4u, self.faces, face, active)
         corners = (corner.x, corner.y, corner.z)
         a, b, c = (
-            mi.Vector3f(p.x, p.y, p.z) for p in (dr.gather(mi.Vector4f, self._buffer, 2 * i, active) for i in corners)
+            mi.Vector3f(p.x, p.y, p.z) for p in (dr.gather(mi.Vector4f, self.vertices, 2 * i, active) for i in corners)
         )
         turned = mi.Vector4f(0)
         for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), corners, strict=True):
-            turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i + 1, active)
+            turned += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active)
         n = dr.cross(b - a, c - a)
         behind = dr.dot(n, d) * dr.dot(n, mi.Vector3f(turned.x, turned.y, turned.z)) > 0
         return behind & self.on_sheet(face) if self.is_sheet else behind  # hairs are thin, and some are open tubes
 
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Surface:
         """Surface at barycentric coordinates `uv` of triangles."""
-        corner = dr.gather(mi.Vector4u, self._corners, face, active)
+        corner = dr.gather(mi.Vector4u, self.faces, face, active)
         weights = (1 - uv.x - uv.y, uv.x, uv.y)
         place, turned, received = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
         for weight, i in zip(weights, (corner.x, corner.y, corner.z), strict=True):
-            place += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i, active)
-            turned += weight * dr.gather(mi.Vector4f, self._buffer, 2 * i + 1, active)
-            received += weight * dr.gather(mi.Vector4f, self._received, i, active)
-        albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in self._map.eval(mi.Point2f(place.w, turned.w), active))
+            place += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i, active)
+            turned += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active)
+            received += weight * dr.gather(mi.Vector4f, self.received, i, active)
+        albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in self.map.eval(mi.Point2f(place.w, turned.w), active))
         smooth = dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
         normal = self.tilted(smooth, slope_y, slope_z)
         return Surface(mi.Vector3f(place.x, place.y, place.z), normal, smooth, albedo, gloss, received)

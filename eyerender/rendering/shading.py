@@ -46,7 +46,7 @@ def shade(
 
     u, v: place on each lamp's disc, [0, 1).
     """
-    view = on_relief(lights, look(values, textures, scene, o, d, active))
+    view = on_relief(values, lights, look(values, textures, scene, o, d, active))
     known, outer_known = mi.Bool(False), mi.Float(0)
     if lights.on_matte is not None:
         outer_known, known = lights.on_matte.at(values, view)

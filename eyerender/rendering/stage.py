@@ -9,37 +9,30 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..errors import InputError
 from ..region.mesh import RegionMesh, region_mesh
 from ..rig.imaging import Ambient
-from .environment import Ambience, Maps
+from .environment import Ambience, Maps, bright_lamps
 from .exchange import Exchange
 from .film import Exposed
-from .frame import (
-    RenderJob,
-    boundary_waves,
-    kinds,
-    light_table,
-    panel_lamps,
-    panel_table,
-    tables,
-)
+from .frame import LampTable, RenderJob, boundary_waves, kinds, panel_lamps, panel_table, tables
 from .head import place_scene
-from .irislight import IrisLight
-from .irisrelief import IrisRelief, Shape
+from .irislight import IrisLight, iris_light
+from .irisrelief import IrisRelief, ReliefShape, ReliefSize, flat_relief, lit_relief, relief_shape
 from .kept import KeptForEye
 from .lampviews import LampViews
-from .mattelight import MatteLight
+from .mattelight import matte_light
 from .meshed import Meshes, meshed
 from .prepared import Prepared
-from .pupillight import PupilLight
-from .recorded import forget
+from .pupillight import PupilLight, pupil_light
+from .recorded import forget, recorded
 from .region import RegionScene
 from .subsurface import tissue_light
 from .surround import Obstacle, Surround
-from .values import Lights, Structure, Values
+from .values import Lights, Structure, Values, sent
 from .view import Textures
 
 _REGIONS, _TEXTURES = 4, 8  # kept
@@ -54,6 +47,30 @@ class _Next:
     job: RenderJob
     posed: Future[RegionMesh] | None = None
     host: Future[Prepared] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _GridSizes:
+    """Whether there is a grid over the iris; lamps that use it; nodes of the relief; points of lamps that light it."""
+
+    gridded: bool
+    lamps: int
+    nodes: int
+    points: int
+
+
+@recorded
+def _fill_grids(
+    values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, shape: ReliefShape | None,
+    side: mi.UInt32, points: mi.UInt32, factors: mi.Float | None, sizes: _GridSizes,
+) -> tuple[IrisLight | None, IrisRelief, PupilLight]:  # fmt: skip
+    """Fill the grids of the lamps' light behind the cornea: on the iris, on its relief, and on the fundus."""
+    pupil = pupil_light(values, lights, scene, factors)
+    on_iris = iris_light(values, lights, scene, views, sizes.lamps, points) if sizes.gridded else None
+    if shape is None:
+        return on_iris, flat_relief(side), pupil
+    relief = lit_relief(values, lights, scene, shape, side, points, (sizes.nodes, sizes.points))
+    return on_iris, relief, pupil
 
 
 class Stage:
@@ -74,7 +91,7 @@ class Stage:
         self._maps = Maps()
         self.meshes = Meshes()
         self._exchange = Exchange()
-        self._shapes: KeptForEye[Shape] = KeptForEye()
+        self._shapes: KeptForEye[ReliefShape] = KeptForEye()
         self._next: _Next | None = None
 
     def _expect(self, job: RenderJob) -> None:
@@ -109,7 +126,7 @@ class Stage:
         textures, views = self._textures_of(job), None
         # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
         if isinstance(place, RegionScene):
-            views = LampViews(host.views, place)
+            views = LampViews.of(host.views, place)
             textures = replace(textures, region=place.skin, lamp_views=views)
         else:
             textures = replace(textures, surround=place.geometry)
@@ -121,44 +138,64 @@ class Stage:
             job.ambient.model_copy(update={"sun": None}) != Ambient(),
             region is not None and region.skin.is_sheet and job.look.scattering is not None,
         )
-        values = Values(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
+        values = Values.upload(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
         if job.mesh_edge_mm is not None:
             values.surfaces = meshed(values.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
-        lights = Lights(host.lamps, len(host.lamps) - len(job.lights))
+        lights = Lights.upload(host.lamps)
         if lit and structure.scattering and region is not None and views is not None:
-            tissues = tissue_light(job, values, lights, region, views, host.tissue_cells)
+            tissues = tissue_light(job, values, host.lamps, lights, region, views, host.tissue_cells)
             textures = replace(textures, tissues=tissues)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
-            ambience = Ambience(even, panel_table(job.ambient, job.anchor_mm), job.ambient.map, self._maps)
-            textures = replace(textures, ambience=ambience)
-        textures = replace(textures, pupil=PupilLight(values, lights, place.scene, host.returned))
+            panels = panel_table(job.ambient, job.anchor_mm)
+            textures = replace(textures, ambience=Ambience.upload(even, panels, job.ambient.map, self._maps))
         if lit:
-            textures = self._lit(host, values, lights, textures, place, after)
+            lights, textures = self._lit(host, values, lights, textures, place, after)
         return Exposed(place.scene, values, lights, textures, host), place
 
     def _lit(
-        self, host: Prepared, values: Values, lights: Lights, textures: Textures,
-        place: Surround | RegionScene, after: RenderJob | None,
-    ) -> Textures:  # fmt: skip
-        """The textures with the light between surfaces; prepares the grids of the lamps' light that a frame can use."""
+        self, host: Prepared, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene,
+        after: RenderJob | None,
+    ) -> tuple[Lights, Textures]:  # fmt: skip
+        """Add the light between surfaces, and the grids of the lamps' light that the frame can use."""
         job = host.job
-        parts = panel_lamps(job.ambient, job.anchor_mm)
-        if textures.ambience is not None:
-            parts += textures.ambience.bright(job.anchor_mm)
-        panels = Lights(light_table(parts, job.M, job.t))
+        parts = panel_lamps(job.ambient, job.anchor_mm) + bright_lamps(job.ambient.map, self._maps, job.anchor_mm)
+        panels = LampTable.of(parts, job.M, job.t)
         read = self._exchange.begun(host, values, lights, panels, textures, place)
         if after is not None:
             self._expect(after)
         solved = read()
-        if not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet):
-            lights.on_iris = IrisLight(values, lights, place.scene, textures.lamp_views)
-        lights.relief = IrisRelief(job, values, lights, place.scene, textures, self._shapes)
+        lights, pupil = self._grids(host, values, lights, textures, place)
         received = solved()
         if not place.obstructed:
-            reach = min(host.reach_mm, _FARTHEST_MM)
-            lights.on_matte = MatteLight(values, lights, place.scene, received, reach)
-        return replace(textures, received=received)
+            reach = dr.opaque(mi.Float, min(host.reach_mm, _FARTHEST_MM))
+            points = dr.opaque(mi.UInt32, host.lamps.points)
+            matte = matte_light(values, lights, place.scene, received, reach, points, host.lamps.gridded)
+            lights = replace(lights, on_matte=matte)
+        return lights, replace(textures, received=received, pupil=pupil)
+
+    def _grids(
+        self, host: Prepared, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene
+    ) -> tuple[Lights, PupilLight]:
+        """The lamps with their light on iris and relief, and the light of the fundus."""
+        job, lamps = host.job, host.lamps
+        count, size = max(len(lamps), 1), ReliefSize.of(job)
+        side = dr.opaque(mi.UInt32, size.side)
+        shape = None
+        if textures.raised:
+            shape = self._shapes.get(
+                job.eye,
+                (size.side, job.look.iris_seed, job.look.iris),
+                lambda: relief_shape(values, textures.heights, side, dr.opaque(mi.UInt32, size.about), size),
+            )
+        factors = host.returned.factors if len(lamps) else np.zeros(0)
+        gridded = not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet)
+        on_iris, relief, pupil = _fill_grids(
+            values, lights, place.scene, textures.lamp_views, shape, side, dr.opaque(mi.UInt32, lamps.points),
+            sent(factors) if factors.any() else None,
+            _GridSizes(gridded, len(lamps) if lamps.gridded else 0, size.side**2, lamps.points * count),
+        )  # fmt: skip
+        return replace(lights, on_iris=on_iris, relief=relief), pupil
 
     def _prepared(self, job: RenderJob) -> tuple[Prepared, Surround | RegionScene]:
         """What NumPy makes of a job, and its posed surroundings."""

@@ -29,18 +29,17 @@ import numpy as np
 from ..arrays import Ints
 from ..optics.diffusion import rings, transmitted
 from ..region.skin import BANDS, SHEET_ROWS
+from .lampviews import LampViews
 from .lighting import irradiance, lamp_blocked
-from .parameters import leaves, traversed
 from .recorded import recorded
-from .region import SHEET_COLUMNS
+from .region import SHEET_COLUMNS, SkinGeometry
 from .tissuecells import SIDE, WIDTH, GlobeCells, SheetCells, TissueCells
 from .values import Lights, Values, aligned, quotient
 from .view import EPSILON_MM
 
 if TYPE_CHECKING:
-    from .frame import RenderJob
-    from .lampviews import LampViews
-    from .region import RegionScene, SkinGeometry
+    from .frame import LampTable, RenderJob
+    from .region import RegionScene
 
 
 _LEVELS = 5  # each half as fine as the one before
@@ -169,56 +168,60 @@ class Places:
         return dr.while_loop(state, more, body, labels=labels, label="places")[1] * (1 / (_RINGS * _TURNS))
 
 
+@dataclass(kw_only=True)
 class TissueLight:
-    """Light of the lamps on skin and globe, each after its way through the tissue."""
+    """Light of the lamps on skin and globe, each after its way through the tissue.
 
-    DRJIT_STRUCT = leaves("_size", "_skin", "_globe", "_values", "_lamps")
+    Attributes:
+        size: of the grid over the skin.
+        skin: light of cells of the skin, and the shares of the lamps that they see, cell by cell.
+        globe: the same of the globe.
+        lamps: number of the lamps, at least 1.
+    """
 
-    def __init__(
-        self,
-        size: Size,
-        skin: tuple[mi.Float, mi.Float],
-        globe: tuple[mi.Float, mi.Float],
-        values: Values,
-        lamps: mi.UInt32,
-    ) -> None:
-        """Take light of cells, and the shares of so many lamps that they see, cell by cell, on skin and globe."""
-        self._size, self._skin, self._globe, self._values, self._lamps = size, skin, globe, values, lamps
+    size: Size
+    skin: tuple[mi.Float, mi.Float]
+    globe: tuple[mi.Float, mi.Float]
+    lamps: mi.UInt32
 
     def on_skin(self, u: mi.Float, v: mi.Float) -> mi.Float:
         """Irradiance (mW/mm^2) at coordinates of the map of the skin."""
-        return self._size.between(mi.Float, self._skin[0], *self._size.place(u, v), 0)
+        return self.size.between(mi.Float, self.skin[0], *self.size.place(u, v), 0)
 
     def skin_sees(self, u: mi.Float, v: mi.Float) -> Callable[[mi.UInt32], mi.Float]:
         """Shares of the lamps, by their numbers, that the skin sees at coordinates of its map."""
-        cells = self._size.cells(*self._size.place(u, v), 1)
-        return lambda lamp: dr.clip(cells.of(mi.Float, self._skin[1], self._lamps, lamp), 0, 1)
+        cells = self.size.cells(*self.size.place(u, v), 1)
+        return lambda lamp: dr.clip(cells.of(mi.Float, self.skin[1], self.lamps, lamp), 0, 1)
 
-    def on_globe(self, x: mi.Vector3f) -> mi.Float:
+    def on_globe(self, values: Values, x: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
-        row, column = self._place(x)
+        row, column = _globe_cell(values, x)
         u = dr.clip(column, 0, SIDE - 1.001)
         j = mi.UInt32(u)
-        return _Cells.at(row, u - mi.Float(j), (j, j + 1), (SIDE, SIDE)).of(mi.Float, self._globe[0])
+        return _Cells.at(row, u - mi.Float(j), (j, j + 1), (SIDE, SIDE)).of(mi.Float, self.globe[0])
 
-    def globe_sees(self, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
+    def globe_sees(self, values: Values, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
         """Shares of the lamps, by their numbers, that points of the globe (eye frame) see."""
-        row, column = (mi.UInt32(dr.clip(p + 0.5, 0, SIDE - 1)) for p in self._place(x))
-        first = (row * SIDE + column) * self._lamps
-        return lambda lamp: dr.gather(mi.Float, self._globe[1], first + lamp)
+        row, column = (mi.UInt32(dr.clip(p + 0.5, 0, SIDE - 1)) for p in _globe_cell(values, x))
+        first = (row * SIDE + column) * self.lamps
+        return lambda lamp: dr.gather(mi.Float, self.globe[1], first + lamp)
 
-    def _place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        return _globe_place(self._values.vector_to_scene(x - self._values.sclera.centre))
+
+def _globe_cell(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """Row and column of points of the globe (eye frame) in the grid over it."""
+    return _globe_place(values.vector_to_scene(x - values.sclera.centre))
 
 
 def tissue_light(
-    job: RenderJob, values: Values, lights: Lights, place: RegionScene, views: LampViews, cells: TissueCells
+    job: RenderJob, values: Values, lamps: LampTable, lights: Lights, place: RegionScene, views: LampViews,
+    cells: TissueCells,
 ) -> TissueLight:  # fmt: skip
     """Compute the light on the tissues of a frame.
 
     Args:
         job: the job.
         values: its numbers.
+        lamps: its lamps, on the host.
         lights: its lamps.
         place: the posed region.
         views: the lamps' views of it.
@@ -228,7 +231,7 @@ def tissue_light(
     assert scattering is not None
     assert job.region is not None
     skin, globe = SheetGrid.of(cells.sheet), GlobeGrid.of(cells.globe)
-    wide, count = lights.widest >= _SMALL, max(len(lights), 1)
+    wide, count = lamps.widest >= _SMALL, max(len(lamps), 1)
     rays = -(-_RAYS // count)
     make = _Maker(
         values,
@@ -236,17 +239,16 @@ def tissue_light(
         place.scene,
         place.skin,
         views,
-        place.skin.relief[skin.rows],
+        place.relief[skin.rows],
         dr.opaque(mi.Bool, wide),
         (dr.opaque(mi.UInt32, max(rays, _WIDE_RAYS if wide else 1)), dr.opaque(mi.UInt32, rays)),
         dr.opaque(mi.Float, transmitted(job.region.skin.albedo, scattering.skin_per_mm)),
         count,
     )
     sheet, between = make.both(skin, globe, Places.of(cells.thick_mm), Places.of(cells.thin_mm))
-    return TissueLight(skin.size, sheet, between, values, dr.maximum(lights.count, 1))
+    return TissueLight(size=skin.size, skin=sheet, globe=between, lamps=dr.maximum(lights.count, 1))
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class _Maker:
     """What the grids of a frame are computed from.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +20,6 @@ from ..geometry.vectors import lengths
 from ..region.look import Look
 from ..region.mapcache import kept
 from ..region.texture import skin_texture
-from .parameters import leaves
 from .recorded import recorded
 from .values import aligned
 
@@ -47,39 +46,48 @@ class Matte:
     albedo: mi.Float
 
 
+@dataclass(kw_only=True)
 class SurroundGeometry:
     """The triangles of the surround for the kernels, and the map of its plane.
 
     Kernels read them from buffers and do not call methods of Mitsuba's shapes and materials: the code of such a call
     depends on how many objects the process has made.
+
+    Attributes:
+        corners: four entries for each triangle, of which the first three are its vertices.
+        vertices: four numbers for each vertex: place (mm), and albedo, negative for that of the map.
+        map: albedo of the plane.
     """
 
-    DRJIT_STRUCT = leaves("_corners", "_vertices", "_map")
+    corners: mi.UInt32
+    vertices: mi.Float
+    map: Any
 
-    def __init__(self, faces: Ints) -> None:
+    @classmethod
+    def of(cls, faces: Ints) -> SurroundGeometry:
+        """Send the triangles (m, 3) to the device."""
         corners = np.zeros((len(faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = faces
-        self._corners = mi.UInt32(aligned(corners.ravel()))
-        self._vertices = mi.Float(0)
-        texture: Any = mi.Texture2f
-        self._map = texture(mi.TensorXf(np.zeros((2, 2, 1), np.float32)), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+        blank, texture = mi.TensorXf(np.zeros((2, 2, 1), np.float32)), cast(Any, mi.Texture2f)
+        plane = texture(blank, use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+        return cls(corners=mi.UInt32(aligned(corners.ravel())), vertices=mi.Float(0), map=plane)
 
     def place(self, vertices: Floats, albedo: Floats) -> None:
         """Set the vertices (n, 3) mm and their albedos (n,); negative ones stand for the map of the plane."""
-        self._vertices = mi.Float(aligned(np.column_stack([vertices, albedo]).astype(np.float32).ravel()))
+        self.vertices = mi.Float(aligned(np.column_stack([vertices, albedo]).astype(np.float32).ravel()))
 
     def paint(self, tile: Floats) -> None:
         """Set the map of the plane's albedo, which repeats."""
-        self._map.set_tensor(mi.TensorXf(tile.astype(np.float32)[..., None]))
+        self.map.set_tensor(mi.TensorXf(tile.astype(np.float32)[..., None]))
 
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Matte:
         """Surface at barycentric coordinates `uv` of triangles."""
-        corner = dr.gather(mi.Vector4u, self._corners, face, active)
-        a, b, c = (dr.gather(mi.Vector4f, self._vertices, i, active) for i in (corner.x, corner.y, corner.z))
+        corner = dr.gather(mi.Vector4u, self.corners, face, active)
+        a, b, c = (dr.gather(mi.Vector4f, self.vertices, i, active) for i in (corner.x, corner.y, corner.z))
         at = a + uv.x * (b - a) + uv.y * (c - a)
         p, q, r = (mi.Vector3f(v.x, v.y, v.z) for v in (a, b, c))
         around = mi.Point2f(at.y + HALF_MM, at.z + HALF_MM) / _TILE_MM
-        mapped = self._map.eval(around, active)[0]
+        mapped = self.map.eval(around, active)[0]
         normal = dr.normalize(dr.cross(q - p, r - p))
         return Matte(mi.Vector3f(at.x, at.y, at.z), normal, dr.select(a.w < 0, mapped, a.w))
 
@@ -108,7 +116,7 @@ class Surround:
         # Without robust intersections rays slip between neighbouring triangles on some processors.
         self.scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surround": mesh})
         self._params: Any = mi.traverse(self.scene)
-        self.geometry = SurroundGeometry(triangles)
+        self.geometry = SurroundGeometry.of(triangles)
         self.obstructed = len(obstacles) > 0
         self._shown: tuple[float, float, float] | None = None
 

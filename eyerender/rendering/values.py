@@ -7,27 +7,34 @@ What determines the kernel (the kinds of surfaces, whether the lens distorts) is
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Reals
-from .parameters import Kind, Parameters, leaves, packed, rebuilt
+from ..arrays import Floats, Reals, Singles
+from .frame import LampTable
+from .parameters import (
+    CameraParameters,
+    ImageParameters,
+    IrisParameters,
+    Kind,
+    LimbusParameters,
+    Parameters,
+    PoseParameters,
+    ScleraParameters,
+    StopParameters,
+    packed,
+    rebuilt,
+)
 from .recorded import recorded
 from .surfaces import Surface
 
-if TYPE_CHECKING:
-    from .irislight import IrisLight
-    from .irisrelief import IrisRelief
-    from .mattelight import MatteLight
-
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
-_POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
-SMALL = 0.02  # the same of lamps whose shadows of hairs are finer than a pixel
+SMALL = 0.02  # radius over distance of lamps whose shadows of hairs are finer than a pixel
 ALL, BITS = 0xFFFFFFFF, 32  # marks of lamps
 _LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
 
@@ -85,21 +92,35 @@ class Structure:
     scattering: bool = False
 
 
+@dataclass(kw_only=True)
 class Values:
-    """The parameters of a frame on the device, and the shape of the pupil's boundary (`boundary`)."""
+    """The parameters of a frame on the device (see `parameters.Parameters`), and what kernels are compiled for.
 
-    DRJIT_STRUCT = leaves(
-        "structure", "boundary", "surfaces", "stop", "iris", "limbus", "sclera", "image", "pose", "camera",
-        "inner_index", "pupil_albedo", "globe_reach", "backdrop_x", "ambient_irradiance",
-    )  # fmt: skip
+    Attributes:
+        structure: what kernels are compiled for.
+        boundary: the shape of the pupil's boundary.
+    """
 
-    def __init__(
-        self,
-        structure: Structure,
-        parameters: Parameters,
-        waves: np.ndarray[Any, np.dtype[np.float64]],
-        tables: Sequence[NDArray[np.float32] | None],
-    ) -> None:
+    structure: Structure
+    boundary: PupilBoundary
+    surfaces: tuple[Surface, ...]
+    inner_index: mi.Float
+    stop: StopParameters
+    iris: IrisParameters
+    limbus: LimbusParameters
+    sclera: ScleraParameters
+    image: ImageParameters
+    pose: PoseParameters
+    camera: CameraParameters
+    pupil_albedo: mi.Float
+    globe_reach: mi.Float
+    backdrop_x: mi.Float
+    ambient_irradiance: mi.Float
+
+    @classmethod
+    def upload(
+        cls, structure: Structure, parameters: Parameters, waves: Floats, tables: Sequence[Singles | None]
+    ) -> Values:
         """Send the numbers to the device.
 
         Args:
@@ -114,19 +135,13 @@ class Values:
             part = [next(left) for _ in range(size)]
             return part[0] if size == 1 else mi.Vector3f(*part) if size == 3 else tuple(part)
 
-        found = rebuilt(parameters, leaf)
-        self.structure = structure
-        self.boundary = PupilBoundary(waves)
-        buffers = [None if table is None else mi.Float(aligned(table)) for table in tables]
-        self.surfaces = tuple(
-            Surface(one.origin, one.axes, one.shape, one.eta, kind, table, one.film)
-            for one, (kind, _), table in zip(found.surfaces, structure.surfaces, buffers, strict=True)
+        sent_parameters = rebuilt(parameters, leaf)
+        others = {f.name: getattr(sent_parameters, f.name) for f in fields(Parameters)}
+        surfaces = tuple(
+            Surface(s.origin, s.axes, s.shape, s.eta, kind, None if table is None else mi.Float(aligned(table)), s.film)
+            for s, (kind, _), table in zip(others.pop("surfaces"), structure.surfaces, tables, strict=True)
         )
-        self.stop, self.iris, self.limbus, self.sclera = found.stop, found.iris, found.limbus, found.sclera
-        self.image, self.pose, self.camera = found.image, found.pose, found.camera
-        self.inner_index, self.pupil_albedo = found.inner_index, found.pupil_albedo
-        self.globe_reach, self.backdrop_x = found.globe_reach, found.backdrop_x
-        self.ambient_irradiance = found.ambient_irradiance
+        return cls(structure=structure, boundary=PupilBoundary.upload(waves), surfaces=surfaces, **others)
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the scene's frame to the eye frame: M^T (x - t)."""
@@ -149,19 +164,24 @@ class Values:
 HARMONICS = 32  # largest number for the pupil's boundary
 
 
+@dataclass(kw_only=True)
 class PupilBoundary:
     """The pupil's boundary: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), f the angle in the stop's plane.
 
-    `waves` (n, 2) are the z_k = c_k - i s_k, k from 1, as pairs. An ellipse has none and costs nothing.
+    Attributes:
+        count: number of the z_k; an ellipse has none and costs nothing.
+        waves: the real and imaginary parts of the z_k, k from 1.
     """
 
-    DRJIT_STRUCT = leaves("count", "_buffer")
+    count: mi.UInt32
+    waves: mi.Float
 
-    def __init__(self, waves: np.ndarray[Any, np.dtype[np.float64]]) -> None:
-        self.count = dr.opaque(mi.UInt32, len(waves))
+    @classmethod
+    def upload(cls, waves: Floats) -> PupilBoundary:
+        """Send z_k = c_k - i s_k, (n, 2), to the device."""
         table = np.zeros((HARMONICS, 2), np.float32)
         table[: len(waves)] = waves
-        self._buffer = mi.Float(aligned(table.ravel()))
+        return cls(count=dr.opaque(mi.UInt32, len(waves)), waves=mi.Float(aligned(table.ravel())))
 
     def radius(self, x: mi.Float, y: mi.Float) -> mi.Float:
         """Radius r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
@@ -173,58 +193,46 @@ class PupilBoundary:
 
         def body(k: mi.UInt32, re: mi.Float, im: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
             k = k - 1
-            re = re + dr.gather(mi.Float, self._buffer, 2 * k)
-            im = im + dr.gather(mi.Float, self._buffer, 2 * k + 1)
+            re = re + dr.gather(mi.Float, self.waves, 2 * k)
+            im = im + dr.gather(mi.Float, self.waves, 2 * k + 1)
             return k, re * c - im * s, re * s + im * c
 
         state = (mi.UInt32(self.count), mi.Float(0), mi.Float(0))
         return 1 + dr.while_loop(state, more, body, labels=("k", "re", "im"), label="margin")[1]
 
 
-def point_like(table: NDArray[np.float64]) -> bool:
-    """Whether all lamps of a table (see `frame.light_table`) are so small that their middles stand for them."""
-    return _widest(table) < _POINT_LIKE and not np.any(table[:, 9] > 0)
-
-
-def _widest(table: NDArray[np.float64]) -> float:
-    """Largest radius of lamps over their distance from the eye."""
-    away = np.linalg.norm(table[:, :3], axis=1)
-    return float(np.max(table[:, 6] / np.maximum(away, 1e-3), initial=0.0))
-
-
+@dataclass(kw_only=True)
 class Lights:
-    """The lamps in the eye frame, (n, 10) numbers in one buffer; kernels do not depend on their number.
+    """The lamps in the eye frame, in one buffer, so kernels do not depend on their number.
 
-    `widest` is the largest radius over the distance from the eye, `points` how many points stand for each lamp at the
-    nodes of a grid, and `gridded` whether lamps of that size may have grids. `suns` is 1 if the last lamp is a sun with
-    sharp shadows, else 0. `on_iris` and `on_matte` are their light
-    in the plane of the iris and on matte surfaces where grids of it are used, and `relief` is the iris' relief in their
-    light.
+    Attributes:
+        count: number of lamps.
+        suns: 1 if the last lamp is a sun with sharp shadows, else 0.
+        rows: the numbers of the lamps, as in `LampTable`.
+        on_iris: their light in the plane of the iris, where a grid of it is used (`irislight.IrisLight`).
+        on_matte: their light on matte surfaces, where grids of it are used (`mattelight.MatteLight`).
+        relief: the relief of the iris in their light (`irisrelief.IrisRelief`).
     """
 
-    DRJIT_STRUCT = leaves("count", "suns", "_buffer", "on_iris", "on_matte", "relief")
+    count: mi.UInt32
+    suns: mi.UInt32
+    rows: mi.Float
+    on_iris: Any = None
+    on_matte: Any = None
+    relief: Any = None
 
-    def __init__(self, table: np.ndarray[Any, np.dtype[np.float64]], suns: int = 0) -> None:
-        self._len = len(table)
-        self.on_iris: IrisLight | None = None
-        self.on_matte: MatteLight | None = None
-        self.relief: IrisRelief | None = None
-        away = np.linalg.norm(table[:, :3], axis=1)
-        self.widest = _widest(table)
-        self.points = 1 if point_like(table) else 4
-        self.gridded = self.widest < _LARGE
-        self.count = dr.opaque(mi.UInt32, self._len)
-        self.suns = dr.opaque(mi.UInt32, suns if self._len and table[-1, 6] < SMALL * away[-1] else 0)
+    @classmethod
+    def upload(cls, table: LampTable) -> Lights:
+        """Send lamps to the device."""
         rows = np.zeros((max(len(table), 1), _LIGHT_ROW), np.float32)
-        rows[: len(table), : table.shape[1]] = table
-        self._buffer = sent(rows)
-
-    def __len__(self) -> int:
-        return self._len
+        rows[: len(table), : table.rows.shape[1]] = table.rows
+        sharp = table.suns and table.widths[-1] < SMALL
+        count, suns = (dr.opaque(mi.UInt32, n) for n in (len(table), table.suns if sharp else 0))
+        return cls(count=count, suns=suns, rows=sent(rows))
 
     def __getitem__(self, i: mi.UInt32) -> Lamp:
         # Four numbers are gathered at once.
-        a, b, c = (dr.gather(mi.Vector4f, self._buffer, i * (_LIGHT_ROW // 4) + k) for k in range(3))
+        a, b, c = (dr.gather(mi.Vector4f, self.rows, i * (_LIGHT_ROW // 4) + k) for k in range(3))
         return Lamp(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(a.w, b.x, b.y), b.z, b.w, c.x, c.y, i)
 
 

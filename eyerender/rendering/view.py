@@ -17,19 +17,12 @@ from ..region.iris import WIDTH_MM, DrawnPattern, iris_maps
 from ..region.look import Look
 from ..region.mapcache import kept
 from ..region.texture import sclera_texture
-from .parameters import traversed
 from .surfaces import Bundle
 from .surround import HALF_MM
 from .values import Values
 
 if TYPE_CHECKING:
-    from .environment import Ambience
-    from .exchange import Received
-    from .lampviews import LampViews
-    from .pupillight import PupilLight
     from .region import SkinGeometry
-    from .subsurface import TissueLight
-    from .surround import SurroundGeometry
 
 EPSILON_MM = 2e-3  # points closer than this are the same in single precision
 _NEAR_MM = 20.0
@@ -114,25 +107,35 @@ class View:
         return 0.5 * both / dr.dot(w, dr.cross(a, b))
 
 
-@traversed
 @dataclass(frozen=True, slots=True)
 class Textures:
-    """Maps of the eye: relative albedo (mean 1) and height (mm) of the iris over (angle, pupil to root), the sclera's.
+    """Maps of the eye, and the light and the surroundings of a frame.
 
-    `raised` tells whether the iris has any heights.
+    Attributes:
+        iris: relative albedo (mean 1) of the iris over (angle, pupil to root).
+        heights: height (mm) of the iris over the same.
+        raised: whether the iris has any heights.
+        sclera: relative albedo of the sclera.
+        surround: `surround.SurroundGeometry` of frames without a region.
+        region: `region.SkinGeometry`.
+        ambience: `environment.Ambience`.
+        lamp_views: `lampviews.LampViews`.
+        pupil: `pupillight.PupilLight`.
+        received: `exchange.Received`.
+        tissues: `subsurface.TissueLight`.
     """
 
     iris: mi.Texture2f
     heights: mi.Texture2f
     raised: bool
     sclera: mi.Texture2f
-    surround: SurroundGeometry | None = None  # of frames without a region
-    region: SkinGeometry | None = None
-    ambience: Ambience | None = None
-    lamp_views: LampViews | None = None
-    pupil: PupilLight | None = None
-    received: Received | None = None
-    tissues: TissueLight | None = None
+    surround: Any = None
+    region: Any = None
+    ambience: Any = None
+    lamp_views: Any = None
+    pupil: Any = None
+    received: Any = None
+    tissues: Any = None
 
     @classmethod
     def of(cls, look: Look) -> Textures:

@@ -151,7 +151,7 @@ def test_irradiance_against_the_integral(renderer, tmp_path):
     weight = (edges[:-1] - edges[1:])[:, None, None] * (np.pi / 64)
     world = w @ map_rotation(spec).T
     expected = np.array([np.sum(weight[..., 0] * values * np.maximum(world @ k, 0)) for k in n]) * 1e-3
-    ambience = Ambience(0.0, np.zeros((0, 13)), spec, Maps())
+    ambience = Ambience.upload(0.0, np.zeros((0, 13)), spec, Maps())
     seen = ambience.irradiance(mi.Vector3f(0), mi.Vector3f(*n.T.astype(np.float32))).numpy()
     # The table's cells are 3.75 degrees large: cosines between them are good to 5e-4, and where the sun sets to .01.
     np.testing.assert_allclose(seen, expected, atol=0.01 * expected.max())
@@ -181,7 +181,7 @@ def test_a_panels_irradiance_against_the_integral(renderer, point, normal):
     n = np.array(normal) / np.linalg.norm(normal)
     area = 4 * np.linalg.norm(right) * np.linalg.norm(up) / s.size**2
     expected = 2e-3 * np.sum(np.maximum(q @ n, 0) * np.maximum(-q @ front, 0) / r**4) * area
-    ambience = Ambience(0.0, table, None, Maps())
+    ambience = Ambience.upload(0.0, table, None, Maps())
     seen = float(ambience.irradiance(mi.Vector3f(*map(float, point)), mi.Vector3f(*map(float, n))).numpy()[0])
     assert seen == pytest.approx(expected, rel=2e-3, abs=1e-9)
 
