@@ -22,6 +22,7 @@ FLOORS = {
     "jsonlines": 0,
     "references": 0,
     "lock": 0,
+    "jit": 0,
     "progress": 0,
     "status": 0,
     "spec": 0,

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from .jit import compiled, inlined
+from ..jit import compiled, inlined
 
 SECTORS, NEAR = 48, 2  # as in edge_model
 DARK, SHADED = 0.35, 0.6  # as in outline

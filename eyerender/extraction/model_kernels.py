@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from .jit import compiled, inlined, summing
+from ..jit import compiled, inlined, summing
 from .kernels import BLOCK, NEAR, SECTORS, factored, median_of, places, sector_at, sectors_at, solved
 
 SHAPE, STILL_PX, KURTOSIS = 5, 1.5e-2, (-1.5, 3.0)  # as in covariance and least_squares

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from .jit import compiled, inlined, summing
+from ..jit import compiled, inlined, summing
 
 UNEXPLAINED = 2.0  # as in fitting
 # As in gaussian_model.

@@ -84,7 +84,7 @@ def test_extraction_is_the_same_with_and_without(without, monkeypatch):
 
 @pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra `fast`")
 def test_machine_code_of_other_versions_is_removed_once_it_is_old(tmp_path):
-    from eyerender.extraction.jit import used
+    from eyerender.jit import used
 
     new, old, recent, other = (tmp_path / name for name in ("0" * 16, "a" * 16, "b" * 16, "mine"))
     month_ago = time.time() - 31 * 86400

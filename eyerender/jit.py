@@ -27,7 +27,7 @@ config: Any = numba_config  # it makes its attributes at run time
 
 def _folder() -> Path:
     """Folder of the machine code of these files as they are."""
-    sources = sorted(Path(__file__).parent.glob("*kernels.py"))
+    sources = sorted(Path(__file__).parent.glob("*/*kernels.py"))
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:_DIGITS]
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eyerender" / "kernels" / digest
 
