@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import fft, ndimage, special
+from scipy import fft, special
 
-from ..arrays import ArrayValue, Bools, Floats, Reals, Singles
+from ..arrays import ArrayValue, Floats, Ints, Reals, Singles
 from ..errors import InputError
 from ..rig.camera import Window
 from .camera import PinholeCamera
@@ -37,11 +37,12 @@ from .sensor import Sensor
 MAX_CONFUSION_PX = 400
 _SHARP_PX = 0.1  # a smaller disc changes nothing
 _RIPPLES_PX = 4
-LARGEST_PX = 64.0  # in a layer: what is blurred more shows no structure
-_RATIO = 1.2  # between the diameters of neighbouring kernels
+_LARGEST_PX = 64.0  # in a layer: what is blurred more shows no structure
+_DISCS = 128  # kernels from one diameter to twice that, for large ones
 _ALIKE = 0.03  # relative difference of blurs' widths that does not matter
 _PIXEL_VARIANCE = 1 / 12
-LEAST_ROOM = 0.02
+_LEAST_ROOM = 0.02
+_LEAST_SHARE = 1e-3  # of a pixel: rounding of coverages leaves less
 
 
 def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: Floats | float) -> Floats:
@@ -127,13 +128,15 @@ def defocused(picture: Reals, diameter_px: float) -> Reals:
     m = reach_px(diameter_px)
     if m == 0:
         return picture
-    whole = _Convolution(picture.shape, m)
-    return np.asarray(np.maximum(whole.back(whole.of(picture, diameter_px)), 0.0)[m:-m, m:-m])
+    height, width = picture.shape
+    size = (fft.next_fast_len(height + m, real=True), fft.next_fast_len(width + m, real=True))
+    transform = fft.rfft2(picture.astype(np.float32), size) * _transfer(diameter_px, size)
+    return np.asarray(np.maximum(fft.irfft2(transform, size)[m : height - m, m : width - m], 0.0))
 
 
 def reach_px(diameter_px: float) -> int:
     """Pixels that must be rendered beyond a window's border for discs of at most this diameter."""
-    return 0 if diameter_px < _SHARP_PX else _margin(min(diameter_px, LARGEST_PX))
+    return 0 if diameter_px < _SHARP_PX else _margin(min(diameter_px, _LARGEST_PX))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,88 +154,66 @@ class Layer(ArrayValue):
     confusion_px: Floats
 
 
-def blurred(layers: Sequence[Layer], reach: int) -> Floats:
+def blurred(layers: Sequence[Layer], reach: int) -> Singles:
     """Blur layers, from front to back, each by its own depths; smaller by `reach` pixels on every side."""
-    shape = layers[0].radiance.shape
-    plan = _Convolution(shape, reach)
-    out, through, open_ = np.zeros(shape), np.ones(shape), np.ones(shape)
-    foremost = True  # such a layer has the whole picture to itself
+    height, width = layers[0].radiance.shape
+    shape = height - 2 * reach, width - 2 * reach
+    out, through = np.zeros(shape, np.float32), np.ones(shape, np.float32)
+    uncovered: Singles | None = None  # share of each pixel; the foremost layer has the whole picture to itself
     for layer in layers:
-        covered = layer.coverage > 0
-        if not covered.any():
+        if not np.any(layer.coverage > 0):
             continue
-        pictures = [layer.radiance, layer.coverage]
-        if not foremost:
-            pictures.append(np.maximum(open_, layer.coverage))
-        radiance, coverage, *rest = plan.spread(pictures, _continued(layer, covered))
-        room = rest[0] if rest else np.ones(shape)
-        foremost = False
-        room = np.maximum(room, LEAST_ROOM)
+        radiance, coverage, room = _spread(layer, uncovered, reach)
         alpha = coverage / room
         out += through * np.maximum(radiance, 0) / (room * np.maximum(alpha, 1))
         through *= 1 - np.clip(alpha, 0, 1)
-        open_ = np.maximum(open_ - layer.coverage, 0)
-    m = reach
-    return out[m:-m, m:-m] if m else out
+        left = (1 if uncovered is None else uncovered) - layer.coverage
+        uncovered = np.where(left > _LEAST_SHARE, left, 0)
+    return out
 
 
-def _continued(layer: Layer, covered: Bools) -> Floats:
-    """Diameters of a layer, continued beyond it from the nearest pixel."""
-    size = np.clip(layer.confusion_px, 0, LARGEST_PX)
-    if covered.all():
-        return np.asarray(size)
-    nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
-    return np.asarray(size[tuple(nearest)])
+def _spread(layer: Layer, uncovered: Singles | None, reach: int) -> tuple[Singles, Singles, Singles | float]:
+    """Spread a layer's radiance, its coverage and the room for it; all are smaller by `reach` on every side."""
+    # numba is imported only where it is needed.
+    from .disc_kernels import LANES, continue_nearest, spread
+
+    covered = layer.coverage > 0
+    pictures = [layer.radiance, layer.coverage]
+    diameter = np.where(covered, np.clip(layer.confusion_px, 0, _LARGEST_PX), 0).astype(np.float32)
+    if uncovered is not None:
+        pictures.append(np.maximum(uncovered, layer.coverage))
+        continue_nearest(diameter, np.where(covered, 0, sum(covered.shape) + 1).astype(np.int32))
+    index, discs, reaches = _nearest_discs(diameter)
+    border, (height, width) = discs.shape[1] // 2, diameter.shape
+    sums = np.zeros((len(pictures), height + 2 * border, width + 2 * border + LANES), np.float32)
+    spread(np.array(pictures, np.float32), index, discs, reaches, sums)
+    cut = border + reach
+    radiance, coverage, *room = sums[:, cut : cut + height - 2 * reach, cut : cut + width - 2 * reach]
+    return radiance, coverage, np.maximum(room[0], _LEAST_ROOM) if room else 1.0
 
 
-def padded(shape: tuple[int, ...], reach: int) -> tuple[int, int]:
-    """Height and width of the Fourier transforms of pictures; they have no factors but 2, 3 and 5."""
-    height, width = (fft.next_fast_len(n + reach, real=True) for n in shape)
-    return height, width
+def _nearest_discs(diameters_px: Singles) -> tuple[Ints, Singles, Ints]:
+    """Index of the nearest disc for each pixel, and the discs with their reaches (see `disc_kernels.spread`).
+
+    Disc k has the diameter 2^(k/128) - 1 pixels: small ones differ by 0.005 pixels, large ones by 0.5 % of their size.
+    """
+    discs, reaches = _discs(reach_px(float(diameters_px.max())))
+    index = np.rint(_DISCS * np.log2(1 + diameters_px)).astype(np.int64)
+    return np.clip(index, 0, len(discs) - 1), discs, reaches
 
 
-class _Convolution:
-    """Convolutions of pictures of one shape by Fourier transforms; the borders repeat nothing within `reach`."""
+@lru_cache(maxsize=4)
+def _discs(reach: int) -> tuple[Singles, Ints]:
+    """The discs that reach at most so far, and their reaches."""
+    from .disc_kernels import LANES
 
-    def __init__(self, shape: tuple[int, ...], reach: int) -> None:
-        self._shape = shape
-        self._size = padded(shape, reach)
-
-    def of(self, picture: Reals, diameter_px: float) -> Floats:
-        """Fourier transform of a picture convolved with a disc."""
-        return np.asarray(fft.rfft2(picture.astype(np.float32), self._size) * _transfer(diameter_px, self._size))
-
-    def back(self, transform: Floats) -> Floats:
-        """Picture of a Fourier transform."""
-        return np.asarray(fft.irfft2(transform, self._size)[: self._shape[0], : self._shape[1]])
-
-    def spread(self, pictures: Sequence[Reals], diameters: Floats) -> list[Floats]:
-        """Spread every pixel of some pictures over the disc of its own diameter, mixed from two kernels."""
-        sizes = kernel_diameters(float(diameters.min()), float(diameters.max()))
-        totals: list[Floats | float] = [0.0] * len(pictures)
-        for k, size in enumerate(sizes):
-            weight = _weight(diameters, sizes, k)
-            if not weight.any():
-                continue
-            for i, picture in enumerate(pictures):
-                totals[i] = totals[i] + self.of(picture * weight, size)
-        return [self.back(np.asarray(t)) for t in totals]
-
-
-def kernel_diameters(low: float, high: float) -> list[float]:
-    """Diameters of kernels that enclose a range; from a common list, so that kernels are made once."""
-    sizes = [0.0, 0.4]
-    while sizes[-1] < high:
-        sizes.append(sizes[-1] * _RATIO)
-    first = max(k for k, size in enumerate(sizes) if size <= low)
-    last = next((k for k, size in enumerate(sizes) if size >= high), len(sizes) - 1)
-    return sizes[first : max(last, first) + 1]
-
-
-def _weight(diameters: Floats, sizes: Sequence[float], k: int) -> Floats:
-    """Share of kernel k for pixels of given diameters: mixtures keep the variance."""
-    square = np.asarray(sizes) ** 2
-    return np.asarray(np.interp(diameters**2, square, np.arange(len(sizes)) == k))
+    count = 1 + int(_DISCS * np.log2(1 + 2 * max(reach - _RIPPLES_PX, 0)))
+    kernels = [disc(2 ** (k / _DISCS) - 1) for k in range(count)]
+    size = 2 * reach + 1
+    discs = np.zeros((len(kernels), size, -(-size // LANES) * LANES), np.float32)
+    for one, kernel in zip(discs, kernels, strict=True):
+        one[: len(kernel), : len(kernel)] = kernel
+    return discs, np.array([len(kernel) // 2 for kernel in kernels])
 
 
 def vignette(lens: Lens, camera: PinholeCamera, window: Window) -> Floats | float:
