@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import io
 import os
-import struct
 import warnings
-import zlib
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -34,7 +32,6 @@ COLOURED = ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr
 
 
 _WAITING = 8  # images of a `Writer`
-_EVERY, _RUNS = 8, 0.5  # rows that are looked at; share of bytes like the one before from which runs are worth it
 
 
 def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> None:
@@ -59,29 +56,17 @@ def encode_png(target: Path | BinaryIO, image: NDArray[Any]) -> None:
 def png_bytes(image: NDArray[Any]) -> bytes:
     """PNG file of (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour (ISO/IEC 15948).
 
-    Noise does not compress, and writing must not cost more than rendering. So there is no search for the best filter
-    of each row, which takes most of the time elsewhere, nor one for repetitions other than runs, which masks have.
+    Noise does not compress, and writing must not cost more than rendering. So every row has the same filter, and no
+    repetitions are searched for other than runs, which masks have.
     """
-    if image.dtype not in (np.uint8, np.uint16) or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+    import cv2
+
+    colour = image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8
+    if not colour and (image.ndim != 2 or image.dtype not in (np.uint8, np.uint16)):
         raise ValueError(f"no PNG holds {image.shape} of {image.dtype}")
-    height, width = image.shape[:2]
-    pixels = np.ascontiguousarray(image, dtype=image.dtype.newbyteorder(">")).view(np.uint8).reshape(height, -1)
-    step = pixels.shape[1] // max(width, 1)
-    rows = np.empty((height, 1 + pixels.shape[1]), np.uint8)
-    if image.dtype == np.uint8 and image.ndim == 2:
-        rows[:, 0], rows[:, 1:] = 0, pixels
-    else:  # differences to the pixel on the left
-        rows[:, 0], rows[:, 1 : 1 + step] = 1, pixels[:, :step]
-        np.subtract(pixels[:, step:], pixels[:, :-step], out=rows[:, 1 + step :])
-    runs = np.mean(rows[::_EVERY, 2:] == rows[::_EVERY, 1:-1]) > _RUNS
-    packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, 8, zlib.Z_RLE if runs else zlib.Z_HUFFMAN_ONLY)
-    header = struct.pack(">IIBBBBB", width, height, 8 * image.itemsize, 0 if image.ndim == 2 else 2, 0, 0, 0)
-    parts = ((b"IHDR", header), (b"IDAT", packer.compress(rows.data) + packer.flush()), (b"IEND", b""))
-    chunks = (
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(name)))
-        for name, data in parts
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+    how = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+    _, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1] if colour else image), how)
+    return data.tobytes()
 
 
 class Writer:

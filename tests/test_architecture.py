@@ -142,7 +142,7 @@ def test_imports_point_down(path):
     ("libraries", "homes"),
     [
         (("mitsuba", "drjit"), {"rendering", "backends"}),
-        (("cv2",), {"extraction", "dataset"}),
+        (("cv2",), {"extraction", "dataset", "imagefile"}),
         (("skimage",), {"dataset"}),
     ],
 )
