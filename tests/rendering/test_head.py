@@ -273,7 +273,7 @@ def test_kernels_do_not_depend_on_where_memory_lies(renderer, folder):
     found, taken = set(), []
     for k in range(12):
         taken.append(np.empty(25600 + 16 * k, np.uint8))  # NumPy's memory lies at multiples of 16 bytes
-        place.skin.pose(place.posed)
+        place._pose_skin(place.posed)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             renderer.radiance(job)

@@ -29,8 +29,8 @@ def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_
     from eyerender.rendering.lampviews import LampViews
     from eyerender.rendering.recorded import forget
 
-    monkeypatch.setattr(stage, "IrisLight", lambda *_: None)  # which uses the views too
-
+    monkeypatch.setattr(stage, "iris_light", lambda *_: None)  # which uses the views too
+    forget()
     rig = rigs.RIGS[name](radius_mm=radius_mm)
     eye = rigs.eye_of(model, side)
     job = rigs.job_of(eye, rig, rig.window(320, 240), pose, region=Region(seed=5, blink=blink), labels=False)

@@ -33,7 +33,7 @@ def test_the_waves_on_the_device_are_the_radius_of_the_stop(renderer, side):
 
     eye = eye_with(CONTOUR, side=side)
     angle = np.linspace(0, 2 * np.pi, 50)
-    margin = PupilBoundary(boundary_waves(eye))
+    margin = PupilBoundary.upload(boundary_waves(eye))
     import mitsuba as mi
 
     mine = np.array(margin.radius(mi.Float(3 * np.cos(angle)), mi.Float(3 * np.sin(angle))))

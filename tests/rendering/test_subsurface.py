@@ -145,7 +145,7 @@ def test_shut_lids_transmit_light(renderer):
     assert shown.textures.tissues is not None
     upper = place.posed.upper_margin
     up = upper[np.argmin(np.abs(upper[:, 1]))]  # where the lids meet before the eye
-    inside = float(shown.textures.tissues.on_globe(mi.Vector3f(*(float(v) for v in up))).numpy()[0])
+    inside = float(shown.textures.tissues.on_globe(shown.values, mi.Vector3f(*(float(v) for v in up))).numpy()[0])
     lamp = shut.lights[0]
     way = lamp.position_mm - up
     outside = lamp.intensity_mw_sr / float(way @ way)  # more than what falls on the slope of the lid
