@@ -21,7 +21,7 @@ with E_s the irradiance of the limbus in sector s from outside, and w_is the sha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -45,6 +45,7 @@ _WEAK, _FEW = 0.25, 4  # of the rays of which the cornea mirrors less, one of fo
 _ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
 _STEPS = 20  # crossings and mirrorings of a ray
 _NEAR_MM = 1e-6
+_SAME_MM = 0.02  # a chamber deeper or shallower by half of this sends each place the same light to three digits
 _AHEAD_MM = 1e-4  # hits are looked for from here on: a root cannot be computed from a point of the surface itself
 _BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
 _WALL_MM = 1.0  # thickness of the sclera
@@ -74,14 +75,23 @@ class Chamber(ArrayValue):
 
 
 def chamber_of(eye: EyeModel, film: float) -> Chamber:
-    """Compute the chamber of an eye with a film of this index on its cornea; pupil and albedos do not matter."""
+    """Compute the chamber of an eye with a film of this index on its cornea; pupil and albedos do not matter.
+
+    As the pupil of a person changes, the centre of the stop moves within the plane of the iris, and by a micrometre
+    across it. A plane that is square to the axis stays the same plane, so depth and root are rounded to `_SAME_MM`, and
+    all images of a person share one chamber, whichever comes first. A tilted plane has a chamber of its own.
+    """
+    root_mm = float(eye.iris_root_radius_mm)
+    if np.array_equal(eye.stop.normal, [1.0, 0.0, 0.0]):
+        depth, root_mm = (_SAME_MM * round(v / _SAME_MM) for v in (float(eye.stop.centre_mm[0]), root_mm))
+        eye = replace(eye, stop=replace(eye.stop, centre_mm=frozen([depth, 0.0, 0.0])))
     plane = (*np.asarray(eye.stop.centre_mm).tolist(), *np.asarray(eye.stop.normal).tolist())
     sclera = (*np.asarray(eye.sclera.centre_mm).tolist(), float(eye.sclera.radius_mm))
     indices = tuple(float(n) for n in eye.front_indices)
     foot = None
     if len(eye.front) > 1:
         foot = float(np.mean(chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(TURNS) / TURNS)))
-    radii = float(eye.iris_root_radius_mm), float(eye.limbus_radius_mm)
+    radii = root_mm, float(eye.limbus_radius_mm)
     return _chamber(tuple(eye.front), indices, film, plane, radii, sclera, foot)
 
 
