@@ -158,25 +158,21 @@ set_up() {
     say "environment ready after $(($(date +%s) - began)) s"
 }
 
-# Brings a libLLVM that renders, once. Without one all but rendering works, so that is a warning; a failure is tried
-# again after an hour at the earliest, so that commands that render nothing do not wait each time. Users who share a
-# checkout have a cache each, in which the package looks for the library.
+# Tries once whether rendering works here, and fetches the library that a bare Debian lacks for it. All but rendering works
+# without, so a failure is a warning, and is tried again after an hour at the earliest. `.llvm` holds the user's cache
+# folder, because users who share a checkout have a cache each, and the files that rendering uses.
 set_up_llvm() {
     cache=${XDG_CACHE_HOME-${HOME-}}
-    if [ -f "$venv/.llvm" ]; then
-        library='' of=''
-        { read -r library && read -r of; } <"$venv/.llvm" || :
-        [ ! -r "$library" ] || [ "$of" != "$cache" ] || return 0
+    if [ -f "$venv/.llvm" ] && [ "$(head -n 1 "$venv/.llvm")" = "$cache" ]; then
+        sed 1d "$venv/.llvm" | while read -r file; do [ -r "$file" ] || exit 1; done && return
     fi
     [ -z "$(find "$venv/.llvm-failed" -mmin -60 2>/dev/null)" ] || return 0
-    if "$venv/bin/python" -m eyerender.backends.set_up --quiet >"$venv/.llvm.$$"; then
-        printf '%s\n' "$cache" >>"$venv/.llvm.$$"
+    if files=$("$venv/bin/python" -m eyerender.backends.set_up); then
+        printf '%s\n' "$cache" "$files" >"$venv/.llvm.$$"
         mv -f "$venv/.llvm.$$" "$venv/.llvm"
         rm -f "$venv/.llvm-failed"
     else
-        status=$?
-        rm -f "$venv/.llvm.$$"
-        [ "$status" != 130 ] || exit 130
+        [ $? != 130 ] || exit 130
         : >"$venv/.llvm-failed"
     fi
 }

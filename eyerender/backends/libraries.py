@@ -5,11 +5,15 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
+WHEEL = "karellen-llvm-core"
 # Libraries that Dr.Jit is linked with and a bare Linux lacks, with their packages on Debian and on Fedora.
 RUNTIME = {"libatomic.so.1": ("libatomic1", "libatomic")} if sys.platform == "linux" else {}
+# Libraries that the wheel's libLLVM needs, each after those that it needs itself. The wheel makes links to them when
+# Python starts, but only in a writable environment, so they are loaded by their real names.
+_BESIDE_LLVM = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
 
 
 def cache_folder() -> Path | None:
@@ -24,67 +28,56 @@ def cache_folder() -> Path | None:
     return home / ".cache" / "eyerender" if home.is_absolute() and home != Path("/") else None
 
 
-def llvm_store() -> Path | None:
-    """Folder into which `setup_llvm` unpacks, one folder per package; None without a home folder."""
+def runtime_store() -> Path | None:
+    """Folder for the libraries of `RUNTIME` that `setup_llvm` has fetched; None without a home folder."""
     folder = cache_folder()
-    return folder / "llvm" if folder else None
+    return folder / "lib" if folder else None
 
 
-def stored_folders() -> tuple[Path, ...]:
-    """Library folders of everything that `setup_llvm` has unpacked."""
-    store = llvm_store()
-    patterns = ("*/usr/lib/*", "*/usr/lib", "*/lib/*")
-    return tuple(p for pattern in patterns for p in sorted(store.glob(pattern)) if p.is_dir()) if store else ()
+def load_runtime() -> list[Path]:
+    """Load the libraries that Dr.Jit is linked with: the system's, else those that `setup_llvm` has fetched.
 
-
-def load_runtime(folders: Sequence[Path] = ()) -> None:
-    """Load the libraries that Dr.Jit is linked with.
-
-    The system is searched first, then `folders` or what `setup_llvm` has unpacked.
+    Returns:
+        The files of those that were fetched and are used.
 
     Raises:
         OSError: a library is nowhere; the message names the package.
     """
+    fetched: list[Path] = []
+    store = runtime_store()
     for name, (debian, fedora) in RUNTIME.items():
         try:
             ctypes.CDLL(name)
         except OSError as error:
-            found = next((f / name for f in (*folders, *stored_folders()) if (f / name).is_file()), None)
-            if found is None:
+            if store is None or not (store / name).is_file():
                 raise OSError(f"{name} is missing (package {debian} on Debian, {fedora} elsewhere)") from error
-            load_library(found)
+            ctypes.CDLL(str(store / name))
+            fetched.append(store / name)
+    return fetched
 
 
-def load_library(library: Path, folders: Sequence[Path] = ()) -> None:
-    """Load a shared library after those of its dependencies that only `folders` have.
+def wheel_libraries() -> list[Path]:
+    """List where pip's libLLVM is recorded, and where `pip install --prefix` adds it to a `--target` folder."""
+    try:
+        wheel = distribution(WHEEL)
+    except PackageNotFoundError:
+        return []
+    recorded = [Path(str(file.locate())) for file in wheel.files or [] if file.name.startswith("libLLVM.so.")]
+    return recorded + sorted(Path(str(wheel.locate_file("lib"))).glob("libLLVM.so.*"))
 
-    LD_LIBRARY_PATH is read when a process starts, so a library that was unpacked into a folder of ours does not find
-    what was unpacked beside it. The system's libraries have priority. The loader's message names the missing object.
+
+def load_llvm(library: Path) -> None:
+    """Load a libLLVM and the libraries that it and Dr.Jit need.
+
+    Their symbols stay private (RTLD_LOCAL), since the loader finds a loaded dependency by its name alone. Public ones
+    would replace the system's C++ runtime in libraries that are loaded later.
 
     Raises:
         OSError: a dependency is nowhere, or the library does not fit this system.
     """
-    for _ in range(64):
-        try:
-            ctypes.CDLL(str(library))
-        except OSError as error:
-            missing = str(error).partition(":")[0].strip()
-            found = next((f / missing for f in folders if "/" not in missing and (f / missing).is_file()), None)
-            if found is None or found == library:
-                raise
-            load_library(found, folders)
-        else:
-            return
-    raise OSError(f"{library}: its dependencies cannot be resolved")
-
-
-def library_folders(library: Path) -> tuple[Path, ...]:
-    """Folders that may hold what was unpacked together with `library`: its own, and lib folders of the same tree."""
-    folders = [library.parent]
-    for above in library.parents:
-        if above.name == "usr" and above != Path("/usr"):
-            tree = above.parent
-            folders += [p for p in sorted(tree.glob("usr/lib/*")) + sorted(tree.glob("lib/*")) if p.is_dir()]
-            folders += [tree / "usr" / "lib", tree / "lib"]
-            break
-    return tuple(dict.fromkeys(folders))
+    load_runtime()
+    for name in _BESIDE_LLVM:
+        file = library.parent / "x86_64-unknown-linux-gnu" / name
+        if file.is_file():
+            ctypes.CDLL(str(file))
+    ctypes.CDLL(str(library))

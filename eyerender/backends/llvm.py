@@ -1,8 +1,8 @@
 """The libLLVM of Mitsuba's llvm variants: finding one that renders, and making Dr.Jit load it.
 
-pip provides none. Some versions are refused, and some end the process at their first kernel, so each candidate is
-probed in a process of its own (`probe`). Dr.Jit loads a libLLVM only when drjit is first imported. `ensure_llvm` runs
-before that, or checks what was loaded.
+On Linux x86-64 the wheel karellen-llvm-core provides it; elsewhere the system must. Some versions are refused, and some
+end the process at their first kernel, so each candidate is probed in a process of its own (`probe`). Dr.Jit loads a
+libLLVM only when drjit is first imported. `ensure_llvm` runs before that, or checks what was loaded.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import BackendError
-from .libraries import library_folders, load_library, load_runtime, stored_folders
+from .libraries import load_llvm, wheel_libraries
 from .probe import Verdict, probe
 from .remedies import llvm_fix
 
@@ -50,9 +50,9 @@ _active: LibLlvm | None = None
 
 
 def candidates() -> Iterator[Path]:
-    """Every libLLVM of this machine, once: the one that the user names, our own, then the system's, newest first."""
+    """Yield every libLLVM of this machine once: the one the user names, the wheel's, the system's from new to old."""
     seen: set[Path] = set()
-    for group in (_named, _stored, _installed):
+    for group in (_named, wheel_libraries, _installed):
         for path in sorted(group(), key=_order):
             real = path.resolve()
             if real not in seen and real.is_file():
@@ -102,9 +102,7 @@ def _activate() -> LibLlvm:
         if not examined.verdict.ok:
             continue
         try:
-            folders = library_folders(examined.path)
-            load_runtime(folders)
-            load_library(examined.path, folders)
+            load_llvm(examined.path)
         except OSError:
             # It is cached as good, but something that it needs has been removed since.
             probe(VARIANT, examined.path, refresh=True)
@@ -167,10 +165,6 @@ def _order(path: Path) -> tuple[bool, list[int], str]:
 def _named() -> list[Path]:
     given = os.environ.get(ENVIRONMENT)
     return [Path(given)] if given else []
-
-
-def _stored() -> list[Path]:
-    return _libraries(list(stored_folders()))
 
 
 def _installed() -> list[Path]:

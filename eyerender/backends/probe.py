@@ -25,7 +25,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from .libraries import cache_folder, library_folders, load_library, load_runtime
+from .libraries import cache_folder, load_llvm, load_runtime
 
 TIMEOUT_S = 180.0
 REFUSAL_AGE_S = 86400.0  # a refusal is checked again after a day, because the GPU may have been busy or memory short
@@ -224,11 +224,10 @@ def main(arguments: Sequence[str]) -> int:
 
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         library = Path(arguments[1]) if len(arguments) > 1 else None
-        folders = library_folders(library) if library else ()
         lasting = False  # a library that does not load lacks something that may be installed later
-        load_runtime(folders)
+        load_runtime()
         if library:
-            load_library(library, folders)
+            load_llvm(library)
             os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
         lasting = True
         answer = {"ok": True, "detail": _work(arguments[0]), "lasting": True}

@@ -39,9 +39,9 @@ def doctor(*, json: Result = None) -> int:
 
 @app.command(name="setup-llvm")
 def setup_llvm() -> int:
-    """Fetch the libLLVM that rendering on the CPU needs, unless one works already.
+    """Find a libLLVM that renders on the CPU, or say how to install one.
 
-    It needs no root rights.
+    On Debian and Ubuntu it also fetches the library libatomic where that is missing, without root rights.
     """
     from ..backends.set_up import setup_llvm as bring
 

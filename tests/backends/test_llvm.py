@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gzip
 import hashlib
 import json
@@ -12,16 +13,17 @@ import subprocess
 import sys
 import textwrap
 import time
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import pytest
 
 from eyerender.backends import apt as apt_module
-from eyerender.backends.apt import Apt
-from eyerender.backends.libraries import cache_folder, library_folders, llvm_store, load_library, load_runtime
+from eyerender.backends.apt import fetch_library
+from eyerender.backends.libraries import WHEEL, cache_folder, load_llvm, load_runtime, runtime_store
 from eyerender.backends.llvm import ENVIRONMENT, VARIANT, candidates, find_llvm, version_of
 from eyerender.backends.probe import REFUSAL_AGE_S, Verdict, probe, run_probe
-from eyerender.backends.remedies import has_archive, llvm_command
+from eyerender.backends.remedies import has_archive, llvm_command, runtime_command
 from eyerender.backends.set_up import setup_llvm
 from eyerender.errors import BackendError
 
@@ -39,14 +41,24 @@ def good() -> Path:
     return found.path
 
 
+@pytest.fixture(scope="module")
+def wheel() -> Path:
+    """The libLLVM of the wheel karellen-llvm-core."""
+    try:
+        files = distribution(WHEEL).files or []
+    except PackageNotFoundError:
+        pytest.skip(f"{WHEEL} is not installed here")
+    return next(Path(str(f.locate())) for f in files if f.name.startswith("libLLVM.so.")).resolve()
+
+
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache folder without verdicts; what was unpacked stays in reach, a bare machine cannot load Dr.Jit without."""
-    store = llvm_store()
+    """A cache folder without verdicts; what was fetched stays in reach, a bare machine cannot load Dr.Jit without."""
+    store = runtime_store()
     folder = tmp_path / "cache" / "eyerender"
     folder.mkdir(parents=True)
     if store is not None and store.is_dir():
-        (folder / "llvm").symlink_to(store)
+        (folder / "lib").symlink_to(store)
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder.parent))
     return folder
 
@@ -88,9 +100,9 @@ def test_version_is_read_from_the_name(name: str, version: tuple[int, ...]) -> N
     assert version_of(Path("/x") / name) == version
 
 
-def test_candidates_are_named_then_own_then_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_candidates_are_named_then_the_wheels_then_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     named = tmp_path / "named" / "libLLVM-15.so"
-    own = tmp_path / "cache" / "eyerender" / "llvm" / "libllvm18" / "usr" / "lib" / "triplet" / "libLLVM.so.18.1"
+    own = tmp_path / "env" / "lib" / "libLLVM.so.18.1"
     loader = tmp_path / "loader"
     others = [loader / name for name in ("libLLVM.so.21.1", "libLLVM-17.so.1", "libLLVM-16.so.1", "libLLVM-14.so.1")]
     for file in (named, own, *others):
@@ -98,10 +110,85 @@ def test_candidates_are_named_then_own_then_newest(tmp_path: Path, monkeypatch: 
         file.touch()
     (loader / "libLLVM-21.so").symlink_to("libLLVM.so.21.1")  # the same file must come once
     monkeypatch.setenv(ENVIRONMENT, str(named))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    install_by_hand(tmp_path / "env" / "lib" / "site-packages", "../libLLVM.so.18.1,,\n", monkeypatch)
     monkeypatch.setenv("LD_LIBRARY_PATH", str(loader))
     ours = [path for path in candidates() if tmp_path.resolve() in path.parents]
     assert ours == [path.resolve() for path in (named, own, *others)]
+
+
+def install_by_hand(site: Path, record: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a distribution of the wheel's name in a folder that comes first on the path."""
+    information = site / f"{WHEEL.replace('-', '_')}-1.dist-info"
+    information.mkdir(parents=True)
+    (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {WHEEL}\nVersion: 1\n")
+    (information / "RECORD").write_text(record)
+    monkeypatch.syspath_prepend(str(site))
+
+
+def test_wheel_that_lost_its_library_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`pip install --target` drops the wheel's libraries and records them where they are not."""
+    monkeypatch.setattr("platform.machine", lambda: "x86_64")
+    monkeypatch.setattr(sys, "platform", "linux")
+    install_by_hand(tmp_path, "../libLLVM.so.23.1,,\n", monkeypatch)
+    assert "--target drops" in llvm_command()
+    assert f"--prefix '{tmp_path}" in llvm_command()
+    (tmp_path / "lib").mkdir()  # where that command puts it
+    (tmp_path / "lib" / "libLLVM.so.23.1").touch()
+    assert "--target drops" not in llvm_command()
+    assert tmp_path / "lib" / "libLLVM.so.23.1" in candidates()
+
+
+@pytest.fixture
+def unfinished(wheel: Path, tmp_path: Path) -> Path:
+    """The wheel's libraries as pip unpacks them, before the links that a start of Python makes where it may write."""
+    beside = wheel.parent / "x86_64-unknown-linux-gnu"
+    copy = tmp_path / "lib" / beside.name
+    copy.mkdir(parents=True)
+    for name in ("libc++.so.1.0", "libc++abi.so.1.0", "libunwind.so.1.0"):
+        shutil.copy(beside / name, copy)
+    return Path(shutil.copy(wheel, tmp_path / "lib"))
+
+
+def test_wheel_renders_without_its_links(unfinished: Path) -> None:
+    verdict = run_probe(VARIANT, unfinished)
+    assert verdict.ok, verdict.detail
+
+
+def test_libraries_of_the_wheel_stay_out_of_the_way_of_others(unfinished: Path) -> None:
+    """Exceptions of another C++ library, loaded afterwards, must not end in LLVM's runtime."""
+    done = python(
+        f"""
+        import ctypes
+        from pathlib import Path
+        from eyerender.backends.libraries import load_llvm, load_runtime
+        def visible():
+            names = ("__cxa_throw", "_Unwind_RaiseException", "LLVMContextCreate")
+            return [hasattr(ctypes.CDLL(None), name) for name in names]
+        load_runtime()
+        before = visible()
+        load_llvm(Path({str(unfinished)!r}))
+        print(visible() == before)
+        import mitsuba as mi
+        mi.set_variant("scalar_rgb")
+        try:
+            mi.load_dict({{"type": "nothing of this name"}})
+        except RuntimeError as error:
+            print("caught")
+        """
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["True", "caught"]
+
+
+def test_wheel_is_found_without_site_packages(wheel: Path) -> None:
+    """`python -S` with PYTHONPATH processes no .pth file."""
+    code = "from eyerender.backends.choose import choose_backend; print(choose_backend('llvm').library)"
+    environment = {k: v for k, v in os.environ.items() if k != ENVIRONMENT}
+    environment["PYTHONPATH"] = os.pathsep.join(os.path.abspath(p) for p in sys.path)
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", code], env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stdout.strip() == str(wheel), done.stderr
 
 
 def test_cache_folder_follows_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,41 +201,9 @@ def test_cache_folder_follows_the_user(tmp_path: Path, monkeypatch: pytest.Monke
     assert cache_folder() is None
 
 
-@needs_compiler
-def test_library_finds_dependencies_unpacked_beside_it(tmp_path: Path) -> None:
-    """top needs middle needs bottom; none is where the loader looks, and bottom lies in the tree's other lib folder."""
-    first, second = tmp_path / "usr" / "lib" / "triplet", tmp_path / "lib" / "triplet"
-    first.mkdir(parents=True)
-    second.mkdir(parents=True)
-    build(second, "libeyerenderbottom.so", "int bottom(void) { return 7; }", "-Wl,-soname,libeyerenderbottom.so")
-    build(
-        first,
-        "libeyerendermiddle.so",
-        "int bottom(void); int middle(void) { return bottom(); }",
-        "-Wl,-soname,libeyerendermiddle.so",
-        f"-L{second}",
-        "-leyerenderbottom",
-    )
-    top = build(
-        first,
-        "libeyerendertop.so",
-        "int middle(void); int top(void) { return middle(); }",
-        f"-L{first}",
-        "-leyerendermiddle",
-        f"-Wl,-rpath-link,{second}",
-    )
-    with pytest.raises(OSError, match=r"libeyerendermiddle\.so"):
-        load_library(top)
-    load_library(top, library_folders(top))
-
-    import ctypes
-
-    assert ctypes.CDLL(str(top)).top() == 7
-
-
 def test_missing_library_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"nothing\.so"):
-        load_library(tmp_path / "nothing.so", (tmp_path,))
+        load_llvm(tmp_path / "nothing.so")
 
 
 def test_good_library_passes_its_probe(good: Path) -> None:
@@ -230,11 +285,10 @@ def test_bad_library_that_the_user_names_is_passed_over(good: Path, tmp_path: Pa
 
 
 def test_mitsuba_imported_before_with_a_good_library_works(good: Path) -> None:
-    load_runtime()
     preload = f"""
         from pathlib import Path
-        from eyerender.backends.libraries import *
-        load_runtime(); load_library(Path({str(good)!r}), library_folders(Path({str(good)!r})))
+        from eyerender.backends.libraries import load_llvm
+        load_llvm(Path({str(good)!r}))
         import mitsuba
         from eyerender.backends.choose import choose_backend
         print(choose_backend("llvm").library)
@@ -274,9 +328,8 @@ def test_importing_the_room_loads_no_mitsuba() -> None:
     assert done.stdout.strip() == "[]", done.stderr
 
 
-def test_without_an_archive_the_command_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_a_library_the_command_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("eyerender.backends.llvm.candidates", lambda: iter(()))
-    monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BackendError, match="no libLLVM here can render") as caught:
         setup_llvm()
     assert llvm_command() in str(caught.value)
@@ -284,39 +337,44 @@ def test_without_an_archive_the_command_is_told(monkeypatch: pytest.MonkeyPatch,
 
 
 def test_conda_users_are_told_condas_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")  # for x86_64 there is a wheel
     monkeypatch.setenv("CONDA_PREFIX", str(tmp_path))
     assert llvm_command() == "run: conda install -c conda-forge libllvm19"
 
 
+ABSENT = "libeyerenderabsent.so.1"
+
+
+@pytest.fixture
+def absent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A library that Dr.Jit needs, as far as the package knows, and that this machine lacks; returns its store."""
+    runtime = {ABSENT: ("libeyerenderabsent1", "eyerenderabsent")}
+    monkeypatch.setattr("eyerender.backends.libraries.RUNTIME", runtime)
+    monkeypatch.setattr("eyerender.backends.set_up.RUNTIME", runtime)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "eyerender" / "lib"
+
+
 @pytest.fixture
 def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package archive on disk: libllvm16, libllvm19 (needs libz3-4 and libc6), libllvm99, libz3-4, libatomic1."""
+    """A package archive on disk with one package: a real library behind a link, as Debian packs libatomic1."""
     architecture = subprocess.run(["dpkg", "--print-architecture"], capture_output=True, text=True, check=True)
     folder = tmp_path / "archive"
     folder.mkdir()
-    entries = []
-    for name, depends in (
-        ("libllvm16", ""),
-        ("libllvm19", "libz3-4 (>= 1), libc6"),
-        ("libllvm99", ""),
-        ("libz3-4", "libc6"),
-        ("libc6", ""),
-        ("libllvm19-dev", ""),
-    ):
-        tree = tmp_path / "build" / name
-        (tree / "DEBIAN").mkdir(parents=True)
-        (tree / "usr" / "lib").mkdir(parents=True)
-        (tree / "usr" / "lib" / f"{name}.so").write_text(name)
-        control = f"Package: {name}\nVersion: 1.0\nArchitecture: {architecture.stdout.strip()}\n"
-        control += f"Maintainer: nobody\nDescription: {name}\n" + (f"Depends: {depends}\n" if depends else "")
-        (tree / "DEBIAN" / "control").write_text(control)
-        deb = folder / f"{name}_1.0.deb"
-        subprocess.run(["dpkg-deb", "-b", str(tree), str(deb)], check=True, capture_output=True)
-        data = deb.read_bytes()
-        entries.append(
-            f"{control}Filename: ./{deb.name}\nSize: {len(data)}\nSHA256: {hashlib.sha256(data).hexdigest()}\n"
-        )
-    (folder / "Packages.gz").write_bytes(gzip.compress("\n".join(entries).encode()))
+    name = "libeyerenderabsent1"
+    tree = tmp_path / "build" / name
+    (tree / "DEBIAN").mkdir(parents=True)
+    (tree / "usr" / "lib" / "triplet").mkdir(parents=True)
+    build(tree / "usr" / "lib" / "triplet", f"{ABSENT}.2.0", "int answer(void) { return 7; }")
+    (tree / "usr" / "lib" / "triplet" / ABSENT).symlink_to(f"{ABSENT}.2.0")
+    control = f"Package: {name}\nVersion: 1.0\nArchitecture: {architecture.stdout.strip()}\n"
+    control += f"Maintainer: nobody\nDescription: {name}\nDepends: libc6\n"
+    (tree / "DEBIAN" / "control").write_text(control)
+    deb = folder / f"{name}_1.0.deb"
+    subprocess.run(["dpkg-deb", "-b", str(tree), str(deb)], check=True, capture_output=True)
+    data = deb.read_bytes()
+    entry = f"{control}Filename: ./{deb.name}\nSize: {len(data)}\nSHA256: {hashlib.sha256(data).hexdigest()}\n"
+    (folder / "Packages.gz").write_bytes(gzip.compress(entry.encode()))
     point_apt_at(f"deb [trusted=yes] file:{folder} ./", tmp_path, monkeypatch)
     return folder
 
@@ -331,50 +389,53 @@ def point_apt_at(source: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @needs_archive
-def test_archive_is_read_preferred_version_first(archive: Path, tmp_path: Path) -> None:
-    assert Apt(tmp_path / "apt").llvm_packages() == ["libllvm19", "libllvm99"]
-
-
-@needs_archive
-def test_package_is_unpacked_with_its_dependencies_but_not_libc(archive: Path, tmp_path: Path) -> None:
-    apt = Apt(tmp_path / "apt")
-    apt.llvm_packages()
-    assert apt.unpack(["libllvm19"], tmp_path / "tree")
-    assert sorted(p.name for p in (tmp_path / "tree" / "usr" / "lib").iterdir()) == ["libllvm19.so", "libz3-4.so"]
-
-
-@needs_archive
-def test_package_that_cannot_be_fetched_is_told(archive: Path, tmp_path: Path) -> None:
-    apt = Apt(tmp_path / "apt")
-    apt.llvm_packages()
-    (archive / "libz3-4_1.0.deb").unlink()
-    assert not apt.unpack(["libllvm19"], tmp_path / "tree")
-    assert apt.complaint
-
-
-@needs_archive
-def test_archive_without_a_fitting_library_leaves_nothing(
-    archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The made-up packages hold no LLVM: each is refused, in one line, and the store stays as empty as it was."""
-    monkeypatch.setattr("eyerender.backends.llvm.candidates", lambda: iter(()))
-    monkeypatch.setattr("eyerender.backends.set_up.RUNTIME", {})
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+@needs_compiler
+def test_library_that_drjit_lacks_is_fetched_once(archive: Path, absent: Path, good: Path) -> None:
+    with pytest.raises(OSError, match="package libeyerenderabsent1 on Debian"):
+        load_runtime()
     said: list[str] = []
-    with pytest.raises(BackendError, match="libllvm99 cannot render"):
-        setup_llvm(say=said.append)
-    assert [p.name for p in (tmp_path / "cache" / "eyerender" / "llvm").iterdir()] == ["lock"]
-    assert len(said) == 3
+    assert setup_llvm(say=said.append).path is not None
+    assert load_runtime() == [absent / ABSENT]
+    assert ctypes.CDLL(str(absent / ABSENT)).answer() == 7
+    assert [path.name for path in absent.iterdir()] == [ABSENT]
+    setup_llvm(say=said.append)
+    assert len(said) == 1
 
 
 @needs_archive
-def test_archive_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@needs_compiler
+def test_package_that_lacks_the_library_leaves_nothing(archive: Path, tmp_path: Path) -> None:
+    with pytest.raises(BackendError, match=r"libeyerenderabsent1 of this archive has no libother\.so"):
+        fetch_library("libeyerenderabsent1", "libother.so", tmp_path / "store")
+    assert not list((tmp_path / "store").iterdir())
+
+
+@needs_archive
+@needs_compiler
+def test_package_that_cannot_be_fetched_is_one_line(archive: Path, absent: Path) -> None:
+    (archive / "libeyerenderabsent1_1.0.deb").unlink()
+    with pytest.raises(BackendError, match=r"libeyerenderabsent1 cannot be downloaded .*; try again, or ") as caught:
+        setup_llvm()
+    assert runtime_command() in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not list(absent.iterdir())
+
+
+@needs_archive
+def test_archive_that_does_not_answer_is_one_line(
+    absent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     point_apt_at(f"deb [trusted=yes] file:{tmp_path}/nowhere ./", tmp_path, monkeypatch)
-    monkeypatch.setattr("eyerender.backends.llvm.candidates", lambda: iter(()))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    with pytest.raises(BackendError, match=r"it does not answer|nowhere") as caught:
+    with pytest.raises(BackendError, match="libeyerenderabsent1 cannot be downloaded") as caught:
         setup_llvm()
     assert "\n" not in str(caught.value)
+
+
+def test_without_an_archive_the_package_is_named(absent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(BackendError, match=f"{ABSENT} is missing") as caught:
+        setup_llvm()
+    assert runtime_command() in str(caught.value)
 
 
 def _mapped_files() -> list[str]:
