@@ -34,16 +34,12 @@ def runtime_store() -> Path | None:
     return folder / "lib" if folder else None
 
 
-def load_runtime() -> list[Path]:
+def load_runtime() -> None:
     """Load the libraries that Dr.Jit is linked with: the system's, else those that `setup_llvm` has fetched.
-
-    Returns:
-        The files of those that were fetched and are used.
 
     Raises:
         OSError: a library is nowhere; the message names the package.
     """
-    fetched: list[Path] = []
     store = runtime_store()
     for name, (debian, fedora) in RUNTIME.items():
         try:
@@ -52,8 +48,6 @@ def load_runtime() -> list[Path]:
             if store is None or not (store / name).is_file():
                 raise OSError(f"{name} is missing (package {debian} on Debian, {fedora} elsewhere)") from error
             ctypes.CDLL(str(store / name))
-            fetched.append(store / name)
-    return fetched
 
 
 def wheel_libraries() -> list[Path]:

@@ -102,8 +102,11 @@ def run_probe(variant: str, library: Path | None = None, timeout_s: float = TIME
     with tempfile.TemporaryDirectory(prefix="eyerender-probe-") as home:
         environment = dict(os.environ)
         # The process has its own HOME, because Dr.Jit stores compiled kernels there and would use one from another
-        # libLLVM.
+        # libLLVM. Libraries that were fetched stay in the cache folder of the user.
         environment["HOME"] = home
+        cache = cache_folder()
+        if cache is not None:
+            environment["XDG_CACHE_HOME"] = str(cache.parent)
         environment["PYTHONPATH"] = os.pathsep.join(os.path.abspath(p) for p in sys.path)
         if library is not None:
             environment["DRJIT_LIBLLVM_PATH"] = str(library)

@@ -1,6 +1,6 @@
 """`setup_llvm`: find a libLLVM that renders, and fetch the libraries of Dr.Jit that a bare Debian lacks.
 
-`python -m eyerender.backends.set_up` runs it and prints the files that rendering will use.
+`python -m eyerender.backends.set_up` runs it and prints the libraries that rendering uses: libLLVM and what was fetched.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ def main() -> int:
         return error.exit_code
     except KeyboardInterrupt:
         return 130
-    print(library.path, *load_runtime(), sep="\n")
+    store = runtime_store()
+    print(library.path, *(sorted(store.glob("lib*")) if store else ()), sep="\n")
     return 0
 
 
