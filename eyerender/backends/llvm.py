@@ -69,9 +69,9 @@ def examine(*, refresh: bool = False) -> Iterator[Examined]:
         yield Examined(path, verdict)
 
 
-def find_llvm(*, refresh: bool = False) -> LibLlvm | None:
+def find_llvm() -> LibLlvm | None:
     """Find the first candidate that renders."""
-    for examined in examine(refresh=refresh):
+    for examined in examine():
         if examined.verdict.ok:
             return LibLlvm.probed(examined.path, examined.verdict)
     return None

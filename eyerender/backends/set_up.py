@@ -1,6 +1,6 @@
 """`setup_llvm`: find a libLLVM that renders, and fetch the libraries of Dr.Jit that a bare Debian lacks.
 
-`python -m eyerender.backends.set_up` runs it and prints the libraries that rendering uses: libLLVM and what was fetched.
+`python -m eyerender.backends.set_up` runs it and prints the paths of that libLLVM and of what was fetched.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from ..errors import BackendError
 from ..progress import Say
 from .apt import fetch_library
 from .libraries import RUNTIME, load_runtime, runtime_store
-from .llvm import LibLlvm, find_llvm
+from .llvm import LibLlvm, examine
 from .remedies import has_archive, llvm_fix, runtime_command
 
 
@@ -35,10 +35,12 @@ def setup_llvm(*, say: Say = _silent) -> LibLlvm:
         load_runtime()
     except OSError as error:
         _fetch_runtime(str(error), say)
-    found = find_llvm(refresh=True)
-    if found is None:
-        raise BackendError(f"no libLLVM here can render; {llvm_fix()}")
-    return found
+    refused = ""
+    for examined in examine(refresh=True):
+        if examined.verdict.ok:
+            return LibLlvm.probed(examined.path, examined.verdict)
+        refused = refused or f" ({examined.path}: {examined.verdict.detail})"
+    raise BackendError(f"no libLLVM here can render{refused}; {llvm_fix()}")
 
 
 def _fetch_runtime(reason: str, say: Say) -> None:

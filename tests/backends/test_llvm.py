@@ -349,6 +349,14 @@ def test_without_a_library_the_command_is_told(monkeypatch: pytest.MonkeyPatch) 
     assert "\n" not in str(caught.value)
 
 
+def test_refused_library_is_told_with_its_reason(cache: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    broken = tmp_path / "libLLVM-19.so"
+    broken.write_text("not a library")
+    monkeypatch.setattr("eyerender.backends.llvm.candidates", lambda: iter((broken,)))
+    with pytest.raises(BackendError, match=r"no libLLVM here can render \(.*libLLVM-19\.so: .*(short|invalid)"):
+        setup_llvm()
+
+
 def test_conda_users_are_told_condas_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("platform.machine", lambda: "aarch64")  # for x86_64 there is a wheel
     monkeypatch.setenv("CONDA_PREFIX", str(tmp_path))
