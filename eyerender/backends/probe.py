@@ -104,6 +104,7 @@ def run_probe(variant: str, library: Path | None = None, timeout_s: float = TIME
         # The process has its own HOME, because Dr.Jit stores compiled kernels there and would use one from another
         # libLLVM. Libraries that were fetched stay in the cache folder of the user.
         environment["HOME"] = home
+        environment.pop("DRJIT_CACHE_DIR", None)
         cache = cache_folder()
         if cache is not None:
             environment["XDG_CACHE_HOME"] = str(cache.parent)

@@ -257,16 +257,17 @@ def test_cache_that_cannot_be_written_is_done_without(good: Path, monkeypatch: p
     assert probe(VARIANT, good).ok
 
 
-def test_probe_finds_what_was_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_probe_finds_what_was_fetched_and_no_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The probing process has a home of its own but the cache folder of its user."""
     interpreter = tmp_path / "python"
-    interpreter.write_text('#!/bin/sh\necho "$HOME $XDG_CACHE_HOME" >&2\nexit 1\n')
+    interpreter.write_text('#!/bin/sh\necho "$HOME${DRJIT_CACHE_DIR-} $XDG_CACHE_HOME" >&2\nexit 1\n')
     interpreter.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(interpreter))
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path))
     home, cache = run_probe(VARIANT).detail.split()
-    assert home != str(tmp_path)
+    assert str(tmp_path) not in home
     assert cache == str(tmp_path / ".cache")
 
 
