@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from ..arrays import Floats, Indices, Reals, Singles, frozen
+from ..arrays import Floats, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
 from .sensor import Sensor
 from .stray import border
@@ -69,16 +69,6 @@ def expose(
     return out
 
 
-def expose_at(
-    sensor: Sensor, irradiance: Reals, wavelength_nm: float, seed: int, corner_px: tuple[int, int], places: Indices
-) -> NDArray[np.uint16]:
-    """The codes (n,) that `expose` gives to some pixels, in the order of the rows; no charge may spill."""
-    noise = _Noise.of(sensor, seed, corner_px, irradiance.shape).at(places) if sensor.noise else None
-    scale = electrons(sensor, np.ones(()), wavelength_nm)
-    mean = np.multiply(irradiance.ravel()[places], scale, dtype=np.float32, casting="same_kind")
-    return np.asarray(_codes(sensor, mean, noise), np.uint16)
-
-
 @dataclass(frozen=True, slots=True)
 class _Noise:
     """Noise of a window: 16 bits for the shot noise and for the read noise of each pixel (2, h, w), and what is fixed.
@@ -104,20 +94,10 @@ class _Noise:
             offset = np.broadcast_to(columns, shape) if offset is None else offset + columns
         return cls(bits, sensitivity, offset)
 
-    def at(self, places: Indices) -> _Noise:
-        """The noise of some pixels, in the order of the rows; (2, n) and (n,)."""
-        fixed = (None if v is None else v.ravel()[places] for v in (self.sensitivity, self.offset))
-        return _Noise(self.bits.reshape(2, -1)[:, places], *fixed)
-
     def of_rows(self, rows: slice) -> _Noise:
         """The noise of some rows."""
         fixed = (None if v is None else v[rows] for v in (self.sensitivity, self.offset))
         return _Noise(self.bits[:, rows], *fixed)
-
-
-def most_electrons(sensor: Sensor) -> float:
-    """Mean beyond which a pixel is clipped whatever its noise; none where its charge may spill."""
-    return float("inf") if sensor.blooming > 0 else 4 * sensor.full_well_e + 1e4
 
 
 def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
@@ -131,7 +111,9 @@ def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
         shot, read = (normals(s).take(bits, mode="clip") for s, bits in zip(sigmas, noise.bits, strict=True))
         if noise.offset is not None:
             read += noise.offset
-        charge = photon_counts(np.minimum(mean, most_electrons(sensor), out=mean), shot)
+        # Beyond this mean a pixel is clipped whatever its noise, unless its charge may spill.
+        most = np.inf if sensor.blooming > 0 else 4 * sensor.full_well_e + 1e4
+        charge = photon_counts(np.minimum(mean, most, out=mean), shot)
     dn = bloomed(charge, sensor.full_well_e, sensor.blooming, sensor.blooming_along)
     dn += read
     dn *= sensor.gain
@@ -147,11 +129,7 @@ def recorded(
     sensor: Sensor, camera: PinholeCamera, window: Window, irradiance: Reals, wavelength_nm: float, seed: int
 ) -> NDArray[np.uint16]:
     """Stored codes (h, w) of a window of a camera's sensor, with the sensor's border; see `expose`."""
-    return bordered(sensor, camera, window, expose(sensor, irradiance, wavelength_nm, seed, window[:2]))
-
-
-def bordered(sensor: Sensor, camera: PinholeCamera, window: Window, codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Codes (h, w) of a window, in which those of the sensor's border are replaced."""
+    codes = expose(sensor, irradiance, wavelength_nm, seed, window[:2])
     if any(sensor.border_px):
         codes[border(sensor, camera, window)] = round(sensor.border_dn)
     return codes
@@ -181,7 +159,7 @@ def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int,
     The bits below are those of SplitMix64 (Steele, Lea, Flood 2014), which maps counters to numbers.
     """
     x, y = (np.arange(n, dtype=np.int64) + start for n, start in zip(shape[::-1], corner_px, strict=True))
-    start = pattern_start(seed, which)
+    start = np.uint64(np.random.SeedSequence([0xF1C5, seed, which]).generate_state(1, np.uint64)[0])
     with np.errstate(over="ignore"):
         z = (x.astype(np.uint64)[None, :] | (y.astype(np.uint64)[:, None] << np.uint64(32))) + start
         z = z * np.uint64(0x9E3779B97F4A7C15)
@@ -189,11 +167,6 @@ def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int,
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     z ^= z >> np.uint64(31)
     return frozen(normals().take((z >> np.uint64(48)).astype(np.uint16)), np.float32)
-
-
-def pattern_start(seed: int, which: int) -> np.uint64:
-    """Where the counter of a fixed pattern starts."""
-    return np.uint64(np.random.SeedSequence([0xF1C5, seed, which]).generate_state(1, np.uint64)[0])
 
 
 def bloomed(charge: Reals, full_well: float, share: float, along: str = "columns") -> Reals:
