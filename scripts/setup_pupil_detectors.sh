@@ -38,6 +38,7 @@ for python in ${EYERENDER_PYTHON:+"$EYERENDER_PYTHON"} python3 python3.12 python
 done
 [ -n "$python" ] || die "no Python with pip was found (EYERENDER_PYTHON=/path/to/python names one)"
 
+umask 077  # the environment runs as you, so nobody else may write to it
 mkdir -p "${place%/*}" || die "cannot write to ${place%/*}"
 log=$place.log
 say "making $place ..."

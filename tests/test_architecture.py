@@ -18,6 +18,7 @@ PACKAGE = Path(eyerender.__file__).resolve().parent
 FLOORS = {
     "errors": 0,
     "arrays": 0,
+    "cachefolder": 0,
     "files": 0,
     "jsonlines": 0,
     "references": 0,
@@ -68,6 +69,7 @@ ORDER = [
     "arrays",
     "progress",
     "status",
+    "cachefolder",
     "files",
     "jsonlines",
     "references",

@@ -5,14 +5,18 @@ Call `choose_backend` before anything imports mitsuba or drjit (see `llvm`); it 
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import os
+import shutil
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from ..cachefolder import cache_folder, private_folder
 from ..errors import BackendError, InputError
 from .libraries import load_runtime
 from .llvm import ensure_llvm
@@ -22,6 +26,8 @@ from .remedies import CUDA_FIX
 BackendName = Literal["cuda", "llvm"]
 BackendChoice = Literal["auto", "cuda", "llvm"]
 
+# Environment variable of Dr.Jit: the folder of its compiled kernels.
+KERNELS = "DRJIT_CACHE_DIR"
 VARIANTS: dict[BackendName, str] = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono"}
 
 
@@ -84,6 +90,7 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
         raise InputError(f"must be >= 1, not {threads}", path="threads")
     if package_version("mitsuba") == "none":
         raise BackendError("mitsuba is not installed; run: pip install mitsuba")
+    _keep_kernels_private()
     if name != "llvm":
         cuda = cuda_state()
         if cuda.ok:
@@ -93,6 +100,24 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
     library = ensure_llvm()
     path = str(library.path) if library.path else None
     return _start("llvm", cpu_name(), threads, llvm=library.version, library=path)
+
+
+def _keep_kernels_private() -> None:
+    """Make Dr.Jit keep its kernels, which are code, in a folder that nobody else can write to.
+
+    Without such a folder they are kept in a temporary one while this process runs. Dr.Jit reads the variable when it is
+    first imported, so nothing can be done where that has happened.
+    """
+    if "drjit" in sys.modules:
+        return
+    given = os.environ.get(KERNELS)
+    place = private_folder(Path(given).absolute()) if given else cache_folder()
+    if place is not None and not given:
+        place /= "drjit"
+    if place is None:
+        place = Path(tempfile.mkdtemp(prefix="eyerender-drjit-"))
+        atexit.register(shutil.rmtree, place, ignore_errors=True)
+    os.environ[KERNELS] = str(place)
 
 
 def _start(

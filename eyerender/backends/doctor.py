@@ -7,8 +7,8 @@ import platform
 import sys
 from dataclasses import dataclass
 
+from ..cachefolder import cache_folder
 from .choose import BackendName, BackendState, cuda_state
-from .libraries import cache_folder
 from .llvm import examine
 from .probe import cpu_name, package_version
 from .remedies import llvm_fix
@@ -45,7 +45,7 @@ def doctor_report() -> DoctorReport:
         platform=platform.platform(),
         cpu=f"{cpu_name()}, {_cpu_count()} usable",
         packages=tuple((package, package_version(package)) for package in packages),
-        cache=str(cache_folder() or "none (no home folder)"),
+        cache=str(cache_folder() or "none (no private folder)"),
     )
 
 

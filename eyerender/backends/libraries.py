@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import sys
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+
+from ..cachefolder import cache_folder
 
 WHEEL = "karellen-llvm-core"
 # Libraries that Dr.Jit is linked with and a bare Linux lacks, with their packages on Debian and on Fedora.
@@ -16,20 +17,8 @@ RUNTIME = {"libatomic.so.1": ("libatomic1", "libatomic")} if sys.platform == "li
 _BESIDE_LLVM = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
 
 
-def cache_folder() -> Path | None:
-    """Folder for what this package found and fetched; None where the user has no home folder."""
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    if os.path.isabs(given):
-        return Path(given) / "eyerender"
-    try:
-        home = Path.home()
-    except RuntimeError:
-        return None
-    return home / ".cache" / "eyerender" if home.is_absolute() and home != Path("/") else None
-
-
 def runtime_store() -> Path | None:
-    """Folder for the libraries of `RUNTIME` that `setup_llvm` has fetched; None without a home folder."""
+    """Folder for the libraries of `RUNTIME` that `setup_llvm` has fetched; None without a private cache folder."""
     folder = cache_folder()
     return folder / "lib" if folder else None
 

@@ -25,7 +25,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from .libraries import cache_folder, load_llvm, load_runtime
+from ..cachefolder import cache_folder
+from .libraries import load_llvm, load_runtime
 
 TIMEOUT_S = 180.0
 REFUSAL_AGE_S = 86400.0  # a refusal is checked again after a day, because the GPU may have been busy or memory short
@@ -101,10 +102,9 @@ def run_probe(variant: str, library: Path | None = None, timeout_s: float = TIME
     """Render a small image with `variant` in a new process and check the result."""
     with tempfile.TemporaryDirectory(prefix="eyerender-probe-") as home:
         environment = dict(os.environ)
-        # The process has its own HOME, because Dr.Jit stores compiled kernels there and would use one from another
-        # libLLVM. Libraries that were fetched stay in the cache folder of the user.
-        environment["HOME"] = home
-        environment.pop("DRJIT_CACHE_DIR", None)
+        # The process has its own cache of kernels, because Dr.Jit would use one that another libLLVM compiled. Libraries
+        # that were fetched stay in the cache folder of the user.
+        environment["HOME"] = environment["DRJIT_CACHE_DIR"] = home
         cache = cache_folder()
         if cache is not None:
             environment["XDG_CACHE_HOME"] = str(cache.parent)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cachefolder import cache_folder
 from ..extraction import FAST, REFINED, Extraction, ExtractionSettings, extract, identify
 from ..rig.camera import PinholeCamera
 from .registry import Command
@@ -53,10 +54,9 @@ def pupil_labs_python() -> Path | None:
     given = os.environ.get(PUPIL_LABS_PYTHON)
     if given:
         return Path(given) if os.access(given, os.X_OK) else None
-    cache = os.environ.get("XDG_CACHE_HOME", "")
-    home = Path(cache) if os.path.isabs(cache) else Path(os.path.expanduser("~")) / ".cache"
-    python = home / "eyerender" / "pupil-detectors" / "bin" / "python"
-    return python if os.access(python, os.X_OK) else None
+    cache = cache_folder()
+    python = None if cache is None else cache / "pupil-detectors" / "bin" / "python"
+    return python if python is not None and os.access(python, os.X_OK) else None
 
 
 def _pupil_labs() -> Command:

@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ..backends.libraries import cache_folder
+from ..cachefolder import cache_folder
 from ..errors import EyerenderError
 from ..files import read_json, write_json
 from ..spec import Positive, Spec

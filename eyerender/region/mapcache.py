@@ -23,7 +23,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..backends.libraries import cache_folder
+from ..cachefolder import cache_folder
 from ..errors import EyerenderError, InputError
 from ..files import PART, read_bytes, written
 from .anatomy import Region

@@ -136,7 +136,7 @@ def test_a_limit_that_is_no_number_is_an_error(place, monkeypatch):
 
 
 def test_a_folder_that_cannot_be_written_costs_only_time(place):
-    place.parent.mkdir(parents=True)
+    place.parent.mkdir(parents=True, exist_ok=True)
     place.write_text("a file in its place")
     kept(ramp, 1)
     kept(ramp, 1)
