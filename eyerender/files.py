@@ -33,23 +33,28 @@ PART = ".part"
 # in its exponent.
 _TO_ZEROS = bytes.maketrans(b"123456789E", b"000000000e")
 _LONG = (b"0" * 200, b"e000", b"e+000")
+_ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{1,30}):/+")  # a single letter is a drive
 _PLAIN = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
 
 
 @contextmanager
-def written(path: str | Path, *, sync: bool = True) -> Iterator[BinaryIO]:
+def written(path: str | Path, *, sync: bool = True, ending: str = PART) -> Iterator[BinaryIO]:
     """Open a new file for writing; it takes its place if the block succeeds, and leaves nothing if it fails.
 
     Args:
         path: the file to write; an old one is replaced.
         sync: make it durable before the block's end: the file is synced before the rename, its folder after it. Without
             it a power cut may leave an empty file, so use it only for what is synced later as a whole.
+        ending: end of the temporary name, for libraries that write to a name (`name` of the file) and choose the format
+            by its end.
 
     Raises:
+        InputError: a folder, pipe, device or socket is in its place.
         EyerenderError: the disk is full or not writable.
     """
     path = Path(path)
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
+    refuse_special(path)
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{ending}")
     made = False
     try:
         # Exclusive mode does not follow or overwrite a link or a file that somebody put there.
@@ -69,6 +74,40 @@ def written(path: str | Path, *, sync: bool = True) -> Iterator[BinaryIO]:
         if made:
             with suppress(OSError):
                 part.unlink()
+
+
+def refuse_special(path: str | Path) -> None:
+    """Check that a file may be written, so that replacing it cannot harm a device, and nothing waits for a pipe.
+
+    A link may be replaced, unless it leads to something else than a file.
+
+    Raises:
+        InputError: the path is an address; or a folder, pipe, device or socket is in its place; or it is in a folder of
+            devices.
+    """
+    refuse_address(path)
+    path = Path(path)
+    try:
+        state = path.stat()
+        folder = path.parent.resolve()
+    except (OSError, ValueError, RuntimeError):  # missing, or refused when it is made
+        return
+    if not stat.S_ISREG(state.st_mode):
+        raise InputError(f"is {_kind(state.st_mode)}, so it is not written to", source=str(path))
+    if folder in (Path("/dev"), Path("/dev/fd")):  # /dev/stdout may be a link to a file
+        raise InputError("is in a folder of devices, so it is not written to", source=str(path))
+
+
+def refuse_address(path: str | Path) -> None:
+    """Check that a path to write to is not an address such as `s3://bucket/x`, of which a path keeps one slash.
+
+    Raises:
+        InputError: it is an address.
+    """
+    address = _ADDRESS.match(str(path))
+    if address is not None:
+        where = f"{address[1]}://{str(path)[address.end() :]}"
+        raise InputError("is an address, and only files of this machine are written", source=where)
 
 
 def write_bytes(path: str | Path, data: bytes, *, sync: bool = True) -> None:
@@ -117,8 +156,10 @@ def make_folder(path: str | Path) -> bool:
     """Make a folder and its missing parents, durably; returns whether it is new.
 
     Raises:
+        InputError: the path is an address.
         OSError: it cannot be made.
     """
+    refuse_address(path)
     path = Path(path)
     missing = [p for p in (path, *path.parents) if not p.exists()]
     path.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +19,7 @@ import numpy as np
 
 from ..arrays import Bytes
 from ..errors import EyerenderError, InputError
-from ..files import opened
+from ..files import opened, written
 from .pair import extract_eyes
 from .pipeline import extract
 from .preprocessing import MAX_PIXELS
@@ -26,6 +28,19 @@ from .settings import ExtractionSettings
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
 MAX_VIDEO_BYTES = 1 << 40
+# FFmpeg's reader of each kind of file that is accepted, by its first bytes. FFmpeg itself would also choose readers of
+# scripts and playlists, which open other files.
+_READERS = (
+    (re.compile(rb".{4}(ftyp|moov|mdat|wide|free|skip|pnot)", re.DOTALL), "mov"),  # MP4 and QuickTime
+    (re.compile(rb"RIFF.{4}AVI ", re.DOTALL), "avi"),
+    (re.compile(rb"\x1aE\xdf\xa3"), "matroska"),  # WebM too
+    (re.compile(rb"\x00\x00\x01\xba"), "mpeg"),
+    (re.compile(rb"\x00\x00\x01\xb3"), "mpegvideo"),
+    (re.compile(rb"G.{187}G.{187}G", re.DOTALL), "mpegts"),
+    (re.compile(rb"0&\xb2u\x8ef\xcf\x11\xa6\xd9\x00\xaa\x00b\xcel"), "asf"),  # WMV
+)
+_HEAD_BYTES = 512
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 # Codec of each kind of file that is written: one that OpenCV's own FFmpeg can encode.
 CODECS = {".mp4": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
 # What is wrong with a file is said in one line of ours, without those of OpenCV and FFmpeg.
@@ -63,10 +78,13 @@ class VideoReader:
     def __init__(self, path: str | Path) -> None:
         self.source = str(path)
         with opened(path, limit=MAX_VIDEO_BYTES) as file:  # a missing file, a folder or a pipe has its own message
-            if os.fstat(file.fileno()).st_size == 0:
-                raise InputError("is empty", source=self.source)
-        # The name is absolute, so that it cannot be taken for the address of a stream.
-        self._capture = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG)
+            head = file.read(_HEAD_BYTES)
+        if not head:
+            raise InputError("is empty", source=self.source)
+        reader = next((name for pattern, name in _READERS if pattern.match(head)), None)
+        if reader is None:
+            raise InputError(f"is not a video ({', '.join(SUFFIXES)})", source=self.source)
+        self._capture = _capture(os.path.abspath(path), reader)
         if not self._capture.isOpened():
             raise InputError("is not a video that can be read", source=self.source)
         size = [self._capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
@@ -93,6 +111,23 @@ class VideoReader:
         self._capture.release()
         if number == 0:
             raise InputError("holds no frame that can be read", source=self.source)
+
+
+def _capture(path: str, reader: str) -> cv2.VideoCapture:
+    """Open a video with one of FFmpeg's readers, which may open nothing but files.
+
+    OpenCV takes these options from the environment alone. The path is absolute, so that it cannot be taken for the
+    address of a stream.
+    """
+    before = os.environ.get(_OPTIONS)
+    os.environ[_OPTIONS] = f"input_format;{reader}|format_whitelist;{reader}|protocol_whitelist;file"
+    try:
+        return cv2.VideoCapture(path, cv2.CAP_FFMPEG)
+    finally:
+        if before is None:
+            del os.environ[_OPTIONS]
+        else:
+            os.environ[_OPTIONS] = before
 
 
 def follow(
@@ -128,13 +163,15 @@ class VideoWriter:
         name = self.path.suffix.lower()
         if name not in CODECS:
             raise InputError(f"must end with {', '.join(CODECS)}", source=str(path))
-        # A video is written under another name first, so that a broken one is not taken for a whole one.
-        self._part = self.path.with_name(f".{self.path.stem}.part{name}")
         even = (width + width % 2, height + height % 2)  # OpenCV cuts off the last row or column of odd sizes
         code = cv2.VideoWriter.fourcc(*CODECS[name])
-        self._writer = cv2.VideoWriter(str(self._part), cv2.CAP_FFMPEG, code, frames_per_s, even)
-        if not self._writer.isOpened():
-            raise EyerenderError(f"{path}: cannot be written")
+        with ExitStack() as stack:
+            # OpenCV opens the file by its name, which nobody can guess and which is ours already.
+            file = stack.enter_context(written(self.path, ending=name))
+            self._writer = cv2.VideoWriter(file.name, cv2.CAP_FFMPEG, code, frames_per_s, even)
+            if not self._writer.isOpened():
+                raise EyerenderError(f"{path}: cannot be written")
+            self._publish = stack.pop_all()
 
     def add(self, picture: Bytes) -> None:
         """Add a picture."""
@@ -146,7 +183,4 @@ class VideoWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._writer.release()
-        if kind is None:
-            self._part.replace(self.path)
-        else:
-            self._part.unlink(missing_ok=True)
+        self._publish.__exit__(kind, error, at)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -13,7 +16,7 @@ import make_ideal_images as ideal
 from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.extraction import REFINED, extract, extract_eyes
-from eyerender.extraction.video import Frame, VideoReader, VideoWriter, follow
+from eyerender.extraction.video import SUFFIXES, Frame, VideoReader, VideoWriter, follow
 from eyerender.geometry.ellipse import Ellipse, iou
 
 SEEDS = range(20_300, 20_306)
@@ -36,6 +39,15 @@ def video(drawings, tmp_path_factory):
     with VideoWriter(path, 320, 240, 50.0) as writer:
         for drawing in drawings:
             writer.add(np.repeat(drawing.image[..., None], 3, axis=2))
+    return path
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """A video of one small grey frame."""
+    path = tmp_path_factory.mktemp("still") / "eye.mkv"
+    with VideoWriter(path, 64, 48, 25.0) as writer:
+        writer.add(np.full((48, 64, 3), 90, np.uint8))
     return path
 
 
@@ -123,3 +135,112 @@ def test_a_broken_video_is_one_line(content, message, tmp_path, capsys):
 def test_a_video_cannot_be_an_address(tmp_path):
     with pytest.raises(InputError):
         VideoReader("http://localhost:1/a.mp4")
+
+
+@pytest.mark.parametrize("planted", ["link", "pipe"])
+def test_a_name_planted_beside_the_overlay_is_not_written_to(still, planted, tmp_path):
+    victim, shown = tmp_path / "victim", tmp_path / "ov.mp4"
+    victim.write_text("precious")
+    guessed = tmp_path / ".ov.part.mp4"
+    if planted == "link":
+        guessed.symlink_to(victim)
+    else:
+        os.mkfifo(guessed)
+    # A process of its own can be ended where it would wait for the pipe.
+    command = [sys.executable, "-m", "eyerender", "extract", str(still), "--overlay", str(shown)]
+    assert subprocess.run(command, capture_output=True, timeout=60).returncode == 0
+    assert victim.read_text() == "precious"
+    assert len(list(VideoReader(shown))) == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == [guessed.name, "ov.mp4", "victim"]
+
+
+def test_an_unfinished_video_has_a_name_of_its_own_and_leaves_nothing(tmp_path):
+    picture, place = np.zeros((48, 64, 3), np.uint8), tmp_path / "a.mp4"
+
+    def fail() -> None:
+        with VideoWriter(place, 64, 48, 25.0) as first:
+            with VideoWriter(place, 64, 48, 25.0) as second:
+                assert len(list(tmp_path.iterdir())) == 2
+                first.add(picture)
+                second.add(picture)
+            assert len(list(VideoReader(place))) == 1
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert list(tmp_path.iterdir()) == [place]
+
+
+@pytest.mark.parametrize("option", ["--overlay", "-o", "--json"])
+@pytest.mark.parametrize("target", ["pipe", "folder", "link to a pipe"])
+def test_what_is_no_file_is_not_written_to(still, option, target, tmp_path, capsys):
+    place = tmp_path / "out.mp4"
+    if target == "pipe":
+        os.mkfifo(place)
+    elif target == "folder":
+        place.mkdir()
+    else:
+        os.mkfifo(tmp_path / "pipe")
+        place.symlink_to("pipe")
+    before = place.lstat()
+    assert run(["extract", str(still), option, str(place)]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"error: {place}: is a ")
+    assert os.path.samestat(before, place.lstat())
+
+
+def _script(folder, kind):
+    """Write a file that is called a video and names other files."""
+    texts = {
+        "concat": "ffconcat version 1.0\nfile real.mkv\n",
+        "playlist": "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nreal.mkv\n#EXT-X-ENDLIST\n",
+        "session": "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\n",
+        "dash": '<?xml version="1.0"?><MPD><Period><BaseURL>real.mkv</BaseURL></Period></MPD>',
+        "image2": "real%03d.mkv",
+    }
+    path = folder / "eyes.mp4"
+    path.write_text(texts[kind])
+    return path
+
+
+@pytest.mark.parametrize("kind", ["concat", "playlist", "session", "dash", "image2"])
+def test_a_video_that_is_a_script_is_refused_in_one_line(video, kind, tmp_path, capsys):
+    (tmp_path / "real.mkv").write_bytes(video.read_bytes())
+    path = _script(tmp_path, kind)
+    assert run(["extract", str(path), "-o", str(tmp_path / "records.jsonl")]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said == [f"error: {path}: is not a video ({', '.join(SUFFIXES)})"]
+    assert not (tmp_path / "records.jsonl").exists()
+
+
+def test_a_script_that_begins_like_a_video_is_not_taken_for_one(video, tmp_path):
+    """Each of FFmpeg's readers is named, so what follows the first bytes cannot choose another one."""
+    (tmp_path / "real.mkv").write_bytes(video.read_bytes())
+    for head in (b"\0\0\0\x14ftyp", b"\0\0\0\x08free", b"RIFF\0\0\0\0AVI ", b"\x1aE\xdf\xa3", b"\0\0\1\xba"):
+        path = tmp_path / "eyes.mp4"
+        path.write_bytes(head + b"\nffconcat version 1.0\nfile real.mkv\n" * 20)
+        with pytest.raises(InputError, match=r"not a video|no frame"):
+            list(VideoReader(path))
+
+
+@pytest.mark.parametrize("name", ["a%03d.mkv", "a*.mkv", "[1-3].mkv", "concat:a.mkv", "a,b|c.mkv"])
+def test_a_name_is_no_pattern(video, name, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(video.read_bytes())
+    assert len(list(VideoReader(path))) == len(SEEDS)
+
+
+@pytest.mark.parametrize(
+    ("ending", "code"),
+    [(".mp4", "mp4v"), (".m4v", "mp4v"), (".mov", "mp4v"), (".avi", "MJPG"), (".mkv", "FFV1"), (".webm", "VP80"),
+     (".mpg", "MPG1"), (".mpeg", "MPG2"), (".wmv", "WMV2"), (".ts", "MPG2"), (".m2v", "MPG2")],
+)  # fmt: skip
+def test_each_kind_of_video_is_read(ending, code, tmp_path, monkeypatch):
+    path = tmp_path / f"a{ending}"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), 25.0, (64, 48))
+    assert writer.isOpened()
+    for k in range(5):
+        writer.write(np.full((48, 64, 3), 40 * k, np.uint8))
+    writer.release()
+    monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "threads;1")
+    assert [int(frame.image.mean()) // 40 for frame in VideoReader(path.rename(path.with_suffix(".mp4")))][:1] == [0]
+    assert os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] == "threads;1"
