@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -134,6 +134,8 @@ class ImageObserver:
         if len(paths) == 1 and os.path.isdir(paths[0]):
             folder = ImageFolder.load(paths[0])
             return self.observe_folder(folder, scene or scene_of(folder), progress=progress)
+        if pictures is not None:
+            _refuse_inputs([_picture_of(path, pictures) for path in paths], paths)
         parts, coloured = [], 0
         job = _FileJob(self.settings, self.gamma, eyes, pictures)
         with _mapper(processes if len(paths) >= LEAST_FOR_POOL else 1) as each:
@@ -216,8 +218,26 @@ class _FileJob:
         if self.pictures is not None:
             full = float(2**depth - 1) if depth <= 16 else float(max(image.max(), 1e-9))
             picture = overlay(image, found, full)
-            write_png(self.pictures / f"{Path(path).stem}.png", np.ascontiguousarray(picture[..., ::-1]))
+            write_png(_picture_of(path, self.pictures), np.ascontiguousarray(picture[..., ::-1]))
         return found, (image.shape[0], image.shape[1]), colour
+
+
+def _picture_of(path: str | Path, folder: Path) -> Path:
+    return folder / f"{Path(path).stem}.png"
+
+
+def _refuse_inputs(pictures: Sequence[Path], paths: Sequence[str | Path]) -> None:
+    """Check that no picture that will be written is one of the images that will be read."""
+    inputs = set()
+    for path in paths:
+        with suppress(OSError, ValueError):  # `read_any_image` says so
+            state = os.stat(path)
+            inputs.add((state.st_dev, state.st_ino))
+    for picture in pictures:
+        with suppress(OSError, ValueError):
+            state = picture.stat()
+            if (state.st_dev, state.st_ino) in inputs:
+                raise InputError("is one of the images, so it is not written to", source=str(picture))
 
 
 def colour_warning(count: int, what: str) -> InputWarning:

@@ -34,6 +34,7 @@ _SIGNS = {
     "results.json": "eyerender/bench-extractors/",
 }
 _SIGN_BYTES = 2**30
+_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp", ".exr", ".hdr")
 _FOLDERS = re.compile(r"(images/)?((images|masks|amodal_masks|noiseless|highlights|shards)(/[0-9]+)?)|images")
 _FILES = re.compile(
     r"(images/)?("  # a study's images are a dataset of their own
@@ -69,6 +70,18 @@ def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
         _refuse_others(folder, known)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", source=str(path)) from None
+
+
+def has_own_name(folder: Path, file: Path) -> bool:
+    """Whether a file in a folder has a name that this package gives there, or is listed as made by it, or is a picture.
+
+    Args:
+        folder: the folder.
+        file: a path below it.
+    """
+    return file.suffix.lower() in _PICTURES or _is_ours(
+        file.relative_to(folder).as_posix(), False, _listed(folder) or set()
+    )
 
 
 def clear(folder: Path, *, known: bool = False) -> None:

@@ -63,7 +63,7 @@ def render(
 
 @app.command(name="quickstart")
 def quickstart(
-    folder: Annotated[Path, Parameter(name="DIR")],
+    output: Annotated[Path, Parameter(name="DIR")],
     /,
     *,
     eye: EyeModel = None,
@@ -76,7 +76,7 @@ def quickstart(
     """Render a small scene, extract its features, estimate gaze, and write a report.
 
     Args:
-        folder: The folder to write.
+        output: The folder to write.
     """
     from ..quickstart import run_quickstart
 
@@ -84,7 +84,7 @@ def quickstart(
     heed = Heed(strict)
     with progress("quickstart") as steps:
         result = run_quickstart(
-            folder, eye=eye, backend=backend, threads=threads, overwrite=overwrite, progress=steps, warn=heed
+            output, eye=eye, backend=backend, threads=threads, overwrite=overwrite, progress=steps, warn=heed
         )
-    emit(result.to_mapping(), f"{result.to_text()}\nreport: {folder / 'report.html'}", json, heed)
+    emit(result.to_mapping(), f"{result.to_text()}\nreport: {output / 'report.html'}", json, heed)
     return 0

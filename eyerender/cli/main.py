@@ -31,6 +31,7 @@ from . import (  # noqa: F401
     study,
 )
 from .app import app
+from .targets import check_outputs
 
 INTERRUPTED = 130
 _interrupted = threading.Event()
@@ -50,7 +51,9 @@ def run(argv: Sequence[str] | None = None) -> int:
     previous = _terminate_like_interrupt()
     try:
         with nullcontext() if cached else _without_cache():
-            code = app(tokens, exit_on_error=False, print_error=False)
+            command, bound, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
+            check_outputs(bound.arguments)
+            code = command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except BrokenPipeError:

@@ -94,7 +94,7 @@ def extract(
         record: Version of the records in the JSON, 1 or 2.
     """
     from ..extraction.video import is_video
-    from ..files import make_folder, written
+    from ..files import make_folder, refuse_special, written
     from ..imageobserver import ImageObserver
     from ..scene import load_scene
     from ..videoobserver import observe_video
@@ -111,6 +111,8 @@ def extract(
     loaded = load_scene(scene) if scene is not None else None
     heed(loaded.warnings() if loaded is not None else ())
     observer = ImageObserver(gamma=gamma)
+    if output is not None:
+        refuse_special(output)
     if is_video(images[0]):
         if len(images) > 1:
             raise InputError("give one video at a time", source=str(images[1]))

@@ -1,0 +1,120 @@
+"""Where a command writes: never over one of its inputs, and never to an address or a device."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..files import parse_json, read_text, refuse_address, refuse_special
+
+# Names of the parameters that say where a command writes; all other paths of a command are inputs.
+OUTPUTS = ("output", "overlay", "json")
+_MAX_DEPTH = 4  # of files that name files: a dataset's spec, its scene, a head's manifest, its meshes
+_MAX_NAME = 1024
+
+
+def check_outputs(arguments: Mapping[str, Any]) -> None:
+    """Check where a command will write, before it does anything.
+
+    Args:
+        arguments: the command's arguments by the names of its parameters.
+
+    Raises:
+        InputError: an output is an address; is an input, also by another name; is a file that an input names, or a
+            file of an input folder; is the JSON target and no file; or will be emptied and holds an input.
+    """
+    said = {name: arguments[name] for name in OUTPUTS if arguments.get(name) is not None}
+    if said.get("json") == "-":  # stdout
+        del said["json"]
+    outputs = {name: Path(value) for name, value in said.items()}
+    for name, place in outputs.items():
+        refuse_address(place)
+        if name == "json":
+            refuse_special(place)
+    if len({os.path.realpath(place) for place in outputs.values()}) < len(outputs):
+        raise InputError("is given for two outputs", source=str(place))
+    existing = [(place, state) for place in outputs.values() if (state := _state(place)) is not None]
+    if existing:
+        given = [path for name, value in arguments.items() if name not in OUTPUTS for path in _paths(value)]
+        for place, state in existing:
+            _refuse_inputs(place, state, given, emptied=bool(arguments.get("overwrite")))
+
+
+def _refuse_inputs(place: Path, state: os.stat_result, given: Sequence[Path], *, emptied: bool) -> None:
+    from ..outfolder import has_own_name
+
+    source, real = str(place), Path(os.path.realpath(place))
+    for path, found in _with_named(given):
+        if os.path.samestat(found, state):
+            raise InputError("is an input of this command, so it is not written to", source=source)
+        read = Path(os.path.realpath(path))
+        if stat.S_ISDIR(found.st_mode) and read in real.parents and has_own_name(read, real):
+            raise InputError(f"belongs to the input {path}, so it is not written to", source=source)
+        if emptied and real in read.parents:
+            raise InputError(f"holds the input {path}, so it is not overwritten", source=source)
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    """Existing files among the values of an argument, and folders where it is a path and not the name of something."""
+    if isinstance(value, tuple | list):
+        for one in value:
+            yield from _paths(one)
+    elif isinstance(value, Path):
+        yield value
+    elif isinstance(value, str):
+        yield from (path for part in {value, *value.split(",")} if _is_file(_state(path := Path(part.strip()))))
+
+
+def _with_named(paths: Iterable[Path]) -> Iterator[tuple[Path, os.stat_result]]:
+    """Paths that exist, and the files that scenes, specs and manifests among them name, relative to themselves."""
+    seen = set()
+    for _ in range(_MAX_DEPTH):
+        named: list[Path] = []
+        for path in paths:
+            state = _state(path)
+            if state is not None and (state.st_dev, state.st_ino) not in seen:
+                seen.add((state.st_dev, state.st_ino))
+                yield path, state
+                named += [path.parent / text for text in _texts(_content(path)) if len(text) <= _MAX_NAME]
+        paths = [path for path in named if _is_file(_state(path))]
+
+
+def _content(path: Path) -> Any:
+    """What a YAML or JSON file holds; None for other files, and for those that cannot be read."""
+    from ..spec import MAX_YAML_BYTES, parse_yaml
+
+    kind = path.suffix.lower()
+    if kind not in (".yaml", ".yml", ".json") or not _is_file(_state(path)):
+        return None
+    try:
+        text = read_text(path, limit=MAX_YAML_BYTES)
+        return parse_json(text) if kind == ".json" else parse_yaml(text, str(path))
+    except InputError:  # the command says so
+        return None
+
+
+def _texts(value: Any) -> set[str]:
+    """Every text in nested lists and mappings."""
+    found, left = set(), [value]
+    while left:
+        one = left.pop()
+        if isinstance(one, str):
+            found.add(one)
+        elif isinstance(one, dict | list):
+            left += one.values() if isinstance(one, dict) else one
+    return found
+
+
+def _is_file(state: os.stat_result | None) -> bool:
+    return state is not None and stat.S_ISREG(state.st_mode)
+
+
+def _state(path: Path) -> os.stat_result | None:
+    try:
+        return path.stat()
+    except (OSError, ValueError):
+        return None
