@@ -26,11 +26,14 @@ from pathlib import Path
 from typing import Any
 
 from ..cachefolder import cache_folder
+from ..errors import InputError
+from ..files import read_json
 from .libraries import load_llvm, load_runtime
 
 TIMEOUT_S = 180.0
 REFUSAL_AGE_S = 86400.0  # a refusal is checked again after a day, because the GPU may have been busy or memory short
 _MARK = "eyerender-probe: "
+_VERDICT_BYTES = 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,10 +154,10 @@ def _identity(library: Path | None) -> Sequence[Any]:
 
 def _read_verdict(file: Path) -> Verdict | None:
     try:
-        stored = json.loads(file.read_text(encoding="utf-8"))["verdict"]
+        stored = read_json(file, limit=_VERDICT_BYTES, follow=False)["verdict"]
         verdict = Verdict(bool(stored["ok"]), str(stored["detail"]))
         return verdict if verdict.ok or time.time() - file.stat().st_mtime < REFUSAL_AGE_S else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (InputError, OSError, ValueError, KeyError, TypeError):
         return None
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..files import read_bytes, read_text, shown
+from ..geometry.ply import plain_ply
 from ..geometry.topography import smooth_heights
 from ..spec import read_yaml
 from .parts import MAX_NODES, GridSpec, TopographySpec
@@ -211,7 +212,7 @@ def _mesh(path: Path) -> Floats:
     """Vertices of a PLY file, (n, 3)."""
     import trimesh  # which takes a quarter of a second
 
-    data = read_bytes(path, limit=MAX_FILE_BYTES)
+    data = plain_ply(read_bytes(path, limit=MAX_FILE_BYTES), source=str(path))
     try:
         loaded: Any = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
         points = np.asarray(loaded.vertices, dtype=np.float64)

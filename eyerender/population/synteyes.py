@@ -25,6 +25,7 @@ from ..eye.kappa import with_kappa
 from ..eye.spec import EyeSpec
 from ..files import read_bytes
 from ..geometry.transforms import read_only
+from ..spec import LARGEST, SMALLEST
 
 CORNEA_INDEX, AQUEOUS_INDEX, VITREOUS_INDEX = 1.376, 1.336, 1.336
 RETINA_THICKNESS_MM = 0.2
@@ -86,9 +87,12 @@ class SyntEye(ArrayValue):
         (r1, r2), d, power = self.lens_radii_mm, self.lens_thickness_mm, self.lens_power_d / 1000.0
         a, v = AQUEOUS_INDEX, VITREOUS_INDEX
         # n P = n F1 + n F2 - d F1 F2, gathered by powers of n.
-        square = 1.0 / r1 - 1.0 / r2 + d / (r1 * r2)
-        linear = -a / r1 + v / r2 - d * (a + v) / (r1 * r2) - power
-        constant = d * a * v / (r1 * r2)
+        with np.errstate(all="ignore"):
+            square = 1.0 / r1 - 1.0 / r2 + d / (r1 * r2)
+            linear = -a / r1 + v / r2 - d * (a + v) / (r1 * r2) - power
+            constant = d * a * v / (r1 * r2)
+        if not np.isfinite([square, linear, constant]).all():  # a radius of 0
+            return float("nan")
         roots = np.roots([square, linear, constant])
         real = roots[np.isreal(roots)].real
         return float(real[np.argmin(np.abs(real - 1.42))]) if len(real) else float("nan")
@@ -134,6 +138,8 @@ class SyntEyes(ArrayValue):
         weights = arrays["weights_orig"]
         if (weights < 0.0).any() or not 0.99 < weights.sum() < 1.01:
             raise InputError("must be shares whose sum is 1", source=str(path), path="weights_orig")
+        if arrays["cov_retina_radii"][0, 0] < SMALLEST:
+            raise InputError("must have a variance > 0 of the axial length", source=str(path), path="cov_retina_radii")
         factors = np.stack([_factor(arrays[name]) for name in ("cov_orig0", "cov_orig1")])
         lens = arrays[_LENS_TERMS].reshape(-1)
         return cls(
@@ -318,8 +324,8 @@ def _arrays(path: str | Path) -> dict[str, Floats]:
     except Exception as error:
         raise InputError(f"is not a NumPy archive that can be read ({type(error).__name__})", source=source) from None
     for name, array in found.items():
-        if not np.isfinite(array).all():
-            raise InputError("holds a value that is not a finite number", source=source, path=name)
+        if not (np.abs(array) <= LARGEST).all():
+            raise InputError(f"holds a value that is not a number within {LARGEST:g}", source=source, path=name)
     return found
 
 

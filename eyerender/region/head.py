@@ -23,6 +23,7 @@ from PIL import Image
 from ..arrays import ArrayValue, Floats, Ints, Singles, frozen
 from ..errors import InputError
 from ..files import opened, read_bytes, shown
+from ..geometry.ply import plain_ply
 from ..spec import file_digest
 from .anatomy import Region
 from .globe import Globe
@@ -263,7 +264,7 @@ def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
         raise InputError("must end with .obj or .ply", source=source)
     # Without its materials a file refers to no other files.
     options: dict[str, Any] = {"skip_materials": True}
-    data = read_bytes(path)
+    data = read_bytes(path) if kind == ".obj" else plain_ply(read_bytes(path), source=source)
     try:
         if kind == ".obj":
             text = "\n" + data.decode("utf-8", errors="replace")

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..cachefolder import cache_folder
 from ..errors import EyerenderError, InputError
-from ..files import PART, read_bytes, written
+from ..files import PART, parse_json, read_bytes, written
 from .anatomy import Region
 from .iris import DrawnPattern
 
@@ -138,13 +138,13 @@ def _read(file: Path) -> NDArray[Any] | None:
 def _decoded(data: bytes) -> NDArray[Any] | None:
     line = data[:_LARGEST_HEADER].partition(b"\n")[0]
     try:
-        header = json.loads(line)
+        header = parse_json(line)
         dtype, shape = header["dtype"], tuple(header["shape"])
         sound = header["schema"] == SCHEMA and dtype in _DTYPES and all(type(n) is int and n >= 0 for n in shape)
         body = memoryview(data)[len(line) + 1 :]
         if sound and len(body) == np.prod(shape) * np.dtype(dtype).itemsize and header["blake2b"] == _checksum(body):
             return np.frombuffer(body, dtype).reshape(shape)
-    except (ValueError, KeyError, TypeError, OverflowError):
+    except (InputError, ValueError, KeyError, TypeError, OverflowError):
         pass
     return None
 

@@ -266,6 +266,11 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
         "give a larger 'spacing_mm'",
     ),
     "not UTF-8": ({"a.csv": b"\xff\xfe\x00"}, {"path": "a.csv", "layout": "points", **AXES}, "not UTF-8"),
+    "PLY of no vertices": (
+        {"a.ply": ply().replace(b"element vertex ", b"element vertex -", 1)},
+        {"path": "a.ply", "layout": "mesh", **AXES},
+        "the file cannot hold so many",
+    ),
     "no PLY": ({"a.ply": b"ply\nnothing"}, {"path": "a.ply", "layout": "mesh", **AXES}, "is not a PLY file"),
     "axes": ({}, {"path": "a.csv", "layout": "points", **AXES, "z": "up"}, "file.z"),
     "ragged": ({"a.csv": ",0,1\n0,1\n"}, {"path": "a.csv", "layout": "matrix", **AXES}, "has 2 cells"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -159,6 +160,31 @@ def test_kappa_gives_alpha_by_tracing():
 def test_other_files_are_refused_with_one_line(changes, message, tmp_path):
     with pytest.raises(InputError, match=message):
         SyntEyes.load(archive(tmp_path / "modeldata.npz", **changes))
+
+
+def test_numbers_that_make_no_eye_are_one_line(tmp_path, monkeypatch):
+    """Zeros, huge and tiny numbers in place of each array, whole or in one place."""
+    monkeypatch.setattr("eyerender.population.synteyes.MAX_REFUSED", 2)  # a hundred draws show no more
+    path = tmp_path / "a.npz"
+    with np.load(archive(path)) as found:
+        arrays = dict(found)
+    for name, array in arrays.items():
+        for value in (0.0, 1e-300, 1e8, 1e308):
+            one = array.copy()
+            one.flat[0] = value
+            for changed in (np.full_like(array, value), one):
+                try:
+                    SyntEyes.load(archive(path, **{name: changed})).draw(0)
+                except InputError as error:
+                    assert "\n" not in str(error)  # noqa: PT017  (some of them are eyes)
+
+
+@pytest.mark.parametrize("radii", [(0.0, -6.0), (10.0, 0.0), (0.0, 0.0), (1e-300, -1e-300)])
+def test_a_lens_without_radii_has_no_index_and_is_refused(model, radii):
+    eye, _ = model.draw(0)
+    flat = replace(eye, lens_radii_mm=np.array(radii))
+    with pytest.raises(InputError):
+        model.eye_file(flat)
 
 
 def test_files_that_are_no_archive_are_refused(tmp_path):

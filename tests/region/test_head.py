@@ -131,12 +131,43 @@ def test_what_is_no_regular_file_is_not_read(tmp_path, name):
         READERS[name](tmp_path)
 
 
-def test_a_mesh_leads_to_no_other_file(tmp_path):
+BROKEN = {
+    "element vertex -5": "element vertex -5.: the file cannot hold so many",
+    "element vertex 99999999999": "cannot hold so many",
+    "element vertex 1e3": "cannot hold so many",
+    "element vertex": "cannot hold so many",
+    "element vertex 3 3": "cannot hold so many",
+    "property float x": "is not a readable mesh",
+    "end_header": "is not a readable mesh",
+}
+
+
+@pytest.mark.parametrize("line", BROKEN)
+def test_a_broken_header_of_a_ply_is_one_line(tmp_path, line, capfd):
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=90.0)
+    text = mesh.export(file_type="ply", encoding="ascii").decode()
+    (tmp_path / "a.ply").write_text(text.replace("\nelement", f"\n{line}\nelement", 1))
+    with pytest.raises(InputError, match=BROKEN[line]) as caught:
+        load_head(spec_of(tmp_path, file="a.ply"))
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("content", [b"", b"ply", b"ply\n" * 99, b"ply\nend_header", b"ply\n" + b"comment a\n" * 9999])
+def test_a_header_without_an_end_is_refused(tmp_path, content):
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.ply: is not a"):
+        load_head(spec_of(tmp_path, file="a.ply"))
+
+
+@pytest.mark.parametrize("comment", ["comment TextureFile pipe", "obj_info texturefile pipe", "comment end_header"])
+def test_a_mesh_leads_to_no_other_file(tmp_path, comment, capfd):
     """Comments of a PLY and libraries of an OBJ may name files anywhere."""
     os.mkfifo(tmp_path / "pipe")
     mesh = trimesh.creation.icosphere(subdivisions=1, radius=90.0)
     text = mesh.export(file_type="ply", encoding="ascii").decode()
-    (tmp_path / "a.ply").write_text(text.replace("\nelement", "\ncomment TextureFile pipe\nelement", 1))
+    (tmp_path / "a.ply").write_text(text.replace("\nelement", f"\n{comment}\nelement", 1))
     (tmp_path / "b.obj").write_text("mtllib pipe\n" + mesh.export(file_type="obj"))
     for name in ("a.ply", "b.obj"):
         assert len(load_head(spec_of(tmp_path, file=name)).faces) == len(mesh.faces)
+    assert capfd.readouterr().err == ""

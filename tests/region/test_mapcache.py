@@ -72,6 +72,10 @@ def test_a_region_is_known_by_all_its_keys(place):
         lambda data: data.replace(b"[60, 50]", b"[30, 100]").replace(b"blake2b", b"blake2c"),
         lambda data: data.replace(b"[60, 50]", b"[-6, -5]"),
         lambda data: b"\xff" * 5000,
+        lambda data: b"[" * 4000 + b"\n" + data,
+        lambda data: b'{"a":' * 800 + b"\n" + data,
+        lambda data: b'{"shape": [' + b"9" * 3000 + b"]}\n" + data,
+        lambda data: b"[]\n" + data,
     ],
 )
 def test_a_damaged_file_is_made_again(place, damage):

@@ -145,6 +145,8 @@ def test_bad_calibrations_are_refused_by_key(tmp_path, changes, words, suffix):
         ("%YAML:1.0\n---\nK: !!opencv-matrix 3\n", "line 3: not valid YAML"),
         ("<opencv_storage><camera_matrix>", "is not valid XML"),
         ('<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "holds a document type or entities"),
+        ("<?x <!-- ?><!DOCTYPE a [<!ENTITY b 'c'>]><?y --> ?><a>&b;</a>", "holds a document type or entities"),
+        ("<" + "<!--" * 50_000, "is not valid XML"),  # a search for the ends of comments would take a minute
         ("{", "is not valid JSON"),
         ("# " + "x" * (2**21 + 1), "too large"),
     ],

@@ -1,0 +1,45 @@
+"""PLY files of strangers: a header that is checked, without comments, for a library that trusts it."""
+
+from __future__ import annotations
+
+import logging
+import re
+
+from ..errors import InputError
+from ..files import shown
+
+MAX_HEADER_BYTES = 65536
+_WORDS = (b"format", b"element", b"property")
+
+# Trimesh logs what it leaves out; a mesh is read or refused here, in one line.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
+
+def plain_ply(data: bytes, *, source: str = "") -> bytes:
+    """PLY file whose header holds formats, elements and properties alone; comments may name other files.
+
+    Raises:
+        InputError: it has no such header, or the header counts elements that the file cannot hold.
+    """
+    head: list[bytes] = []
+    start = 0
+    while (end := data.find(b"\n", start, MAX_HEADER_BYTES)) >= 0:
+        line, start = data[start:end].strip(), end + 1
+        words = line.split()
+        if not head and line != b"ply":
+            break
+        if line == b"end_header":
+            return b"\n".join([*head, line, b""]) + data[start:]
+        if not head or (words and words[0] in _WORDS):
+            _check(words, len(data) - start, source)
+            head.append(line)
+    raise InputError("is not a PLY file that can be read (its header does not begin or end)", source=source)
+
+
+def _check(words: list[bytes], left: int, source: str) -> None:
+    """Check a line's count of elements: each takes at least a byte of what is left of the file."""
+    if words[0] == b"element" and not (
+        len(words) == 3 and re.fullmatch(rb"[0-9]{1,18}", words[2]) and int(words[2]) <= left
+    ):
+        said = shown(b" ".join(words).decode(errors="replace"))
+        raise InputError(f"is not a PLY file that can be read ({said}: the file cannot hold so many)", source=source)

@@ -1,0 +1,50 @@
+"""Texts of strangers that would make a careless search start again and again: reading them takes linear time."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from eyerender.errors import EyerenderError
+from eyerender.files import read_json
+from eyerender.gaze.records import load_observations
+from eyerender.region.head import _objects
+from eyerender.rig.opencv import read_opencv
+
+SIZE = 200_000
+# What is linear takes 1.6 s of processor time at most (a file of so many broken lines). A step that is quadratic as a
+# search for the ends of comments was takes 40 s, and its time grows with the square of the size.
+LIMIT_S = 8.0
+TEXTS = {
+    "camera.xml": ["<" + "<!--", "<?x <!-- ", "<!-- -", "<a>", "<a b='", "<a>&#65;", "<![CDATA[", "<a><m>1 "],
+    "camera.json": ["[", '{"a":', '{"a": "\\', "1", "{" + " "],
+    "camera.yml": ["%YAML:", "a: >\n\n", "&a ", "1:", "1_", "- ", "[", "{a: ", "a: '', ", "? ", "# ", "a: [*a,"],
+    "data.json": ["[", '{"a":', '"\\u0000', "1", "-", "1e", " "],
+    "records.csv": ["a,", "a\n", '"', '"a""b', ";", "pupil_x_px_", "-mm", "pupil_x,pupil_y\n1,"],
+    "records.jsonl": ["{}\n", "["],
+    "head.obj": ["v 0 0 0\n", "f 1 1 1\n", "f 1//", "o a\n", "g a\n", "\\\n", "v 1 ", "usemtl a\n"],
+    "head.ply": ["ply\n", "ply\ncomment ", "ply\nelement vertex 1\n", "ply\nproperty float x\n"],
+}
+READERS = {
+    "camera": read_opencv,
+    "data": read_json,
+    "records": lambda path: load_observations(path, None),
+    "head": _objects,
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_repeated_text_takes_linear_time(name, tmp_path):
+    path = tmp_path / name
+    for text in TEXTS[name]:
+        # Once the whole is repeated, once its last characters.
+        for whole in (text * (SIZE // len(text)), text + text[-2:] * (SIZE // 2)):
+            Path(path).write_text(whole)
+            start = time.process_time()
+            try:
+                READERS[path.stem](path)
+            except EyerenderError as error:
+                assert "\n" not in str(error)  # noqa: PT017
+            assert time.process_time() - start < LIMIT_S, whole[:40]
