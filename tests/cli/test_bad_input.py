@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -370,6 +371,27 @@ def test_an_interrupted_run_says_so_and_leaves_nothing(place, tmp_path_factory, 
     assert err.splitlines()[-1] == "interrupted"
     assert "Traceback" not in err
     assert not Path("out").exists()
+
+
+@pytest.mark.render
+def test_a_run_in_the_background_of_a_script_is_ended_with_sigterm(place):
+    """A shell without job control lets what it starts with & ignore SIGINT."""
+    script = f"{sys.executable} -m eyerender generate dataset_quick out --workers 1 & echo $!; wait $!; echo $?"
+    with subprocess.Popen(["sh", "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as shell:
+        assert shell.stdout is not None
+        number = int(shell.stdout.readline())
+        while not Path("out", "run.json").exists():
+            time.sleep(0.05)
+        os.kill(number, signal.SIGINT)
+        with pytest.raises(subprocess.TimeoutExpired):
+            shell.wait(1.0)
+        os.kill(number, signal.SIGTERM)
+        out, err = shell.communicate(timeout=60)
+    assert out.split() == ["130"]
+    assert err.splitlines()[-1] == "interrupted"
+    assert "start again on out to resume" in err
+    assert "Traceback" not in err
+    assert not [path for path in Path("out").rglob("*") if path.name.endswith(".part")]
 
 
 @pytest.mark.render
