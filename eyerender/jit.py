@@ -62,7 +62,7 @@ def compiled(function: Function) -> Function:
         config.CACHE_DIR = FOLDER
         try:
             kept = njit(cache=True, nogil=True, error_model="numpy")(function)
-            if kept.stats.cache_path.startswith(FOLDER):  # else numba chose a folder that nobody checked
+            if str(kept.stats.cache_path).startswith(FOLDER):  # else numba chose a folder that nobody checked
                 return cast(Function, kept)
         except (RuntimeError, OSError):  # numba found no folder to write to
             pass

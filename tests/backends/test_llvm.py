@@ -20,11 +20,12 @@ import pytest
 
 from eyerender.backends import apt as apt_module
 from eyerender.backends.apt import fetch_library
-from eyerender.backends.libraries import WHEEL, cache_folder, load_llvm, load_runtime, runtime_store
+from eyerender.backends.libraries import WHEEL, load_llvm, load_runtime, runtime_store
 from eyerender.backends.llvm import ENVIRONMENT, VARIANT, candidates, find_llvm, version_of
 from eyerender.backends.probe import REFUSAL_AGE_S, Verdict, probe, run_probe
 from eyerender.backends.remedies import has_archive, llvm_command, runtime_command
 from eyerender.backends.set_up import setup_llvm
+from eyerender.cachefolder import cache_folder
 from eyerender.errors import BackendError
 
 COMPILER = shutil.which("cc")
