@@ -374,8 +374,10 @@ def test_an_interrupted_run_says_so_and_leaves_nothing(place, tmp_path_factory, 
 
 
 @pytest.mark.render
-def test_a_run_in_the_background_of_a_script_is_ended_with_sigterm(place):
+def test_a_run_in_the_background_of_a_script_is_ended_with_sigterm(place, capsys):
     """A shell without job control lets what it starts with & ignore SIGINT."""
+    assert run(["generate", "--help"]) == 0
+    assert "SIGTERM" in capsys.readouterr().out
     script = f"{sys.executable} -m eyerender generate dataset_quick out --workers 1 & echo $!; wait $!; echo $?"
     with subprocess.Popen(["sh", "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as shell:
         assert shell.stdout is not None
