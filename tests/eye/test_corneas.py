@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from typing import Any
 
 import numpy as np
@@ -225,6 +227,16 @@ def test_measured_points_become_the_cornea(name, tmp_path):
     truth = -keratoconus(y, z) + keratoconus(0.0, 0.0)
     # 2e-6 mm is the error of the bicubic; PLY holds single precision, and rings are denser than the grid near the axis.
     assert np.abs(surface.local_sag(y, z) - truth).max() < (2e-5 if name in ("mesh", "polar") else 2e-6)
+
+
+def test_a_texture_that_measured_points_name_is_not_looked_for(tmp_path, caplog):
+    """Trimesh would look for the picture, and log a traceback, which Python prints where nobody has set up logging."""
+    content = ply().replace(b"\nelement", b"\ncomment TextureFile pipe\nelement", 1)
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "a.ply").write_bytes(content)
+    keys = {"layout": "mesh", "x": "temporal", "y": "down", "z": "out", "unit": "mm", "spacing_mm": 0.25}
+    assert read_topography(TopographySpec(path="a.ply", **keys), tmp_path).heights_mm is not None
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
 def test_a_file_with_gaps_is_fitted_around_them(tmp_path):

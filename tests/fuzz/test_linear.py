@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,7 @@ TEXTS = {
     "head.obj": ["v 0 0 0\n", "f 1 1 1\n", "f 1//", "o a\n", "g a\n", "\\\n", "v 1 ", "usemtl a\n"],
     "head.ply": ["ply\n", "ply\ncomment ", "ply\nelement vertex 1\n", "ply\nproperty float x\n"],
 }
-READERS = {
+READERS: dict[str, Callable[[Path], object]] = {
     "camera": read_opencv,
     "data": read_json,
     "records": lambda path: load_observations(path, None),
