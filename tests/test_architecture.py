@@ -70,6 +70,7 @@ ORDER = [
     "progress",
     "status",
     "cachefolder",
+    "jit",
     "files",
     "jsonlines",
     "references",

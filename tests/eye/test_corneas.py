@@ -234,7 +234,14 @@ def test_a_texture_that_measured_points_name_is_not_looked_for(tmp_path, caplog)
     content = ply().replace(b"\nelement", b"\ncomment TextureFile pipe\nelement", 1)
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "a.ply").write_bytes(content)
-    keys: dict[str, Any] = {"layout": "mesh", "x": "temporal", "y": "down", "z": "out", "unit": "mm", "spacing_mm": 0.25}
+    keys: dict[str, Any] = {
+        "layout": "mesh",
+        "x": "temporal",
+        "y": "down",
+        "z": "out",
+        "unit": "mm",
+        "spacing_mm": 0.25,
+    }
     assert read_topography(TopographySpec(path="a.ply", **keys), tmp_path).heights_mm is not None
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
