@@ -48,7 +48,9 @@ def _fetch_runtime(reason: str, say: Say) -> None:
         raise BackendError(f"{reason}; {runtime_command()}")
     store = runtime_store()
     if store is None:
-        raise BackendError(f"{reason}; there is no private cache folder to fetch it into: set XDG_CACHE_HOME to a folder of yours")
+        raise BackendError(
+            f"{reason}; there is no private cache folder to fetch it into: set XDG_CACHE_HOME to a folder of yours"
+        )
     try:
         for name, (package, _) in RUNTIME.items():
             say(f"fetching {package} from the package archive")
