@@ -7,7 +7,6 @@ import os
 import platform
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NoReturn, TypeGuard, overload
 
@@ -21,6 +20,7 @@ from .imagefile import read_image
 from .jsonlines import JsonLines
 from .observation import EYES, Observations, concatenate, count_heads
 from .rig.camera import Window
+from .versions import package_version
 
 IMAGE_SCHEMA = "eyerender/image/3"
 # Version 2 has no masks of highlights, version 1 neither `gamma` nor the class 4 of masks; they are read wherever
@@ -387,10 +387,6 @@ A change of the code that changes them raises it. A run that was begun with anot
 
 def versions() -> dict[str, str]:
     """Versions on which a result depends."""
-    out = {"python": platform.python_version(), "results": str(RESULTS)}
-    for name in ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless"):
-        try:
-            out[name] = version(name)
-        except PackageNotFoundError:
-            out[name] = "unknown"
-    return out
+    packages = ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless")
+    found = {name: package_version(name) for name in packages}
+    return {"python": platform.python_version(), "results": str(RESULTS), **found}

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+import eyerender
 from tests.support.paths import ROOT
 
 
@@ -56,8 +57,10 @@ def run(site, cwd, *argv):
 
 def test_features_of_a_shipped_scene_from_another_folder(site, tmp_path):
     folder, _, _ = site
-    where = run(folder, tmp_path, "-c", "import eyerender; print(eyerender.__file__)")
-    assert Path(where.stdout.strip()).is_relative_to(folder)
+    where = run(folder, tmp_path, "-c", "import eyerender; print(eyerender.__file__, len(dir(eyerender)))")
+    file, names = where.stdout.split()
+    assert Path(file).is_relative_to(folder)
+    assert int(names) == len(eyerender.__all__)
     done = run(folder, tmp_path, "-m", "eyerender", "features", "guestrin2006", "--json", "-")
     assert done.returncode == 0, done.stderr
     data = json.loads(done.stdout)

@@ -52,8 +52,8 @@ def homes() -> dict[str, str]:
     for name in er.__all__:
         if name in ("gaze", "__version__"):
             continue
-        home = er._HOMES[name]
-        pages = [page for page, (_, starts) in GROUPS.items() if home.split(".")[0] in starts]
+        home = getattr(er, name).__module__.split(".")[1]
+        pages = [page for page, (_, starts) in GROUPS.items() if home in starts]
         found[name] = pages[0] if pages else "api_observers"
     return found
 

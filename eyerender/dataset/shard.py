@@ -23,7 +23,8 @@ from typing import Any
 from ..errors import InputError
 from ..files import MAX_FILE_BYTES, inside, make_folder, read_json, remove_file, sync_folder, sync_tree, write_json
 from ..imagefile import Writer
-from ..imagefolder import IMAGE_SCHEMA, STAGE
+from ..imagefolder import IMAGE_SCHEMA, STAGE, versions
+from ..versions import package_version
 from .maker import MadeImage, Maker
 
 SHARD_SCHEMA = "eyerender/shard/1"
@@ -298,17 +299,9 @@ def sum_of(path: Path) -> dict[str, Any]:
 
 def run_versions() -> dict[str, str]:
     """Versions that affect a dataset's bytes."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    from ..imagefolder import versions
-
     found = versions()
-    found.pop("opencv-python-headless", None)  # nothing here uses it
-    try:
-        found["pillow"] = version("pillow")
-    except PackageNotFoundError:
-        found["pillow"] = "unknown"
-    return found
+    del found["opencv-python-headless"]  # nothing here uses it
+    return {**found, "pillow": package_version("pillow")}
 
 
 def cpu_family() -> str:

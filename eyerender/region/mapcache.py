@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from ..cachefolder import cache_folder
 from ..errors import EyerenderError, InputError
 from ..files import PART, parse_json, read_bytes, written
+from ..versions import __version__
 from .anatomy import Region
 from .iris import DrawnPattern
 
@@ -103,7 +103,7 @@ def _code() -> list[str]:
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
-    return [version("eyerender"), digest.hexdigest(), np.__version__, scipy.__version__]
+    return [__version__, digest.hexdigest(), np.__version__, scipy.__version__]
 
 
 def _checksum(data: memoryview | bytes) -> str:

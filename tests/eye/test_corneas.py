@@ -16,7 +16,7 @@ import eyerender as er
 from eyerender.analytic.features import features
 from eyerender.errors import InputError
 from eyerender.eye.meshes import crossing, eye_meshes
-from eyerender.eye.parts import TopographySpec
+from eyerender.eye.parts import TopographySpec, ZernikeSpec
 from eyerender.eye.pose import Poses
 from eyerender.eye.topography import read_topography
 from eyerender.optics.solve import apparent_points, mirror_points
@@ -85,9 +85,10 @@ def test_many_eyes_in_one_batch_are_each_alone(name):
     rng = np.random.default_rng(6)
     eyes = []
     for k in range(11):
+        shape: Any
         if name == "zernike":
             c = np.array(GOLDEN) + rng.normal(size=45) * 1e-4 * (np.arange(45) > 2)
-            shape = er.eye.parts.ZernikeSpec(kind="zernike", radius_mm=3.25, coefficients_mm=c)
+            shape = ZernikeSpec(kind="zernike", radius_mm=3.25, coefficients_mm=tuple(c))
         else:
             shape = grid_of(lambda y, z, k=k: conic_depth(y, z, 7.6 + 0.03 * k, -0.2), 5.5 - 0.25 * (k % 2))
         eyes.append(eye_with(shape).build(eye="left" if k % 3 else "right"))
