@@ -11,12 +11,23 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, Union, get_args
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    GetCoreSchemaHandler,
+    Tag,
+    ValidationError,
+)
+from pydantic_core import CoreSchema
 
 from .errors import InputError, Problems
 from .files import opened, read_text, shown
@@ -46,10 +57,25 @@ Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 
 
-def kind_tag(value: object) -> str:
-    """Tag of a member of a union of specs that differ in `kind`: 'grid' is that of `GridSpec`."""
-    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
-    return f"{str(kind).capitalize()}Spec"
+@dataclass(frozen=True, slots=True)
+class ByKind:
+    """Choice among the specs of a union by their key `kind`: `Annotated[SphereSpec | ConicSpec, ByKind()]`."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        members = {str(get_args(member.model_fields["kind"].annotation)[0]): member for member in get_args(source)}
+        *names, last = members
+        kinds = Discriminator(
+            _kind_tag,
+            custom_error_type="unknown_kind",
+            custom_error_message=f"kind must be {', '.join(names)} or {last}",
+        )
+        tagged = tuple(Annotated[member, Tag(f"[{kind}]")] for kind, member in members.items())
+        return handler.generate_schema(Annotated[Union[tagged], kinds])  # noqa: UP007
+
+
+def _kind_tag(value: object) -> str:
+    """Pydantic's name for the member of a union of specs that differ in `kind`."""
+    return f"[{value.get('kind') if isinstance(value, Mapping) else getattr(value, 'kind', None)}]"
 
 
 class KeyProblem(ValueError):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 from scipy.special import log_ndtr, ndtri_exp
@@ -155,17 +155,7 @@ Draw = (
     | SobolDraw
     | SequenceDraw
 )
-_KINDS: dict[str, type[Draw]] = {
-    "fixed": FixedDraw,
-    "uniform": UniformDraw,
-    "log_uniform": LogUniformDraw,
-    "integer": IntegerDraw,
-    "truncated_normal": NormalDraw,
-    "choice": ChoiceDraw,
-    "grid": GridDraw,
-    "sobol": SobolDraw,
-    "sequence": SequenceDraw,
-}
+_KINDS: dict[str, type[Draw]] = {str(get_args(kind.model_fields[MARK].annotation)[0]): kind for kind in get_args(Draw)}
 KINDS = tuple(_KINDS)
 
 

@@ -7,12 +7,11 @@ surface.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Field
 
-from ..spec import FileSpec, Number, Positive, Spec, Vec2, Vec3, kind_tag
+from ..spec import ByKind, FileSpec, Number, Positive, Spec, Vec2, Vec3
 
 # This is the number of surfaces of the finest lens of shells.
 MAX_SURFACES = 400
@@ -155,19 +154,7 @@ class PlaneSpec(Spec):
 
 
 ShapeSpec = Annotated[
-    Annotated[SphereSpec, Tag("SphereSpec")]
-    | Annotated[ConicSpec, Tag("ConicSpec")]
-    | Annotated[BiconicSpec, Tag("BiconicSpec")]
-    | Annotated[EllipsoidSpec, Tag("EllipsoidSpec")]
-    | Annotated[QuadricSpec, Tag("QuadricSpec")]
-    | Annotated[PlaneSpec, Tag("PlaneSpec")]
-    | Annotated[ZernikeSpec, Tag("ZernikeSpec")]
-    | Annotated[GridSpec, Tag("GridSpec")],
-    Discriminator(
-        kind_tag,
-        custom_error_type="unknown_kind",
-        custom_error_message="kind must be sphere, conic, biconic, ellipsoid, quadric, plane, zernike or grid",
-    ),
+    SphereSpec | ConicSpec | BiconicSpec | EllipsoidSpec | QuadricSpec | PlaneSpec | ZernikeSpec | GridSpec, ByKind()
 ]
 
 
@@ -256,19 +243,7 @@ class GradientLensSpec(Spec):
     )
 
 
-def _lens_tag(value: object) -> str | None:
-    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
-    return {"surfaces": "SurfaceLensSpec", "gradient": "GradientLensSpec"}.get(str(kind), "UnknownSpec")
-
-
-Lens = Annotated[
-    Annotated[SurfaceLensSpec, Tag("SurfaceLensSpec")] | Annotated[GradientLensSpec, Tag("GradientLensSpec")],
-    Discriminator(
-        _lens_tag,
-        custom_error_type="unknown_kind",
-        custom_error_message="kind must be surfaces or gradient",
-    ),
-]
+Lens = Annotated[SurfaceLensSpec | GradientLensSpec, ByKind()]
 
 
 class ContourSpec(Spec):

@@ -9,11 +9,11 @@ from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Field, model_validator
 from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
 from ..arrays import Floats
-from ..spec import Number, Positive, Spec, kind_tag
+from ..spec import ByKind, Number, Positive, Spec
 
 # Gauss and Hermite's points for means over a standard normal number; smooth maps need few, kinked ones are off by 1e-4.
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(180)
@@ -239,19 +239,7 @@ class Mixture(_Marginal):
         return centre, float(np.sqrt(weight @ (sd**2 + (mean - centre) ** 2)))
 
 
-Marginal = Annotated[
-    Annotated[Fixed, Tag("FixedSpec")]
-    | Annotated[Normal, Tag("NormalSpec")]
-    | Annotated[Lognormal, Tag("LognormalSpec")]
-    | Annotated[Uniform, Tag("UniformSpec")]
-    | Annotated[Share, Tag("ShareSpec")]
-    | Annotated[Mixture, Tag("MixtureSpec")],
-    Discriminator(
-        kind_tag,
-        custom_error_type="unknown_kind",
-        custom_error_message="kind must be fixed, normal, lognormal, uniform, share or mixture",
-    ),
-]
+Marginal = Annotated[Fixed | Normal | Lognormal | Uniform | Share | Mixture, ByKind()]
 
 
 def truncated(z: Floats, low: float, high: float) -> Floats:

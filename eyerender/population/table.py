@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Field, model_validator
 
-from ..spec import FileSpec, Number, Positive, Spec, kind_tag
+from ..spec import ByKind, FileSpec, Number, Positive, Spec
 from .marginals import Fixed, Lognormal, Marginal, Mixture, Normal, Share, Uniform
 
 FOLDER = Path(__file__).parent / "tables"
@@ -47,20 +47,7 @@ class Regression(Spec):
         return self
 
 
-Distribution = Annotated[
-    Annotated[Fixed, Tag("FixedSpec")]
-    | Annotated[Normal, Tag("NormalSpec")]
-    | Annotated[Lognormal, Tag("LognormalSpec")]
-    | Annotated[Uniform, Tag("UniformSpec")]
-    | Annotated[Share, Tag("ShareSpec")]
-    | Annotated[Mixture, Tag("MixtureSpec")]
-    | Annotated[Regression, Tag("RegressionSpec")],
-    Discriminator(
-        kind_tag,
-        custom_error_type="unknown_kind",
-        custom_error_message="kind must be fixed, normal, lognormal, uniform, share, mixture or regression",
-    ),
-]
+Distribution = Annotated[Fixed | Normal | Lognormal | Uniform | Share | Mixture | Regression, ByKind()]
 
 
 class Quantity(Spec):
