@@ -9,6 +9,7 @@ from .comparison import Comparison as Comparison
 from .comparison import compare as compare
 from .dataset.estimate import estimate as estimate
 from .dataset.export import export as export
+from .dataset.options import RunOptions as RunOptions
 from .dataset.realise import sample as sample
 from .dataset.run import generate as generate
 from .dataset.sheet import preview as preview

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import cyclopts
 from cyclopts import App, Parameter
 
 from ..versions import __version__
+
+
+def option_name(field: str) -> str:
+    """Name of a parameter or field on the command line: `timeout_s` is --timeout, with its unit in the help."""
+    return cyclopts.default_name_transform(field).removesuffix("-s")
+
 
 app = App(
     name="eyerender",
@@ -15,5 +22,5 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
     help_format="markdown",
-    default_parameter=Parameter(negative=()),
+    default_parameter=Parameter(negative=(), name_transform=option_name),
 )

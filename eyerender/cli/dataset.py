@@ -7,9 +7,10 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from ..dataset.options import RunOptions
 from ..errors import EyerenderError, InputError
 from .app import app
-from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads, positive
+from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads
 from .output import Heed, emit, progress, say
 
 
@@ -19,19 +20,13 @@ def generate(
     /,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     *,
-    workers: int | None = None,
     shard: str | None = None,
-    engine: Literal["local", "ray"] = "local",
-    address: str | None = None,
     dry_run: bool = False,
     measure: bool = False,
     eye: EyeModel = None,
     seed: Seed = None,
     count: int | None = None,
-    backend: Backend = "auto",
-    threads: Threads = None,
-    timeout: float = 600.0,
-    overwrite: Overwrite = False,
+    options: Annotated[RunOptions, Parameter(name="*")] = RunOptions(),
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -44,26 +39,18 @@ def generate(
     Args:
         spec: A dataset file, or the name of a shipped one.
         output: The folder to write.
-        workers: Number of worker processes (default: one per processor, as far as memory allows).
         shard: K/N: make only every N-th shard, starting with the K-th (1 <= K <= N). Use it for array jobs that write
             to one folder.
-        engine: Processes on this machine (local), or actors on a Ray cluster (ray).
-        address: Address of the Ray cluster (default: start one on this machine).
         dry_run: Only estimate the time and the disk space, from the last measured rate of this spec on this machine.
         measure: With --dry-run, make a few samples to measure the rate.
         count: Make the first COUNT samples of the spec's plan. A count above the spec's own plans a larger dataset.
-        timeout: Seconds without a sign of life after which a worker is ended and its shard is retried.
     """
-    positive("--workers", workers)
-    positive("--threads", threads)
-    if not timeout > 0:
-        raise InputError("must be > 0", source="--timeout")
     part = _part(shard)
     if measure and not dry_run:
         raise InputError("needs --dry-run", source="--measure")
     if output is None and not dry_run:
         raise InputError("give the folder to write", source="--output")
-    if overwrite and shard is not None:
+    if options.overwrite and shard is not None:
         raise InputError(
             "cannot be combined with --shard, because other jobs may be writing to the folder", source="--overwrite"
         )
@@ -71,39 +58,14 @@ def generate(
     if output is None or dry_run:
         from ..dataset.estimate import estimate
 
-        found = estimate(
-            spec,
-            eye=eye,
-            seed=seed,
-            count=count,
-            workers=workers,
-            backend=backend,
-            threads=threads,
-            measure=measure,
-            warn=heed,
-        )
+        found = estimate(spec, options, eye=eye, seed=seed, count=count, measure=measure, warn=heed)
         emit(found, _estimate_text(found), json, heed)
         return 0
     from ..dataset.run import generate as run
 
     with progress("generating") as steps:
         done = run(
-            spec,
-            output,
-            eye=eye,
-            seed=seed,
-            count=count,
-            workers=workers,
-            part=part,
-            engine=engine,
-            address=address,
-            backend=backend,
-            threads=threads,
-            timeout_s=timeout,
-            overwrite=overwrite,
-            progress=steps,
-            say=say,
-            warn=heed,
+            spec, output, options, eye=eye, seed=seed, count=count, part=part, progress=steps, say=say, warn=heed
         )
     emit(done, _generate_text(done), json, heed)
     return 0
@@ -163,7 +125,6 @@ def preview(
         spec: A scene or dataset file, or the name of a shipped one.
         output: The picture to write.
     """
-    positive("--threads", threads)
     from ..dataset.sheet import preview as render
 
     heed = Heed(strict)

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from .app import app
-from .options import EyeModel, Overwrite, Result, Strict, positive
+from .options import EyeModel, Overwrite, Result, Strict, at_least_one
 from .output import Heed, emit
 
 
@@ -21,7 +21,7 @@ def export_scene(
     eye: EyeModel = None,
     frame: int = 0,
     side: str | None = None,
-    spp: int = 64,
+    spp: Annotated[int, Parameter(validator=at_least_one)] = 64,
     overwrite: Overwrite = False,
     strict: Strict = False,
     json: Result = None,
@@ -38,7 +38,6 @@ def export_scene(
     from ..images import export_scene as write
     from ..scene import load_scene
 
-    positive("--spp", spp)
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)
     heed(loaded.warnings())

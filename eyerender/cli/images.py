@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from .app import app
-from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads, positive
+from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads
 from .output import Heed, emit, progress, say
 
 
@@ -45,7 +45,6 @@ def render(
     from ..outfolder import refuse_non_empty
     from ..scene import load_scene
 
-    positive("--threads", threads)
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye, spp=spp, seed=seed, surfaces=surfaces)
     heed(loaded.warnings())
@@ -80,7 +79,6 @@ def quickstart(
     """
     from ..quickstart import run_quickstart
 
-    positive("--threads", threads)
     heed = Heed(strict)
     with progress("quickstart") as steps:
         result = run_quickstart(

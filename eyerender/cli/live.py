@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 from .app import app
-from .options import Backend, EyeModel, Strict, Threads, positive
+from .options import Backend, EyeModel, Strict, Threads
 from .output import Heed
 
 
@@ -34,7 +34,6 @@ def live(
     """
     if find_spec("nicegui") is None:
         raise InputError("needs NiceGUI (the extra 'live'); run: pip install nicegui", source="live")
-    positive("--threads", threads)
     from ..live.server import serve
     from ..scene import load_scene
 

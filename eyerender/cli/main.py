@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from types import FrameType
 from typing import Any
 
-from cyclopts import CycloptsError
+from cyclopts import CycloptsError, ValidationError
 
 from ..errors import MAX_MESSAGE, EyerenderError, InputError, one_line
 
@@ -30,7 +30,7 @@ from . import (  # noqa: F401
     realism,
     study,
 )
-from .app import app
+from .app import app, option_name
 from .targets import check_outputs
 
 INTERRUPTED = 130
@@ -51,9 +51,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     previous = _terminate_like_interrupt()
     try:
         with nullcontext() if cached else _without_cache():
-            command, bound, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
-            check_outputs(bound.arguments)
-            code = command(*bound.args, **bound.kwargs)
+            code = _called(tokens)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except BrokenPipeError:
@@ -70,6 +68,16 @@ def run(argv: Sequence[str] | None = None) -> int:
             signal.signal(number, handler)
 
 
+def _called(tokens: Sequence[str]) -> Any:
+    """Parse the tokens and call their command."""
+    try:
+        command, given, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
+    except InputError as error:  # a record of options that refuses one of its fields
+        raise InputError(error.reason, source=f"--{option_name(error.path)}") from None
+    check_outputs(given.arguments)
+    return command(*given.args, **given.kwargs)
+
+
 def _without_cache() -> AbstractContextManager[None]:
     # The package's regions are imported only where they are needed.
     from ..region.mapcache import without_cache
@@ -79,6 +87,8 @@ def _without_cache() -> AbstractContextManager[None]:
 
 def _reported(error: BaseException) -> int | None:
     """Print an expected error as one line and return the exit code; for other errors print nothing and return None."""
+    if isinstance(error, ValidationError) and error.argument is not None:
+        return _fail(f"{error.argument.name}: {error.exception_message}", InputError.exit_code)
     if isinstance(error, CycloptsError):
         return _fail(" ".join(str(error).split()), InputError.exit_code)
     if isinstance(error, InputError):

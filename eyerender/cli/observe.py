@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
 from ..status import Status
 from .app import app
-from .options import EyeModel, Result, Strict, positive
+from .options import Count, EyeModel, Result, Strict
 from .output import Heed, emit, progress
 
 
@@ -73,7 +73,7 @@ def extract(
     eyes: int = 1,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     overlay: Path | None = None,
-    processes: int | None = None,
+    processes: Count = None,
     record: int = RECORD,
     strict: Strict = False,
     json: Result = None,
@@ -105,7 +105,6 @@ def extract(
         raise InputError("must be between 0.1 and 10", source="--gamma")
     if eyes not in (1, 2):
         raise InputError("must be 1 or 2", source="--eyes")
-    positive("--processes", processes)
     _check_record(record)
     heed = Heed(strict)
     loaded = load_scene(scene) if scene is not None else None

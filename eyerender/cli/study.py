@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from ..study.options import StudyOptions
 from .app import app
-from .options import Backend, Overwrite, Result, Threads, positive
+from .options import Result
 from .output import emit, progress, say
 
 
@@ -18,16 +19,8 @@ def study(
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    protocol: Literal["corrected", "published", "both"] = "both",
-    observer: Literal["analytic", "image", "both"] | None = None,
     eyes: str | None = None,
-    workers: int | None = None,
-    spp: int | None = None,
-    noise: Literal["on", "off", "both"] = "both",
-    auto_exposure: float | None = None,
-    backend: Backend = "auto",
-    threads: Threads = None,
-    overwrite: Overwrite = False,
+    options: Annotated[StudyOptions, Parameter(name="*")] = StudyOptions(),
     json: Result = None,
 ) -> int:
     """Replicate a published gaze study, or compare observers or conditions.
@@ -41,41 +34,14 @@ def study(
             image-derived features on the head-mounted rig), or conditions (analytic errors over the screen, head
             positions, pupil sizes and eye parameters).
         output: The folder to write.
-        protocol: guestrin2006 and blignaut2014: what the authors' software computes (published), what the paper says
-            (corrected), or both.
-        observer: Features from ray optics (analytic), from rendered images (image), or both for comparison (default:
-            analytic; both for observers).
         eyes: Eye models separated by commas, as catalogue names or eye files (default: E1 to E5).
-        workers: Number of worker processes (default: one per processor).
-        spp: Samples per pixel of the images (default: the scene's value).
-        noise: Images with sensor noise (on), without it (off), or both.
-        auto_exposure: Choose one exposure time for the images of each eye model, so that 98 % of the pixels are at most
-            at this share of full scale.
     """
     from ..study.literature import MODELS
     from ..study.run import REPORT, run_study
 
-    positive("--spp", spp)
-    positive("--threads", threads)
-    positive("--workers", workers)
     names = MODELS if eyes is None else tuple(e.strip() for e in eyes.split(",") if e.strip())
     with progress(f"study {name}") as steps:
-        summary = run_study(
-            name,
-            output,
-            protocol=protocol,
-            observer=observer,
-            eyes=names,
-            workers=workers,
-            spp=spp,
-            noise=noise,
-            auto_exposure=auto_exposure,
-            backend=backend,
-            threads=threads,
-            overwrite=overwrite,
-            progress=steps,
-            say=say,
-        )
+        summary = run_study(name, output, options, eyes=names, progress=steps, say=say)
     emit(summary, f"{_table(summary)}\n\nreport: {output / REPORT}", json)
     return 0
 

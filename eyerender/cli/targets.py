@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ def check_outputs(arguments: Mapping[str, Any]) -> None:
         InputError: an output is an address; is an input, also by another name; is a file that an input names, or a
             file of an input folder; is the JSON target and no file; or will be emptied and holds an input.
     """
+    arguments = dict(_flattened(arguments))
     said = {name: arguments[name] for name in OUTPUTS if arguments.get(name) is not None}
     if said.get("json") == "-":  # stdout
         del said["json"]
@@ -42,6 +44,15 @@ def check_outputs(arguments: Mapping[str, Any]) -> None:
         given = [path for name, value in arguments.items() if name not in OUTPUTS for path in _paths(value)]
         for place, state in existing:
             _refuse_inputs(place, state, given, emptied=bool(arguments.get("overwrite")))
+
+
+def _flattened(arguments: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """The arguments, with the fields of records of options in their place."""
+    for name, value in arguments.items():
+        if is_dataclass(value):
+            yield from ((field.name, getattr(value, field.name)) for field in fields(value))
+        else:
+            yield name, value
 
 
 def _refuse_inputs(place: Path, state: os.stat_result, given: Sequence[Path], *, emptied: bool) -> None:

@@ -5,19 +5,20 @@ from __future__ import annotations
 import io
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..backends.choose import BackendChoice
 from ..errors import Warn
 from ..imagefile import encode_png
 from .maker import Maker
+from .options import RunOptions
 from .plan import Plan
 from .rates import Rate, keep_rate, last_rate, now
 from .realise import frames_of, realise
-from .run import Options, worker_count
+from .run import worker_count
 from .spec import DatasetSpec
 
 _SUBJECTS = 3
@@ -25,15 +26,14 @@ _SUBJECTS = 3
 
 def estimate(
     spec: str | Path | DatasetSpec | Plan,
+    options: RunOptions = RunOptions(),
     *,
     eye: str | None = None,
     seed: int | None = None,
     count: int | None = None,
-    workers: int | None = None,
-    backend: BackendChoice = "auto",
-    threads: int | None = None,
     measure: bool = False,
     warn: Warn | None = None,
+    **changes: Any,
 ) -> dict[str, Any]:
     """Time and disk that `generate` would need: seconds = (samples t + subjects t_subject) / workers.
 
@@ -41,14 +41,13 @@ def estimate(
 
     Args:
         spec: as for `generate`.
+        options: as for `generate`.
         eye: as for `generate`.
         seed: as for `generate`.
         count: as for `generate`.
-        workers: as for `generate`.
-        backend: as for `generate`.
-        threads: as for `generate`.
         measure: make two samples of each of a few subjects to measure the rate.
         warn: called with warnings about the spec; it may raise.
+        changes: as for `generate`.
 
     Returns:
         Schema eyerender/estimate/2; `seconds` and `bytes` are None where no rate is known.
@@ -57,16 +56,17 @@ def estimate(
         InputError: the first sample cannot be made at all.
         BackendError: with `measure`; there is nothing to render with.
     """
+    options = replace(options, **changes)
     plan = Plan.load(spec, eye=eye, seed=seed, count=count)
     if warn is not None:
         warn(plan.warnings())
     samples, shards = plan.spec.count, plan.spec.shard_count
-    processes, each = worker_count(Options(workers=workers, threads=threads), shards)
+    processes, each = worker_count(options, shards)
     frames = frames_of(plan)
     if measure:
-        rate: Rate | None = measured_rate(plan, Maker(plan, frames, backend=backend, threads=each))
+        rate: Rate | None = measured_rate(plan, Maker(plan, frames, backend=options.backend, threads=each))
     else:
-        rate = last_rate(plan, backend)
+        rate = last_rate(plan, options.backend)
     seconds = None
     if rate is not None:
         subjects = plan.subject_of(samples - 1)[0] + 1

@@ -9,11 +9,10 @@ import socket
 import time
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
-from ..backends.choose import BackendChoice
 from ..errors import EyerenderError, InputError, Warn
 from ..files import make_folder, remove_file
 from ..imagefolder import DATASET
@@ -22,6 +21,7 @@ from ..outfolder import clear, refuse_non_empty
 from ..plausibility import saturation_warnings
 from ..progress import Progress, Say
 from .assemble import assemble, damage
+from .options import RunOptions
 from .plan import Plan
 from .pool import NO_SHARD, Events, LocalPool
 from .rates import Rate, keep_rate, now
@@ -50,46 +50,19 @@ class Engine(Protocol):
         """Make shards, and return those that were given up, with the reasons."""
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """Options of a run; none of them changes a byte of the result."""
-
-    workers: int | None = None
-    part: tuple[int, int] = (1, 1)
-    engine: Literal["local", "ray"] = "local"
-    address: str | None = None
-    backend: BackendChoice = "auto"
-    threads: int | None = None
-    timeout_s: float = 600.0
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("workers", "threads"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InputError(f"must be >= 1, not {value}", path=name)
-        if not self.timeout_s > 0:
-            raise InputError(f"must be > 0, not {self.timeout_s:g}", path="timeout_s")
-
-
 def generate(
     spec: str | Path | DatasetSpec | Plan,
     path: str | Path,
+    options: RunOptions = RunOptions(),
     *,
     eye: str | None = None,
     seed: int | None = None,
     count: int | None = None,
-    workers: int | None = None,
     part: tuple[int, int] = (1, 1),
-    engine: Literal["local", "ray"] = "local",
-    address: str | None = None,
-    backend: BackendChoice = "auto",
-    threads: int | None = None,
-    timeout_s: float = 600.0,
-    overwrite: bool = False,
     progress: Progress | None = None,
     say: Say | None = None,
     warn: Warn | None = None,
+    **changes: Any,
 ) -> dict[str, Any]:
     """Make a labelled dataset, or what is missing of it in a folder where a run was stopped.
 
@@ -98,21 +71,16 @@ def generate(
     Args:
         spec: a dataset file, the name of a shipped one, a spec built in Python, or a plan.
         path: the folder to write.
+        options: workers, engine, backend and the like.
         eye: replaces the eye model of the spec: a name of the catalogue or an eye file.
         seed: replaces the seed of the spec.
         count: makes the first `count` samples of the spec's plan, or plans a larger dataset.
-        workers: processes; by default one per processor, as far as memory allows.
         part: (k, n) makes only every n-th shard, starting with the k-th; for array jobs that write to one folder.
-        engine: processes of this machine, or actors on a Ray cluster.
-        address: of the Ray cluster; by default one is started on this machine.
-        backend: the render backend.
-        threads: total number of processor threads; by default all.
-        timeout_s: seconds without a sign of life after which a worker is ended and its shard is tried again.
-        overwrite: replace what the folder holds.
         progress: called with (images done, images in all, note).
         say: called with lines for the log.
         warn: called with warnings about the spec before the run, where it may raise to stop it, and about saturated
             images after it.
+        changes: fields of `RunOptions` by name, instead of those of `options`: `generate(spec, path, workers=2)`.
 
     Returns:
         A summary: schema eyerender/generate/1.
@@ -124,19 +92,21 @@ def generate(
         EyerenderError: the disk is full or not writable, or shards were given up after repeated tries.
     """
     plan = Plan.load(spec, eye=eye, seed=seed, count=count)
-    options = Options(workers, part, engine, address, backend, threads, timeout_s, overwrite)
+    options = replace(options, **changes)
     if warn is not None:
         warn(plan.warnings())
-    done = _generate(plan, path, options, progress or (lambda *_: None), say or (lambda _: None))
+    done = _generate(plan, path, options, part, progress or (lambda *_: None), say or (lambda _: None))
     if warn is not None:
         statistics = done.get("statistics", {})
         warn(saturation_warnings(statistics.get("images_saturated", 0), statistics.get("images", 0), str(path)))
     return done
 
 
-def _generate(plan: Plan, path: str | Path, options: Options, progress: Progress, say: Say) -> dict[str, Any]:
+def _generate(
+    plan: Plan, path: str | Path, options: RunOptions, part: tuple[int, int], progress: Progress, say: Say
+) -> dict[str, Any]:
     folder = Path(path)
-    k, n = options.part
+    k, n = part
     if not 1 <= k <= n:
         raise InputError("must be K/N with 1 <= K <= N", source="--shard")
     if folder.exists() and not folder.is_dir():
@@ -149,10 +119,10 @@ def _generate(plan: Plan, path: str | Path, options: Options, progress: Progress
     created = False
     try:
         created = make_folder(folder)
-        with run_lock(folder, options.part, say):
+        with run_lock(folder, part, say):
             if options.overwrite and n == 1:
                 clear(folder)
-            run = _Run(plan, folder, options, frames, progress, say)
+            run = _Run(plan, folder, options, part, frames, progress, say)
             with final_lock(folder, say):
                 resumed = begin(folder, plan, run.repaired)
             try:
@@ -177,7 +147,7 @@ def usable_cpus() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def worker_count(options: Options, shards: int) -> tuple[int, int]:
+def worker_count(options: RunOptions, shards: int) -> tuple[int, int]:
     """Numbers of workers and of threads of each: by default one worker per processor while memory suffices."""
     cpus = options.threads or usable_cpus()
     workers = options.workers
@@ -195,7 +165,8 @@ class _Run:
 
     plan: Plan
     folder: Path
-    options: Options
+    options: RunOptions
+    part: tuple[int, int]
     frames: int
     progress: Progress
     say: Say
@@ -217,7 +188,7 @@ class _Run:
 
     def make(self, resumed: bool) -> dict[str, Any]:
         """Make this part's missing shards, and assemble the dataset when none is missing."""
-        spec, (k, n) = self.plan.spec, self.options.part
+        spec, (k, n) = self.plan.spec, self.part
         mine = set(range(k - 1, spec.shard_count, n))
         done = finished(self.folder)
         self._withdraw(done & mine)

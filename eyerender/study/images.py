@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Ints, frozen
-from ..backends.choose import BackendChoice
 from ..errors import InputError
 from ..files import read_json
 from ..imagefolder import DATASET, METADATA, RUN, ImageEntry
@@ -28,6 +27,7 @@ from ..observation import EYES, Observations
 from ..progress import Progress, Say
 from ..scene import Scene
 from ..scene.spec import SceneSpec
+from .options import StudyOptions
 
 _SHARD_IMAGES = 27  # two or three seconds of work, the largest loss by a kill
 _PATIENCE_S = 60.0  # per image, after which a silent worker counts as dead
@@ -35,19 +35,15 @@ _PATIENCE_S = 60.0  # per image, after which a silent worker counts as dead
 
 @dataclass(frozen=True, slots=True)
 class ImageSettings:
-    """Settings of the images: the dataset's folder, samples per pixel (None: the scene's), and where to render.
+    """Settings of the images: the dataset's folder, the study's options, and receivers of progress and log.
 
     With `auto_exposure` the images of each eye model have one exposure of their own (see `DatasetSpec`).
     """
 
     folder: Path
-    spp: int | None = None
-    workers: int | None = None
-    backend: BackendChoice = "auto"
-    threads: int | None = None
+    options: StudyOptions = StudyOptions()
     progress: Progress | None = None
     say: Say | None = None
-    auto_exposure: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,15 +132,15 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
 
     scenes = list({_digest(scene): scene for scene in scenes}.values())
     found = read_images(settings.folder)
-    level = settings.auto_exposure
+    options, level = settings.options, settings.options.auto_exposure
     if found is None or found.auto_exposure != level or not all(found.holds(scene) for scene in scenes):
         plan = Plan.of(dataset_spec(study, scenes, level), source=str(settings.folder))
         generate(
             plan,
             settings.folder,
-            workers=settings.workers,
-            backend=settings.backend,
-            threads=settings.threads,
+            workers=options.workers,
+            backend=options.backend,
+            threads=options.threads,
             timeout_s=600.0 + _PATIENCE_S * len(scenes[0].index()),
             overwrite=not _begun(settings.folder, plan),
             progress=settings.progress,
@@ -153,7 +149,7 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
         found = read_images(settings.folder)
     if found is None or not all(found.holds(scene) for scene in scenes):
         raise InputError("its dataset lacks images of this study", source=str(settings.folder))
-    return replace(found, spp=settings.spp)
+    return replace(found, spp=options.spp)
 
 
 def dataset_spec(study: str, scenes: Sequence[Scene], auto_exposure: float | None = None) -> Any:

@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from ..backends.choose import BackendChoice
 from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
 from ..files import read_json, write_json, write_text
@@ -26,6 +26,7 @@ from .head_mounted import head_mounted_part
 from .images import ImageSettings, StudyImages, make_images
 from .literature import MODELS, VARIANTS
 from .observing import ObserverKind, Observing
+from .options import StudyOptions
 from .replicate import blignaut_part, facing, guestrin_part, scenes_of
 from .results import write_results
 
@@ -44,19 +45,12 @@ _TOGETHER: dict[str, Callable[..., together.Results]] = {
 def run_study(
     name: str,
     folder: str | Path,
+    options: StudyOptions = StudyOptions(workers=1),
     *,
-    protocol: Literal["corrected", "published", "both"] = "both",
-    observer: Literal["analytic", "image", "both"] | None = None,
     eyes: Sequence[str] = MODELS,
-    workers: int | None = 1,
-    spp: int | None = None,
-    noise: Literal["on", "off", "both"] = "both",
-    auto_exposure: float | None = None,
-    backend: BackendChoice = "auto",
-    threads: int | None = None,
-    overwrite: bool = False,
     progress: Progress | None = None,
     say: Say | None = None,
+    **changes: Any,
 ) -> dict[str, Any]:
     """Run a study and write summary.json, findings.json, CSV of both and report.html into a folder.
 
@@ -67,20 +61,11 @@ def run_study(
         name: guestrin2006, blignaut2014, observers (both observers on the head-mounted rig), or conditions (what lies
             beyond the paper; analytic).
         folder: where the results go.
-        protocol: the authors' software's reading, the corrected one, or both.
-        observer: analytic features, features of rendered images, or both. Default: both for `observers`, whose only
-            choice it is, else analytic.
+        options: protocol, observer, workers and the like.
         eyes: eye models (catalogue names or files). With E5 and `published`, its two published variants come along.
-        workers: processes; None: one a processor.
-        spp: samples per pixel of the images.
-        noise: images with the sensor's noise, without it, or both.
-        auto_exposure: share of full scale that 98 % of the pixels stay below, by one exposure of the images of each eye
-            model; None: the exposure of the study's scene.
-        backend: what renders the images.
-        threads: of all workers together.
-        overwrite: replace what the folder holds.
         progress: called with (done, total, note).
         say: called with what goes wrong on the way.
+        changes: fields of `StudyOptions` by name, instead of those of `options`.
 
     Returns:
         The summary that was written.
@@ -95,32 +80,31 @@ def run_study(
         raise InputError("name each eye once", source="--eyes")
     for eye in eyes:
         load_eye(eye)
-    observer = observer or ("both" if name == "observers" else "analytic")
+    options = replace(options, **changes)
+    observer = options.observer or ("both" if name == "observers" else "analytic")
     if name == "conditions" and observer != "analytic":
         raise InputError("the study 'conditions' supports the analytic observer only", source="--observer")
     if name == "observers" and observer != "both":
         raise InputError("the study 'observers' compares both observers", source="--observer")
-    if workers is not None and workers < 1:
-        raise InputError("must be >= 1", source="--workers")
-    settings: dict[str, Any] = {"study": name, "protocol": protocol, "observer": observer, "eyes": list(eyes)}
+    settings: dict[str, Any] = {"study": name, "protocol": options.protocol, "observer": observer, "eyes": list(eyes)}
     if observer != "analytic":
-        settings |= {"spp": spp, "sensor_noise": noise}
-    settings |= _exposure(auto_exposure, observer)
+        settings |= {"spp": options.spp, "sensor_noise": options.noise}
+    settings |= _exposure(options.auto_exposure, observer)
     folder = Path(folder)
-    protocols = ("published", "corrected") if protocol == "both" else (protocol,)
-    kinds = _kinds(observer, noise)
-    with _claimed(folder, settings, overwrite):
+    protocols = ("published", "corrected") if options.protocol == "both" else (options.protocol,)
+    kinds = _kinds(observer, options.noise)
+    with _claimed(folder, settings, options.overwrite):
         start = time.monotonic()
         images = None
         if any(kind != "analytic" for kind in kinds):
-            made = ImageSettings(folder / IMAGES, spp, workers, backend, threads, _noted(progress), say, auto_exposure)
+            made = ImageSettings(folder / IMAGES, options, _noted(progress), say)
             images = _images(name, eyes, protocols, kinds, made)
         jobs = [
             (observings, eye, told)
             for observings in _observings(name, kinds, images)
             for eye, told in _models(name, eyes, protocols, observings)
         ]
-        count = workers or len(os.sched_getaffinity(0))
+        count = options.workers or len(os.sched_getaffinity(0))
         parts = _collected(partial(_job, name), jobs, [_told(job) for job in jobs], count, progress)
         rows, found, more, page = _TOGETHER[name](parts, protocols)
         more = {"settings": settings, "seconds": round(time.monotonic() - start, 2), **more}
@@ -169,7 +153,9 @@ def _images(
         scenes, turned = [head_mounted.scene(eye) for eye in eyes], False
     else:
         scenes, turned = scenes_of(module, eyes, protocols), facing(module)
-    shots = [s for scene in scenes for k in kinds for s in Observing(k).shots(scene, facing=turned, spp=settings.spp)]
+    shots = [
+        s for scene in scenes for k in kinds for s in Observing(k).shots(scene, facing=turned, spp=settings.options.spp)
+    ]
     return make_images(name, [shot.scene for shot in shots], settings)
 
 

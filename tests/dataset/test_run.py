@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from eyerender.dataset.options import RunOptions
 from eyerender.dataset.pool import LocalPool
 from eyerender.dataset.realise import frames_of
-from eyerender.dataset.run import Options, worker_count
+from eyerender.dataset.run import worker_count
 from eyerender.dataset.shard import finished
 from eyerender.dataset.worker import Job
 from eyerender.errors import EyerenderError, InputError
@@ -243,9 +244,9 @@ def test_workers_are_recycled(tmp_path):
 
 
 def test_threads_are_divided():
-    assert worker_count(Options(workers=2, threads=8), 100) == (2, 4)
-    assert worker_count(Options(workers=3, threads=2), 100) == (3, 1)
-    assert worker_count(Options(threads=2), 1) == (1, 2)
+    assert worker_count(RunOptions(workers=2, threads=8), 100) == (2, 4)
+    assert worker_count(RunOptions(workers=3, threads=2), 100) == (3, 1)
+    assert worker_count(RunOptions(threads=2), 1) == (1, 2)
 
 
 def test_samples_given_up_are_recorded(tmp_path):
