@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields, replace
 from itertools import pairwise
 from operator import is_
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatLike, Floats, Indices
-from ..geometry.surfaces import Surface
+from ..arrays import Indices
 from ..geometry.transforms import read_only, stacked
-from ..optics.gradient import GradientMedium
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
 
 Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str]
-S = TypeVar("S", bound=Surface)
+_NUMBERS = tuple(f.name for f in fields(EyeModel) if f.name not in ("name", "side", "wavelength_nm", "back_passing"))
+_RECORDS = (LineOfSight, RotationCentres, Sphere, Stop)
 
 CHUNK_POINTS = 12000
 """Points refracted at once: fewer leave the time to the interpreter, more leave the cache (measured: 8,000 to
@@ -39,75 +39,42 @@ def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
     if any(structure_of(eye) != structure for eye in eyes):
         raise ValueError("eyes of different structure cannot be stacked")
 
-    def numbers(values: Sequence[FloatLike]) -> Floats:
-        return read_only([float(v) for v in values])
-
-    def points(values: Sequence[Floats]) -> Floats:
-        return read_only(stacked(values))
-
-    gradients = [e.lens_gradient for e in eyes if e.lens_gradient is not None]
     waves = max(e.stop.contour.shape[-1] for e in eyes)
-    return EyeModel(
-        name=first.name,
-        side=first.side,
-        wavelength_nm=first.wavelength_nm,
-        front=tuple(_stack(surfaces) for surfaces in zip(*(e.front for e in eyes), strict=True)),
-        front_indices=tuple(numbers(n) for n in zip(*(e.front_indices for e in eyes), strict=True)),
-        back=tuple(_stack(surfaces) for surfaces in zip(*(e.back for e in eyes), strict=True)),
-        back_indices=tuple(numbers(n) for n in zip(*(e.back_indices for e in eyes), strict=True)),
-        back_rims_mm=tuple(numbers(n) for n in zip(*(e.back_rims_mm for e in eyes), strict=True)),
-        back_passing=first.back_passing,
-        retina=_stack(tuple(e.retina for e in eyes)),
-        stop=Stop(*(points(v) for v in zip(*(_stop_parts(e.stop, waves) for e in eyes), strict=True))),
-        limbus_radius_mm=numbers([e.limbus_radius_mm for e in eyes]),
-        iris_root_radius_mm=numbers([e.iris_root_radius_mm for e in eyes]),
-        sclera=Sphere(points([e.sclera.centre_mm for e in eyes]), numbers([e.sclera.radius_mm for e in eyes])),
-        rotation=RotationCentres(
-            points([e.rotation.azimuth_centre_mm for e in eyes]),
-            points([e.rotation.elevation_centre_mm for e in eyes]),
-            points([e.rotation.torsion_centre_mm for e in eyes]),
-        ),
-        fovea_mm=points([e.fovea_mm for e in eyes]),
-        incident_node_mm=points([e.incident_node_mm for e in eyes]),
-        chief_ray=LineOfSight(
-            points([e.chief_ray.point_mm for e in eyes]), points([e.chief_ray.direction for e in eyes])
-        ),
-        lens_gradient=GradientMedium.stack(gradients) if gradients else None,
-    )
+    parts = {name: tuple(getattr(e, name) for e in eyes) for name in _NUMBERS}
+    parts["stop"] = tuple(_with_waves(e.stop, waves) for e in eyes)
+    return replace(first, **{name: _stacked(values) for name, values in parts.items()})
 
 
 def take_eyes(eye: EyeModel, index: Indices) -> EyeModel:
     """Eyes of a batch at `index`; a single eye is returned as it is."""
     if eye.fovea_mm.ndim == 1:
         return eye
+    return replace(eye, **{name: _taken(getattr(eye, name), index) for name in _NUMBERS})
 
-    def numbers(values: Sequence[FloatLike]) -> tuple[FloatLike, ...]:
-        return tuple(np.asarray(v)[index] for v in values)
 
-    rotation, ray = eye.rotation, eye.chief_ray
-    return EyeModel(
-        name=eye.name,
-        side=eye.side,
-        wavelength_nm=eye.wavelength_nm,
-        front=tuple(s.take(index) for s in eye.front),
-        front_indices=numbers(eye.front_indices),
-        back=tuple(s.take(index) for s in eye.back),
-        back_indices=numbers(eye.back_indices),
-        back_rims_mm=numbers(eye.back_rims_mm),
-        back_passing=eye.back_passing,
-        retina=eye.retina.take(index),
-        stop=Stop(*(part[index] for part in _stop_parts(eye.stop, eye.stop.contour.shape[-1]))),
-        limbus_radius_mm=np.asarray(eye.limbus_radius_mm)[index],
-        iris_root_radius_mm=np.asarray(eye.iris_root_radius_mm)[index],
-        sclera=Sphere(eye.sclera.centre_mm[index], np.asarray(eye.sclera.radius_mm)[index]),
-        rotation=RotationCentres(
-            rotation.azimuth_centre_mm[index], rotation.elevation_centre_mm[index], rotation.torsion_centre_mm[index]
-        ),
-        fovea_mm=eye.fovea_mm[index],
-        incident_node_mm=eye.incident_node_mm[index],
-        chief_ray=LineOfSight(ray.point_mm[index], ray.direction[index]),
-        lens_gradient=None if eye.lens_gradient is None else eye.lens_gradient.take(index),
-    )
+def _stacked(values: tuple[Any, ...]) -> Any:
+    """Stack a part of n eyes: arrays or numbers, tuples, records of arrays, surfaces and media."""
+    first = values[0]
+    if isinstance(first, np.ndarray):
+        return read_only(stacked(values))
+    if isinstance(first, tuple):
+        return tuple(_stacked(parts) for parts in zip(*values, strict=True))
+    if isinstance(first, _RECORDS):
+        return type(first)(*(_stacked(tuple(getattr(v, f.name) for v in values)) for f in fields(first)))
+    if hasattr(first, "stack"):
+        return type(first).stack(values)
+    return None if first is None else read_only(list(map(float, values)))
+
+
+def _taken(value: Any, index: Indices) -> Any:
+    """Parts of a batch of eyes at `index`."""
+    if isinstance(value, np.ndarray):
+        return value[index]
+    if isinstance(value, tuple):
+        return tuple(_taken(part, index) for part in value)
+    if isinstance(value, _RECORDS):
+        return type(value)(*(_taken(getattr(value, f.name), index) for f in fields(value)))
+    return None if value is None else value.take(index)
 
 
 def groups(eyes: Sequence[EyeModel], which: Indices) -> list[tuple[tuple[EyeModel, Indices | None], Indices]]:
@@ -158,12 +125,7 @@ def slices(count: int, size: int) -> list[slice]:
     return [slice(low, high) for low, high in pairwise(edges)]
 
 
-def _stack(surfaces: tuple[S, ...]) -> S:
-    return type(surfaces[0]).stack(surfaces)
-
-
-def _stop_parts(stop: Stop, waves: int) -> tuple[Floats, ...]:
-    """Numbers of the stop, with its contour padded by zeros to `waves`."""
-    contour = np.zeros((*stop.contour.shape[:-1], waves))
-    contour[..., : stop.contour.shape[-1]] = stop.contour
-    return stop.centre_mm, stop.rotation, stop.semi_axes_mm, stop.handed, contour
+def _with_waves(stop: Stop, waves: int) -> Stop:
+    """The stop with its contour padded by zeros to `waves`."""
+    missing = waves - stop.contour.shape[-1]
+    return replace(stop, contour=np.pad(stop.contour, ((0, 0), (0, missing)))) if missing else stop

@@ -12,12 +12,15 @@ surface are numbers, or arrays with one leading batch axis (one surface per eye)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Self
+from dataclasses import fields, replace
+from functools import cache
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Bools, Floats, Indices
+from .transforms import flip_y, mirror_rotation, read_only, stacked
 
 Xyz = tuple[Floats, Floats, Floats]
 
@@ -75,11 +78,12 @@ class Surface(ABC):
 
     origin_mm: Floats
     rotation: Floats
+    kind: ClassVar[str]
+    """Kind of the surface: 'quadric', 'biconic', 'zernike' or 'grid'."""
 
-    @property
-    @abstractmethod
-    def kind(self) -> str:
-        """Kind of the surface: 'quadric' or 'biconic'."""
+    def __post_init__(self) -> None:
+        for name, value in zip(_names(type(self)), self._parts(), strict=True):
+            object.__setattr__(self, name, read_only(value))
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -108,22 +112,36 @@ class Surface(ABC):
     def local_sag(self, y: Floats, z: Floats) -> Floats:
         """Depth x of the sheet in the local frame over the local (y, z); NaN where the sheet does not reach."""
 
-    @abstractmethod
     def take(self, index: Indices) -> Self:
         """Surfaces of the batch at `index`; a single surface is returned as it is."""
-
-    @abstractmethod
-    def scaled(self, centre_mm: Floats, factor: float) -> Self:
-        """Multiply all distances from `centre_mm` (3,) by `factor` > 0."""
-
-    @abstractmethod
-    def mirrored(self) -> Self:
-        """Mirror the surface, y -> -y, for the other eye."""
+        return type(self)(*(part[index] for part in self._parts())) if self.batch_shape else self
 
     @classmethod
-    @abstractmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
         """Combine single surfaces of this kind into a batch."""
+        return cls(*(stacked(parts) for parts in zip(*(s._parts() for s in surfaces), strict=True)))
+
+    def placed(self, origin_mm: Floats, rotation: Floats) -> Self:
+        """The surface elsewhere."""
+        return replace(self, origin_mm=origin_mm, rotation=rotation)  # type: ignore[type-var]
+
+    def scaled(self, centre_mm: Floats, factor: float) -> Self:
+        """Multiply all distances from `centre_mm` (3,) by `factor` > 0."""
+        origin = centre_mm + factor * (self.origin_mm - centre_mm)
+        return replace(self, origin_mm=origin, **self._scaled_shape(factor))  # type: ignore[type-var]
+
+    def mirrored(self) -> Self:
+        """Mirror the surface, y -> -y, for the other eye."""
+        placed = {"origin_mm": flip_y(self.origin_mm), "rotation": mirror_rotation(self.rotation)}
+        return replace(self, **placed, **self._mirrored_shape())  # type: ignore[type-var]
+
+    @abstractmethod
+    def _scaled_shape(self, factor: float) -> dict[str, Floats]:
+        """The parts of the shape that change where all lengths are multiplied by `factor`."""
+
+    @abstractmethod
+    def _mirrored_shape(self) -> dict[str, Floats]:
+        """The parts of the shape that change where y changes its sign in the local frame too."""
 
     def __eq__(self, other: object) -> bool:
         return type(other) is type(self) and all(
@@ -133,9 +151,13 @@ class Surface(ABC):
     def __hash__(self) -> int:
         return hash((type(self), *((a + 0.0).tobytes() for a in self._key())))
 
-    @abstractmethod
+    def _parts(self) -> tuple[Any, ...]:
+        """Arrays from which the surface is made."""
+        return tuple([getattr(self, name) for name in _names(type(self))])
+
     def _key(self) -> tuple[Floats, ...]:
         """Arrays that define the surface."""
+        return self._parts()
 
     # -- points (..., 3) ----------------------------------------------------------------------------------------------
 
@@ -187,6 +209,12 @@ class Surface(ABC):
         axis_x, axis_y, axis_z = (fit(self.rotation[..., i, 0], point[0].ndim) for i in range(3))
         along = local_x * axis_x + local_y * axis_y + local_z * axis_z
         return np.asarray(np.sqrt(np.maximum(local_x**2 + local_y**2 + local_z**2 - along**2, 0.0)))
+
+
+@cache
+def _names(kind: type) -> tuple[str, ...]:
+    """Names of the arrays from which surfaces of a kind are made."""
+    return tuple(f.name for f in fields(kind) if f.init)
 
 
 def components(points: npt.ArrayLike) -> Xyz:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Self
+from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import FloatLike, Floats, Indices
+from ..arrays import FloatLike, Floats
 from .surfaces import fit
 from .surfaces_graph import GraphSurface, Jet, Slopes, biconic_jet, biconic_slopes
-from .transforms import flip_y, mirror_rotation, read_only, stacked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,20 +32,7 @@ class Biconic(GraphSurface):
     conic_constants: Floats
     _untilted: bool = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        for name in ("origin_mm", "rotation", "radii_mm", "conic_constants"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-        object.__setattr__(self, "_untilted", bool(np.all(self.rotation == np.eye(3))))
-
-    @property
-    def kind(self) -> str:
-        """The word 'biconic'."""
-        return "biconic"
-
-    @property
-    def untilted(self) -> bool:
-        """Whether the local axes are those of the eye."""
-        return self._untilted
+    kind: ClassVar[str] = "biconic"
 
     def slopes(self, y: Floats, z: Floats) -> Slopes:
         """Height and slopes over the local (y, z)."""
@@ -60,29 +46,13 @@ class Biconic(GraphSurface):
         """The conic of mean curvature and mean 1 + Q."""
         return np.mean(1.0 / self.radii_mm, axis=-1), 1.0 + np.mean(self.conic_constants, axis=-1)
 
-    def take(self, index: Indices) -> Self:
-        """Surfaces of the batch at `index`; a single surface is returned as it is."""
-        if not self.batch_shape:
-            return self
-        return type(self)(*(part[index] for part in self._key()))
+    def _scaled_shape(self, factor: float) -> dict[str, Floats]:
+        """Radii; conic constants stay."""
+        return {"radii_mm": factor * self.radii_mm}
 
-    def scaled(self, centre_mm: Floats, factor: float) -> Self:
-        """Multiply all distances from `centre_mm` (3,) by `factor` > 0; conic constants stay."""
-        origin = centre_mm + factor * (self.origin_mm - centre_mm)
-        return type(self)(origin, self.rotation, factor * self.radii_mm, self.conic_constants)
-
-    def mirrored(self) -> Self:
-        # The sag is even in y, so only the placement is mirrored.
-        """Mirror the surface, y -> -y."""
-        return type(self)(flip_y(self.origin_mm), mirror_rotation(self.rotation), self.radii_mm, self.conic_constants)
-
-    def _key(self) -> tuple[Floats, ...]:
-        return self.origin_mm, self.rotation, self.radii_mm, self.conic_constants
-
-    @classmethod
-    def stack(cls, surfaces: tuple[Self, ...]) -> Self:
-        """Combine single biconics into a batch."""
-        return cls(*(stacked(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
+    def _mirrored_shape(self) -> dict[str, Floats]:
+        """Nothing, because the sag is even in y."""
+        return {}
 
     def _constants(self, ndim: int) -> tuple[FloatLike, ...]:
         curvature = 1.0 / self.radii_mm

@@ -47,10 +47,16 @@ class GraphSurface(Surface):
 
     __slots__ = ()
 
+    _untilted: bool
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "_untilted", bool(np.all(self.rotation == np.eye(3))))
+
     @property
-    @abstractmethod
     def untilted(self) -> bool:
         """Whether the local axes are those of the eye."""
+        return self._untilted
 
     @abstractmethod
     def slopes(self, y: Floats, z: Floats) -> Slopes:

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from ..arrays import FloatLike, Floats, Indices
 from .surfaces import fit
 from .surfaces_graph import GraphSurface, Jet, Slopes, biconic_jet, biconic_slopes
-from .transforms import flip_y, mirror_rotation, read_only, stacked
+from .transforms import read_only, stacked
 from .zernike import mirrored, order_of, product_basis, products
 
 Parts = tuple[Floats, ...]
@@ -39,7 +39,6 @@ class Measured(GraphSurface):
 
     outer: Floats
     window_mm: Floats
-    _untilted: bool
 
     @abstractmethod
     def measured(self, y: Floats, z: Floats, second: bool, outer: Parts | None = None) -> Parts:
@@ -51,15 +50,6 @@ class Measured(GraphSurface):
             second: whether second derivatives are wanted.
             outer: the same numbers of the outer biconic, if they are known.
         """
-
-    @abstractmethod
-    def placed(self, origin_mm: Floats, rotation: Floats) -> Self:
-        """The surface elsewhere."""
-
-    @property
-    def untilted(self) -> bool:
-        """Whether the local axes are those of the eye."""
-        return self._untilted
 
     def slopes(self, y: Floats, z: Floats) -> Slopes:
         """Height and slopes over the local (y, z)."""
@@ -177,28 +167,22 @@ class ZernikeSurface(Measured):
     table: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
     _untilted: bool = field(init=False, repr=False)
 
+    kind: ClassVar[str] = "zernike"
+
     def __post_init__(self) -> None:
-        for name in ("origin_mm", "rotation", "base", "radius_mm", "coefficients_mm", "outer", "window_mm"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-        object.__setattr__(self, "_untilted", bool(np.all(self.rotation == np.eye(3))))
-        table = self.table
-        if not table.size:
+        GraphSurface.__post_init__(self)
+        if not self.table.size:
             order = self.order
             table = -np.einsum("dkj,...j->...dk", products(order), self.coefficients_mm, optimize=True)
             table /= self.radius_mm[..., None, None] ** np.array([0, 1, 1, 2, 2, 2])[:, None]
             # The constant term makes the height 0 on the axis.
             table[..., 0, 0] -= table[..., 0, :] @ product_basis(order, np.zeros(()), np.zeros(()), 0)
-        object.__setattr__(self, "table", read_only(table))
+            object.__setattr__(self, "table", read_only(table))
 
     @property
     def order(self) -> int:
         """Radial order of the expansion."""
         return order_of(self.coefficients_mm.shape[-1])
-
-    @property
-    def kind(self) -> str:
-        """The word 'zernike'."""
-        return "zernike"
 
     def measured(self, y: Floats, z: Floats, second: bool, outer: Parts | None = None) -> Parts:
         """Height of the expansion and its derivatives (see `Measured`)."""
@@ -218,51 +202,22 @@ class ZernikeSurface(Measured):
         conic = biconic_jet((c, c, k, k), y, z) if second else biconic_slopes((c, c, k, k), y, z)
         return tuple(a + b for a, b in zip(parts, conic[:count], strict=True))
 
-    def take(self, index: Indices) -> Self:
-        """Surfaces of the batch at `index`; a single surface is returned as it is."""
-        if not self.batch_shape:
-            return self
-        return type(self)(*(part[index] for part in (*self._key(), self.table)))
+    def _scaled_shape(self, factor: float) -> dict[str, Floats]:
+        return {
+            "base": self.base * np.array([1.0 / factor, 1.0]),
+            "radius_mm": factor * self.radius_mm,
+            "coefficients_mm": factor * self.coefficients_mm,
+            "outer": _scaled_outer(self.outer, factor),
+            "window_mm": factor * self.window_mm,
+            "table": np.zeros(0),
+        }
 
-    def scaled(self, centre_mm: Floats, factor: float) -> Self:
-        """Multiply all distances from `centre_mm` (3,) by `factor` > 0."""
-        origin = centre_mm + factor * (self.origin_mm - centre_mm)
-        return type(self)(
-            origin,
-            self.rotation,
-            self.base * np.array([1.0 / factor, 1.0]),
-            factor * self.radius_mm,
-            factor * self.coefficients_mm,
-            _scaled_outer(self.outer, factor),
-            factor * self.window_mm,
-        )
-
-    def placed(self, origin_mm: Floats, rotation: Floats) -> Self:
-        """The surface elsewhere."""
-        return replace(self, origin_mm=origin_mm, rotation=rotation)
-
-    def mirrored(self) -> Self:
-        """Mirror the surface, y -> -y."""
-        return type(self)(
-            flip_y(self.origin_mm),
-            mirror_rotation(self.rotation),
-            self.base,
-            self.radius_mm,
-            mirrored(self.coefficients_mm),
-            _mirrored_outer(self.outer),
-            self.window_mm,
-        )
+    def _mirrored_shape(self) -> dict[str, Floats]:
+        coefficients = mirrored(self.coefficients_mm)
+        return {"coefficients_mm": coefficients, "outer": _mirrored_outer(self.outer), "table": np.zeros(0)}
 
     def _key(self) -> tuple[Floats, ...]:
-        return (
-            self.origin_mm,
-            self.rotation,
-            self.base,
-            self.radius_mm,
-            self.coefficients_mm,
-            self.outer,
-            self.window_mm,
-        )
+        return self._parts()[:-1]
 
     @classmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
@@ -270,8 +225,7 @@ class ZernikeSurface(Measured):
         counts = {surface.coefficients_mm.shape[-1] for surface in surfaces}
         if len(counts) > 1:
             surfaces = tuple(surface.with_terms(max(counts)) for surface in surfaces)
-        keys = ((*surface._key(), surface.table) for surface in surfaces)
-        return cls(*(stacked(parts) for parts in zip(*keys, strict=True)))
+        return cls(*(stacked(parts) for parts in zip(*(s._parts() for s in surfaces), strict=True)))
 
     def with_terms(self, count: int) -> Self:
         """The same surface with coefficients of 0 up to `count` terms."""
@@ -306,16 +260,11 @@ class GridSurface(Measured):
     table: Floats
     _untilted: bool = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        for name in ("origin_mm", "rotation", "outer", "window_mm", "centre_mm", "spacing_mm", "table"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-        object.__setattr__(self, "row", np.asarray(self.row, dtype=np.intp))
-        object.__setattr__(self, "_untilted", bool(np.all(self.rotation == np.eye(3))))
+    kind: ClassVar[str] = "grid"
 
-    @property
-    def kind(self) -> str:
-        """The word 'grid'."""
-        return "grid"
+    def __post_init__(self) -> None:
+        GraphSurface.__post_init__(self)
+        object.__setattr__(self, "row", np.asarray(self.row, dtype=np.intp))
 
     @property
     def coefficients_mm(self) -> Floats:
@@ -347,59 +296,28 @@ class GridSurface(Measured):
 
     def take(self, index: Indices) -> Self:
         """Surfaces of the batch at `index`; a single surface is returned as it is. The table is shared."""
-        if not self.batch_shape:
-            return self
-        o, r, outer, window, centre, spacing, row = (part[index] for part in self._parts())
-        return type(self)(o, r, outer, window, centre, spacing, row, self.table)
-
-    def scaled(self, centre_mm: Floats, factor: float) -> Self:
-        """Multiply all distances from `centre_mm` (3,) by `factor` > 0."""
-        origin = centre_mm + factor * (self.origin_mm - centre_mm)
-        return type(self)(
-            origin,
-            self.rotation,
-            _scaled_outer(self.outer, factor),
-            factor * self.window_mm,
-            factor * self.centre_mm,
-            factor * self.spacing_mm,
-            self.row,
-            factor * self.table,
-        )
-
-    def placed(self, origin_mm: Floats, rotation: Floats) -> Self:
-        """The surface elsewhere."""
-        return replace(self, origin_mm=origin_mm, rotation=rotation)
+        *parts, table = self._parts()
+        return type(self)(*(*(part[index] for part in parts), table)) if self.batch_shape else self
 
     def with_outer(self, outer: Floats) -> Self:
         """The same bicubic heights on another biconic."""
         return replace(self, outer=outer)
 
-    def mirrored(self) -> Self:
-        """Mirror the surface, y -> -y."""
-        return type(self)(
-            flip_y(self.origin_mm),
-            mirror_rotation(self.rotation),
-            _mirrored_outer(self.outer),
-            self.window_mm,
-            self.centre_mm * np.array([-1.0, 1.0]),
-            self.spacing_mm,
-            self.row,
-            self.table[:, ::-1],
-        )
+    def _scaled_shape(self, factor: float) -> dict[str, Floats]:
+        return {
+            "outer": _scaled_outer(self.outer, factor),
+            "window_mm": factor * self.window_mm,
+            "centre_mm": factor * self.centre_mm,
+            "spacing_mm": factor * self.spacing_mm,
+            "table": factor * self.table,
+        }
 
-    def _parts(self) -> tuple[Any, ...]:
-        return (
-            self.origin_mm,
-            self.rotation,
-            self.outer,
-            self.window_mm,
-            self.centre_mm,
-            self.spacing_mm,
-            self.row,
-        )
+    def _mirrored_shape(self) -> dict[str, Floats]:
+        centre = self.centre_mm * np.array([-1.0, 1.0])
+        return {"outer": _mirrored_outer(self.outer), "centre_mm": centre, "table": self.table[:, ::-1]}
 
     def _key(self) -> tuple[Floats, ...]:
-        return (*self._parts()[:-1], self.coefficients_mm)
+        return (*self._parts()[:-2], self.coefficients_mm)
 
     @classmethod
     def stack(cls, surfaces: tuple[Self, ...]) -> Self:
@@ -409,7 +327,7 @@ class GridSurface(Measured):
         for whole, surface in zip(table, surfaces, strict=True):
             pad = (size - surface.table.shape[-1]) // 2
             whole[pad : pad + surface.table.shape[-1], pad : pad + surface.table.shape[-1]] = surface.coefficients_mm
-        parts = zip(*(surface._parts()[:-1] for surface in surfaces), strict=True)
+        parts = zip(*(surface._parts()[:-2] for surface in surfaces), strict=True)
         o, r, outer, window, centre, spacing = (stacked(part) for part in parts)
         return cls(o, r, outer, window, centre, spacing, np.arange(len(surfaces)), table)
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Self
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, Indices
+from ..arrays import Bools, Floats
 from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit
-from .transforms import MIRROR, flip_y, mirror_rotation, read_only, stacked
+from .transforms import MIRROR, flip_y, read_only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,9 +33,10 @@ class Quadric(Surface):
     _eye: tuple[Floats | float, ...] = field(init=False, repr=False)
     _axial: bool = field(init=False, repr=False)
 
+    kind: ClassVar[str] = "quadric"
+
     def __post_init__(self) -> None:
-        for name in ("origin_mm", "rotation", "matrix", "vector", "constant"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
+        Surface.__post_init__(self)
         turned = self.rotation @ self.matrix @ np.swapaxes(self.rotation, -1, -2)
         turned_vector = np.einsum("...ij,...j->...i", self.rotation, self.vector)
         pulled = np.einsum("...ij,...j->...i", turned, self.origin_mm)
@@ -112,11 +113,6 @@ class Quadric(Surface):
             np.broadcast_to(factor[..., None] * np.asarray(vector), (*shape, 3)),
             np.broadcast_to(factor * np.asarray(constant), shape),
         )
-
-    @property
-    def kind(self) -> str:
-        """The word 'quadric'."""
-        return "quadric"
 
     @property
     def coefficients(self) -> tuple[Floats | float, ...]:
@@ -202,35 +198,11 @@ class Quadric(Surface):
             stable = half >= 0.0
             return np.asarray(np.where(stable, -rest / np.where(stable, half + root, 1.0), (root - half) / xx))
 
-    def take(self, index: Indices) -> Self:
-        """Surfaces of the batch at `index`; a single surface is returned as it is."""
-        if not self.batch_shape:
-            return self
-        return type(self)(*(part[index] for part in self._key()))
+    def _scaled_shape(self, factor: float) -> dict[str, Floats]:
+        return {"vector": factor * self.vector, "constant": factor * factor * self.constant}
 
-    def scaled(self, centre_mm: Floats, factor: float) -> Self:
-        """Multiply all distances from `centre_mm` (3,) by `factor` > 0."""
-        origin = centre_mm + factor * (self.origin_mm - centre_mm)
-        return type(self)(origin, self.rotation, self.matrix, factor * self.vector, factor * factor * self.constant)
-
-    def mirrored(self) -> Self:
-        # In the mirrored local frame y changes sign too, so the local implicit function is mirrored with it.
-        """Mirror the surface, y -> -y."""
-        return type(self)(
-            flip_y(self.origin_mm),
-            mirror_rotation(self.rotation),
-            MIRROR @ self.matrix @ MIRROR,
-            flip_y(self.vector),
-            self.constant,
-        )
-
-    def _key(self) -> tuple[Floats, ...]:
-        return self.origin_mm, self.rotation, self.matrix, self.vector, self.constant
-
-    @classmethod
-    def stack(cls, surfaces: tuple[Self, ...]) -> Self:
-        """Combine single quadrics into a batch."""
-        return cls(*(stacked(parts) for parts in zip(*(s._key() for s in surfaces), strict=True)))
+    def _mirrored_shape(self) -> dict[str, Floats]:
+        return {"matrix": MIRROR @ self.matrix @ MIRROR, "vector": flip_y(self.vector)}
 
 
 def centre_of(quadric: Quadric) -> Floats:

@@ -15,9 +15,10 @@ ratio of the ray tube's cross section at the target to its solid angle at the so
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -39,6 +40,7 @@ One rounding of the direction moves a ray by 1e-7 mm at 1e9 mm. What counts is t
 is 1e-12 rad for every end that is farther, up to infinity.
 """
 
+_Nested = TypeVar("_Nested")
 _FAST_STEPS = 8
 _GUARDED_STEPS = 60
 _RETREATS = 12
@@ -82,8 +84,7 @@ class Corrected(NamedTuple):
     status: Statuses
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class _Shot:
+class _Shot(NamedTuple):
     first: Xyz
     last: Xyz
     turning: Xyz
@@ -135,28 +136,11 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
     for crossing, point in zip((path[0], path[-1]), (shot.first, shot.last), strict=True):
         if crossing.beyond_rim is not None:
             mark(status, ~inside_rim(crossing, point), crossing.beyond_rim)
-    tube = np.abs(shot.determinant)
-    if shape:
-        return Connection(
-            start=direction,
-            first=shot.first,
-            last=shot.last,
-            turning=shot.turning,
-            end=shot.end,
-            residual_mm=shot.residual_mm,
-            tube_mm2_sr=tube,
-            status=status,
-        )
-    return Connection(
-        start=_single(direction),
-        first=_single(shot.first),
-        last=_single(shot.last),
-        turning=_single(shot.turning),
-        end=_single(shot.end),
-        residual_mm=shot.residual_mm.reshape(()),
-        tube_mm2_sr=tube.reshape(()),
-        status=status.reshape(()),
-    )
+    found: dict[str, Any] = {
+        "start": direction, "first": shot.first, "last": shot.last, "turning": shot.turning, "end": shot.end,
+        "residual_mm": shot.residual_mm, "tube_mm2_sr": np.abs(shot.determinant), "status": status,
+    }  # fmt: skip
+    return Connection(**(found if shape else {name: _each(np.squeeze, value) for name, value in found.items()}))
 
 
 def correct(
@@ -353,11 +337,11 @@ def _rescue(
         trial = _shoot(few_path, few_start, few_source, way, few_target)
         way, trial = _guarded(few_path, few_start, few_source, few_target, way, trial, done)
         better = ~done & _better(trial, best)
-        best_way, best = _choose(~better, best_way, way), _merge(better, trial, best)
+        best_way, best = _choose(~better, best_way, way), _choose(~better, best, trial)
         done = (best.status == Status.OK) & _settled(best, 100.0)
         if done.all():
             break
-    return _put(direction, best_way, index), _merge_at(shot, best, index)
+    return _put(direction, best_way, index), _put(shot, best, index)
 
 
 def _guarded(
@@ -374,7 +358,7 @@ def _guarded(
             trial_way = _stepped(way, shot, np.where(active & ~moved, fraction, 0.0))
             trial = _shoot(path, n_start, source, trial_way, target)
             accept = active & ~moved & (trial.status == Status.OK) & (trial.residual_mm < shot.residual_mm)
-            way, shot = _choose(~accept, way, trial_way), _merge(accept, trial, shot)
+            way, shot = _choose(~accept, way, trial_way), _choose(~accept, shot, trial)
             moved |= accept
             if (moved | ~active).all():
                 break
@@ -414,71 +398,38 @@ def taken(crossing: Crossing, frame: Indices) -> Crossing:
     )
 
 
-def _merge(mask: Bools, new: _Shot, old: _Shot) -> _Shot:
-    def both(a: Xyz, b: Xyz) -> Xyz:
-        return _choose(~mask, b, a)
-
-    return _Shot(
-        first=both(new.first, old.first),
-        last=both(new.last, old.last),
-        turning=both(new.turning, old.turning),
-        end=both(new.end, old.end),
-        along=np.where(mask, new.along, old.along),
-        miss=both(new.miss, old.miss),
-        residual_mm=np.where(mask, new.residual_mm, old.residual_mm),
-        tubes=(both(new.tubes[0], old.tubes[0]), both(new.tubes[1], old.tubes[1])),
-        determinant=np.where(mask, new.determinant, old.determinant),
-        status=np.where(mask, new.status, old.status),
-    )
+def _each(function: Callable[..., Any], *values: _Nested) -> _Nested:
+    """Apply a function to each array of nested tuples of one structure."""
+    first: Any = values[0]
+    if not isinstance(first, tuple):
+        return function(*values)  # type: ignore[no-any-return]
+    parts = [_each(function, *some) for some in zip(*values, strict=True)]
+    return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)  # type: ignore[return-value]
 
 
-def _merge_at(shot: _Shot, few: _Shot, index: tuple[Indices, ...]) -> _Shot:
-    def place(old: Floats, new: Floats) -> Floats:
+def _put(old: _Nested, new: _Nested, index: tuple[Indices, ...]) -> _Nested:
+    """Copy of old values with new ones at an index."""
+
+    def put(old: Floats, new: Floats) -> Floats:
         out = np.array(old)
         out[index] = new
         return out
 
-    return _Shot(
-        first=_put(shot.first, few.first, index),
-        last=_put(shot.last, few.last, index),
-        turning=_put(shot.turning, few.turning, index),
-        end=_put(shot.end, few.end, index),
-        along=place(shot.along, few.along),
-        miss=_put(shot.miss, few.miss, index),
-        residual_mm=place(shot.residual_mm, few.residual_mm),
-        tubes=(_put(shot.tubes[0], few.tubes[0], index), _put(shot.tubes[1], few.tubes[1], index)),
-        determinant=place(shot.determinant, few.determinant),
-        status=np.asarray(place(shot.status, few.status)),  # type: ignore[arg-type]
-    )
-
-
-def _put(old: Xyz, new: Xyz, index: tuple[Indices, ...]) -> Xyz:
-    out = (np.array(old[0]), np.array(old[1]), np.array(old[2]))
-    for whole, part in zip(out, new, strict=True):
-        whole[index] = part
-    return out
+    return _each(put, old, new)
 
 
 def _pick(point: Xyz, index: tuple[Indices, ...]) -> Xyz:
-    return point[0][index], point[1][index], point[2][index]
+    return _each(lambda values: values[index], point)
 
 
-def _choose(old_where: Bools, old: Xyz, new: Xyz) -> Xyz:
-    return (
-        np.where(old_where, old[0], new[0]),
-        np.where(old_where, old[1], new[1]),
-        np.where(old_where, old[2], new[2]),
-    )
+def _choose(old_where: Bools, old: _Nested, new: _Nested) -> _Nested:
+    return _each(partial(np.where, old_where), old, new)
 
 
 def _spread(point: Xyz, shape: tuple[int, ...]) -> Xyz:
     # There must be at least one axis, so that rays can be picked out of the batch.
     full = shape or (1,)
     return np.broadcast_to(point[0], full), np.broadcast_to(point[1], full), np.broadcast_to(point[2], full)
-
-
-def _single(point: Xyz) -> Xyz:
-    return point[0].reshape(()), point[1].reshape(()), point[2].reshape(())
 
 
 def _basis(direction: Xyz) -> tuple[Xyz, Xyz]:
