@@ -361,20 +361,6 @@ def conic_from_parameters(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_r
     )
 
 
-def parameters_from_conic(conic: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """Centre (..., 2), semi-axes (..., 2) and angle (...) of conics (..., 6); NaN where there is no real ellipse."""
-    a, b, c, d, e, f = np.moveaxis(np.asarray(conic, dtype=np.float64), -1, 0)
-    with np.errstate(all="ignore"):
-        det = 4.0 * a * c - b * b
-        cx, cy = (b * e - 2.0 * c * d) / det, (b * d - 2.0 * a * e) / det
-        level = -(f + 0.5 * (d * cx + e * cy))  # value of the quadratic form on the boundary
-        scale = 4.0 * level / det
-        semi_a, semi_b, angle = _axes_from_shape_matrix(scale * c, -0.5 * scale * b, scale * a)
-    real = (det > 0.0) & (level * (a + c) > 0.0)
-    nan = np.where(real, 1.0, np.nan)
-    return np.stack([cx * nan, cy * nan], axis=-1), np.stack([semi_a * nan, semi_b * nan], axis=-1), angle * nan
-
-
 def from_cv2(rotated_rect: tuple[tuple[float, float], tuple[float, float], float]) -> Ellipse:
     """Convert OpenCV's rotated rectangle: centre, full axes (width, height), degrees of the width from +x toward +y."""
     (cx, cy), (width, height), degrees = rotated_rect
@@ -438,11 +424,3 @@ def _chord(ellipse: Ellipse, y: Floats) -> tuple[Floats, Floats]:
     linear = b * y + d
     root = np.sqrt(np.maximum(linear * linear - 4.0 * a * (c * y * y + e * y + f), 0.0))
     return (-linear - root) / (2.0 * a), (-linear + root) / (2.0 * a)
-
-
-def polygon_area(points: ArrayLike) -> Floats:
-    """Shoelace area of closed polygons (..., k, 2), px^2; positive for polygons that run from +x toward +y."""
-    p = np.asarray(points, dtype=np.float64)
-    q = np.roll(p, -1, axis=-2)
-    area: Floats = 0.5 * np.sum(p[..., 0] * q[..., 1] - q[..., 0] * p[..., 1], axis=-1)
-    return area

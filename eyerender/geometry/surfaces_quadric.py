@@ -203,13 +203,3 @@ class Quadric(Surface):
 
     def _mirrored_shape(self) -> dict[str, Floats]:
         return {"matrix": MIRROR @ self.matrix @ MIRROR, "vector": flip_y(self.vector)}
-
-
-def centre_of(quadric: Quadric) -> Floats:
-    """Centre -A^-1 b, where the gradient vanishes, in the eye frame (..., 3).
-
-    Raises:
-        LinAlgError: a paraboloid or plane has no centre.
-    """
-    local = -np.linalg.solve(quadric.matrix, quadric.vector[..., None])[..., 0]
-    return quadric.to_eye(local)

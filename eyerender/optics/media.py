@@ -48,8 +48,6 @@ class SellmeierMedium:
 
 Medium = ConstantMedium | CauchyMedium
 
-AIR = ConstantMedium(1.0)
-
 _WATER = (
     (5.666959820e-1, 5.084151894e-3),
     (1.731900098e-1, 1.818488474e-2),

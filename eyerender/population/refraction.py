@@ -110,21 +110,6 @@ def solve(eyes: Biometry) -> Optics:
     return Optics(steep, flat, axis, p_steep, p_flat, p_axis, _lens(eyes, behind))
 
 
-def refraction_with(eyes: Biometry, lens_c0: Floats) -> Floats:
-    """Mean refraction (D) that the eyes would have with other lenses, in closed form backwards from the retina."""
-    cornea, aqueous, vitreous = _indices(eyes.wavelength_nm)
-    index = lens_index(lens_c0, eyes.wavelength_nm)
-    front, back = eyes.lens_radii_mm
-    depth = eyes.axial_length_mm - eyes.chamber_depth_mm - eyes.lens_thickness_mm
-    inside = vitreous / depth - (index - vitreous) / back
-    at_lens = inside / (1.0 + eyes.lens_thickness_mm / index * inside) - (index - aqueous) / front
-    gap = (eyes.chamber_depth_mm - eyes.corneal_thickness_mm) / aqueous
-    behind = at_lens / (1.0 + gap * at_lens) - (aqueous - cornea) / eyes.posterior_radius_mm
-    before = behind / (1.0 + eyes.corneal_thickness_mm / cornea * behind)
-    at_cornea = before - (cornea - 1.0) / eyes.corneal_radius_mm
-    return np.asarray(1000.0 * at_cornea / (1.0 + eyes.vertex_mm * at_cornea))
-
-
 def _lens(eyes: Biometry, behind: Floats) -> Floats:
     """First coefficient of the lens that brings the vergence behind the cornea to a focus on the retina."""
     _, aqueous, vitreous = _indices(eyes.wavelength_nm)

@@ -6,8 +6,7 @@ paired difference = mean(error from images - error from rays) with its 95 % conf
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -38,10 +37,6 @@ class FeatureDifference:
     bias_mm: float | None
     sd_mm: float | None
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Convert to a mapping for JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, slots=True)
 class GazeDifference:
@@ -57,10 +52,6 @@ class GazeDifference:
     difference_deg: float
     low_deg: float
     high_deg: float
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Convert to a mapping for JSON."""
-        return asdict(self)
 
 
 def features(
@@ -120,17 +111,7 @@ def _difference(
         return FeatureDifference(protocol, observer, eye_model, feature, n, int((~good).sum()), *nothing)
     at_eye = v * mm_per_px[good, None]
     return FeatureDifference(
-        protocol,
-        observer,
-        eye_model,
-        feature,
-        n,
-        int((~good).sum()),
-        float(v[:, 0].mean()),
-        float(v[:, 1].mean()),
-        float(v[:, 0].std(ddof=1)),
-        float(v[:, 1].std(ddof=1)),
-        float(np.median(np.linalg.norm(v, axis=1))),
-        float(np.linalg.norm(at_eye.mean(axis=0))),
-        float(np.sqrt(at_eye.var(axis=0, ddof=1).sum())),
-    )
+        protocol, observer, eye_model, feature, n, int((~good).sum()), float(v[:, 0].mean()), float(v[:, 1].mean()),
+        float(v[:, 0].std(ddof=1)), float(v[:, 1].std(ddof=1)), float(np.median(np.linalg.norm(v, axis=1))),
+        float(np.linalg.norm(at_eye.mean(axis=0))), float(np.sqrt(at_eye.var(axis=0, ddof=1).sum())),
+    )  # fmt: skip

@@ -129,5 +129,5 @@ def _as_mappings(apart: Apart, made_of: Sequence[Budget]) -> dict[str, Any]:
     features, gaze = apart
     out: dict[str, Any] = {"error_budget": [b.to_mapping() for b in made_of]}
     if features:
-        out["observers"] = {"features": [f.to_mapping() for f in features], "gaze": [g.to_mapping() for g in gaze]}
+        out["observers"] = {"features": list(map(asdict, features)), "gaze": list(map(asdict, gaze))}
     return out

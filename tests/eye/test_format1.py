@@ -13,8 +13,9 @@ from eyerender.eye.catalogue import load_eye
 from eyerender.eye.format1 import upgraded
 from eyerender.eye.parts import GradientLensSpec
 from eyerender.eye.spec import EyeSpec
-from eyerender.geometry.surfaces_quadric import Quadric, centre_of
+from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.geometry.transforms import rotation_x, rotation_y, rotation_z, tilt_rotation
+from tests.support.surfaces import centre_of
 
 CENTRED: list[tuple[dict[str, Any], list[float]]] = [
     ({"kind": "sphere", "radius_mm": 7.8}, [-7.8, 0.3, -0.2]),

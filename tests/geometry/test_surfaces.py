@@ -13,9 +13,10 @@ from eyerender.eye.parts import PlacedSpec
 from eyerender.geometry.graphs import graphs_of
 from eyerender.geometry.surfaces import components, join
 from eyerender.geometry.surfaces_biconic import Biconic
-from eyerender.geometry.surfaces_quadric import Quadric, centre_of
+from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.geometry.transforms import flip_y, tilt_rotation
 from tests.support.corneas import measured_shapes
+from tests.support.surfaces import centre_of
 
 TILT = tilt_rotation(np.radians([1.0, -2.0, 3.0]))
 SURFACES = {

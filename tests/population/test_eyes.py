@@ -12,7 +12,7 @@ from eyerender.eye.kappa import alpha_deg, kappa_deg
 from eyerender.eye.refraction import refraction_d
 from eyerender.population.people import biometry
 from eyerender.population.pupil import watson_yellott_mm
-from eyerender.population.refraction import lens_index, refraction_with
+from eyerender.population.refraction import Biometry, _indices, lens_index
 from eyerender.population.table import default_table
 
 POWER = ("refraction_d", "refraction_j0_d", "refraction_j45_d")
@@ -63,6 +63,21 @@ def test_lens_index_is_that_of_the_literature(people):
     # SyntEyes' test eye has 1.4236, and 1.441 - 0.00039 y is 1.424 at 44 years (Dubbelman and van der Heijde 2001).
     assert index.mean() == pytest.approx(1.424, abs=0.006)
     assert 0.005 < index.std() < 0.02
+
+
+def refraction_with(eyes: Biometry, lens_c0):
+    """Mean refraction (D) that the eyes would have with other lenses, in closed form backwards from the retina."""
+    cornea, aqueous, vitreous = _indices(eyes.wavelength_nm)
+    index = lens_index(lens_c0, eyes.wavelength_nm)
+    front, back = eyes.lens_radii_mm
+    depth = eyes.axial_length_mm - eyes.chamber_depth_mm - eyes.lens_thickness_mm
+    inside = vitreous / depth - (index - vitreous) / back
+    at_lens = inside / (1.0 + eyes.lens_thickness_mm / index * inside) - (index - aqueous) / front
+    gap = (eyes.chamber_depth_mm - eyes.corneal_thickness_mm) / aqueous
+    behind = at_lens / (1.0 + gap * at_lens) - (aqueous - cornea) / eyes.posterior_radius_mm
+    before = behind / (1.0 + eyes.corneal_thickness_mm / cornea * behind)
+    at_cornea = before - (cornea - 1.0) / eyes.corneal_radius_mm
+    return np.asarray(1000.0 * at_cornea / (1.0 + eyes.vertex_mm * at_cornea))
 
 
 def test_closed_form_goes_both_ways(people):

@@ -7,8 +7,9 @@ import pytest
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.landmarks import field_direction
-from eyerender.geometry.surfaces_quadric import Quadric, centre_of
+from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.scene import load_scene
+from tests.support.surfaces import centre_of
 
 
 def test_the_published_lens_is_the_authors_software():

@@ -12,3 +12,13 @@ def quadric_of(row, sign):
     a, b, c, d, e, f, g, h, i, k = row[:10]
     matrix = np.array([[a, d, e], [d, b, f], [e, f, c]]) / b
     return Quadric.oriented(matrix, np.array([g, h, i]) / b, k / b, sign)
+
+
+def centre_of(quadric):
+    """Centre -A^-1 b, where the gradient vanishes, in the eye frame (..., 3).
+
+    Raises:
+        LinAlgError: a paraboloid or plane has no centre.
+    """
+    local = -np.linalg.solve(quadric.matrix, quadric.vector[..., None])[..., 0]
+    return quadric.to_eye(local)
