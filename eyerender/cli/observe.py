@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
 from ..status import Status
 from .app import app
-from .options import Count, EyeModel, Result, Strict
+from .options import AtLeastOne, EyeModel, Result, Strict
 from .output import Heed, emit, progress
 
 
@@ -73,7 +73,7 @@ def extract(
     eyes: int = 1,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     overlay: Path | None = None,
-    processes: Count = None,
+    processes: AtLeastOne = None,
     record: int = RECORD,
     strict: Strict = False,
     json: Result = None,

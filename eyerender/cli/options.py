@@ -31,4 +31,4 @@ Result = Annotated[
         name="--json", allow_leading_hyphen=True, help="Write the result as JSON to a file, or to stdout with -."
     ),
 ]
-Count = Annotated[int | None, Parameter(validator=at_least_one)]
+AtLeastOne = Annotated[int | None, Parameter(validator=at_least_one)]
