@@ -27,7 +27,6 @@ from pydantic import (
     Tag,
     ValidationError,
 )
-from pydantic_core import CoreSchema
 
 from .errors import InputError, Problems
 from .files import opened, read_text, shown
@@ -61,7 +60,7 @@ NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 class ByKind:
     """Choice among the specs of a union by their key `kind`: `Annotated[SphereSpec | ConicSpec, ByKind()]`."""
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
         members = {str(get_args(member.model_fields["kind"].annotation)[0]): member for member in get_args(source)}
         *names, last = members
         kinds = Discriminator(
