@@ -105,8 +105,8 @@ def run_probe(variant: str, library: Path | None = None, timeout_s: float = TIME
     """Render a small image with `variant` in a new process and check the result."""
     with tempfile.TemporaryDirectory(prefix="eyerender-probe-") as home:
         environment = dict(os.environ)
-        # The process has its own cache of kernels, because Dr.Jit would use one that another libLLVM compiled. Libraries
-        # that were fetched stay in the cache folder of the user.
+        # The process has its own cache of kernels, because Dr.Jit would use one that another libLLVM compiled.
+        # Libraries that were fetched stay in the cache folder of the user.
         environment["HOME"] = environment["DRJIT_CACHE_DIR"] = home
         cache = cache_folder()
         if cache is not None:
