@@ -111,10 +111,10 @@ class Bench:
         rig = rigs.LampRig(camera, tuple(lights))
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
         shown, surround = self.renderer.bind(job)
-        values = shown.values
+        values = shown.frame
         u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, n * n))
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
-        view = look(values, shown.textures, surround.scene, o, d, True)
+        view = look(values, o, d, True)
         inner = view.inner.numpy().T
         rho = np.hypot(inner[:, 1], inner[:, 2]).reshape(n, n)
         cornea = view.cornea.numpy().astype(bool).reshape(n, n)

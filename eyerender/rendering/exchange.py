@@ -65,11 +65,10 @@ from .places import (
     skin_places,
 )
 from .recorded import recorded
-from .values import Lights, Values, aligned, one_by_one, sent
-from .view import Textures, appearance, iris_albedo, meet, outer_albedo
+from .values import Frame, Lights, aligned, one_by_one, sent
+from .view import appearance, iris_albedo, meet, outer_albedo
 
 if TYPE_CHECKING:
-    from .lampviews import LampViews
     from .prepared import Prepared
     from .region import RegionScene
     from .surround import Surround
@@ -390,7 +389,7 @@ class Exchange:
         self._interiors: KeptForEye[_Interior] = KeptForEye()
 
     def begun(
-        self, host: Prepared, values: Values, lights: Lights, panels: LampTable, textures: Textures,
+        self, host: Prepared, frame: Frame, panels: LampTable,
         place: Surround | RegionScene,
     ) -> Callable[[], Callable[[], Received]]:  # fmt: skip
         """Begin to find what the places of a frame receive straight from the lamps, and what they see of each other.
@@ -401,36 +400,32 @@ class Exchange:
 
         Args:
             host: the job, its lamps, and the places on the globe.
-            values: its numbers.
-            lights: its lamps.
+            frame: the frame, with the region and the ambient light.
             panels: parts of its panels, and the bright parts of its map, as lamps.
-            textures: its textures, with the region and the ambient light.
             place: its surroundings.
         """
         from .region import RegionScene
 
         region = place if isinstance(place, RegionScene) else None
-        frame, job = self._frame(host, region), host.job
-        numbers = Received.dark(job.interreflection, frame.chamber, frame.grid, frame.plane)
-        if not job.interreflection and not values.structure.ambient:
-            return lambda: lambda: numbers.filled(*frame.dark(region))
-        tables, sizes = _tables(frame, host.lamps, panels)
-        found = _light_places(
-            values, lights, Lights.upload(panels), textures, place.scene, numbers, tables, sizes
-        )  # fmt: skip
+        places, job = self._places(host, region), host.job
+        numbers = Received.dark(job.interreflection, places.chamber, places.grid, places.plane)
+        if not job.interreflection and not frame.structure.ambient:
+            return lambda: lambda: numbers.filled(*places.dark(region))
+        tables, sizes = _tables(places, host.lamps, panels)
+        found = _light_places(frame, Lights.upload(panels), numbers, tables, sizes)
 
         def read() -> Callable[[], Received]:
-            known = found.read(frame, sizes)
-            return lambda: numbers.filled(*frame.solved(region, known))
+            known = found.read(places, sizes)
+            return lambda: numbers.filled(*places.solved(region, known))
 
         return read
 
-    def _frame(self, host: Prepared, region: RegionScene | None) -> _Frame:
+    def _places(self, host: Prepared, region: RegionScene | None) -> _Places:
         """The places of a job."""
         job, globe = host.job, host.job.globe
         plan = self._plan(region, globe)
         points, normals, plane = _others(job, globe, region, plan.skin)
-        return _Frame(job, host.places, self._inside(job), plan, points, normals, plane)
+        return _Places(job, host.places, self._inside(job), plan, points, normals, plane)
 
     def _inside(self, job: RenderJob) -> _Interior:
         """The chamber of a job's eye."""
@@ -458,7 +453,7 @@ def _halvings(ambient: Ambient) -> int:
 
 
 @dataclass(frozen=True)
-class _Frame:
+class _Places:
     """The places of a frame: on the globe, on skin or surround (`points`, `normals`), on the limbus, in the chamber."""
 
     job: RenderJob
@@ -682,34 +677,34 @@ class _Sizes:
     panels: bool
 
 
-def _tables(frame: _Frame, lamps: LampTable, panels: LampTable) -> tuple[_Tables, _Sizes]:
+def _tables(places: _Places, lamps: LampTable, panels: LampTable) -> tuple[_Tables, _Sizes]:
     """Send the places of a frame to the device."""
-    plan, interior = frame.plan, frame.interior
+    plan, interior = places.plan, places.interior
     inside = interior.gain.shape[1]
-    near = frame.near_cornea if len(lamps) else np.zeros(0, int)
+    near = places.near_cornea if len(lamps) else np.zeros(0, int)
     sizes = _Sizes(
-        outside=_rounded(frame.outside, _PLACES),
+        outside=_rounded(places.outside, _PLACES),
         near_cornea=_rounded(len(near), _PLACES),
         lanes=_rounded(plan.rays + inside, _LANES),
-        at_spots=frame.on_globe * RAYS + inside if plan.skin is not None and len(lamps) else 0,
+        at_spots=places.on_globe * RAYS + inside if plan.skin is not None and len(lamps) else 0,
         lamps=len(lamps) > 0,
         panels=len(panels) > 0,
     )
     rows = None
     if len(near):
         padded = np.append(near, np.full(sizes.near_cornea - len(near), near[0]))
-        rows = sent(np.column_stack([frame.points[padded], frame.normals[padded]]))
+        rows = sent(np.column_stack([places.points[padded], places.normals[padded]]))
     counts = (
-        frame.on_globe, frame.on_skin, frame.outside - IRIS_TURNS, frame.outside, plan.rays, plan.rays + inside
+        places.on_globe, places.on_skin, places.outside - IRIS_TURNS, places.outside, plan.rays, plan.rays + inside
     )  # fmt: skip
     on_globe, on_skin, before_limbus, outside, rays_outside, rays = (dr.opaque(mi.UInt32, n) for n in counts)
     each = 1 if lamps.widest < _SMALL else _SPOTS
     outer, mirrored, within = (
         tuple(dr.opaque(mi.UInt32, k * width) for k in range(each))
-        for width in (2 * frame.outside, sizes.near_cornea, PLACES)
+        for width in (2 * places.outside, sizes.near_cornea, PLACES)
     )
     tables = _Tables(
-        outer=sent(np.resize(frame.outer, (sizes.outside, 6))), inside=interior.rows, near_cornea=rows,
+        outer=sent(np.resize(places.outer, (sizes.outside, 6))), inside=interior.rows, near_cornea=rows,
         leaving=interior.leaving, of_place=plan.of_place, stands_for=plan.stands_for, on_globe=on_globe,
         on_skin=on_skin, before_limbus=before_limbus, outside=outside, rays_outside=rays_outside, rays=rays,
         spots=(outer, mirrored, within),
@@ -735,30 +730,30 @@ class _Found:
     met: tuple[mi.Float, ...]
     lit: mi.Float | None
 
-    def read(self, frame: _Frame, sizes: _Sizes) -> _Known:
+    def read(self, places: _Places, sizes: _Sizes) -> _Known:
         """Read it, which waits for all launches."""
-        count = frame.outside
+        count = places.outside
         direct, bare = (part[:count] for part in np.split(_mean(self.direct, 2 * sizes.outside), 2))
         mirrored = np.zeros(count)
-        near = frame.near_cornea
+        near = places.near_cornea
         if self.mirrored:
-            mirrored[frame.on_globe + near] = _mean([[one] for one in self.mirrored], sizes.near_cornea)[: len(near)]
+            mirrored[places.on_globe + near] = _mean([[one] for one in self.mirrored], sizes.near_cornea)[: len(near)]
         soft, hard, free, shaded = (
             np.zeros(count) if part is None else part.numpy()[:count].astype(float)
             for part in (self.soft, self.hard, self.free, self.shaded)
         )
         lamps, panels = _mean(self.lamps, PLACES), _mean(self.panels, PLACES)
-        return _Known(direct, bare, mirrored, soft, hard, free, shaded, lamps, panels, self._seen(frame))
+        return _Known(direct, bare, mirrored, soft, hard, free, shaded, lamps, panels, self._seen(places))
 
-    def _seen(self, frame: _Frame) -> _Seen:
-        plan, globe = frame.plan, frame.on_globe * RAYS
-        rays = plan.rays + frame.interior.gain.shape[1]
+    def _seen(self, places: _Places) -> _Seen:
+        plan, globe = places.plan, places.on_globe * RAYS
+        rays = plan.rays + places.interior.gain.shape[1]
         lit = np.full(rays, -1.0, np.float32)
         if self.lit is not None:
             straight = self.lit.numpy()
             lit[:globe], lit[plan.rays :] = straight[:globe], straight[globe:]
         target, weight, near, sky, free, bare = (column.numpy()[:rays] for column in self.met)
-        shares = _shares(plan.count, frame.interior.gain)
+        shares = _shares(plan.count, places.interior.gain)
         bare = lit if plan.skin is None else bare
         return _Seen(shares, target, weight, near, sky, free, lit, bare)
 
@@ -777,40 +772,35 @@ def _mean(found: Sequence[Sequence[mi.Float]], width: int) -> Floats:
 
 
 @recorded
-def _light_places(
-    values: Values, lights: Lights, panels: Lights, textures: Textures, scene: mi.Scene, numbers: Received,
-    tables: _Tables, sizes: _Sizes,
-) -> _Found:  # fmt: skip
+def _light_places(frame: Frame, panels: Lights, numbers: Received, tables: _Tables, sizes: _Sizes) -> _Found:
     """Find the light that the places of a frame receive straight from all lamps, and what they see of each other."""
-    views = textures.lamp_views
+    # Shadows of panels are found with rays alone.
+    lit_by_panels = replace(frame, lights=panels, textures=replace(frame.textures, lamp_views=None))
     outer, mirrored, within = tables.spots
-    direct = [_onto_outer(values, scene, tables, lights, views, first, sizes.outside) for first in outer]
+    direct = [_onto_outer(frame, tables, first, sizes.outside) for first in outer]
     soft = hard = free = shaded = None
-    if values.structure.ambient:
+    if frame.structure.ambient:
         n = _row(tables.outer, 6, dr.arange(mi.UInt32, sizes.outside))
-        soft, hard = textures.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
+        soft, hard = frame.textures.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
         dr.eval(soft, hard)
     if sizes.panels:
-        shaded, free = _onto_outer(values, scene, tables, panels, None, None, sizes.outside)
+        shaded, free = _onto_outer(lit_by_panels, tables, None, sizes.outside)
     off = []
     if tables.near_cornea is not None:
-        off = [_off_cornea(values, lights, scene, tables.near_cornea, first, sizes.near_cornea) for first in mirrored]
-    inside = [_inside(values, lights, scene, tables.inside, first) for first in within] if sizes.lamps else []
-    parts = [_inside(values, panels, scene, tables.inside, within[0])] if sizes.panels else []
-    met, spot = _rays_of(values, lights, textures, scene, numbers, tables, sizes.lanes)
+        off = [_off_cornea(frame, tables.near_cornea, first, sizes.near_cornea) for first in mirrored]
+    inside = [_inside(frame, tables.inside, first) for first in within] if sizes.lamps else []
+    parts = [_inside(lit_by_panels, tables.inside, within[0])] if sizes.panels else []
+    met, spot = _rays_of(frame, numbers, tables, sizes.lanes)
     lit = None
     if sizes.at_spots:
-        lit = _at_spots(values, lights, scene, views, spot, tables, sizes.at_spots)
+        lit = _at_spots(frame, spot, tables, sizes.at_spots)
     return _Found(
         direct=direct, mirrored=off, soft=soft, hard=hard, free=free, shaded=shaded, lamps=inside, panels=parts,
         met=met, lit=lit,
     )  # fmt: skip
 
 
-def _onto_outer(
-    values: Values, scene: mi.Scene, tables: _Tables, lights: Lights, views: LampViews | None,
-    first: mi.UInt32 | None, count: int,
-) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+def _onto_outer(frame: Frame, tables: _Tables, first: mi.UInt32 | None, count: int) -> tuple[mi.Float, mi.Float]:
     """Irradiance of the places outside the eye from lamps, with and without shadows; `count` lanes.
 
     Places on the lamps' discs begin with the number `first`; without it these are their middles.
@@ -819,28 +809,26 @@ def _onto_outer(
     n = _row(tables.outer, 6, index)
     x, normal = mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:])
     away = (index >= tables.on_globe) & (index < tables.before_limbus)
-    start, facing = values.point_to_eye(x + _START_MM * normal), values.vector_to_eye(normal)
+    start, facing = frame.point_to_eye(x + _START_MM * normal), frame.vector_to_eye(normal)
     u, v = (mi.Float(0), mi.Float(0)) if first is None else _spots(index + first)
     sheet = away & (index < tables.on_globe + tables.on_skin)
-    found = onto_points(values, lights, scene, start, facing, away, u, v, views, sheet)
+    found = onto_points(frame, start, facing, away, u, v, sheet)
     dr.eval(found)
     return found
 
 
-def _off_cornea(
-    values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32, count: int
-) -> mi.Float:
+def _off_cornea(frame: Frame, rows: mi.Float, first: mi.UInt32, count: int) -> mi.Float:
     """Irradiance of points from lamps by way of the cornea; places on their discs begin with the number `first`."""
     index = dr.arange(mi.UInt32, count)
     n = _row(rows, 6, index)
     normal = mi.Vector3f(*n[3:])
-    x, facing = values.point_to_eye(mi.Vector3f(*n[:3]) + _START_MM * normal), values.vector_to_eye(normal)
-    lit = off_cornea(values, lights, scene, x, facing, *_spots(index + first))
+    x, facing = frame.point_to_eye(mi.Vector3f(*n[:3]) + _START_MM * normal), frame.vector_to_eye(normal)
+    lit = off_cornea(frame, x, facing, *_spots(index + first))
     dr.eval(lit)
     return lit
 
 
-def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
+def _inside(frame: Frame, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
     """Irradiance of the chamber's places from lamps; places on their discs begin with the number `first`."""
 
     def of(begin: int, end: int, inner: bool) -> mi.Float:
@@ -848,11 +836,11 @@ def _inside(values: Values, lights: Lights, scene: mi.Scene, rows: mi.Float, fir
         n = _row(rows, 7, index + begin)
         x, inside, normal = mi.Vector3f(*n[:3]), n[6] > 0, mi.Vector3f(*n[3:6])
         u, v = _spots(index + first)
-        surfaces = values.surfaces if inner else values.surfaces[:-1]
-        return through_cornea(values, lights, scene, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
+        surfaces = frame.surfaces if inner else frame.surfaces[:-1]
+        return through_cornea(frame, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
 
     # If there is a back of the cornea, the wall is the rim of the cornea, in front of it.
-    parts = [of(0, PLACES, True)] if len(values.surfaces) == 1 else [of(0, IRIS, True), of(IRIS, PLACES, False)]
+    parts = [of(0, PLACES, True)] if len(frame.surfaces) == 1 else [of(0, IRIS, True), of(IRIS, PLACES, False)]
     dr.eval(parts)
     return parts
 
@@ -866,9 +854,7 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
     return (r * c) * e1 + (r * s) * e2 + dr.sqrt(1 - u) * normal
 
 
-def _rays_of(
-    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, numbers: Received, tables: _Tables, lanes: int
-) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+def _rays_of(frame: Frame, numbers: Received, tables: _Tables, lanes: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """What the rays of places meet: the columns of `_Seen` but for `lit`, and places on skin (see `_met`).
 
     The first rays belong to places outside the eye. There are more lanes than rays.
@@ -881,15 +867,15 @@ def _rays_of(
     o = mi.Vector3f(*n[:3]) + _START_MM * normal
     d = _pattern(normal, index)
     rays = _row(tables.leaving, 6, index - first, inside)
-    o = dr.select(outside, o, values.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
-    d = dr.select(outside, d, values.vector_to_scene(mi.Vector3f(*rays[3:6])))
+    o = dr.select(outside, o, frame.point_to_scene(mi.Vector3f(*rays[:3]) + 2e-3 * mi.Vector3f(*rays[3:6])))
+    d = dr.select(outside, d, frame.vector_to_scene(mi.Vector3f(*rays[3:6])))
     active = index < tables.rays
-    target, weight, open_, distance, spot = _met(values, textures, scene, numbers, o, d, index, active, tables)
+    target, weight, open_, distance, spot = _met(frame, numbers, o, d, index, active, tables)
     sky = mi.Float(0) * o.x
-    if values.structure.ambient:
-        assert textures.ambience is not None
-        sky = dr.pi * textures.ambience.soft(d, outside | open_)
-    bare = mi.Float(-1) if textures.region is None else _bare(lights, *spot)
+    if frame.structure.ambient:
+        assert frame.textures.ambience is not None
+        sky = dr.pi * frame.textures.ambience.soft(d, outside | open_)
+    bare = mi.Float(-1) if frame.textures.region is None else _bare(frame.lights, *spot)
     results = (target, weight, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky, bare)
     dr.eval(results, spot)
     return results, spot
@@ -911,10 +897,7 @@ def _bare(lights: Lights, on_skin: mi.Bool, x: mi.Vector3f, normal: mi.Vector3f)
     return dr.select(on_skin, total, -1)
 
 
-def _at_spots(
-    values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, spot: tuple[Any, ...], tables: _Tables,
-    lanes: int,
-) -> mi.Float:  # fmt: skip
+def _at_spots(frame: Frame, spot: tuple[Any, ...], tables: _Tables, lanes: int) -> mi.Float:
     """Irradiance straight from the lamps at points of the skin that rays of globe and chamber have met, else -1.
 
     What eye and lids send to each other in the narrow space between them comes from places close by, where the light
@@ -929,7 +912,7 @@ def _at_spots(
     def light(_: mi.Bool, x: mi.Vector3f, normal: mi.Vector3f, number: mi.UInt32) -> mi.Float:
         start = x + _START_MM * normal
         u, v = _spots(number * mi.UInt32(_SHUFFLED))
-        return onto_points(values, lights, scene, start, normal, mi.Bool(True), u, v, views, mi.Bool(True))[0]
+        return onto_points(frame, start, normal, mi.Bool(True), u, v, mi.Bool(True))[0]
 
     lit = dr.if_stmt(state, on_skin, light, lambda *_: mi.Float(-1))
     dr.eval(lit)
@@ -937,36 +920,35 @@ def _at_spots(
 
 
 def _met(
-    values: Values, textures: Textures, scene: mi.Scene, numbers: Received, o: mi.Vector3f, d: mi.Vector3f,
-    index: mi.UInt32, active: mi.Bool, tables: _Tables,
-) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float, tuple[mi.Bool, mi.Vector3f, mi.Vector3f]]:  # fmt: skip
+    frame: Frame, numbers: Received, o: mi.Vector3f, d: mi.Vector3f, index: mi.UInt32, active: mi.Bool, tables: _Tables
+) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float, tuple[mi.Bool, mi.Vector3f, mi.Vector3f]]:
     """What is met along rays with these numbers.
 
     The place, the share of its irradiance that is sent back, whether nothing is met, the distance, and for the outer
     side of the sheet of skin (a mark) point and normal in the eye frame.
     """
-    view, hit = meet(values, scene, o, d, active, coherent=False)
-    view = appearance(values, textures, view, hit, d)
-    albedo = outer_albedo(values, textures, view)
+    view, hit = meet(frame, o, d, active, coherent=False)
+    view = appearance(frame, view, hit, d)
+    albedo = outer_albedo(frame, view)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.
     s, t = _spots(index * mi.UInt32(_SHUFFLED))
     first = tables.on_globe
-    at = values.point_to_scene(view.point)
-    if textures.region is not None:
-        face = textures.region.face(hit)
-        inner = textures.region.from_behind(face, hit.prim_uv, d, view.other)
-        corner = textures.region.corner(face, hit.prim_uv, s, view.other)
+    at = frame.point_to_scene(view.point)
+    if frame.textures.region is not None:
+        face = frame.textures.region.face(hit)
+        inner = frame.textures.region.from_behind(face, hit.prim_uv, d, view.other)
+        corner = frame.textures.region.corner(face, hit.prim_uv, s, view.other)
         which = dr.gather(mi.Int32, tables.stands_for, 2 * corner + dr.select(inner, 1, 0), view.other)
         other = first + mi.UInt32(which)
         matte = view.other & (~inner | (which >= mi.Int32(tables.on_skin)))
-        on_skin = view.other & ~inner & textures.region.on_sheet(face)
+        on_skin = view.other & ~inner & frame.textures.region.on_sheet(face)
     else:
         on_skin = mi.Bool(False)
         ring, turn = numbers.surround_place(at)
         ring = mi.UInt32(dr.clip(ring + s, 0, RINGS - 1))
         turn = mi.UInt32(dr.clip(turn + t, 0, TURNS))
         other = first + ring * TURNS + dr.select(turn < TURNS, turn, 0)
-        matte = view.other & (dr.abs(at.x - values.backdrop_x) < 1e-2)
+        matte = view.other & (dr.abs(at.x - frame.backdrop_x) < 1e-2)
     column, row = numbers.globe_place(at)
     columns, rows = numbers.columns, numbers.rows
     on_globe = mi.UInt32(dr.clip(row + s, 0, rows - 1)) * columns + mi.UInt32(dr.clip(column + t, 0, columns - 1))
@@ -974,8 +956,8 @@ def _met(
     depth, sector = numbers.iris_place(view.inner)
     sector = mi.UInt32(dr.clip(sector + t, 0, IRIS_TURNS))
     cell = mi.UInt32(dr.clip(depth + s, 0, IRIS_RINGS - 1)) * IRIS_TURNS + dr.select(sector < IRIS_TURNS, sector, 0)
-    behind = dr.select(view.pupil, values.pupil_albedo, iris_albedo(values, textures, view.inner))
-    inside = view.passed * behind / (values.inner_index * values.inner_index)
+    behind = dr.select(view.pupil, frame.pupil_albedo, iris_albedo(frame, view.inner))
+    inside = view.passed * behind / (frame.inner_index * frame.inner_index)
     target = dr.select(through, tables.outside + cell, dr.select(view.other, other, on_globe))
     back = dr.select(through, inside, dr.select(view.other & ~matte, 0, albedo))
     back = dr.select(view.met, back, 0)

@@ -28,12 +28,11 @@ from .groups import Group, shade_group
 from .recorded import recorded
 from .sampling import Pattern, Samples, camera_ray, lattice_generator
 from .shading import shade
-from .values import SMALL, Lamp, Lights, Values, aligned, quotient
-from .view import RegionHit, Textures, View, meet, meet_globe, region_hit
+from .values import SMALL, Frame, Lamp, aligned, quotient
+from .view import RegionHit, View, meet, meet_globe, region_hit
 
 if TYPE_CHECKING:
     from .prepared import Prepared
-    from .region import SkinGeometry
 
 _LANES = 2**24  # samples at a time; more are rendered in several passes
 _LARGEST_GROUP = 4
@@ -47,12 +46,9 @@ _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and betw
 
 @dataclass(frozen=True, slots=True)
 class Exposed:
-    """A bound frame for rendering: its Mitsuba scene, numbers, lamps and textures, and what NumPy makes of its job."""
+    """A bound frame for rendering, on the device, and what NumPy makes of its job."""
 
-    scene: mi.Scene
-    values: Values
-    lights: Lights
-    textures: Textures
+    frame: Frame
     host: Prepared
 
 
@@ -152,10 +148,10 @@ def begun(shown: Exposed, window: Window, spp: int, seed: int, *, layered: bool)
     """Begin to take the samples of a window, for what `mean_radiance` returns, or if `layered`, `mean_parts`."""
     width, height = window[2:]
     shape = height, width
-    grouped = shown.values.structure.region
+    grouped = shown.frame.structure.region
     if not grouped and not layered and spp >= _MANY:
         return Film(*_adaptive(shown, window, spp, seed), shape, spp, layered)
-    size = group_size(spp, shown.values.structure.scattering) if grouped else 1
+    size = group_size(spp, shown.frame.structure.scattering) if grouped else 1
     sums: list[mi.Float] = []
     failed = mi.UInt32(0)
     each = max(1, min(spp // size, _LANES // (width * height * size)))
@@ -281,26 +277,24 @@ def _taken_by(
     shown: Exposed, window: Window, spp: int, seed: int
 ) -> Callable[[mi.UInt32, mi.UInt32, bool], tuple[list[mi.Float], mi.UInt32]]:
     """The function that takes samples of a window's pixels."""
-    seen = shown.values, shown.lights, shown.textures, shown.scene
-    return partial(_taken, *seen, Pixels.of(window), Pattern.of(spp, seed))
+    return partial(_taken, shown.frame, Pixels.of(window), Pattern.of(spp, seed))
 
 
 @recorded
 def _taken(
-    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, pixels: Pixels, pattern: Pattern,
-    pixel: mi.UInt32, k: mi.UInt32, layered: bool,
-) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
+    frame: Frame, pixels: Pixels, pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32, layered: bool
+) -> tuple[list[mi.Float], mi.UInt32]:
     """What samples k of pixels show, and the number of failed light paths."""
     u, v = pixels.at(pixel)
     samples = _samples(u, v, pattern)
     spot, on_lamp = samples.in_pixel(k), samples.pair(k, 0)
-    o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
-    seen = shade(values, lights, textures, scene, o, d, mi.Bool(True), on_lamp.x, on_lamp.y)
+    o, d, cosine = camera_ray(frame, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
+    seen = shade(frame, o, d, mi.Bool(True), on_lamp.x, on_lamp.y)
     cosine = cosine * cosine
     lanes = [seen.radiance * cosine * cosine]
     if layered:
-        view, _ = meet(values, scene, o, d, True)
-        near = view.nearness(values, d)
+        view, _ = meet(frame, o, d, True)
+        near = view.nearness(frame, d)
         parts = (view.other, view.cornea | view.sclera)
         lanes = [dr.select(part, x, 0) for part in parts for x in (lanes[0], mi.Float(1), near)]
     dr.eval(lanes, seen.failures)  # together, because a separate reduction would trace everything again
@@ -336,7 +330,7 @@ def _groups(
     fine, seen = mi.UInt32(marks), mi.UInt8(aligned(tiles.ravel().astype(np.uint8)))
     hits = _hits_of(shown, window, pattern, chosen, (first * size * times, count * size * times))
     return _shaded(
-        *(shown.values, shown.lights, shown.textures, shown.scene, grid, pattern, fine, hits, seen),
+        *(shown.frame, grid, pattern, fine, hits, seen),
         dr.opaque(mi.Bool, shown.host.lamps.widest < SMALL),
         rows * columns * count, window[2] * window[3], layered,
     )  # fmt: skip
@@ -351,7 +345,7 @@ def _hits_of(
 
     numbers: the first of the samples, and how many each pixel has.
     """
-    assert shown.textures.region is not None
+    assert shown.frame.textures.region is not None
     if not len(chosen):
         nothing = dr.zeros(mi.Float, _TILE)
         return nothing, mi.UInt32(nothing), nothing, nothing
@@ -361,19 +355,18 @@ def _hits_of(
     pixel = dr.gather(mi.UInt32, mi.UInt32(aligned(chosen.astype(np.uint32))), place)
     k = index - place * each + dr.opaque(mi.UInt32, numbers[0])
     dr.eval(pixel, k)
-    return _hits(shown.values, shown.textures.region, shown.scene, Pixels.of(window), pattern, pixel, k)
+    return _hits(shown.frame, Pixels.of(window), pattern, pixel, k)
 
 
 @recorded
 def _hits(
-    values: Values, skin: SkinGeometry, scene: mi.Scene, pixels: Pixels, pattern: Pattern, pixel: mi.UInt32,
-    k: mi.UInt32,
-) -> tuple[mi.Float, mi.UInt32, mi.Float, mi.Float]:  # fmt: skip
+    frame: Frame, pixels: Pixels, pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32
+) -> tuple[mi.Float, mi.UInt32, mi.Float, mi.Float]:
     """What samples k of fine pixels hit of the region: distance, triangle, and place on it."""
     u, v = pixels.at(pixel)
     spot = _samples(u, v, pattern, mi.Bool(True)).in_pixel(k)
-    o, d, _ = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
-    hit = region_hit(skin, scene, meet_globe(values, o, d), o, d)
+    o, d, _ = camera_ray(frame, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
+    hit = region_hit(frame.textures.region, frame.scene, meet_globe(frame, o, d), o, d)
     found = hit.t, hit.face, hit.prim_uv.x, hit.prim_uv.y
     dr.eval(found)
     return found
@@ -381,18 +374,25 @@ def _hits(
 
 @recorded
 def _shaded(
-    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, grid: _Grid, pattern: Pattern, fine: mi.UInt32,
-    hits: tuple[mi.Float, mi.UInt32, mi.Float, mi.Float], plain: mi.UInt8, small: mi.Bool, packets: int, pixels: int,
+    frame: Frame,
+    grid: _Grid,
+    pattern: Pattern,
+    fine: mi.UInt32,
+    hits: tuple[mi.Float, mi.UInt32, mi.Float, mi.Float],
+    plain: mi.UInt8,
+    small: mi.Bool,
+    packets: int,
+    pixels: int,
     layered: bool,
-) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
+) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums over what the groups of each pixel show, in the order of the pixels, and the number of failed light paths.
 
     There is one group per lane; a packet is a group of each pixel of a tile.
     """
     # Embree traces sixteen neighbouring lanes together. They are one group of 4 x 4 pixels each, so that their camera
     # rays are close and their lamp rays go the same way.
-    assert textures.region is not None
-    skin = textures.region
+    assert frame.textures.region is not None
+    skin = frame.textures.region
     index = dr.arange(mi.UInt32, packets * _TILE * _TILE)
     packet = index // (_TILE * _TILE)
     lane = index - packet * (_TILE * _TILE)
@@ -416,7 +416,7 @@ def _shaded(
 
     def ray(j: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
         spot = samples.in_pixel(number(j))
-        o, d, cosine = camera_ray(values, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
+        o, d, cosine = camera_ray(frame, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
         cosine = cosine * cosine
         return o, d, cosine * cosine
 
@@ -428,12 +428,12 @@ def _shaded(
             t, face, a, b = (dr.gather(type(part), part, first_hit + j) for part in hits)
             return RegionHit(t, face, mi.Point2f(a, b))
 
-        found: RegionHit = dr.if_stmt((), traced > 0, known, lambda: region_hit(skin, scene, alone, o, d))
+        found: RegionHit = dr.if_stmt((), traced > 0, known, lambda: region_hit(skin, frame.scene, alone, o, d))
         return found
 
-    all_samples, suns = samples.count, lights.suns
+    all_samples, suns = samples.count, frame.lights.suns
     # A frame without lamps has a dark one. The sun comes first, and the others are taken in turn.
-    others = dr.maximum(lights.count, 1) - suns
+    others = dr.maximum(frame.lights.count, 1) - suns
     lamps = dr.maximum(others, 1)
 
     def count_of(i: mi.UInt32, users: mi.UInt32) -> mi.UInt32:
@@ -443,20 +443,17 @@ def _shaded(
         first = k < suns
         which = i - quotient(i, lamps) * lamps + (k - suns) * users
         share = mi.Float(users) / mi.Float(dr.maximum(quotient(users + lamps - 1 - which, lamps), 1))
-        return lights[dr.select(first, lights.count - 1, which)], dr.select(first, 1, share)
+        return frame.lights[dr.select(first, frame.lights.count - 1, which)], dr.select(first, 1, share)
 
     across, tile_rows, tile_columns = grid.plain
     # Lanes may be outside.
     place = dr.minimum(y // across, tile_rows - 1) * tile_columns + dr.minimum(x // across, tile_columns - 1)
     several = groups < others
     parts, radiance, failures = shade_group(
-        values,
-        lights,
-        textures,
-        scene,
+        frame,
         Group(
             each,
-            finely & values.structure.scattering,
+            finely & frame.structure.scattering,
             ray,
             hit,
             lambda j: samples.pair(number(j), 0),

@@ -56,7 +56,6 @@ class RenderJob(ArrayValue):
         t: (3,) translation of that motion, mm.
         camera: the camera.
         window: (x0, y0, width, height) in full-sensor pixels.
-        lights: the lamps.
         sensor: the sensor.
         look: albedos and textures.
         wavelength_nm: wavelength in vacuum.

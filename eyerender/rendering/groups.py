@@ -12,8 +12,8 @@ import mitsuba as mi
 from .lighting import lamp_blocked, on_relief, straight, through_cornea
 from .region import film_normal, glossy_normal
 from .shading import direct, indirect, off_eye
-from .values import Lamp, Lights, Values
-from .view import RegionHit, Textures, View, behind, look_at_skin, meet_globe, outer_albedo
+from .values import Frame, Lamp
+from .view import RegionHit, View, behind, look_at_skin, meet_globe, outer_albedo
 from .water import parts_of, through_water, wetted
 
 if TYPE_CHECKING:
@@ -72,9 +72,7 @@ class Part:
     near: mi.Float
 
 
-def shade_group(
-    values: Values, lights: Lights, textures: Textures, scene: mi.Scene, group: Group
-) -> tuple[tuple[Part, ...], mi.Float, mi.UInt32]:
+def shade_group(frame: Frame, group: Group) -> tuple[tuple[Part, ...], mi.Float, mi.UInt32]:
     """Sum radiance and failed light paths over a group's samples in front of an eye region.
 
     The parts, from front to back, are what is before the skin, the skin, and the globe. There are none unless the group
@@ -85,8 +83,8 @@ def shade_group(
     tears), at the first sample that hits it. The result is multiplied by the number of hits on that surface. In a plain
     pixel the first sample that hits the skin represents the others.
     """
-    assert textures.region is not None
-    shading = _GroupShading(values, lights, textures, textures.region, scene, group)
+    assert frame.textures.region is not None
+    shading = _GroupShading(frame, frame.textures.region, group)
     no = mi.Bool(False)
     depths = tuple(mi.Float(0) for _ in range(3)) if group.layered else ()
     state = (mi.UInt32(0), no, mi.Float(0), OnGlobe.none(), Kept.none(), Kept.none(), no, no, mi.UInt32(0), depths)
@@ -117,17 +115,14 @@ def shade_group(
 class _GroupShading:
     """Steps of `shade_group` for one frame."""
 
-    values: Values
-    lights: Lights
-    textures: Textures
+    frame: Frame
     skin: SkinGeometry
-    scene: mi.Scene
     group: Group
 
     @property
     def soft(self) -> bool:
         """Whether light spreads inside skin and sclera."""
-        return self.values.structure.scattering
+        return self.frame.structure.scattering
 
     def number(self, i: mi.UInt32) -> mi.UInt32:
         """Index of the i-th sample to trace: the middle one first, then the others in turn."""
@@ -161,11 +156,11 @@ class _GroupShading:
         `known` says whether the previous sample has sent its own ray to the lamp, `blocked` whether that ray met
         anything.
         """
-        values, group, skin = self.values, self.group, self.skin
+        frame, group, skin = self.frame, self.group, self.skin
         j = self.number(i)
         o, d, weight = group.ray(j)
 
-        view = meet_globe(values, o, d)
+        view = meet_globe(frame, o, d)
         hit = group.hit(j, view, o, d)
         view, face = behind(view, hit, mi.Bool(True)), hit.face
         at = o + hit.t * d
@@ -180,7 +175,7 @@ class _GroupShading:
             view = View(*parts)
         if group.layered:
             # Before the branches below: Dr.Jit would reuse their values outside of them.
-            add = weight * view.nearness(values, d)
+            add = weight * view.nearness(frame, d)
             seen = (view.other & ~on_sheet, view.other & on_sheet, view.cornea | view.sclera)
             depths = tuple(n + dr.select(there, add, 0) for n, there in zip(depths, seen, strict=True))
 
@@ -207,7 +202,7 @@ class _GroupShading:
 
         def own_ray(_: mi.Bool) -> mi.Bool:
             source = self.lamp_point(group.shared(mi.UInt32(0))[0], j)
-            return self.skin_blocked(group.shared(mi.UInt32(0))[0], source, values.point_to_eye(at), on_sheet, asked)
+            return self.skin_blocked(group.shared(mi.UInt32(0))[0], source, frame.point_to_eye(at), on_sheet, asked)
 
         blocked = dr.if_stmt((blocked,), asked, own_ray, lambda blocked: blocked)
         known |= asked
@@ -220,31 +215,31 @@ class _GroupShading:
         self, total: mi.Float, d: mi.Vector3f, view: View, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
     ) -> tuple[Any, ...]:
         """Add what menisci mirror to `total`; the direction in air, and the parts of the view, of what is behind."""
-        values, skin, no = self.values, self.skin, mi.Bool(False)
+        frame, skin, no = self.frame, self.skin, mi.Bool(False)
         film, wet = wetted(skin.water, o, d, view.distance)
         # Mirror images of lamps in water are smaller than a pixel, so no sample stands for others.
         drop = Kept.none().with_(wet, j, skin.on_water(film), film.prim_uv, weight, no, no)
         total = dr.if_stmt((total,), wet, lambda total: self.add_region(total, drop, False), lambda total: total)
-        view, d = through_water(values, skin, film, wet, view, o, d)
+        view, d = through_water(frame, skin, film, wet, view, o, d)
         return total, d, *parts_of(view)
 
     def globe_radiance(self, view: View, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
         """Radiance of the globe along sample j's ray, and failed light paths."""
-        values, lights, textures, scene, group = self.values, self.lights, self.textures, self.scene, self.group
-        seen = on_relief(values, lights, replace(view, other=mi.Bool(False)))
-        inner, missed = through_cornea(values, lights, scene, seen.inner, seen.lit_inside, *group.spot(j))
-        albedo = outer_albedo(values, textures, seen)
-        assert textures.received is not None
-        received = textures.received.globe(values.point_to_scene(seen.point))
-        rest = indirect(values, textures, scene, seen, d, albedo, inner, received)
-        return rest + self.lamps_on_globe(seen, albedo, -values.vector_to_eye(d), j), missed
+        frame, group = self.frame, self.group
+        seen = on_relief(frame, replace(view, other=mi.Bool(False)))
+        inner, missed = through_cornea(frame, seen.inner, seen.lit_inside, *group.spot(j))
+        albedo = outer_albedo(frame, seen)
+        assert frame.textures.received is not None
+        received = frame.textures.received.globe(frame.point_to_scene(seen.point))
+        rest = indirect(frame, seen, d, albedo, inner, received)
+        return rest + self.lamps_on_globe(seen, albedo, -frame.vector_to_eye(d), j), missed
 
     def lamps_on_globe(self, seen: View, albedo: mi.Float, back: mi.Vector3f, j: mi.UInt32) -> mi.Float:
         """Radiance of the matte globe at sample j: the light of all lamps, less what is kept from it.
 
         The samples of a pixel share the rays to the lamps. So only shadows that end within the pixel are noisy.
         """
-        values, lights, group = self.values, self.lights, self.group
+        frame, lights, group = self.frame, self.frame.lights, self.group
 
         mirror = (film_normal(seen.normal), back)
         u, v = group.spot(j)
@@ -256,15 +251,15 @@ class _GroupShading:
 
         if self.soft:
             # What went through the tissue is known, and what remains is the film's highlight.
-            tissues = self.textures.tissues
+            tissues = self.frame.textures.tissues
             assert tissues is not None
-            covered, share = ~seen.cornea | (seen.opacity > 0), tissues.globe_sees(self.values, seen.point)
+            covered, share = ~seen.cornea | (seen.opacity > 0), tissues.globe_sees(self.frame, seen.point)
 
             def shine(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
                 lamp = lights[i]
                 return i + 1, total + lit_by(lamp, mi.Float(0))[1] * share(lamp.number)
 
-            state = (mi.UInt32(0), direct(seen, albedo, tissues.on_globe(self.values, seen.point), mi.Float(0)))
+            state = (mi.UInt32(0), direct(seen, albedo, tissues.on_globe(self.frame, seen.point), mi.Float(0)))
             labels = ("i", "total")
             return dr.while_loop(state, lambda i, _: covered & (i < lights.count), shine, labels=labels, label="film")[
                 1
@@ -279,7 +274,7 @@ class _GroupShading:
         def subtract(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             lamp, share = group.lamp(j, k)
             source, lit = lit_by(lamp, albedo)
-            barred = lamp_blocked(values, self.scene, seen.point, source, False, ~seen.cornea, lit > 0)
+            barred = lamp_blocked(frame, seen.point, source, False, ~seen.cornea, lit > 0)
             return k + 1, total - dr.select(barred, lit * share, 0)
 
         state, asked = (mi.UInt32(0), total), group.asked(j)
@@ -304,29 +299,29 @@ class _GroupShading:
         self, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, asked: mi.Bool
     ) -> mi.Bool:
         """Whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
-        values, views = self.values, self.textures.lamp_views
+        frame, views = self.frame, self.frame.textures.lamp_views
         assert views is not None
         # Where the lamp's own view shows bare skin alone, only the globe may be in the way.
-        clear = views.clear(lamp.number, values.point_to_scene(x), asked & on_sheet)
-        return lamp_blocked(values, self.scene, x, source, True, True, asked & ~clear)
+        clear = views.clear(lamp.number, frame.point_to_scene(x), asked & on_sheet)
+        return lamp_blocked(frame, x, source, True, True, asked & ~clear)
 
     def add_region(self, total: mi.Float, kept: Kept, on_sheet: bool) -> mi.Float:
         """Add to `total` the radiance of a kept hit on the region, from the lamps that the group uses."""
-        values, group = self.values, self.group
+        frame, group = self.frame, self.group
         _, d, _ = group.ray(kept.j)
-        view = look_at_skin(values, self.skin, kept.face, kept.uv, d, kept.weight > 0)
-        rest = off_eye(values, self.textures, self.scene, view, d, view.albedo, view.received)
+        view = look_at_skin(frame, self.skin, kept.face, kept.uv, d, kept.weight > 0)
+        rest = off_eye(frame, view, d, view.albedo, view.received)
         inside, matte, sees = mi.Float(0), view.albedo, None
         soft = self.soft and on_sheet
         if soft:
-            tissues = self.textures.tissues
+            tissues = self.frame.textures.tissues
             assert tissues is not None
             on_map = self.skin.map_place(kept.face, kept.uv, kept.weight > 0)
             on_skin, sees = tissues.on_skin(*on_map), tissues.skin_sees(*on_map)
             inside, matte = direct(view, view.albedo, on_skin, mi.Float(0)), mi.Float(0)
         total += (rest + inside) * kept.weight
         faint = _FAINT * inside
-        mirror = (glossy_normal(view.normal, view.gloss), -values.vector_to_eye(d))
+        mirror = (glossy_normal(view.normal, view.gloss), -frame.vector_to_eye(d))
         turn = dr.sincos(group.shared_spot.y * (2 * dr.pi))
 
         def more(k: mi.UInt32, *_: object) -> mi.Bool:

@@ -20,9 +20,8 @@ import drjit as dr
 import mitsuba as mi
 
 from .irradiancegrid import BENT, IrradianceGrid, unevenness
-from .lampviews import LampViews
 from .lighting import LampPath, behind
-from .values import BITS, Lights, Values
+from .values import BITS, Frame
 from .view import STEEPEST, opacity
 
 _SIDE = 80
@@ -46,11 +45,11 @@ class IrisLight:
     behind_rim: mi.UInt32
     paths: mi.Float
 
-    def at(self, values: Values, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
+    def at(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
         """Irradiance (mW/mm^2) at points of the plane of the iris (eye frame), and the lamps that it lacks, as bits."""
-        q = x - values.stop.centre
-        scale = 0.5 * (_SIDE - 1) / _half(values)
-        u, v = (dr.dot(q, axis) * scale + 0.5 * (_SIDE - 1) for axis in (values.stop.u, values.stop.v))
+        q = x - frame.stop.centre
+        scale = 0.5 * (_SIDE - 1) / _half(frame)
+        u, v = (dr.dot(q, axis) * scale + 0.5 * (_SIDE - 1) for axis in (frame.stop.u, frame.stop.v))
         place = self.grid.place(u, v, active)
         total, left = self.grid.at(place)
         lamps = dr.gather(mi.UInt32, self.behind_rim, place.cell, place.inside)
@@ -62,7 +61,7 @@ class IrisLight:
                 a, b = _rows(self.paths, first + k * _SIDE - _SIDE)
                 whole += place.down[k] * dr.dot(place.across, a)
                 out += place.down[k] * dr.dot(place.across, b)
-            return lamps & (lamps - 1), total + whole * (1 - opacity(values, out))
+            return lamps & (lamps - 1), total + whole * (1 - opacity(frame, out))
 
         _, total = dr.while_loop(
             (lamps, total), lambda lamps, _: lamps != 0, add, labels=("lamps", "total"), label="behind the rim"
@@ -70,21 +69,16 @@ class IrisLight:
         return total, left
 
 
-def _half(values: Values) -> mi.Float:
+def _half(frame: Frame) -> mi.Float:
     """Half the width of the grid, mm."""
-    return values.iris.root_radius + _SPARE_MM
+    return frame.iris.root_radius + _SPARE_MM
 
 
-def iris_light(
-    values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, lamps: int, points: mi.UInt32
-) -> IrisLight:
+def iris_light(frame: Frame, lamps: int, points: mi.UInt32) -> IrisLight:
     """Fill the grid over the plane of the iris.
 
     Args:
-        values: the scene's numbers.
-        lights: the lamps.
-        scene: what may stand in the way.
-        views: the lamps' views of an eye region; None for a bare eye.
+        frame: the frame.
         lamps: number of lamps; 0 where none may use a grid.
         points: number of points that stand for a lamp.
     """
@@ -94,18 +88,18 @@ def iris_light(
         return IrisLight(grid=IrradianceGrid.unknown(_SIDE), behind_rim=none, paths=dr.zeros(mi.Float, 8))
     index = dr.arange(mi.UInt32, _NODES * lamps)
     lamp = index // _NODES
-    lit, *paths = _at_nodes(values, lights, scene, views, points, lamp, index - lamp * _NODES)
+    lit, *paths = _at_nodes(frame, points, lamp, index - lamp * _NODES)
     dr.eval(lit, paths)
-    rows = _four_in_a_row(paths, min(lamps, BITS), lights.count)
+    rows = _four_in_a_row(paths, min(lamps, BITS), frame.lights.count)
 
     def steady_behind_rim(k: mi.UInt32, cell: mi.UInt32, allowed: mi.Float) -> mi.Bool:
         four = [_rows(rows, k * _NODES + cell + n * _SIDE - _SIDE) for n in range(4)]
         whole, out = ([value for row in four for value in row[m]] for m in (0, 1))
         bent, least, most = unevenness(whole)
-        steep = unevenness(out)[0] * most * STEEPEST * values.limbus.gain
+        steep = unevenness(out)[0] * most * STEEPEST * frame.limbus.gain
         return (least > 0) & (bent + steep <= _STEADY / BENT * allowed)
 
-    grid, behind_rim = IrradianceGrid.build(_SIDE, lit, lights.count, held=steady_behind_rim)
+    grid, behind_rim = IrradianceGrid.build(_SIDE, lit, frame.lights.count, held=steady_behind_rim)
     return IrisLight(grid=grid, behind_rim=behind_rim, paths=rows)
 
 
@@ -126,33 +120,30 @@ def _rows(paths: mi.Float, node: mi.UInt32) -> tuple[mi.Vector4f, mi.Vector4f]:
     return dr.gather(mi.Vector4f, paths, 2 * node), dr.gather(mi.Vector4f, paths, 2 * node + 1)
 
 
-def _at_nodes(
-    values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, points: mi.UInt32,
-    i: mi.UInt32, node: mi.UInt32,
-) -> tuple[mi.Float, mi.Float, mi.Float]:  # fmt: skip
+def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Irradiance of lamps i at nodes, the same behind a clear rim, and the radius (mm) where it enters.
 
     Where anything may hide the lamps, or a path was not found, irradiances are negative. Behind a clear rim, that of a
     lamp with several points is so, too.
     """
-    stop, half = values.stop, _half(values)
+    stop, half, views = frame.stop, _half(frame), frame.textures.lamp_views
     row = node // _SIDE
     a, b = (half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (node - row * _SIDE, row))
     x = stop.centre + a * stop.u + b * stop.v
-    lamp = lights[i]
-    within = (a * a + b * b < dr.square(half)) & behind(values.surfaces[-1], x, _AHEAD_MM)
+    lamp = frame.lights[i]
+    within = (a * a + b * b < dr.square(half)) & behind(frame.surfaces[-1], x, _AHEAD_MM)
 
     def more(k: mi.UInt32, *_: object) -> mi.Bool:
         return within & (k < points)
 
     def body(k: mi.UInt32, total: mi.Float, whole: mi.Float, out: mi.Float, hidden: mi.Bool) -> tuple[Any, ...]:
         source = lamp.node(k, points)
-        path = LampPath.to(values, scene, lamp, source, x, within, ahead_mm=_AHEAD_MM)
+        path = LampPath.to(frame, lamp, source, x, within, ahead_mm=_AHEAD_MM)
         total += dr.select(path.blocked, 0, path.gain)
         usable = ~path.blocked & (points == 1)
         hidden |= path.failed
         if views is not None:
-            free = views.clear(i, values.point_to_scene(path.entry), path.whole > 0)
+            free = views.clear(i, frame.point_to_scene(path.entry), path.whole > 0)
             hidden |= path.enters & (path.blocked | ~free)
             usable &= free
         return k + 1, total, dr.select(usable, path.whole, -1), path.out, hidden

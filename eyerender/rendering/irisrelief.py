@@ -28,7 +28,7 @@ from .lighting import LampPath, behind
 from .parameters import StopParameters
 from .recorded import recorded
 from .surfaces import Surface
-from .values import Lights, Values
+from .values import Frame, Lights
 from .view import iris_height
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
@@ -126,25 +126,25 @@ class IrisRelief:
     heights: mi.Float
     shades: mi.Float
 
-    def hit(self, values: Values, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+    def hit(self, frame: Frame, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Foot in the plane (eye frame) of the place that rays meet.
 
         Args:
-            values: the scene's numbers.
+            frame: the frame.
             x: where they would meet the plane.
             slant: their lateral motion per mm of height above it.
             active: the lanes that matter.
         """
         active &= self.raised
-        grid, z = relief_grid(values, self.count), mi.Float(0)
+        grid, z = relief_grid(frame, self.count), mi.Float(0)
         for _ in range(_FIXED_POINT_STEPS):
             z = grid.interpolate(self.heights, x + z * slant, active)
         return dr.select(active, x + z * slant, x)
 
-    def share(self, values: Values, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    def share(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """The q of the module's docstring at feet `x`."""
         active &= self.raised
-        return dr.select(active, relief_grid(values, self.count).interpolate(self.shades, x, active), 1)
+        return dr.select(active, relief_grid(frame, self.count).interpolate(self.shades, x, active), 1)
 
 
 class ReliefSize(NamedTuple):
@@ -163,9 +163,9 @@ class ReliefSize(NamedTuple):
         return cls(side, -(-side // _BLOCK), int(np.ceil((_REACH_MM * _SLANT * side / (2 * half_mm) + 2) / _BLOCK)))
 
 
-def relief_grid(values: Values, count: mi.UInt32) -> ReliefGrid:
+def relief_grid(frame: Frame, count: mi.UInt32) -> ReliefGrid:
     """Make the grid over the iris with so many nodes along a side."""
-    return ReliefGrid(stop=values.stop, half=values.iris.root_radius + _SPARE_MM, count=count)
+    return ReliefGrid(stop=frame.stop, half=frame.iris.root_radius + _SPARE_MM, count=count)
 
 
 def flat_relief(count: mi.UInt32) -> IrisRelief:
@@ -177,20 +177,20 @@ def flat_relief(count: mi.UInt32) -> IrisRelief:
 
 @recorded
 def relief_shape(
-    values: Values, pattern: mi.Texture2f, side: mi.UInt32, about: mi.UInt32, size: ReliefSize
+    frame: Frame, pattern: mi.Texture2f, side: mi.UInt32, about: mi.UInt32, size: ReliefSize
 ) -> ReliefShape:
     """Compute the heights of an iris.
 
     Args:
-        values: the scene's numbers.
+        frame: the frame.
         pattern: the map of heights.
         side: number of nodes along a side, on the device.
         about: number of blocks on each side that are near a block, on the device.
         size: the same numbers on the host, of which only sizes of arrays depend.
     """
-    grid = relief_grid(values, side)
+    grid = relief_grid(frame, side)
     column, row = grid.nodes(size.side**2)
-    heights = iris_height(values, pattern, grid.point(mi.Float(column), mi.Float(row)))
+    heights = iris_height(frame, pattern, grid.point(mi.Float(column), mi.Float(row)))
     dr.eval(heights)
     last = side - 1
     per = mi.Float(last) / (2 * grid.half)
@@ -235,34 +235,27 @@ def _highest_nearby(heights: mi.Float, side: mi.UInt32, about: mi.UInt32, blocks
     return dr.while_loop(state, lambda k, _: k < wide * wide, beside, label="blocks beside")[1]
 
 
-def lit_relief(
-    values: Values, lights: Lights, scene: mi.Scene, shape: ReliefShape, side: mi.UInt32, each: mi.UInt32,
-    size: tuple[int, int],
-) -> IrisRelief:  # fmt: skip
+def lit_relief(frame: Frame, shape: ReliefShape, side: mi.UInt32, each: mi.UInt32, size: tuple[int, int]) -> IrisRelief:
     """Compute the lamps' light on an iris with heights.
 
     Args:
-        values: the scene's numbers.
-        lights: the lamps.
-        scene: what may stand in the way.
+        frame: the frame.
         shape: the heights.
         side: number of nodes along a side.
         each: number of points that stand for a lamp.
         size: numbers of nodes, and of points of lamps.
     """
-    grid = relief_grid(values, side)
+    grid = relief_grid(frame, side)
     column, row = grid.nodes(size[0])
-    rows = _arriving(values, lights, scene, grid, each, _COARSE * _COARSE * size[1])
-    shades = _shades(lights, rows, shape, grid, each, column, row)
+    rows = _arriving(frame, grid, each, _COARSE * _COARSE * size[1])
+    shades = _shades(frame.lights, rows, shape, grid, each, column, row)
     dr.eval(shades)
     shades = grid.corners_of(shades, column, row)
     dr.eval(shades)
     return IrisRelief(count=side, raised=dr.opaque(mi.Bool, True), heights=shape.corners, shades=shades)
 
 
-def _arriving(
-    values: Values, lights: Lights, scene: mi.Scene, grid: ReliefGrid, each: mi.UInt32, lanes: int
-) -> mi.Float:
+def _arriving(frame: Frame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi.Float:
     """E, E t_u, E t_v and E' of points of the lamps at coarse places, in rows."""
     count = mi.UInt32(_COARSE)
     coarse = ReliefGrid(stop=grid.stop, half=grid.half, count=count)
@@ -271,17 +264,17 @@ def _arriving(
     place = index - spot * (_COARSE * _COARSE)
     row = place // count
     x = coarse.point(mi.Float(place - row * count), mi.Float(row))
-    lamp = lights[spot // each]
+    lamp = frame.lights[spot // each]
     source = lamp.node(spot - (spot // each) * each, each)
-    normal = values.stop.normal
+    normal = frame.stop.normal
     # The search for paths to other points is long, and in vain.
-    reached = (lights.count > 0) & behind(values.surfaces[-1], x)
-    path = LampPath.to(values, scene, lamp, source, x, reached)
-    above = LampPath.to(values, scene, lamp, source, x + _RAISED_MM * normal, reached)
+    reached = (frame.lights.count > 0) & behind(frame.surfaces[-1], x)
+    path = LampPath.to(frame, lamp, source, x, reached)
+    above = LampPath.to(frame, lamp, source, x + _RAISED_MM * normal, reached)
     lit = dr.select(path.blocked, 0, path.gain)
     more = dr.select(above.gain > 0, (above.gain - path.gain) / _RAISED_MM, 0)
-    lateral = _arrival(values.surfaces, source, path.entry, normal)
-    rows = (lit, lit * dr.dot(lateral, values.stop.u), lit * dr.dot(lateral, values.stop.v), more)
+    lateral = _arrival(frame.surfaces, source, path.entry, normal)
+    rows = (lit, lit * dr.dot(lateral, frame.stop.u), lit * dr.dot(lateral, frame.stop.v), more)
     out = dr.zeros(mi.Float, 4 * dr.width(index))
     dr.scatter(out, mi.Vector4f(*(dr.select(lit > 0, value, 0) for value in rows)), index)
     dr.eval(out)

@@ -18,7 +18,7 @@ from .lighting import lamp_blocked, straight
 from .recorded import recorded
 from .region import glossy_normal
 from .sampling import camera_ray
-from .values import Values
+from .values import Frame
 from .view import View, hidden, look, meet, meet_globe, outer_albedo
 from .water import on_water
 
@@ -54,20 +54,20 @@ class PartLabels(ArrayValue):
 def part_labels(shown: Exposed, window: Window) -> Callable[[], PartLabels]:
     """Begin to compute the labels of a window; the result waits for them. Rays that miss the globe are not traced."""
     _, _, width, height = window
-    found = _parts(shown.values, shown.scene, Pixels.of(window), width * height)
+    found = _parts(shown.frame.bare(), Pixels.of(window), width * height)
     return lambda: PartLabels(*(frozen(part.numpy().reshape(height, width), np.uint8) for part in found))
 
 
 @recorded
-def _parts(values: Values, scene: mi.Scene, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8]:
+def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8]:
     """What the centres of pixels show, with and without occluders."""
     u, v = pixels.at(dr.arange(mi.UInt32, count))
-    o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
-    alone = meet_globe(values, o, d)
+    o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
+    alone = meet_globe(frame, o, d)
     clear = alone.cornea & (alone.opacity < 0.5)
     inside = dr.select(alone.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
     amodal = dr.select(clear, inside, dr.select(alone.cornea | alone.sclera, mi.UInt8(SCLERA), mi.UInt8(BACKGROUND)))
-    part = dr.select(hidden(values, scene, alone, o, d), mi.UInt8(BACKGROUND), amodal)
+    part = dr.select(hidden(frame, alone, o, d), mi.UInt8(BACKGROUND), amodal)
     dr.eval(amodal, part)
     return part, amodal
 
@@ -78,24 +78,22 @@ def highlights(shown: Exposed, window: Window) -> Bools:
     Both are light of the lamps alone, with its shadows. Lens and sensor do not matter, nor do glints of the cornea.
     Pixels that show mostly cornea are not marked. Without an eye region nothing but the cornea mirrors lamps.
     """
-    values, lights, textures = shown.values, shown.lights, shown.textures
+    frame, lights = shown.frame, shown.frame.lights
     mirrored = scattered = beside = 0.0
-    for i in range(_ACROSS * _ACROSS if values.structure.region else 0):
+    for i in range(_ACROSS * _ACROSS if frame.structure.region else 0):
         place = ((i % _ACROSS + 0.5) / _ACROSS - 0.5, (i // _ACROSS + 0.5) / _ACROSS - 0.5)
         o, d = _rays(shown, window, *(dr.opaque(mi.Float, c) for c in place))
-        view = look(values, textures, shown.scene, o, d, mi.Bool(True))
-        albedo = outer_albedo(values, textures, view)  # of what is below the water
-        view = on_water(values, textures, view, o, d)
-        mirror = (glossy_normal(view.normal, view.gloss), -values.vector_to_eye(d))
+        view = look(frame, o, d, mi.Bool(True))
+        albedo = outer_albedo(frame, view)  # of what is below the water
+        view = on_water(frame, view, o, d)
+        mirror = (glossy_normal(view.normal, view.gloss), -frame.vector_to_eye(d))
 
         def add(
             k: mi.UInt32, shine: mi.Float, even: mi.Float, view: View = view, mirror: Any = mirror
         ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
             lamp = lights[k]
             received, sheen = straight(lamp, lamp.position, view, mirror)
-            barred = lamp_blocked(
-                values, shown.scene, view.point, lamp.position, view.other, ~view.cornea, received > 0
-            )
+            barred = lamp_blocked(frame, view.point, lamp.position, view.other, ~view.cornea, received > 0)
             return k + 1, shine + dr.select(barred, 0, sheen), even + dr.select(barred, 0, received)
 
         state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
@@ -114,7 +112,7 @@ def highlights(shown: Exposed, window: Window) -> Bools:
 def depths_mm(shown: Exposed, window: Window) -> Singles:
     """Distances (height, width) of the first surfaces from the nodal point, infinite where there is none."""
     o, d = _rays(shown, window, mi.Float(0), mi.Float(0))
-    view, _ = meet(shown.values, shown.scene, o, d, True)
+    view, _ = meet(shown.frame, o, d, True)
     depth = dr.select(view.met, view.distance, dr.inf)
     return frozen(depth.numpy().reshape(window[3], window[2]), np.float32)
 
@@ -122,5 +120,5 @@ def depths_mm(shown: Exposed, window: Window) -> Singles:
 def _rays(shown: Exposed, window: Window, right: mi.Float, down: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Camera rays through places beside the centres of a window's pixels (px)."""
     u, v = Pixels.of(window).at(dr.arange(mi.UInt32, window[2] * window[3]))
-    o, d, _ = camera_ray(shown.values, mi.Float(u) + right, mi.Float(v) + down)
+    o, d, _ = camera_ray(shown.frame, mi.Float(u) + right, mi.Float(v) + down)
     return o, d

@@ -11,7 +11,7 @@ import mitsuba as mi
 from .manifold import connect
 from .region import glossy_normal, sheen
 from .surfaces import Surface
-from .values import ALL, BITS, Lamp, Lights, Values
+from .values import ALL, BITS, Frame, Lamp
 from .view import EPSILON_MM, View, meet_sphere, opacity
 
 if TYPE_CHECKING:
@@ -19,13 +19,7 @@ if TYPE_CHECKING:
 
 
 def lamp_blocked(
-    values: Values,
-    scene: mi.Scene,
-    x: mi.Vector3f,
-    lamp: mi.Vector3f,
-    sphere: mi.Bool,
-    cornea: mi.Bool,
-    active: mi.Bool,
+    frame: Frame, x: mi.Vector3f, lamp: mi.Vector3f, sphere: mi.Bool, cornea: mi.Bool, active: mi.Bool
 ) -> mi.Bool:
     """Whether anything stands between a point of the eye frame and a lamp.
 
@@ -34,44 +28,44 @@ def lamp_blocked(
     d = lamp - x
     distance = dr.norm(d)
     d /= distance
-    r = x - values.sclera.centre
+    r = x - frame.sclera.centre
     along = dr.dot(r, d)
-    reach = values.globe_reach
+    reach = frame.globe_reach
     near = dr.squared_norm(r) - along * along < reach * reach
     # Where only the bulge of the cornea can block, most rays pass the sphere about it.
-    way, bulge2 = values.limbus.bulge - x, dr.square(values.limbus.bulge_radius)
+    way, bulge2 = frame.limbus.bulge - x, dr.square(frame.limbus.bulge_radius)
     ahead, away2 = dr.dot(way, d), dr.squared_norm(way)
     near &= mi.Bool(sphere) | ((away2 - ahead * ahead < bulge2) & ((ahead > 0) | (away2 < bulge2)))
     blocked = dr.if_stmt(
         (x, r, d, distance, mi.Bool(sphere), mi.Bool(cornea)),
         near & (mi.Bool(sphere) | mi.Bool(cornea)),
-        lambda x, r, d, distance, sphere, cornea: _globe_blocks(values, x, r, d, distance, sphere, cornea),
+        lambda x, r, d, distance, sphere, cornea: _globe_blocks(frame, x, r, d, distance, sphere, cornea),
         lambda x, r, d, distance, sphere, cornea: mi.Bool(False),
     )
-    if not values.structure.obstacles:
-        return blocked | (values.point_to_scene(lamp).x < values.backdrop_x)
-    ray = mi.Ray3f(mi.Point3f(values.point_to_scene(x + EPSILON_MM * d)), values.vector_to_scene(d))
+    if not frame.structure.obstacles:
+        return blocked | (frame.point_to_scene(lamp).x < frame.backdrop_x)
+    ray = mi.Ray3f(mi.Point3f(frame.point_to_scene(x + EPSILON_MM * d)), frame.vector_to_scene(d))
     ray.maxt = distance * (1 - 1e-4)
     return dr.if_stmt(
         (blocked,),
         active & ~blocked,
-        lambda blocked: blocked | scene.ray_test(ray, coherent=True, active=True),
+        lambda blocked: blocked | frame.scene.ray_test(ray, coherent=True, active=True),
         lambda blocked: blocked,
     )
 
 
 def _globe_blocks(
-    values: Values, x: mi.Vector3f, r: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
+    frame: Frame, x: mi.Vector3f, r: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
 ) -> mi.Bool:
     """Whether the globe blocks the way; r is the point relative to the sclera's centre."""
-    t, met = meet_sphere(r, d, values.sclera.radius)
+    t, met = meet_sphere(r, d, frame.sclera.radius)
     blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
-    front = values.surfaces[0]
+    front = frame.surfaces[0]
     o, dl = front.point_in(x), front.vector_in(d)
     t, met = front.hit(o, dl)
     y = o + t * dl
     rho2 = y.y * y.y + y.z * y.z
-    met &= (rho2 < values.limbus.radius * values.limbus.radius) & (y.x > values.limbus.floor)
+    met &= (rho2 < frame.limbus.radius * frame.limbus.radius) & (y.x > frame.limbus.floor)
     return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
 
 
@@ -107,9 +101,7 @@ def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vecto
 
 
 def onto_points(
-    values: Values,
-    lights: Lights,
-    scene: mi.Scene,
+    frame: Frame,
     x: mi.Vector3f,
     normal: mi.Vector3f,
     other: mi.Bool,
@@ -122,46 +114,40 @@ def onto_points(
 
     `other` marks points off the globe.
 
-    u, v: place on each lamp's disc, [0, 1). views: the lamps' views of a region, which spare rays from the points
-    `on_sheet`, those on the outer side of its sheet of skin.
+    u, v: place on each lamp's disc, [0, 1). on_sheet: points on the outer side of a region's sheet of skin, for which
+    the lamps' views of it spare rays.
     """
+    views = frame.textures.lamp_views
     sine, cosine_v = dr.sincos(v * (2 * dr.pi))
 
     def body(i: mi.UInt32, total: mi.Float, free: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-        lamp: Lamp = lights[i]
+        lamp: Lamp = frame.lights[i]
         source = lamp.point(u, sine, cosine_v)
         lit = irradiance(lamp, source, x, normal)
         asked = lit > 0
         if views is not None:
-            asked &= ~views.clear(i, values.point_to_scene(x), asked & on_sheet)
-        blocked = lamp_blocked(values, scene, x, source, other, True, asked)
+            asked &= ~views.clear(i, frame.point_to_scene(x), asked & on_sheet)
+        blocked = lamp_blocked(frame, x, source, other, True, asked)
         return i + 1, total + dr.select(blocked, 0, lit), free + lit
 
     # One zero for both sums: whether Dr.Jit takes two for one varies, and with it the kernel.
     dark = mi.Float(0) * x.x
     state, labels = (mi.UInt32(0), dark, dark), ("i", "total", "free")
-    _, total, free = dr.while_loop(state, lambda i, *_: i < lights.count, body, labels=labels, label="lamps on places")
+    _, total, free = dr.while_loop(
+        state, lambda i, *_: i < frame.lights.count, body, labels=labels, label="lamps on places"
+    )
     return total, free
 
 
 def light(
-    values: Values,
-    lights: Lights,
-    scene: mi.Scene,
-    view: View,
-    back: mi.Vector3f,
-    u: mi.Float,
-    v: mi.Float,
-    known: mi.Bool | None = None,
+    frame: Frame, view: View, back: mi.Vector3f, u: mi.Float, v: mi.Float, known: mi.Bool | None = None
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.UInt32]:
     """Light on the eye.
 
     The cornea is convex: where it faces a lamp it does not shadow itself.
 
     Args:
-        values: the scene's numbers.
-        lights: the lamps.
-        scene: what may stand in the way.
+        frame: the frame.
         view: the points that are lit.
         back: unit direction of the viewer (eye frame).
         u: place on each lamp's disc, [0, 1).
@@ -172,41 +158,39 @@ def light(
         Irradiance (mW/mm^2) at the first surface where it is matte, the radiance of its sheen towards `back`, the
         irradiance in the plane of the iris, and failed paths.
     """
-    if values.structure.region:
+    if frame.structure.region:
         # Skin fills the image and every lamp costs a ray through the region, so each sample uses one lamp, which stands
         # for all.
-        count = mi.Float(lights.count)
-        one = dr.minimum(mi.UInt32(u * count), lights.count - 1)
-        lamp: Lamp = lights[one]
+        count = mi.Float(frame.lights.count)
+        one = dr.minimum(mi.UInt32(u * count), frame.lights.count - 1)
+        lamp: Lamp = frame.lights[one]
         source = lamp.point(u * count - mi.Float(one), *dr.sincos(v * (2 * dr.pi)))
         direct, shine = straight(lamp, source, view, (glossy_normal(view.normal, view.gloss), back))
-        blocked = lamp_blocked(values, scene, view.point, source, view.other, ~view.cornea, direct > 0)
+        blocked = lamp_blocked(frame, view.point, source, view.other, ~view.cornea, direct > 0)
         share = dr.select(blocked, 0, count)
-        bent, failures = through_cornea(values, lights, scene, view.inner, view.lit_inside, u, v)
+        bent, failures = through_cornea(frame, view.inner, view.lit_inside, u, v)
         return direct * share, shine * share, bent, failures
 
     sine, cosine = dr.sincos(v * (2 * dr.pi))
 
     def onto_matte(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        lamp: Lamp = lights[i]
+        lamp: Lamp = frame.lights[i]
         source = lamp.point(u, sine, cosine)
         direct, _ = straight(lamp, source, view)
-        blocked = lamp_blocked(values, scene, view.point, source, view.other, ~view.cornea, direct > 0)
+        blocked = lamp_blocked(frame, view.point, source, view.other, ~view.cornea, direct > 0)
         return i + 1, total + dr.select(blocked, 0, direct)
 
     matte = view.matte if known is None else view.matte & ~known
     state = (mi.UInt32(0), mi.Float(0))
     _, direct = dr.while_loop(
-        state, lambda i, _: matte & (i < lights.count), onto_matte, labels=("i", "direct"), label="lamps"
+        state, lambda i, _: matte & (i < frame.lights.count), onto_matte, labels=("i", "direct"), label="lamps"
     )
-    bent, failures = through_cornea(values, lights, scene, view.inner, view.lit_inside, u, v)
+    bent, failures = through_cornea(frame, view.inner, view.lit_inside, u, v)
     return direct, mi.Float(0), bent, failures
 
 
 def through_cornea(
-    values: Values,
-    lights: Lights,
-    scene: mi.Scene,
+    frame: Frame,
     inner: mi.Vector3f,
     inside: mi.Bool,
     u: mi.Float,
@@ -219,64 +203,56 @@ def through_cornea(
     u, v: place on each lamp's disc, [0, 1). normal: unit normals at the points; None for those of the plane. surfaces:
     those in front of the points; None for all.
     """
-    bent, left, rest = mi.Float(0), mi.UInt32(ALL), inside & behind((surfaces or values.surfaces)[-1], inner)
-    if lights.on_iris is not None:
-        bent, left = lights.on_iris.at(values, inner, rest)
-    many = lights.count > BITS
+    bent, left, rest = mi.Float(0), mi.UInt32(ALL), inside & behind((surfaces or frame.surfaces)[-1], inner)
+    if frame.lights.on_iris is not None:
+        bent, left = frame.lights.on_iris.at(frame, inner, rest)
+    many = frame.lights.count > BITS
     sine, cosine = dr.sincos(v * (2 * dr.pi))
 
     def more(i: mi.UInt32, *_: object) -> mi.Bool:
-        return rest & (i < lights.count)
+        return rest & (i < frame.lights.count)
 
     def body(
         i: mi.UInt32, left: mi.UInt32, bent: mi.Float, failures: mi.UInt32
     ) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.UInt32]:
-        lamp: Lamp = lights[i]
-        path = LampPath.to(values, scene, lamp, lamp.point(u, sine, cosine), inner, rest, normal, surfaces)
+        lamp: Lamp = frame.lights[i]
+        path = LampPath.to(frame, lamp, lamp.point(u, sine, cosine), inner, rest, normal, surfaces)
         failed = dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
         left &= left - 1
         following = dr.select(many, i + 1, dr.tzcnt(left))
         return following, left, bent + dr.select(path.blocked, 0, path.gain), failures + failed
 
     # Of the lamps whose light is not known, the next one is at the lowest bit; without bits the number is too high.
-    first = dr.select(left == 0, lights.count, dr.select(many, 0, dr.tzcnt(left)))
+    first = dr.select(left == 0, frame.lights.count, dr.select(many, 0, dr.tzcnt(left)))
     state, labels = (first, left, bent, mi.UInt32(0)), ("i", "left", "bent", "failures")
     _, _, bent, failures = dr.while_loop(state, more, body, labels=labels, label="lamps")
-    if normal is None and lights.relief is not None:
-        bent *= lights.relief.share(values, inner, inside)
+    if normal is None and frame.lights.relief is not None:
+        bent *= frame.lights.relief.share(frame, inner, inside)
     return bent, failures
 
 
-def off_cornea(
-    values: Values,
-    lights: Lights,
-    scene: mi.Scene,
-    x: mi.Vector3f,
-    normal: mi.Vector3f,
-    u: mi.Float,
-    v: mi.Float,
-) -> mi.Float:
+def off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float) -> mi.Float:
     """Irradiance (mW/mm^2) of points before the eye (eye frame) from all lamps by way of the cornea as a mirror.
 
     u, v: place on each lamp's disc, [0, 1).
     """
     sine, cosine = dr.sincos(v * (2 * dr.pi))
-    front, reach = values.surfaces[:1], values.limbus.radius
+    front, reach = frame.surfaces[:1], frame.limbus.radius
 
     def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        lamp: Lamp = lights[i]
+        lamp: Lamp = frame.lights[i]
         source = lamp.point(u, sine, cosine)
         path = connect(front, source, x, normal, x, reach, mi.Bool(True), mirror=True)
         local = front[0].point_in(path.entry)
         out = dr.sqrt(local.y * local.y + local.z * local.z)
         there = path.found & (out < reach)
-        blocked = lamp_blocked(values, scene, path.entry, source, True, False, there)
-        blocked |= lamp_blocked(values, scene, path.entry, x, True, False, there & ~blocked)
-        lit = lamp.radiant_intensity(path.leaving) * path.transfer * (1 - opacity(values, out))
+        blocked = lamp_blocked(frame, path.entry, source, True, False, there)
+        blocked |= lamp_blocked(frame, path.entry, x, True, False, there & ~blocked)
+        lit = lamp.radiant_intensity(path.leaving) * path.transfer * (1 - opacity(frame, out))
         return i + 1, total + dr.select(there & ~blocked, lit, 0)
 
     state, labels = (mi.UInt32(0), mi.Float(0) * x.x), ("i", "total")
-    _, total = dr.while_loop(state, lambda i, _: i < lights.count, body, labels=labels, label="mirrored lamps")
+    _, total = dr.while_loop(state, lambda i, _: i < frame.lights.count, body, labels=labels, label="mirrored lamps")
     return total
 
 
@@ -291,12 +267,12 @@ def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
     return met & (t < away + ahead_mm)
 
 
-def on_relief(values: Values, lights: Lights, view: View) -> View:
+def on_relief(frame: Frame, view: View) -> View:
     """The view with the places on the relief of the iris that the rays meet, as their feet in its plane."""
-    if lights.relief is None:
+    if frame.lights.relief is None:
         return view
     seen = view.cornea & ~view.pupil & (view.passed > 0)
-    return replace(view, inner=lights.relief.hit(values, view.inner, view.slant, seen))
+    return replace(view, inner=frame.lights.relief.hit(frame, view.inner, view.slant, seen))
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,8 +300,7 @@ class LampPath:
     @classmethod
     def to(
         cls,
-        values: Values,
-        scene: mi.Scene,
+        frame: Frame,
         lamp: Lamp,
         source: mi.Vector3f,
         inner: mi.Vector3f,
@@ -339,16 +314,16 @@ class LampPath:
         ahead_mm: as for `connect`.
         """
         # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
-        scale, shift = values.image.scale, values.image.shift
+        scale, shift = frame.image.scale, frame.image.shift
         aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
-        normal = values.stop.normal if normal is None else normal
+        normal = frame.stop.normal if normal is None else normal
         path = connect(
-            surfaces or values.surfaces, source, inner, normal, aim, values.limbus.radius, active, ahead_mm=ahead_mm
+            surfaces or frame.surfaces, source, inner, normal, aim, frame.limbus.radius, active, ahead_mm=ahead_mm
         )
-        local = values.surfaces[0].point_in(path.entry)
+        local = frame.surfaces[0].point_in(path.entry)
         out = dr.sqrt(local.y * local.y + local.z * local.z)
-        clear = 1 - opacity(values, out)
+        clear = 1 - opacity(frame, out)
         enters = path.found & (clear > 0)
-        blocked = lamp_blocked(values, scene, path.entry, source, True, False, enters)
+        blocked = lamp_blocked(frame, path.entry, source, True, False, enters)
         whole = dr.select(path.found, lamp.radiant_intensity(path.leaving) * path.transfer, 0)
         return cls(whole * clear, whole, out, path.entry, enters, blocked, path.failed)

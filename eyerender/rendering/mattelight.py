@@ -19,11 +19,11 @@ import mitsuba as mi
 from .irradiancegrid import IrradianceGrid, grid_nodes
 from .lighting import irradiance, lamp_blocked
 from .recorded import recorded
-from .values import Lights, Values
+from .values import Frame
 from .view import GLOBE_EDGE, View, globe_map
 
 if TYPE_CHECKING:
-    from .exchange import Received
+    pass
 
 _SIDE = 128
 _MIDDLE = 0.5 * (_SIDE - 1)
@@ -44,16 +44,16 @@ class MatteLight:
     plane: IrradianceGrid
     reach: mi.Float
 
-    def at(self, values: Values, view: View) -> tuple[mi.Float, mi.Bool]:
+    def at(self, frame: Frame, view: View) -> tuple[mi.Float, mi.Bool]:
         """Irradiance (mW/mm^2) at points that are seen, and whether it is known: not on the rim of the cornea."""
 
         def on_plane(point: mi.Vector3f) -> tuple[mi.Float, mi.UInt32]:
-            x, scale = values.point_to_scene(point), _MIDDLE / self.reach
-            before = view.other & (values.camera.centre.x > values.backdrop_x)
+            x, scale = frame.point_to_scene(point), _MIDDLE / self.reach
+            before = view.other & (frame.camera.centre.x > frame.backdrop_x)
             return self.plane.at(self.plane.place(_MIDDLE + scale * x.y, _MIDDLE + scale * x.z, before))
 
         def on_globe(point: mi.Vector3f) -> tuple[mi.Float, mi.UInt32]:
-            at = globe_map(values, point)
+            at = globe_map(frame, point)
             return self.globe.at(self.globe.place((_SIDE - 1) * at.x, (_SIDE - 1) * at.y, view.sclera))
 
         found, left = dr.if_stmt((view.point,), view.other, on_plane, on_globe)
@@ -62,17 +62,11 @@ class MatteLight:
 
 
 @recorded
-def matte_light(
-    values: Values, lights: Lights, scene: mi.Scene, received: Received, reach: mi.Float, points: mi.UInt32,
-    gridded: bool,
-) -> MatteLight:  # fmt: skip
+def matte_light(frame: Frame, reach: mi.Float, points: mi.UInt32, gridded: bool) -> MatteLight:
     """Fill the grids.
 
     Args:
-        values: the scene's numbers.
-        lights: the lamps.
-        scene: what may stand in the way.
-        received: the light of other surfaces.
+        frame: the frame.
         reach: distance (mm) from the axis of the unrotated eye within which the plane is seen.
         points: number of points that stand for a lamp.
         gridded: whether the lamps may have grids.
@@ -84,15 +78,15 @@ def matte_light(
     sine, cosine = dr.sincos(polar * GLOBE_EDGE)
     share = dr.select(polar > 0, sine / polar, 0)
     normal = mi.Vector3f(cosine, a * share, b * share)
-    x = values.sclera.centre + values.sclera.radius * normal
+    x = frame.sclera.centre + frame.sclera.radius * normal
     # Under the cornea the grid goes on as if there were none, because cells at its rim have nodes there.
-    local = values.surfaces[0].point_in(x)
-    outside = (local.y * local.y + local.z * local.z > dr.square(values.limbus.radius)) | (normal.x < 0)
-    on_globe = _lit(values, lights, scene, points, x, normal, mi.Bool(False), outside)
-    more = received.globe(values.point_to_scene(x)).x
-    seen = values.point_to_eye(mi.Vector3f(values.backdrop_x, reach * a, reach * b))
-    yes, normal = mi.Bool(True), values.vector_to_eye(mi.Vector3f(1, 0, 0))
-    on_plane = _lit(values, lights, scene, points, seen, normal, yes, yes)
+    local = frame.surfaces[0].point_in(x)
+    outside = (local.y * local.y + local.z * local.z > dr.square(frame.limbus.radius)) | (normal.x < 0)
+    on_globe = _lit(frame, points, x, normal, mi.Bool(False), outside)
+    more = frame.textures.received.globe(frame.point_to_scene(x)).x
+    seen = frame.point_to_eye(mi.Vector3f(frame.backdrop_x, reach * a, reach * b))
+    yes, normal = mi.Bool(True), frame.vector_to_eye(mi.Vector3f(1, 0, 0))
+    on_plane = _lit(frame, points, seen, normal, yes, yes)
     dr.eval(on_globe, more, on_plane)
     one = dr.opaque(mi.UInt32, 1)  # the sum over the lamps stands for a single one
     globe, _ = IrradianceGrid.build(_SIDE, on_globe, one, more=more)
@@ -101,9 +95,8 @@ def matte_light(
 
 
 def _lit(
-    values: Values, lights: Lights, scene: mi.Scene, points: mi.UInt32, x: mi.Vector3f, normal: mi.Vector3f,
-    sphere: mi.Bool, cornea: mi.Bool,
-) -> mi.Float:  # fmt: skip
+    frame: Frame, points: mi.UInt32, x: mi.Vector3f, normal: mi.Vector3f, sphere: mi.Bool, cornea: mi.Bool
+) -> mi.Float:
     """Irradiance of all lamps at points (eye frame), which the globe's sphere and the cornea may keep from them.
 
     Under the cornea, where that is not asked, a lamp that stands low may be hidden from points just beyond the rim.
@@ -112,15 +105,15 @@ def _lit(
 
     def body(k: mi.UInt32, total: mi.Float, doubtful: mi.Bool) -> tuple[mi.UInt32, mi.Float, mi.Bool]:
         i = k // points
-        lamp = lights[i]
+        lamp = frame.lights[i]
         source = lamp.node(k - i * points, points)
         lit = irradiance(lamp, source, x, normal)
-        blocked = lamp_blocked(values, scene, x, source, sphere, cornea, lit > 0)
+        blocked = lamp_blocked(frame, x, source, sphere, cornea, lit > 0)
         cosine = dr.dot(dr.normalize(source - x), normal)
         doubtful = doubtful | (~cornea & (cosine > -_LOW) & (cosine < _SLOPE))
         return k + 1, total + dr.select(blocked, 0, lit), doubtful
 
-    state, count = (mi.UInt32(0), mi.Float(0) * x.x, mi.Bool(False)), lights.count * points
+    state, count = (mi.UInt32(0), mi.Float(0) * x.x, mi.Bool(False)), frame.lights.count * points
     labels = ("k", "total", "doubtful")
     _, total, doubtful = dr.while_loop(state, lambda k, *_: k < count, body, labels=labels, label="lamps on a grid")
     return dr.select(doubtful, -1, total / mi.Float(points))

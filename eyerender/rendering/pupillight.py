@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..eye.fundus import CELLS, EDGE
 from .lighting import LampPath
-from .values import Lights, Values
+from .values import Frame
 
 
 @dataclass(kw_only=True)
@@ -35,13 +35,11 @@ class PupilLight:
         return dr.lerp(low, high, t)
 
 
-def pupil_light(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Float | None) -> PupilLight:
+def pupil_light(frame: Frame, factors: mi.Float | None) -> PupilLight:
     """Fill the grid.
 
     Args:
-        values: the scene's numbers.
-        lights: the lamps.
-        scene: what may stand in the way.
+        frame: the frame.
         factors: the return factors of the lamps; None where nothing is returned.
     """
     if factors is None:
@@ -51,19 +49,21 @@ def pupil_light(values: Values, lights: Lights, scene: mi.Scene, factors: mi.Flo
     index = dr.arange(mi.UInt32, CELLS * CELLS)
     row = index // CELLS
     u, v = ((mi.Float(k) + 0.5) * (2 * EDGE / CELLS) - EDGE for k in (index - row * CELLS, row))
-    a, b = values.stop.axes
+    a, b = frame.stop.axes
     # Points beyond the margin get the light of the nearest point within it.
     shrink = dr.rcp(dr.maximum(dr.sqrt(u * u + v * v), 1))
-    x = values.stop.centre + (u * shrink * a) * values.stop.u + (v * shrink * b) * values.stop.v
+    x = frame.stop.centre + (u * shrink * a) * frame.stop.u + (v * shrink * b) * frame.stop.v
 
     def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         factor = dr.gather(mi.Float, factors, i * (CELLS * CELLS) + index)
-        lamp = lights[i]
-        path = LampPath.to(values, scene, lamp, lamp.position, x, factor > 0)
+        lamp = frame.lights[i]
+        path = LampPath.to(frame, lamp, lamp.position, x, factor > 0)
         return i + 1, total + dr.select(path.blocked, 0, path.gain * factor)
 
     state = (mi.UInt32(0), mi.Float(0) * x.x)
     labels = ("i", "total")
-    _, total = dr.while_loop(state, lambda i, _: i < lights.count, body, labels=labels, label="light of the fundus")
+    _, total = dr.while_loop(
+        state, lambda i, _: i < frame.lights.count, body, labels=labels, label="light of the fundus"
+    )
     dr.eval(total)
     return PupilLight(cells=total)

@@ -154,7 +154,7 @@ class Renderer:
         x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
         corner = mi.Float(0)  # of the unit square, which is the disc's centre
         inside = dr.full(mi.Bool, True, len(points_mm))
-        bent, _ = through_cornea(shown.values, shown.lights, shown.scene, x, inside, corner, corner)
+        bent, _ = through_cornea(shown.frame, x, inside, corner, corner)
         return np.asarray(bent.numpy(), dtype=float)
 
     def labels(self, job: RenderJob) -> PartLabels:

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .values import Values
+from .values import Frame
 
 _PHI = 1.324717957244746
 _ALPHA = tuple(round(_PHI ** -(k + 1) * 2**32) for k in range(2))
@@ -97,14 +97,14 @@ class Samples:
         )
 
 
-def camera_ray(values: Values, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+def camera_ray(frame: Frame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
     """Ray of the scene's frame through pixel (u, v), centres at integers: origin, unit direction, cos to the axis."""
-    fx, fy = values.camera.focal
-    cx, cy = values.camera.principal
+    fx, fy = frame.camera.focal
+    cx, cy = frame.camera.principal
     xd, yd = (u - cx) / fx, (v - cy) / fy
     x, y = mi.Float(xd), mi.Float(yd)
-    if values.structure.distorted:
-        k1, k2, p1, p2, k3 = values.camera.distortion
+    if frame.structure.distorted:
+        k1, k2, p1, p2, k3 = frame.camera.distortion
         for _ in range(_UNDISTORT_STEPS):
             r2 = x * x + y * y
             radial = dr.rcp(1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
@@ -112,6 +112,6 @@ def camera_ray(values: Values, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, m
                 (xd - (2 * p1 * x * y + p2 * (r2 + 2 * x * x))) * radial,
                 (yd - (p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)) * radial,
             )
-    d = values.camera.right * x + values.camera.down * y + values.camera.forward
+    d = frame.camera.right * x + frame.camera.down * y + frame.camera.forward
     inv = dr.rsqrt(dr.squared_norm(d))
-    return values.camera.centre, d * inv, inv
+    return frame.camera.centre, d * inv, inv

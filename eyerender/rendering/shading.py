@@ -15,8 +15,8 @@ import mitsuba as mi
 
 from .lighting import light, on_relief
 from .region import film_normal, film_reflectance
-from .values import Lights, Values
-from .view import EPSILON_MM, Textures, View, iris_albedo, look, outer_albedo, stop_coordinates
+from .values import Frame
+from .view import EPSILON_MM, View, iris_albedo, look, outer_albedo, stop_coordinates
 
 _FLAT_MM = 1e-2  # from the plane of a surround
 
@@ -31,33 +31,23 @@ class Shaded:
     failures: mi.UInt32
 
 
-def shade(
-    values: Values,
-    lights: Lights,
-    textures: Textures,
-    scene: mi.Scene,
-    o: mi.Vector3f,
-    d: mi.Vector3f,
-    active: mi.Bool,
-    u: mi.Float,
-    v: mi.Float,
-) -> Shaded:
+def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, u: mi.Float, v: mi.Float) -> Shaded:
     """Radiance along rays of the scene's frame, from light that comes from the lamps by the shortest way.
 
     u, v: place on each lamp's disc, [0, 1).
     """
-    view = on_relief(values, lights, look(values, textures, scene, o, d, active))
+    view = on_relief(frame, look(frame, o, d, active))
     known, outer_known = mi.Bool(False), mi.Float(0)
-    if lights.on_matte is not None:
-        outer_known, known = lights.on_matte.at(values, view)
-    outer, shine, inner, failures = light(values, lights, scene, view, -values.vector_to_eye(d), u, v, known)
+    if frame.lights.on_matte is not None:
+        outer_known, known = frame.lights.on_matte.at(frame, view)
+    outer, shine, inner, failures = light(frame, view, -frame.vector_to_eye(d), u, v, known)
     outer += outer_known
-    albedo = outer_albedo(values, textures, view)
-    received = of_surroundings(values, textures, view, known)
-    if values.structure.region:
-        assert textures.received is not None
-        received = dr.select(view.other, view.received, textures.received.globe(values.point_to_scene(view.point)))
-    seen = indirect(values, textures, scene, view, d, albedo, inner, received) + direct(view, albedo, outer, shine)
+    albedo = outer_albedo(frame, view)
+    received = of_surroundings(frame, view, known)
+    if frame.structure.region:
+        assert frame.textures.received is not None
+        received = dr.select(view.other, view.received, frame.textures.received.globe(frame.point_to_scene(view.point)))
+    seen = indirect(frame, view, d, albedo, inner, received) + direct(view, albedo, outer, shine)
     return Shaded(seen, view, albedo, failures)
 
 
@@ -66,86 +56,69 @@ def direct(view: View, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi
     return dr.select(view.met, _cover(view) * (albedo * outer * dr.inv_pi + shine), 0)
 
 
-def of_surroundings(values: Values, textures: Textures, view: View, known: mi.Bool) -> mi.Vector4f:
+def of_surroundings(frame: Frame, view: View, known: mi.Bool) -> mi.Vector4f:
     """What points of a bare globe and of its surround receive from other surfaces (see `exchange.Received`).
 
     Obstacles receive nothing. The light from other surfaces on the globe is left out where it is `known`.
     """
-    received, nothing = textures.received, mi.Vector4f(0, 1, 0, 0)
+    received, nothing = frame.textures.received, mi.Vector4f(0, 1, 0, 0)
     assert received is not None
 
     def of_plane(x: mi.Vector3f) -> mi.Vector4f:
-        return dr.select(dr.abs(x.x - values.backdrop_x) < _FLAT_MM, received.surround(x), nothing)
+        return dr.select(dr.abs(x.x - frame.backdrop_x) < _FLAT_MM, received.surround(x), nothing)
 
     def of_either(x: mi.Vector3f) -> mi.Vector4f:
         return dr.if_stmt((x,), view.other, of_plane, received.globe)
 
     known &= ~view.other
-    wanted = view.matte if values.structure.ambient else view.matte & ~known
-    found = dr.if_stmt((values.point_to_scene(view.point),), wanted, of_either, lambda x: nothing)
+    wanted = view.matte if frame.structure.ambient else view.matte & ~known
+    found = dr.if_stmt((frame.point_to_scene(view.point),), wanted, of_either, lambda x: nothing)
     return mi.Vector4f(dr.select(known, 0, found.x), found.y, found.z, found.w)
 
 
 def indirect(
-    values: Values,
-    textures: Textures,
-    scene: mi.Scene,
-    view: View,
-    d: mi.Vector3f,
-    albedo: mi.Float,
-    inner: mi.Float,
-    received: mi.Vector4f,
+    frame: Frame, view: View, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float, received: mi.Vector4f
 ) -> mi.Float:
     """Radiance other than `direct`.
 
     Args:
-        values: the scene's numbers.
-        textures: its textures.
-        scene: what may stand in the way.
+        frame: the frame.
         view: what is seen.
         d: directions of the rays (scene's frame).
         albedo: of what is matte.
         inner: irradiance of the lamps in the plane of the iris.
         received: what the first surface receives from other surfaces (see `exchange.Received`).
     """
-    index = values.inner_index
-    rest = off_eye(values, textures, scene, view, d, albedo, received)
-    if not values.structure.ambient:
-        rest += _mirrored(values, textures, scene, view, d, 1 - _cover(view))
+    index = frame.inner_index
+    rest = off_eye(frame, view, d, albedo, received)
+    if not frame.structure.ambient:
+        rest += _mirrored(frame, view, d, 1 - _cover(view))
     leaving = (
         dr.if_stmt(
             (view.inner, inner),
             view.lit_inside,
-            lambda x, lit: _leaving(values, textures, view.pupil, x, lit),
+            lambda x, lit: _leaving(frame, view.pupil, x, lit),
             lambda x, lit: mi.Float(0),
         )
         * dr.inv_pi
         / (index * index)
     )
-    if textures.pupil is not None:
+    if frame.textures.pupil is not None:
         seen = view.cornea & view.pupil
-        leaving += dr.select(seen, textures.pupil.at(*stop_coordinates(values, view.inner), seen), 0)
+        leaving += dr.select(seen, frame.textures.pupil.at(*stop_coordinates(frame, view.inner), seen), 0)
     rest += dr.select(view.cornea, (1 - view.opacity) * view.passed * leaving, 0)
     return dr.select(view.met, rest, 0)
 
 
-def off_eye(
-    values: Values,
-    textures: Textures,
-    scene: mi.Scene,
-    view: View,
-    d: mi.Vector3f,
-    albedo: mi.Float,
-    received: mi.Vector4f,
-) -> mi.Float:
+def off_eye(frame: Frame, view: View, d: mi.Vector3f, albedo: mi.Float, received: mi.Vector4f) -> mi.Float:
     """The same of what is not the clear cornea; see `indirect`."""
     even, mirrored = received.x, mi.Float(0)
-    if values.structure.ambient:
-        assert textures.ambience is not None
+    if frame.structure.ambient:
+        assert frame.textures.ambience is not None
         facing = view.normal if view.level is None else view.level
-        x, normal = values.point_to_scene(view.point), values.vector_to_scene(facing)
-        even += received.y * textures.ambience.irradiance(x, normal)
-        mirrored = _mirrored(values, textures, scene, view, d, 1 - _cover(view))
+        x, normal = frame.point_to_scene(view.point), frame.vector_to_scene(facing)
+        even += received.y * frame.textures.ambience.irradiance(x, normal)
+        mirrored = _mirrored(frame, view, d, 1 - _cover(view))
     return dr.select(view.met, _cover(view) * albedo * even * dr.inv_pi + mirrored, 0)
 
 
@@ -154,51 +127,47 @@ def _cover(view: View) -> mi.Float:
     return dr.select(view.cornea, view.opacity, 1)
 
 
-def _leaving(values: Values, textures: Textures, pupil: mi.Bool, x: mi.Vector3f, lit: mi.Float) -> mi.Float:
+def _leaving(frame: Frame, pupil: mi.Bool, x: mi.Vector3f, lit: mi.Float) -> mi.Float:
     """Radiosity of points in the plane of the iris that have the irradiance `lit` from the lamps."""
-    assert textures.received is not None
-    albedo = dr.if_stmt(
-        (x,), ~pupil, lambda x: iris_albedo(values, textures, x), lambda x: mi.Float(values.pupil_albedo)
-    )
-    return albedo * (lit + textures.received.iris(x))
+    assert frame.textures.received is not None
+    albedo = dr.if_stmt((x,), ~pupil, lambda x: iris_albedo(frame, x), lambda x: mi.Float(frame.pupil_albedo))
+    return albedo * (lit + frame.textures.received.iris(x))
 
 
-def _mirrored(
-    values: Values, textures: Textures, scene: mi.Scene, view: View, d: mi.Vector3f, clear: mi.Float
-) -> mi.Float:
+def _mirrored(frame: Frame, view: View, d: mi.Vector3f, clear: mi.Float) -> mi.Float:
     """Radiance that wet surfaces mirror to the camera, but for that of the lamps.
 
     The front cornea, where it is `clear`, mirrors the ambient light and the surfaces about it. The film of tears
     elsewhere mirrors the ambient light.
     """
-    received = textures.received
+    received = frame.textures.received
     assert received is not None
     normal, share = view.normal, view.mirrored * clear
     seen, wet = mi.Float(0), view.cornea & (clear > 0)
     film = mi.Bool(False)
-    if values.structure.ambient and values.structure.region:
+    if frame.structure.ambient and frame.structure.region:
         film = ~view.cornea & view.met & (view.gloss > 0.5)
         normal = dr.select(film, film_normal(view.normal), view.normal)
-        cosine = -dr.dot(normal, values.vector_to_eye(d))
+        cosine = -dr.dot(normal, frame.vector_to_eye(d))
         share = dr.select(film, film_reflectance(cosine, view.gloss), share)
-    normal = values.vector_to_scene(normal)
+    normal = frame.vector_to_scene(normal)
     way = d - 2 * dr.dot(d, normal) * normal
-    start = values.point_to_scene(view.point) + EPSILON_MM * normal
-    if values.structure.ambient:
-        assert textures.ambience is not None
-        seen = values.ambient_irradiance * dr.inv_pi + textures.ambience.radiance(start, way, wet | film)
+    start = frame.point_to_scene(view.point) + EPSILON_MM * normal
+    if frame.structure.ambient:
+        assert frame.textures.ambience is not None
+        seen = frame.ambient_irradiance * dr.inv_pi + frame.textures.ambience.radiance(start, way, wet | film)
     else:
         wet &= received.on
-    if values.structure.obstacles:
-        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
+    if frame.structure.obstacles:
+        hit = frame.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
         barred = hit.is_valid()
         surface = mi.Float(0)
-        if textures.region is not None:
-            skin = textures.region.surface(textures.region.face(hit), hit.prim_uv, barred & wet)
+        if frame.textures.region is not None:
+            skin = frame.textures.region.surface(frame.textures.region.face(hit), hit.prim_uv, barred & wet)
             surface = dr.select(wet, skin.albedo * skin.received.z * dr.inv_pi, 0)
         seen = dr.select(barred, surface, seen)
     else:
-        t = (values.backdrop_x - start.x) / dr.select(way.x < -1e-4, way.x, -1)
+        t = (frame.backdrop_x - start.x) / dr.select(way.x < -1e-4, way.x, -1)
         seen = dr.if_stmt(
             (start + t * way, seen),
             wet & (way.x < -1e-4) & (t > 0),

@@ -32,7 +32,7 @@ from .recorded import forget, recorded
 from .region import RegionScene
 from .subsurface import tissue_light
 from .surround import Obstacle, Surround
-from .values import Lights, Structure, Values, sent
+from .values import Frame, Lights, Structure, sent
 from .view import Textures
 
 _REGIONS, _TEXTURES = 4, 8  # kept
@@ -60,17 +60,16 @@ class _GridSizes:
 
 
 @recorded
-def _fill_grids(
-    values: Values, lights: Lights, scene: mi.Scene, views: LampViews | None, shape: ReliefShape | None,
-    side: mi.UInt32, points: mi.UInt32, factors: mi.Float | None, sizes: _GridSizes,
+def _grids_behind_cornea(
+    frame: Frame, shape: ReliefShape | None, side: mi.UInt32, points: mi.UInt32, factors: mi.Float | None,
+    sizes: _GridSizes,
 ) -> tuple[IrisLight | None, IrisRelief, PupilLight]:  # fmt: skip
-    """Fill the grids of the lamps' light behind the cornea: on the iris, on its relief, and on the fundus."""
-    pupil = pupil_light(values, lights, scene, factors)
-    on_iris = iris_light(values, lights, scene, views, sizes.lamps, points) if sizes.gridded else None
+    """Fill the grids of the lamps' light on the iris, on its relief, and on the fundus."""
+    pupil = pupil_light(frame, factors)
+    on_iris = iris_light(frame, sizes.lamps, points) if sizes.gridded else None
     if shape is None:
         return on_iris, flat_relief(side), pupil
-    relief = lit_relief(values, lights, scene, shape, side, points, (sizes.nodes, sizes.points))
-    return on_iris, relief, pupil
+    return on_iris, lit_relief(frame, shape, side, points, (sizes.nodes, sizes.points)), pupil
 
 
 class Stage:
@@ -123,11 +122,10 @@ class Stage:
         """
         host, place = self._prepared(job)
         region = place if isinstance(place, RegionScene) else None
-        textures, views = self._textures_of(job), None
+        textures = self._textures_of(job)
         # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
         if isinstance(place, RegionScene):
-            views = LampViews.of(host.views, place)
-            textures = replace(textures, region=place.skin, lamp_views=views)
+            textures = replace(textures, region=place.skin, lamp_views=LampViews.of(host.views, place))
         else:
             textures = replace(textures, surround=place.geometry)
         structure = Structure(
@@ -138,64 +136,57 @@ class Stage:
             job.ambient.model_copy(update={"sun": None}) != Ambient(),
             region is not None and region.skin.is_sheet and job.look.scattering is not None,
         )
-        values = Values.upload(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
+        frame = Frame.upload(
+            structure, host.parameters, boundary_waves(job.eye), tables(job.eye),
+            lights=Lights.upload(host.lamps), textures=textures, scene=place.scene,
+        )  # fmt: skip
         if job.mesh_edge_mm is not None:
-            values.surfaces = meshed(values.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
-        lights = Lights.upload(host.lamps)
-        if lit and structure.scattering and region is not None and views is not None:
-            tissues = tissue_light(job, values, host.lamps, lights, region, views, host.tissue_cells)
-            textures = replace(textures, tissues=tissues)
+            frame.surfaces = meshed(frame.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
+        if lit and structure.scattering and region is not None:
+            textures.tissues = tissue_light(job, frame, host.lamps, region, host.tissue_cells)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
             panels = panel_table(job.ambient, job.anchor_mm)
-            textures = replace(textures, ambience=Ambience.upload(even, panels, job.ambient.map, self._maps))
+            textures.ambience = Ambience.upload(even, panels, job.ambient.map, self._maps)
         if lit:
-            lights, textures = self._lit(host, values, lights, textures, place, after)
-        return Exposed(place.scene, values, lights, textures, host), place
+            self._light(host, frame, place, after)
+        return Exposed(frame, host), place
 
-    def _lit(
-        self, host: Prepared, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene,
-        after: RenderJob | None,
-    ) -> tuple[Lights, Textures]:  # fmt: skip
+    def _light(self, host: Prepared, frame: Frame, place: Surround | RegionScene, after: RenderJob | None) -> None:
         """Add the light between surfaces, and the grids of the lamps' light that the frame can use."""
         job = host.job
         parts = panel_lamps(job.ambient, job.anchor_mm) + bright_lamps(job.ambient.map, self._maps, job.anchor_mm)
-        panels = LampTable.of(parts, job.M, job.t)
-        read = self._exchange.begun(host, values, lights, panels, textures, place)
+        read = self._exchange.begun(host, frame, LampTable.of(parts, job.M, job.t), place)
         if after is not None:
             self._expect(after)
         solved = read()
-        lights, pupil = self._grids(host, values, lights, textures, place)
-        received = solved()
+        self._fill_grids(host, frame, place)
+        frame.textures.received = solved()
         if not place.obstructed:
             reach = dr.opaque(mi.Float, min(host.reach_mm, _FARTHEST_MM))
             points = dr.opaque(mi.UInt32, host.lamps.points)
-            matte = matte_light(values, lights, place.scene, received, reach, points, host.lamps.gridded)
-            lights = replace(lights, on_matte=matte)
-        return lights, replace(textures, received=received, pupil=pupil)
+            frame.lights.on_matte = matte_light(frame, reach, points, host.lamps.gridded)
 
-    def _grids(
-        self, host: Prepared, values: Values, lights: Lights, textures: Textures, place: Surround | RegionScene
-    ) -> tuple[Lights, PupilLight]:
-        """The lamps with their light on iris and relief, and the light of the fundus."""
-        job, lamps = host.job, host.lamps
-        count, size = max(len(lamps), 1), ReliefSize.of(job)
-        side = dr.opaque(mi.UInt32, size.side)
-        shape = None
-        if textures.raised:
+    def _fill_grids(self, host: Prepared, frame: Frame, place: Surround | RegionScene) -> None:
+        """Add the light of the lamps behind the cornea."""
+        job, lamps, heights = host.job, host.lamps, frame.textures.heights
+        size = ReliefSize.of(job)
+        side, shape = dr.opaque(mi.UInt32, size.side), None
+        if frame.textures.raised:
             shape = self._shapes.get(
                 job.eye,
                 (size.side, job.look.iris_seed, job.look.iris),
-                lambda: relief_shape(values, textures.heights, side, dr.opaque(mi.UInt32, size.about), size),
+                lambda: relief_shape(frame.bare(), heights, side, dr.opaque(mi.UInt32, size.about), size),
             )
-        factors = host.returned.factors if len(lamps) else np.zeros(0)
         gridded = not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet)
-        on_iris, relief, pupil = _fill_grids(
-            values, lights, place.scene, textures.lamp_views, shape, side, dr.opaque(mi.UInt32, lamps.points),
-            sent(factors) if factors.any() else None,
-            _GridSizes(gridded, len(lamps) if lamps.gridded else 0, size.side**2, lamps.points * count),
-        )  # fmt: skip
-        return replace(lights, on_iris=on_iris, relief=relief), pupil
+        points = lamps.points * max(len(lamps), 1)
+        sizes = _GridSizes(gridded, len(lamps) if lamps.gridded else 0, size.side**2, points)
+        factors = host.returned.factors
+        sent_factors = sent(factors) if len(lamps) and factors.any() else None
+        lights, textures = frame.lights, frame.textures
+        lights.on_iris, lights.relief, textures.pupil = _grids_behind_cornea(
+            frame, shape, side, dr.opaque(mi.UInt32, lamps.points), sent_factors, sizes
+        )
 
     def _prepared(self, job: RenderJob) -> tuple[Prepared, Surround | RegionScene]:
         """What NumPy makes of a job, and its posed surroundings."""

@@ -29,12 +29,11 @@ import numpy as np
 from ..arrays import Ints
 from ..optics.diffusion import rings, transmitted
 from ..region.skin import BANDS, SHEET_ROWS
-from .lampviews import LampViews
 from .lighting import irradiance, lamp_blocked
 from .recorded import recorded
 from .region import SHEET_COLUMNS, SkinGeometry
 from .tissuecells import SIDE, WIDTH, GlobeCells, SheetCells, TissueCells
-from .values import Lights, Values, aligned, quotient
+from .values import Frame, aligned, quotient
 from .view import EPSILON_MM
 
 if TYPE_CHECKING:
@@ -193,38 +192,35 @@ class TissueLight:
         cells = self.size.cells(*self.size.place(u, v), 1)
         return lambda lamp: dr.clip(cells.of(mi.Float, self.skin[1], self.lamps, lamp), 0, 1)
 
-    def on_globe(self, values: Values, x: mi.Vector3f) -> mi.Float:
+    def on_globe(self, frame: Frame, x: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
-        row, column = _globe_cell(values, x)
+        row, column = _globe_cell(frame, x)
         u = dr.clip(column, 0, SIDE - 1.001)
         j = mi.UInt32(u)
         return _Cells.at(row, u - mi.Float(j), (j, j + 1), (SIDE, SIDE)).of(mi.Float, self.globe[0])
 
-    def globe_sees(self, values: Values, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
+    def globe_sees(self, frame: Frame, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
         """Shares of the lamps, by their numbers, that points of the globe (eye frame) see."""
-        row, column = (mi.UInt32(dr.clip(p + 0.5, 0, SIDE - 1)) for p in _globe_cell(values, x))
+        row, column = (mi.UInt32(dr.clip(p + 0.5, 0, SIDE - 1)) for p in _globe_cell(frame, x))
         first = (row * SIDE + column) * self.lamps
         return lambda lamp: dr.gather(mi.Float, self.globe[1], first + lamp)
 
 
-def _globe_cell(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+def _globe_cell(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     """Row and column of points of the globe (eye frame) in the grid over it."""
-    return _globe_place(values.vector_to_scene(x - values.sclera.centre))
+    return _globe_place(frame.vector_to_scene(x - frame.sclera.centre))
 
 
 def tissue_light(
-    job: RenderJob, values: Values, lamps: LampTable, lights: Lights, place: RegionScene, views: LampViews,
-    cells: TissueCells,
+    job: RenderJob, frame: Frame, lamps: LampTable, place: RegionScene, cells: TissueCells
 ) -> TissueLight:  # fmt: skip
     """Compute the light on the tissues of a frame.
 
     Args:
         job: the job.
-        values: its numbers.
+        frame: the frame.
         lamps: its lamps, on the host.
-        lights: its lamps.
         place: the posed region.
-        views: the lamps' views of it.
         cells: the cells of the grids.
     """
     scattering = job.look.scattering
@@ -234,11 +230,8 @@ def tissue_light(
     wide, count = lamps.widest >= _SMALL, max(len(lamps), 1)
     rays = -(-_RAYS // count)
     make = _Maker(
-        values,
-        lights,
-        place.scene,
+        frame,
         place.skin,
-        views,
         place.relief[skin.rows],
         dr.opaque(mi.Bool, wide),
         (dr.opaque(mi.UInt32, max(rays, _WIDE_RAYS if wide else 1)), dr.opaque(mi.UInt32, rays)),
@@ -246,7 +239,7 @@ def tissue_light(
         count,
     )
     sheet, between = make.both(skin, globe, Places.of(cells.thick_mm), Places.of(cells.thin_mm))
-    return TissueLight(size=skin.size, skin=sheet, globe=between, lamps=dr.maximum(lights.count, 1))
+    return TissueLight(size=skin.size, skin=sheet, globe=between, lamps=dr.maximum(frame.lights.count, 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,11 +247,9 @@ class _Maker:
     """What the grids of a frame are computed from.
 
     Attributes:
-        values: the scene's numbers.
-        lights: the lamps.
+        frame: the frame.
         scene: the posed region.
         skin: its surface.
-        views: the lamps' views of it.
         relief: slopes of the cells of the skin's grid.
         wide: whether some lamp is too wide for one point.
         rays: number of rays to each lamp from cells of skin and globe.
@@ -266,11 +257,8 @@ class _Maker:
         lamps: number of lamps, at least 1.
     """
 
-    values: Values
-    lights: Lights
-    scene: mi.Scene
+    frame: Frame
     skin: SkinGeometry
-    views: LampViews
     relief: mi.Float
     wide: mi.Bool
     rays: tuple[mi.UInt32, mi.UInt32]
@@ -309,13 +297,13 @@ class _Maker:
         Returns:
             The vectors, and the share of each lamp that each cell sees, cell by cell.
         """
-        values, lights, skin = self.values, self.lights, self.skin
+        frame, lights, skin = self.frame, self.frame.lights, self.skin
         cells, columns = grid.rows * grid.columns // 4, grid.size.columns // 2
         straight = dr.zeros(mi.Float, 4 * cells)
         seen = dr.zeros(mi.Float, self.lamps * cells)
         index = grid.sent[1]
         row, column = index // columns, index % columns
-        centre = values.point_to_scene(values.sclera.centre)
+        centre = frame.point_to_scene(frame.sclera.centre)
         points, spread = self.rays[0], self.wide
         shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
 
@@ -325,23 +313,23 @@ class _Maker:
             x, n = skin.sheet_point(grid.vertex_row(2 * row + half, 2 * t - mi.Float(half)), across)
             # The conjunctiva dips into the globe where both join. Neither shades the other there.
             out = x - centre
-            return centre + out * dr.maximum(1, (values.sclera.radius + _JOINT_MM) * dr.rcp(dr.norm(out))), n
+            return centre + out * dr.maximum(1, (frame.sclera.radius + _JOINT_MM) * dr.rcp(dr.norm(out))), n
 
         at, n = place(mi.Float(0.5), mi.Float(0.5))
-        x, facing = values.point_to_eye(at), values.vector_to_eye(n)
+        x, facing = frame.point_to_eye(at), frame.vector_to_eye(n)
 
         def of_lamp(i: mi.UInt32, total: mi.Vector3f) -> tuple[mi.UInt32, mi.Vector3f]:
             lamp = lights[i]
             before = spread | (dr.dot(lamp.position - x, facing) > 0)
-            clear = self.views.clear(i, at, before)
+            clear = self.frame.textures.lamp_views.clear(i, at, before)
             count = dr.select(before, dr.select(clear & ~spread, 1, points), 0)
 
             def at_point(k: mi.UInt32, flux: mi.Vector3f, free: mi.Float) -> tuple[mi.UInt32, mi.Vector3f, mi.Float]:
                 u, v = _spots(shifts[1], k)
                 sine, cosine = dr.sincos(v * (2 * dr.pi))
-                start = values.point_to_eye(place(*_spots(shifts[0], k))[0])
+                start = frame.point_to_eye(place(*_spots(shifts[0], k))[0])
                 source = lamp.point(u, sine, cosine)
-                hidden = lamp_blocked(values, self.scene, start, source, True, True, ~clear)
+                hidden = lamp_blocked(frame, start, source, True, True, ~clear)
                 to = dr.select(spread, source, lamp.position) - x
                 inv2 = dr.rcp(dr.squared_norm(to))
                 to *= dr.sqrt(inv2)
@@ -359,7 +347,7 @@ class _Maker:
         state = (mi.UInt32(0), mi.Vector3f(0) * x.x)
         labels = ("i", "total")
         _, total = dr.while_loop(state, lambda i, _: i < lights.count, of_lamp, labels=labels, label="lamps on skin")
-        total = values.vector_to_scene(total)
+        total = frame.vector_to_scene(total)
         dr.eval(total)
         for k, number in enumerate((total.x, total.y, total.z)):
             dr.scatter(straight, number, 4 * index + k)
@@ -375,11 +363,11 @@ class _Maker:
         dr.scatter(cells, dr.gather(mi.Float, coarse, grid.over), grid.under)
         lit, seen = self._on_globe(grid.between)
         dr.scatter(cells, dr.gather(mi.Float, cells, grid.between) + lit, grid.between)
-        return grid.spread(cells, self.values.sclera.radius, places), seen
+        return grid.spread(cells, self.frame.sclera.radius, places), seen
 
     def _on_globe(self, index: mi.UInt32) -> tuple[mi.Float, mi.Float]:
         """Irradiance of cells of the grid over the globe straight from the lamps; shares of each lamp that they see."""
-        values, lights = self.values, self.lights
+        frame, lights = self.frame, self.frame.lights
         seen = dr.zeros(mi.Float, self.lamps * SIDE * SIDE)
         points = self.rays[1]
         shifts = [mi.sample_tea_32(index, mi.UInt32(key)) for key in _KEYS]
@@ -395,9 +383,9 @@ class _Maker:
                 u, v = _spots(shifts[1], k)
                 source = lamp.point(u, *dr.sincos(v * (2 * dr.pi)))
                 lit = irradiance(lamp, source, x, normal)
-                local = values.surfaces[0].point_in(x)
-                outside = local.y * local.y + local.z * local.z > dr.square(values.limbus.radius)
-                hidden = lamp_blocked(values, self.scene, x, source, False, outside, lit > 0)
+                local = frame.surfaces[0].point_in(x)
+                outside = local.y * local.y + local.z * local.z > dr.square(frame.limbus.radius)
+                hidden = lamp_blocked(frame, x, source, False, outside, lit > 0)
                 return k + 1, total + dr.select(hidden, 0, lit), free + dr.select(hidden, 0, 1)
 
             state, labels = (mi.UInt32(0), mi.Float(0), mi.Float(0)), ("k", "total", "free")
@@ -414,21 +402,21 @@ class _Maker:
 
     def _globe_surface(self, n: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
         """Point and normal (eye frame) of the globe along directions (scene's frame) from its centre."""
-        values, away = self.values, 8.0
-        d = values.vector_to_eye(n)
-        o = values.sclera.centre + (values.sclera.radius + away) * d
-        front = values.surfaces[0]
+        frame, away = self.frame, 8.0
+        d = frame.vector_to_eye(n)
+        o = frame.sclera.centre + (frame.sclera.radius + away) * d
+        front = frame.surfaces[0]
         ol, dl = front.point_in(o), front.vector_in(-d)
         t, met, facing = front.meet(ol, dl)
         y = ol + t * dl
-        met &= (y.y * y.y + y.z * y.z < dr.square(values.limbus.radius)) & (y.x > values.limbus.floor) & (t < away)
+        met &= (y.y * y.y + y.z * y.z < dr.square(frame.limbus.radius)) & (y.x > frame.limbus.floor) & (t < away)
         return o - dr.select(met, t, away) * d, dr.normalize(dr.select(met, front.vector_out(facing), d))
 
     def _through_lids(self, index: mi.UInt32, size: Size, sheet: mi.Float) -> mi.Float:
         """Irradiance of two by two cells of the globe by way of lids on them: exp(-k t) of that on the lid's skin."""
-        values, skin, half = self.values, self.skin, SIDE // 2
+        frame, skin, half = self.frame, self.skin, SIDE // 2
         n = _globe_direction(2 * mi.Float(index // half) + 0.5, 2 * mi.Float(index % half) + 0.5)
-        start = values.point_to_scene(self._globe_surface(n)[0])
+        start = frame.point_to_scene(self._globe_surface(n)[0])
         inner = self._next(start, n, mi.Float(EPSILON_MM), mi.Bool(True))
         outer = self._next(start, n, inner.t + _BETWEEN_MM, inner.is_valid())
         last = dr.select(outer.is_valid(), outer.t, inner.t)
@@ -443,7 +431,7 @@ class _Maker:
         """First hit along rays beyond a distance and within a lid's thickness; its t counts from the start."""
         ray = mi.Ray3f(mi.Point3f(o + first * d), d)
         ray.maxt = _LID_MM - first
-        hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        hit = self.frame.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         hit.t += first
         return hit
 

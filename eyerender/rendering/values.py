@@ -1,4 +1,4 @@
-"""The parameters of a frame on the device, as opaque Dr.Jit arrays of size one.
+"""A frame on the device; its parameters are opaque Dr.Jit arrays of size one.
 
 A literal that changes between frames would be compiled into the kernel, so everything that can change is stored here.
 What determines the kernel (the kinds of surfaces, whether the lens distorts) is the `Structure`.
@@ -7,7 +7,7 @@ What determines the kernel (the kinds of surfaces, whether the lens distorts) is
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -93,12 +93,15 @@ class Structure:
 
 
 @dataclass(kw_only=True)
-class Values:
-    """The parameters of a frame on the device (see `parameters.Parameters`), and what kernels are compiled for.
+class Frame:
+    """A frame on the device: its parameters (see `parameters.Parameters`), and all that kernels read.
 
     Attributes:
         structure: what kernels are compiled for.
         boundary: the shape of the pupil's boundary.
+        lights: the lamps, with the grids of their light.
+        textures: the maps of the eye, the surroundings, and the light of other surfaces (`view.Textures`).
+        scene: what may stand in the way.
     """
 
     structure: Structure
@@ -116,11 +119,22 @@ class Values:
     globe_reach: mi.Float
     backdrop_x: mi.Float
     ambient_irradiance: mi.Float
+    lights: Lights
+    textures: Any
+    scene: mi.Scene
 
     @classmethod
     def upload(
-        cls, structure: Structure, parameters: Parameters, waves: Floats, tables: Sequence[Singles | None]
-    ) -> Values:
+        cls,
+        structure: Structure,
+        parameters: Parameters,
+        waves: Floats,
+        tables: Sequence[Singles | None],
+        *,
+        lights: Lights | None = None,
+        textures: Any = None,
+        scene: mi.Scene | None = None,
+    ) -> Frame:
         """Send the numbers to the device.
 
         Args:
@@ -128,6 +142,9 @@ class Values:
             parameters: the numbers.
             waves: the pupil's boundary.
             tables: the cells of measured surfaces.
+            lights: the lamps.
+            textures: as the attribute.
+            scene: as the attribute.
         """
         left = iter(one_by_one(packed(parameters)))
 
@@ -141,7 +158,14 @@ class Values:
             Surface(s.origin, s.axes, s.shape, s.eta, kind, None if table is None else mi.Float(aligned(table)), s.film)
             for s, (kind, _), table in zip(others.pop("surfaces"), structure.surfaces, tables, strict=True)
         )
-        return cls(structure=structure, boundary=PupilBoundary.upload(waves), surfaces=surfaces, **others)
+        boundary = PupilBoundary.upload(waves)
+        seen: dict[str, Any] = {"lights": lights, "textures": textures, "scene": scene}
+        return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, **seen)
+
+    def bare(self) -> Frame:
+        """The frame without lamps and textures, for recordings that should last when these change."""
+        without: dict[str, Any] = {"lights": None, "textures": None}
+        return replace(self, **without)
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the scene's frame to the eye frame: M^T (x - t)."""

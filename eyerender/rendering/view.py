@@ -19,7 +19,7 @@ from ..region.mapcache import kept
 from ..region.texture import sclera_texture
 from .surfaces import Bundle
 from .surround import HALF_MM
-from .values import Values
+from .values import Frame
 
 if TYPE_CHECKING:
     from .region import SkinGeometry
@@ -71,43 +71,43 @@ class View:
         """Whether the ray meets anything."""
         return self.cornea | self.sclera | self.other
 
-    def nearness(self, values: Values, d: mi.Vector3f) -> mi.Float:
+    def nearness(self, frame: Frame, d: mi.Vector3f) -> mi.Float:
         """Inverse depth (1/mm) of what camera rays along d (scene's frame) show.
 
         Behind the cornea it is the change of direction that keeps a ray on its place in the plane of the iris while the
         pinhole moves across the optical axis: by the mean of moves in two directions, because the image is astigmatic.
         """
-        forward = values.camera.forward
+        forward = frame.camera.forward
         near = dr.rcp(dr.maximum(self.distance * dr.dot(d, forward), 1e-3))
         deep = self.lit_inside & (self.opacity < 0.5)
         return dr.if_stmt(
             (mi.Vector3f(d), near),
             deep,
-            lambda d, near: dr.clip(self._nearness_inside(values, d), _DEEPEST * near, near),
+            lambda d, near: dr.clip(self._nearness_inside(frame, d), _DEEPEST * near, near),
             lambda _, near: near,
         )
 
-    def _nearness_inside(self, values: Values, d: mi.Vector3f) -> mi.Float:
+    def _nearness_inside(self, frame: Frame, d: mi.Vector3f) -> mi.Float:
         """The same of lanes that show the plane of the iris."""
-        camera, front = values.camera, values.surfaces[0]
+        camera, front = frame.camera, frame.surfaces[0]
         cosine = dr.dot(d, camera.forward)
-        turned = [values.vector_to_eye(cosine * (e - d * dr.dot(e, d))) for e in (camera.right, camera.down)]
-        moved = [values.vector_to_eye(e) for e in (camera.right, camera.down)]
+        turned = [frame.vector_to_eye(cosine * (e - d * dr.dot(e, d))) for e in (camera.right, camera.down)]
+        moved = [frame.vector_to_eye(e) for e in (camera.right, camera.down)]
         y, form = front.on_surface(self.point)
-        w, none = values.vector_to_eye(d), mi.Vector3f(0)
+        w, none = frame.vector_to_eye(d), mi.Vector3f(0)
         at = []
         for points, ways in (([self.distance * e for e in turned], turned), (moved, [none, none])):
             bundle = front.bend(Bundle(y, w, *points, *ways), form)[0]
-            for surface in values.surfaces[1:]:
+            for surface in frame.surfaces[1:]:
                 bundle = surface.refract_bundle(bundle)[0]
-            s = dr.dot(values.stop.centre - bundle.y, values.stop.normal) / dr.dot(bundle.w, values.stop.normal)
+            s = dr.dot(frame.stop.centre - bundle.y, frame.stop.normal) / dr.dot(bundle.w, frame.stop.normal)
             at.append((bundle.w, bundle.da + s * bundle.wa, bundle.db + s * bundle.wb))
         (w, a, b), (_, p, q) = at
         both = dr.dot(w, dr.cross(p, b)) + dr.dot(w, dr.cross(a, q))
         return 0.5 * both / dr.dot(w, dr.cross(a, b))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(kw_only=True)
 class Textures:
     """Maps of the eye, and the light and the surroundings of a frame.
 
@@ -148,7 +148,8 @@ class Textures:
             texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat) for rows in maps
         )
         sclera = texture(mi.TensorXf(kept(sclera_texture, look.iris_seed)[..., None]), use_accel=False)
-        return cls(iris, heights, look.iris.relief > 0 or look.iris.convexity_mm > 0, sclera)
+        raised = look.iris.relief > 0 or look.iris.convexity_mm > 0
+        return cls(iris=iris, heights=heights, raised=raised, sclera=sclera)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,27 +190,27 @@ class RegionHit:
 Hit: TypeAlias = "mi.PreliminaryIntersection3f | PlaneHit"
 
 
-def opacity(values: Values, rho: mi.Float) -> mi.Float:
+def opacity(frame: Frame, rho: mi.Float) -> mi.Float:
     """Share by which the cornea's rim has turned to sclera at radius `rho` (mm): a smooth step up to the limbus."""
-    s = dr.clip((rho - values.limbus.radius) * values.limbus.gain + 1, 0, 1)
+    s = dr.clip((rho - frame.limbus.radius) * frame.limbus.gain + 1, 0, 1)
     return s * s * (3 - 2 * s)
 
 
-def look(values: Values, textures: Textures, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> View:
+def look(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> View:
     """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris."""
-    view, hit = meet(values, scene, o, d, active)
-    return appearance(values, textures, view, hit, d)
+    view, hit = meet(frame, o, d, active)
+    return appearance(frame, view, hit, d)
 
 
-def appearance(values: Values, textures: Textures, view: View, hit: Hit, d: mi.Vector3f) -> View:
+def appearance(frame: Frame, view: View, hit: Hit, d: mi.Vector3f) -> View:
     """View of rays along which `meet` found `view` and `hit`, with the surface of what is not the eye."""
-    region, surround = textures.region, textures.surround
+    region, surround = frame.textures.region, frame.textures.surround
     if region is not None:
-        there = look_at_skin(values, region, region.face(hit), hit.prim_uv, d, view.other)
+        there = look_at_skin(frame, region, region.face(hit), hit.prim_uv, d, view.other)
     else:
         assert surround is not None
         matte = surround.surface(hit.prim_index, hit.prim_uv, view.other)
-        there = replace(_matte(values, matte.point, matte.normal, d, view.other), albedo=matte.albedo)
+        there = replace(_matte(frame, matte.point, matte.normal, d, view.other), albedo=matte.albedo)
     return replace(
         view,
         point=dr.select(view.other, there.point, view.point),
@@ -220,20 +221,18 @@ def appearance(values: Values, textures: Textures, view: View, hit: Hit, d: mi.V
     )
 
 
-def meet(
-    values: Values, scene: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True
-) -> tuple[View, Hit]:
+def meet(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True) -> tuple[View, Hit]:
     """View of the globe along rays, and the hit of Embree or OptiX, whose surface is not evaluated yet.
 
     coherent: whether neighbouring rays are alike, as those of a camera.
     """
-    alone = meet_globe(values, o, d)
+    alone = meet_globe(frame, o, d)
     hit: Hit
-    if values.structure.obstacles:
+    if frame.structure.obstacles:
         ray = _ray(alone, o, d)  # whatever is behind the eye does not matter
-        hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+        hit = frame.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
     else:
-        hit = PlaneHit.of(values.backdrop_x, o, d, alone.distance)
+        hit = PlaneHit.of(frame.backdrop_x, o, d, alone.distance)
     return behind(alone, hit, active), hit
 
 
@@ -253,13 +252,13 @@ def region_hit(skin: SkinGeometry, scene: mi.Scene, alone: View, o: mi.Vector3f,
     return RegionHit(dr.select(hit.is_valid(), hit.t, dr.inf), skin.face(hit), hit.prim_uv)
 
 
-def hidden(values: Values, scene: mi.Scene, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
+def hidden(frame: Frame, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
     """Whether anything of the scene is in front of the globe, where the rays of `meet_globe` meet it."""
     met = alone.cornea | alone.sclera
-    if not values.structure.obstacles:
-        return met & PlaneHit.of(values.backdrop_x, o, d, alone.distance).is_valid()
+    if not frame.structure.obstacles:
+        return met & PlaneHit.of(frame.backdrop_x, o, d, alone.distance).is_valid()
     return dr.if_stmt(
-        (), met, lambda: scene.ray_test(_ray(alone, o, d), coherent=True, active=True), lambda: mi.Bool(False)
+        (), met, lambda: frame.scene.ray_test(_ray(alone, o, d), coherent=True, active=True), lambda: mi.Bool(False)
     )
 
 
@@ -270,18 +269,18 @@ def _ray(alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Ray3f:
     return ray
 
 
-def meet_globe(values: Values, o: mi.Vector3f, d: mi.Vector3f) -> View:
+def meet_globe(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> View:
     """View of the globe along rays, as if it stood alone; the distance of rays that miss it has no bound."""
     # In single precision the ray must start next to the eye.
     t0 = -dr.dot(o, d) - _NEAR_MM
-    oe, de = values.point_to_eye(o + t0 * d), values.vector_to_eye(d)
-    front = values.surfaces[0]
+    oe, de = frame.point_to_eye(o + t0 * d), frame.vector_to_eye(d)
+    front = frame.surfaces[0]
     ol, dl = front.point_in(oe), front.vector_in(de)
     tc, on_cornea, facing = front.meet(ol, dl)
     yl = ol + tc * dl
     rho = dr.sqrt(yl.y * yl.y + yl.z * yl.z)
-    on_cornea &= (rho < values.limbus.radius) & (yl.x > values.limbus.floor)
-    ts, on_sclera = meet_sphere(oe - values.sclera.centre, de, values.sclera.radius)
+    on_cornea &= (rho < frame.limbus.radius) & (yl.x > frame.limbus.floor)
+    ts, on_sclera = meet_sphere(oe - frame.sclera.centre, de, frame.sclera.radius)
     # The sphere's front is behind the cornea, so a ray that meets the sphere first has met no clear cornea. This avoids
     # cracks, even where the rim of a tilted or toric cornea is no circle of the sphere.
     on_cornea &= ~on_sclera | (tc < ts)
@@ -292,7 +291,7 @@ def meet_globe(values: Values, o: mi.Vector3f, d: mi.Vector3f) -> View:
     normal, mirrored, passed, inner, slant, pupil = dr.if_stmt(
         (facing, oe + tc * de, dl),
         on_cornea,
-        lambda facing, y, dl: _refracted(values, facing, y, dl),
+        lambda facing, y, dl: _refracted(frame, facing, y, dl),
         lambda *_: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Vector3f(0), mi.Bool(False)),
     )
     xs = oe + ts * de
@@ -302,8 +301,8 @@ def meet_globe(values: Values, o: mi.Vector3f, d: mi.Vector3f) -> View:
         other=mi.Bool(False),
         distance=dr.select(on_cornea | on_sclera, t_eye, _FAR),
         point=dr.select(on_cornea, oe + tc * de, xs),
-        normal=dr.normalize(dr.select(on_cornea, normal, xs - values.sclera.centre)),
-        opacity=dr.select(on_cornea, opacity(values, rho), 1),
+        normal=dr.normalize(dr.select(on_cornea, normal, xs - frame.sclera.centre)),
+        opacity=dr.select(on_cornea, opacity(frame, rho), 1),
         mirrored=mirrored,
         passed=passed,
         inner=inner,
@@ -316,16 +315,16 @@ def meet_globe(values: Values, o: mi.Vector3f, d: mi.Vector3f) -> View:
 
 
 def look_at_skin(
-    values: Values, region: SkinGeometry, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, other: mi.Bool
+    frame: Frame, region: SkinGeometry, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, other: mi.Bool
 ) -> View:
     """View of rays that meet places on triangles of an eye region, where `other`."""
     skin = region.surface(face, uv, other)
-    view = _matte(values, skin.point, skin.normal, d, other)
-    level = _facing(values, skin.smooth, d) if values.structure.scattering else None
+    view = _matte(frame, skin.point, skin.normal, d, other)
+    level = _facing(frame, skin.smooth, d) if frame.structure.scattering else None
     return replace(view, albedo=skin.albedo, gloss=skin.gloss, received=skin.received, level=level)
 
 
-def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector3f, other: mi.Bool) -> View:
+def _matte(frame: Frame, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector3f, other: mi.Bool) -> View:
     """View of matte points of the scene; normals are turned to the viewer."""
     no, nothing = mi.Bool(False), mi.Float(0)
     return View(
@@ -333,8 +332,8 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
         sclera=no,
         other=other,
         distance=nothing,
-        point=values.point_to_eye(point),
-        normal=_facing(values, facing, d),
+        point=frame.point_to_eye(point),
+        normal=_facing(frame, facing, d),
         opacity=mi.Float(1),
         mirrored=nothing,
         passed=nothing,
@@ -347,14 +346,14 @@ def _matte(values: Values, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector
     )
 
 
-def _facing(values: Values, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
+def _facing(frame: Frame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
     """Normals (eye frame) turned to the viewer; normals and rays are given in the scene's frame."""
-    normal = values.vector_to_eye(normal)
-    return dr.normalize(dr.select(dr.dot(normal, values.vector_to_eye(d)) > 0, -normal, normal))
+    normal = frame.vector_to_eye(normal)
+    return dr.normalize(dr.select(dr.dot(normal, frame.vector_to_eye(d)) > 0, -normal, normal))
 
 
 def _refracted(
-    values: Values, N: mi.Vector3f, y: mi.Vector3f, dl: mi.Vector3f
+    frame: Frame, N: mi.Vector3f, y: mi.Vector3f, dl: mi.Vector3f
 ) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Vector3f, mi.Vector3f, mi.Bool]:
     """From the front cornea to the plane of the iris.
 
@@ -362,7 +361,7 @@ def _refracted(
 
     N, dl: normal and direction in the front surface's frame; y: the point in the eye frame.
     """
-    front = values.surfaces[0]
+    front = frame.surfaces[0]
     c = -dr.dot(N, dl)
     c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
     mirrored = front.mirrored(c, c2)
@@ -370,40 +369,40 @@ def _refracted(
     w = front.vector_out(front.eta * dl + (front.eta * c - c2) * N)
     inside = mi.Vector3f(y)
     reached = mi.Bool(True)
-    for surface in values.surfaces[1:]:
+    for surface in frame.surfaces[1:]:
         inside, w, share, ok = surface.refract(inside, w)
         passed *= share
         reached &= ok
-    n = values.stop.normal
+    n = frame.stop.normal
     down = dr.dot(w, n)
-    s = dr.dot(values.stop.centre - inside, n) / down
-    inner = dr.select(s > 0, inside + s * w, _beyond_root(values, inside))
-    pu, pv = stop_coordinates(values, inner)
-    margin = values.boundary.radius(pu, pv)
+    s = dr.dot(frame.stop.centre - inside, n) / down
+    inner = dr.select(s > 0, inside + s * w, _beyond_root(frame, inside))
+    pu, pv = stop_coordinates(frame, inner)
+    margin = frame.boundary.radius(pu, pv)
     pupil = reached & (pu * pu + pv * pv < margin * margin)
     # A ray that finds no way may have no place at all, and nothing may be computed from that.
-    inner = dr.select(reached, inner, values.stop.centre)
+    inner = dr.select(reached, inner, frame.stop.centre)
     slant = dr.select(reached & (down < -0.05), w / down - n, 0)
     return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, slant, pupil
 
 
-def _beyond_root(values: Values, x: mi.Vector3f) -> mi.Vector3f:
+def _beyond_root(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
     """Places in the plane of the iris, just beyond its root, that stand for points behind the plane.
 
     Where a shallow chamber's cornea ends behind the plane, a real iris bends back to its root. It is lit there about as
     at the end of the flat one.
     """
-    n, centre = values.stop.normal, values.stop.centre
-    scale = (values.iris.root_radius + EPSILON_MM) * dr.rsqrt(dr.maximum(x.y * x.y + x.z * x.z, 1e-12))
+    n, centre = frame.stop.normal, frame.stop.centre
+    scale = (frame.iris.root_radius + EPSILON_MM) * dr.rsqrt(dr.maximum(x.y * x.y + x.z * x.z, 1e-12))
     y, z = x.y * scale, x.z * scale
     return mi.Vector3f(centre.x - (n.y * (y - centre.y) + n.z * (z - centre.z)) / n.x, y, z)
 
 
-def stop_coordinates(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+def stop_coordinates(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     """Coordinates of points of the stop's plane along its semi-axes, in units of these."""
-    q = x - values.stop.centre
-    a, b = values.stop.axes
-    return dr.dot(q, values.stop.u) / a, dr.dot(q, values.stop.v) / b
+    q = x - frame.stop.centre
+    a, b = frame.stop.axes
+    return dr.dot(q, frame.stop.u) / a, dr.dot(q, frame.stop.v) / b
 
 
 def meet_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Bool]:
@@ -414,12 +413,12 @@ def meet_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Fl
     return c / q, (disc > 0) & (q > 0) & (c > 0)
 
 
-def _iris_place(values: Values, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+def _iris_place(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
     """Place of points of the iris' plane: share of the way from margin to root, turn, distance to the root, width."""
-    pu, pv = stop_coordinates(values, x)
-    a, b = values.stop.axes
-    beyond = (dr.sqrt(pu * pu + pv * pv) - values.boundary.radius(pu, pv)) * dr.sqrt(a * b)
-    left = values.iris.root_radius - dr.sqrt(x.y * x.y + x.z * x.z)
+    pu, pv = stop_coordinates(frame, x)
+    a, b = frame.stop.axes
+    beyond = (dr.sqrt(pu * pu + pv * pv) - frame.boundary.radius(pu, pv)) * dr.sqrt(a * b)
+    left = frame.iris.root_radius - dr.sqrt(x.y * x.y + x.z * x.z)
     width = dr.maximum(beyond + dr.maximum(left, 0), 1e-4)
     return dr.clip(beyond / width, 0, 1), dr.atan2(pv, pu) / (2 * dr.pi), left, width
 
@@ -429,51 +428,51 @@ def _on_iris(texture: mi.Texture2f, s: mi.Float, turn: mi.Float) -> mi.Float:
     return texture.eval(mi.Point2f(turn, (1 + s * (rows - 2)) / rows))[0]
 
 
-def iris_height(values: Values, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float:
+def iris_height(frame: Frame, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float:
     """Height (mm) of the iris above points of its plane, 0 in the pupil and beyond the root, by the map of its heights.
 
     The pattern stretches with the iris. A narrow iris is as steep as a wide one, so its heights are less.
     """
-    s, turn, left, width = _iris_place(values, x)
-    bulge = values.iris.convexity * dr.minimum(width / WIDTH_MM, 1) * 4 * s * (1 - s)
-    pattern = values.iris.relief * dr.minimum(width / _WIDE_MM, 1) * _on_iris(heights, s, turn)
+    s, turn, left, width = _iris_place(frame, x)
+    bulge = frame.iris.convexity * dr.minimum(width / WIDTH_MM, 1) * 4 * s * (1 - s)
+    pattern = frame.iris.relief * dr.minimum(width / _WIDE_MM, 1) * _on_iris(heights, s, turn)
     return dr.select((s > 0) & (left > 0), bulge + pattern, 0)
 
 
-def iris_albedo(values: Values, textures: Textures, x: mi.Vector3f) -> mi.Float:
+def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
     """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
-    s, turn, left, _ = _iris_place(values, x)
-    texture = _on_iris(textures.iris, s, turn)
-    albedo = values.iris.albedo * dr.maximum(1 + values.iris.contrast * (texture - 1), 0.02)
+    s, turn, left, _ = _iris_place(frame, x)
+    texture = _on_iris(frame.textures.iris, s, turn)
+    albedo = frame.iris.albedo * dr.maximum(1 + frame.iris.contrast * (texture - 1), 0.02)
     edge = dr.clip((s - _RING[0]) / (_RING[1] - _RING[0]), 0, 1)
-    albedo *= 1 - values.iris.ring * edge * edge * (3 - 2 * edge)
-    return dr.select(left > 0, albedo, values.limbus.albedo)
+    albedo *= 1 - frame.iris.ring * edge * edge * (3 - 2 * edge)
+    return dr.select(left > 0, albedo, frame.limbus.albedo)
 
 
-def outer_albedo(values: Values, textures: Textures, view: View) -> mi.Float:
+def outer_albedo(frame: Frame, view: View) -> mi.Float:
     """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
     return dr.if_stmt(
         (view.point, view.albedo),
         view.other,
         lambda point, other: other,
-        lambda point, other: _sclera_albedo(values, textures, point),
+        lambda point, other: _sclera_albedo(frame, point),
     )
 
 
-def globe_map(values: Values, point: mi.Vector3f) -> mi.Point2f:
+def globe_map(frame: Frame, point: mi.Vector3f) -> mi.Point2f:
     """Place in [0, 1]^2 of points of the globe (eye frame) in the azimuthal equidistant map of its front."""
-    r = point - values.sclera.centre
+    r = point - frame.sclera.centre
     polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / GLOBE_EDGE
     inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
     return mi.Point2f(0.5 + 0.5 * polar * r.y * inv, 0.5 + 0.5 * polar * r.z * inv)
 
 
-def _sclera_albedo(values: Values, textures: Textures, point: mi.Vector3f) -> mi.Float:
-    texture = textures.sclera.eval(globe_map(values, point))[0]
-    sclera = values.sclera.albedo * dr.maximum(1 + values.sclera.contrast * (texture - 1), 0.02)
+def _sclera_albedo(frame: Frame, point: mi.Vector3f) -> mi.Float:
+    texture = frame.textures.sclera.eval(globe_map(frame, point))[0]
+    sclera = frame.sclera.albedo * dr.maximum(1 + frame.sclera.contrast * (texture - 1), 0.02)
     # The grey ring of the limbus fades into the white over its width, on the side of the sclera.
-    local = values.surfaces[0].point_in(point)
-    away = dr.sqrt(local.y * local.y + local.z * local.z) - values.limbus.radius
-    s = dr.clip(0.5 + 0.5 * away * values.limbus.gain, 0, 1)
+    local = frame.surfaces[0].point_in(point)
+    away = dr.sqrt(local.y * local.y + local.z * local.z) - frame.limbus.radius
+    s = dr.clip(0.5 + 0.5 * away * frame.limbus.gain, 0, 1)
     s = s * s * (3 - 2 * s)
-    return values.limbus.albedo + s * (sclera - values.limbus.albedo)
+    return frame.limbus.albedo + s * (sclera - frame.limbus.albedo)

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..optics.media import TEARS
-from .values import Values
-from .view import Textures, View, look_at_skin, meet_globe
+from .values import Frame
+from .view import View, look_at_skin, meet_globe
 
 if TYPE_CHECKING:
     from .region import SkinGeometry
@@ -36,18 +36,18 @@ def wetted(
     return film, film.is_valid()
 
 
-def on_water(values: Values, textures: Textures, view: View, o: mi.Vector3f, d: mi.Vector3f) -> View:
+def on_water(frame: Frame, view: View, o: mi.Vector3f, d: mi.Vector3f) -> View:
     """The view of camera rays where menisci are in front of it, else `view` itself."""
-    region = textures.region
+    region = frame.textures.region
     if region is None or region.water is None:
         return view
     film, wet = wetted(region.water, o, d, view.distance)
-    water = look_at_skin(values, region, region.on_water(film), film.prim_uv, d, wet)
+    water = look_at_skin(frame, region, region.on_water(film), film.prim_uv, d, wet)
     return View(*(dr.select(wet, a, b) for a, b in zip(parts_of(water), parts_of(view), strict=True)))
 
 
 def through_water(
-    values: Values,
+    frame: Frame,
     skin: SkinGeometry,
     film: mi.PreliminaryIntersection3f,
     wet: mi.Bool,
@@ -62,16 +62,16 @@ def through_water(
         view = View(*parts)
         x = o + film.t * d
         surface = skin.surface(skin.on_water(film), film.prim_uv, wet)
-        below = values.vector_to_scene(view.normal)
+        below = frame.vector_to_scene(view.normal)
         inside, enters = _refracted(d, surface.normal, 1 / _INDEX)
         cosine = dr.maximum(-dr.dot(inside, below), _LEAST)
-        deep = dr.dot(x - values.point_to_scene(view.point), below)
+        deep = dr.dot(x - frame.point_to_scene(view.point), below)
         outside, leaves = _refracted(inside, below, _INDEX)
         way = dr.select(enters & leaves, outside, d)
-        seen = meet_globe(values, x + (deep / cosine) * inside, way)
+        seen = meet_globe(frame, x + (deep / cosine) * inside, way)
         found = enters & leaves & (seen.cornea | seen.sclera)
         # Below the water nothing mirrors the lamps. The distance is that at which the depth is the one without water.
-        forward = values.camera.forward
+        forward = frame.camera.forward
         dry, distance = mi.Float(0), view.distance * (dr.dot(d, forward) / dr.dot(way, forward))
         seen = replace(seen, distance=distance)
         seen, view = (replace(v, gloss=dry, mirrored=dry) for v in (seen, view))

@@ -17,7 +17,7 @@ def test_the_grids_change_no_pixel(renderer, monkeypatch, model, name, pose):
     eye, rig = rigs.eye_of(model), rigs.RIGS[name](radius_mm=0.0)
     job = rigs.job_of(eye, rig, rig.window(240, 180), pose, labels=False)
     found, part = renderer.radiance(job, spp=4), renderer.labels(job).part
-    grids = renderer.bind(job)[0].lights.on_matte
+    grids = renderer.bind(job)[0].frame.lights.on_matte
     used = [float(np.mean(grid.left.numpy() == 0)) for grid in (grids.globe, grids.plane)]
     assert min(used) > 0.2
     monkeypatch.setattr(stage, "matte_light", lambda *_: None)

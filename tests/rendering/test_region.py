@@ -185,9 +185,9 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
     assert 0.3 < plain.mean() < 0.95
     u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, width * height))
     for du, dv in ((-0.45, -0.45), (0.45, -0.1), (0.0, 0.45)):
-        o, d, _ = camera_ray(shown.values, mi.Float(u) + du, mi.Float(v) + dv)
-        _, hit = meet(shown.values, shown.scene, o, d, True)
-        on_sheet = hit.is_valid() & shown.textures.region.on_sheet(shown.textures.region.face(hit))
+        o, d, _ = camera_ray(shown.frame, mi.Float(u) + du, mi.Float(v) + dv)
+        _, hit = meet(shown.frame, o, d, True)
+        on_sheet = hit.is_valid() & shown.frame.textures.region.on_sheet(shown.frame.textures.region.face(hit))
         # A ray in a million or so slips between two triangles: Embree's test is not watertight.
         assert np.count_nonzero(~on_sheet.numpy().astype(bool)[plain]) <= 3
     quick = renderer.radiance(job)
@@ -273,8 +273,8 @@ def test_fine_pixels_are_those_that_hairs_touch(renderer):
     hairs = np.zeros(height * width, dtype=bool)
     for k in range(36):
         right, down = (k % 6 + 0.5) / 6 - 0.5, (k // 6 + 0.5) / 6 - 0.5
-        o, d, _ = camera_ray(shown.values, *(mi.Float(x.astype(np.float32)) for x in (column + right, row + down)))
-        hit = shown.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=True)
+        o, d, _ = camera_ray(shown.frame, *(mi.Float(x.astype(np.float32)) for x in (column + right, row + down)))
+        hit = shown.frame.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=True)
         hairs |= (hit.is_valid() & ~place.skin.on_sheet(place.skin.face(hit))).numpy()
     hairs = hairs.reshape(fine.shape)
     assert 0.02 < hairs.mean() < 0.2

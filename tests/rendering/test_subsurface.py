@@ -49,7 +49,7 @@ def grids(renderer, bound):
     globe = light.GlobeGrid.of(GlobeCells.of(place.posed, bound.globe, 8.0))
     n = light._globe_direction(*(mi.Float(k) for k in np.divmod(np.arange(SIDE**2), SIDE)))
     on_globe = float(bound.eye.sclera.radius_mm) * n.numpy().T
-    return sheet, on_sheet.reshape(sheet.rows, sheet.columns, 3), globe, on_globe, shown.values.sclera.radius
+    return sheet, on_sheet.reshape(sheet.rows, sheet.columns, 3), globe, on_globe, shown.frame.sclera.radius
 
 
 def spread(grid, lit, length_mm, *radius):
@@ -142,10 +142,10 @@ def test_shut_lids_transmit_light(renderer):
 
     shut = job("remote", region=BARE.model_copy(update={"blink": 1.0}))
     shown, place = renderer.bind(shut)
-    assert shown.textures.tissues is not None
+    assert shown.frame.textures.tissues is not None
     upper = place.posed.upper_margin
     up = upper[np.argmin(np.abs(upper[:, 1]))]  # where the lids meet before the eye
-    inside = float(shown.textures.tissues.on_globe(shown.values, mi.Vector3f(*(float(v) for v in up))).numpy()[0])
+    inside = float(shown.frame.textures.tissues.on_globe(shown.frame, mi.Vector3f(*(float(v) for v in up))).numpy()[0])
     lamp = shut.lights[0]
     way = lamp.position_mm - up
     outside = lamp.intensity_mw_sr / float(way @ way)  # more than what falls on the slope of the lid

@@ -213,9 +213,9 @@ def rings(renderer: Any, job: RenderJob) -> dict[str, Any]:
     v, u = (k.ravel() for k in np.mgrid[y0 : y0 + h, x0 : x0 + w])
     kinds = []
     for du, dv in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
-        o, d, _ = camera_ray(shown.values, mi.Float(u + du), mi.Float(v + dv))
-        view, hit = meet(shown.values, shown.scene, mi.Vector3f(o + dr.zeros(mi.Float, len(u))), d, mi.Bool(True))
-        region = shown.textures.region
+        o, d, _ = camera_ray(shown.frame, mi.Float(u + du), mi.Float(v + dv))
+        view, hit = meet(shown.frame, mi.Vector3f(o + dr.zeros(mi.Float, len(u))), d, mi.Bool(True))
+        region = shown.frame.textures.region
         sheet = view.other if region is None else view.other & region.on_sheet(region.face(hit))
         cornea, pupil, sclera, other = (np.array(k, dtype=bool) for k in (view.cornea, view.pupil, view.sclera, sheet))
         ring = 1 + np.digitize(
