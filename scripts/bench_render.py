@@ -110,7 +110,7 @@ class Bench:
         black = rigs.BLACK.model_copy(update={"iris_albedo": 0.5, "iris_contrast": 0.0})
         rig = rigs.LampRig(camera, tuple(lights))
         job = rigs.job_of(eye, rig, (0, 0, n, n), look=black)
-        shown, surround = self.renderer.bind(job)
+        shown, _ = self.renderer.bind(job)
         values = shown.frame
         u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, n * n))
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
