@@ -3,7 +3,7 @@
 The index of that code is a pickle, so it is kept only in a private folder (`cachefolder`).
 
 Numba compiles a function again when its own file changed, but not when another file did from which it calls a
-function. So the machine code is kept in a folder of a name that depends on all files of compiled functions. When such
+function. So the machine code is kept in a folder of a name that depends on all files with compiled functions. When such
 a folder is made, those of other versions that nothing has used for thirty days are removed.
 """
 
@@ -13,20 +13,24 @@ import hashlib
 import os
 import re
 import shutil
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from numba import njit
+import numba
 from numba.core import config as numba_config
+from numba.core import event as numba_event
 
 from .cachefolder import cache_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _DIGITS, _UNUSED_S = 16, 30 * 86400.0
 config: Any = numba_config  # it makes its attributes at run time
+event: Any = numba_event
+njit: Any = numba.njit  # its types lack some options
 
 
 def _folder() -> Path | None:
@@ -34,7 +38,8 @@ def _folder() -> Path | None:
     cache = cache_folder()
     if cache is None or not os.access(cache, os.W_OK):
         return None
-    sources = sorted(Path(__file__).parent.glob("*/*kernels.py"))
+    package = Path(__file__).parent
+    sources = sorted([*package.glob("extraction/**/*.py"), *package.glob("*/*kernels.py")])
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:_DIGITS]
     return cache / "kernels" / digest
 
@@ -53,29 +58,59 @@ def used(folder: Path) -> Path:
 
 
 FOLDER = None if (_place := _folder()) is None else str(used(_place))
+FUNCTIONS: list[Any] = []  # what `compiled` made: numba's dispatchers
+# Helpers are called by compiled functions only.
+HELPER: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+ABOUT_S = 40  # time that compilation takes, as people are told
+
+
+class _Announcement(numba_event.Listener):
+    """Says once, on stderr, that the extractor is being compiled."""
+
+    def __init__(self) -> None:
+        self.said = FOLDER is not None and any(Path(FOLDER).glob("pupil_*"))
+
+    def on_start(self, event: Any) -> None:
+        """Speak at the first compilation, where no earlier process kept anything."""
+        if not self.said and event.data["dispatcher"].py_func.__module__.startswith("eyerender.extraction"):
+            self.said = True
+            print(f"compiling the extractor (once per machine), about {ABOUT_S} s ...", file=sys.stderr)
+
+    def on_end(self, event: object) -> None:
+        """Do nothing."""
+
+
+event.register("numba:compile", _Announcement())
 
 
 def compiled(function: Function) -> Function:
     """Compile at the first call; the machine code is kept on disk if a private folder there can be written."""
+    made = _dispatcher(function)
+    FUNCTIONS.append(made)
+    return cast(Function, made)
+
+
+def _dispatcher(function: Callable[..., Any]) -> Any:
+    """Make what compiles a function at its first call."""
     if FOLDER is not None:
         before = config.CACHE_DIR
         config.CACHE_DIR = FOLDER
         try:
-            kept = njit(cache=True, nogil=True, error_model="numpy")(function)
+            kept = njit(cache=True, no_cfunc_wrapper=True, nogil=True, error_model="numpy")(function)
             if str(kept.stats.cache_path).startswith(FOLDER):  # else numba chose a folder that nobody checked
-                return cast(Function, kept)
+                return kept
         except (RuntimeError, OSError):  # numba found no folder to write to
             pass
         finally:
             config.CACHE_DIR = before
-    return cast(Function, njit(nogil=True, error_model="numpy")(function))
+    return njit(nogil=True, error_model="numpy")(function)
 
 
 def summing(function: Function) -> Function:
     """Compile a helper whose sums may be taken in any order, so that they use vector instructions."""
-    return cast(Function, njit(error_model="numpy", fastmath={"reassoc", "contract"})(function))
+    return cast(Function, njit(fastmath={"reassoc", "contract"}, **HELPER)(function))
 
 
 def inlined(function: Function) -> Function:
     """Compile a helper as part of what calls it."""
-    return cast(Function, njit(inline="never", error_model="numpy")(function))
+    return cast(Function, njit(**HELPER)(function))

@@ -155,7 +155,13 @@ set_up() {
     for stamp in $stamps; do printf '%s\n' "$now" >"$venv/.stamp-$stamp"; done
     trap - INT TERM HUP
     exec 8>&- 9>&-
+    set_up_extractor
     say "environment ready after $(($(date +%s) - began)) s"
+}
+
+# Compiles the extractor, once per version of it. Without it the first extraction does so.
+set_up_extractor() {
+    "$venv/bin/python" -m eyerender.extraction.compile || :
 }
 
 # Tries once whether rendering works here, and fetches the library that a bare Debian lacks for it. All but rendering works

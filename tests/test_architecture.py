@@ -209,7 +209,7 @@ def test_a_type_alias_is_defined_once():
 
 
 def test_import_is_light():
-    heavy = ("mitsuba", "drjit", "cv2", "skimage", "matplotlib", "torch", "pyarrow")
+    heavy = ("mitsuba", "drjit", "cv2", "skimage", "matplotlib", "torch", "pyarrow", "numba")
     uses = {"None": heavy, "eyerender.gaze": (*heavy, "scipy", "pydantic"), "eyerender.gaze.Regression": heavy}
     # Every worker of a run pays for what the renderer imports.
     renderer = (
@@ -220,6 +220,20 @@ def test_import_is_light():
         code = f"import sys, eyerender; {use}; print([m for m in {banned} if m in sys.modules])"
         out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert out.stdout.strip() == "[]"
+
+
+def test_features_need_no_extractor(tmp_path):
+    """What `eyerender features` runs is compiled nowhere: it must not wait for OpenCV and numba."""
+    code = f"""import sys
+from eyerender.cli.main import main
+try:
+    main(["features", "headset", "--json", {str(tmp_path / "out.json")!r}])
+except SystemExit as end:
+    assert not end.code
+assert not [m for m in ("numba", "cv2", "mitsuba") if m in sys.modules]
+"""
+    subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (tmp_path / "out.json").stat().st_size > 0
 
 
 @pytest.mark.parametrize("package", [eyerender, eyerender.gaze], ids=lambda package: package.__name__)

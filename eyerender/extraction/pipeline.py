@@ -24,7 +24,7 @@ from .glints.windows import window_radius
 from .preprocessing import DN, Part, Prepared, invert, prepare
 from .pupil.consensus import median_off
 from .pupil.covariance import boundary_deviation
-from .pupil.edge_model import SECTORS, EdgeModel
+from .pupil.edge_model import EdgeModel
 from .pupil.glare import NO_PATCH, levels_beside
 from .pupil.refinement import LID, PixelFit, refine
 from .pupil.scoring import pupil_of
@@ -149,7 +149,7 @@ def _deviation(pupil: PupilResult) -> float:
 def _iris_level(prepared: Prepared, found: Found, model: EdgeModel) -> float:
     """Level just outside the seen parts of the boundary, in the image as it is."""
     away = 1.5 * model.sigma_px + 1.0
-    levels = levels_beside(model.ellipse.numbers(), away, SECTORS, prepared.linear, (0, 0), NO_PATCH)
+    levels = levels_beside(model.ellipse.numbers(), away, prepared.linear, (0, 0), NO_PATCH)
     return median(levels[found.sectors])
 
 

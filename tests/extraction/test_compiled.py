@@ -1,28 +1,59 @@
-"""The compiled functions against their NumPy twins, on what extraction calls them with."""
+"""The extractor's compiled functions against NumPy versions of them, on what extraction calls them with."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import time
 
 import numpy as np
-import pytest
 
 import make_ideal_images as ideal
-from eyerender.extraction import compiled, extract
-from eyerender.extraction.compiled import TWINS, kernel
+from eyerender.extraction import extract, preprocessing
+from eyerender.extraction.compile import compile_all, functions
+from eyerender.extraction.glints import detection, gaussian_model, prescreening, subtraction
+from eyerender.extraction.pupil import (
+    candidates,
+    consensus,
+    covariance,
+    edge_model,
+    edges,
+    least_squares,
+    occlusion,
+    outline,
+    refinement,
+    search,
+)
+from eyerender.jit import used
+from tests.support import extraction_oracles as oracles
 
 CONDITIONS = ("eight-glints", "lid", "jpeg")
-
-
-@pytest.fixture
-def without(monkeypatch):
-    """Extraction without compiled functions."""
-    monkeypatch.setenv("EYERENDER_COMPILED", "0")
-    kernel.cache_clear()
-    yield
-    kernel.cache_clear()
+COMPARED = [
+    (preprocessing, "_differences"),
+    (candidates, "_ring_levels"),
+    (candidates, "_levels_about"),
+    (candidates, "_interior"),
+    (edges, "_ridges"),
+    (edges, "_at_the_iris"),
+    (consensus, "direct_fits"),
+    (consensus, "_support"),
+    (consensus, "_settled"),
+    (covariance, "_edge_sums"),
+    (covariance, "_along_outline"),
+    (search, "_overlap"),
+    (outline, "_along"),
+    (edge_model, "_levels"),
+    (least_squares, "_pixel_sums"),
+    (refinement, "_band"),
+    (occlusion, "_visible"),
+    (detection, "_maxima"),
+    (detection, "_widths"),
+    (detection, "_compact"),
+    (detection, "_parted"),
+    (detection, "_above_ring"),
+    (prescreening, "_bells"),
+    (gaussian_model, "_spot_rows"),
+    (subtraction, "_subtracted"),
+]
 
 
 def images():
@@ -44,48 +75,43 @@ def same(ours, theirs, name):
         assert (ours == theirs).mean() > 0.999, name
         return
     scale = float(np.nanmax(np.abs(theirs), initial=1e-3))
-    single = ("settled", "ring_levels", "ridges")  # single precision in one of the two
+    single = ("_settled", "_ring_levels", "_ridges", "_above_ring")  # single precision in one of the two
     # Of an ellipse through nearly straight points only some six digits are determined.
     limit = 1e-4 if name in single else 1e-5 if name == "direct_fits" else 1e-8
     np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=limit * scale, err_msg=name)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra `fast`")
-def test_every_compiled_function_gives_what_its_twin_gives(monkeypatch):
-    called = dict.fromkeys(TWINS, 0)
+def test_compiled_functions_give_what_numpy_gives(monkeypatch):
+    compile_all()  # before names are replaced, by which compiled functions know each other
+    called = {name: 0 for _, name in COMPARED}
 
-    def compared(name):
-        function = kernel(name)
-
+    def compared(function, name):
         def both(*args):
             called[name] += 1
             result = function(*args)
-            same(result, TWINS[name](*args), name)
+            same(result, getattr(oracles, name)(*args), name)
             return result
 
         return both
 
-    monkeypatch.setattr(compiled, "kernel", compared)
+    for module, name in COMPARED:
+        monkeypatch.setattr(module, name, compared(getattr(module, name), name))
     for image, depth in images():
         assert extract(image, bit_depth=depth).pupil.ok
     assert min(called.values()) > 0, called
 
 
-def test_extraction_is_the_same_with_and_without(without, monkeypatch):
-    results = [extract(image, bit_depth=depth).pupil for image, depth in images()]
-    monkeypatch.setenv("EYERENDER_COMPILED", "1")
-    kernel.cache_clear()
-    for (image, depth), pupil in zip(images(), results, strict=True):
-        other = extract(image, bit_depth=depth).pupil
-        np.testing.assert_allclose(other.ellipse.centre_px, pupil.ellipse.centre_px, atol=1e-4)
-        np.testing.assert_allclose(other.ellipse.semi_axes_px, pupil.ellipse.semi_axes_px, atol=1e-4)
-        assert other.confidence == pytest.approx(pupil.confidence, abs=1e-4)
+def test_everything_is_compiled_beforehand():
+    """Extraction must compile nothing more, neither another function nor one for other types."""
+    compile_all()
+    before = {one.__name__: len(one.signatures) for one in functions()}
+    assert min(before.values()) > 0, before
+    for image, depth in images():
+        extract(image, bit_depth=depth)
+    assert {one.__name__: len(one.signatures) for one in functions()} == before
 
 
-@pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra `fast`")
 def test_machine_code_of_other_versions_is_removed_once_it_is_old(tmp_path):
-    from eyerender.jit import used
-
     new, old, recent, other = (tmp_path / name for name in ("0" * 16, "a" * 16, "b" * 16, "mine"))
     month_ago = time.time() - 31 * 86400
     for folder in (old, recent, other):

@@ -10,9 +10,10 @@ from scipy import integrate, ndimage, optimize, special
 import make_ideal_images as ideal
 from eyerender.extraction import extract
 from eyerender.extraction.pupil.covariance import to_axes
-from eyerender.extraction.pupil.edge_model import EdgeModel, Place, Profile
-from eyerender.extraction.pupil.least_squares import FIXED, jacobian, moved
+from eyerender.extraction.pupil.edge_model import EdgeModel
+from eyerender.extraction.pupil.least_squares import FIXED
 from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct
+from tests.support.extraction_oracles import Place, Profile, jacobian, moved
 
 
 def test_blurred_edge_of_a_disc():

@@ -12,6 +12,7 @@ from eyerender.extraction.glints import deblending, fits, fitting, gaussian_mode
 from eyerender.extraction.glints.classification import compared
 from eyerender.extraction.preprocessing import DN
 from eyerender.status import Status
+from tests.support.extraction_oracles import pixel_profile
 
 SEEDS = range(20_000, 20_008)
 
@@ -158,18 +159,16 @@ def test_spots_light_in_each_others_windows():
     pixels = windows.cut(np.zeros((60, 60), np.float32), lambda x, y: np.zeros(x.shape), start, width, 255.0)
     theta = np.zeros((3, 8))
     theta[:, :2], theta[:, 2], theta[:, 3:5] = start, np.log([90.0, 70.0, 50.0]), np.log(width)[:, None]
-    others = windows.Others.of(pixels, theta, ~np.eye(3, dtype=bool), 1.0)
-    light = others.light(theta, pixels.data.size)
+    pairs = windows.shining_pairs(pixels, theta, ~np.eye(3, dtype=bool), 1.0)
+    light = windows.light_of_others(pixels.windows, theta, pairs, pixels.data.size)
     x, y = (pixels.centre[pixels.spot] + np.stack([pixels.dx, pixels.dy], axis=-1)).T
     for i, j in ((0, 1), (1, 0)):
         own = pixels.spot == i
-        gx, gy = (fits.profile(at[own], c, width[j]) for at, c in zip((x, y), start[j], strict=True))
+        gx, gy = (pixel_profile(at[own], c, width[j]) for at, c in zip((x, y), start[j], strict=True))
         np.testing.assert_allclose(light[own], np.exp(theta[j, 2]) * gx * gy, atol=1e-9)
     assert light[pixels.spot != 2].max() > 1.0
     assert not light[pixels.spot == 2].any()
-    shining = np.array([True, False, True])
-    assert not others.light(theta, pixels.data.size, shining)[pixels.spot == 0].any()
-    assert windows.Others.of(pixels, theta, np.zeros((3, 3), dtype=bool), 1.0) is None
+    assert windows.shining_pairs(pixels, theta, np.zeros((3, 3), dtype=bool), 1.0).shape == (0, 2)
 
 
 def _drawn(theta: np.ndarray, noise: float, clip: float, shape: tuple[int, int] = (60, 60)) -> np.ndarray:
@@ -177,7 +176,7 @@ def _drawn(theta: np.ndarray, noise: float, clip: float, shape: tuple[int, int] 
     y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
     image = np.full(shape, 20.0) + np.random.default_rng(3).normal(0.0, noise, shape)
     for cx, cy, height, sx, sy in theta:
-        image += height * fits.profile(x, cx, sx) * fits.profile(y, cy, sy)
+        image += height * pixel_profile(x, cx, sx) * pixel_profile(y, cy, sy)
     return np.minimum(image, clip).astype(np.float32)
 
 

@@ -17,7 +17,7 @@ from eyerender.extraction.pupil.covariance import (
     reshaped,
     towards_round,
 )
-from eyerender.extraction.pupil.edge_model import SECTORS, Place
+from eyerender.extraction.pupil.places import SECTORS, Place
 from eyerender.geometry.ellipse import Ellipse, iou
 
 SEEDS = range(20_000, 20_006)

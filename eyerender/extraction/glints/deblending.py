@@ -15,7 +15,7 @@ from ...arrays import Bools, Floats
 from ..preprocessing import DN, Image
 from .fits import SpotFit, joined
 from .fitting import UNEXPLAINED, FittedSpots, fit_spots, report
-from .gaussian_model import STEPS, Limits, descend, slopes
+from .gaussian_model import ALONE, STEPS, Limits, descend, slopes
 from .windows import window_radius
 
 Background = Callable[[Floats, Floats], Floats]
@@ -64,7 +64,7 @@ def give_edges(fitted: FittedSpots, blur_px: float, widest_px: float, limits: Li
         return fit
     index, rest, pixels = index[chosen], rest[pixels.rows(chosen)], pixels.taken(chosen)
     start = np.concatenate([fitted.theta[index], edge[chosen]], axis=1)
-    ended = descend(pixels, start, rest, None, limits, blur_px, 2 * STEPS)
+    ended = descend(pixels, start, rest, ALONE, limits, blur_px, 2 * STEPS)
     again = report(pixels, ended, rest, limits, blur_px)
     better = np.flatnonzero(again.converged & (again.residual_dn < 0.7 * fit.residual_dn[index]))
     return fit.replaced(index[better], again.taken(better)) if better.size else fit

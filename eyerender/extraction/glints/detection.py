@@ -10,9 +10,10 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices, Singles
 from ...geometry.ellipse import Ellipse
-from ..compiled import twin
+from ...jit import compiled, inlined
 from ..preprocessing import Image, Prepared, as_image
 from ..settings import ExtractionSettings
+from ..statistics import select
 from .prescreening import bell_shaped
 
 SMOOTH_PX = 0.7  # standard deviation of the Gaussian that smooths the image first
@@ -22,10 +23,7 @@ LEAST_OF_BLOCK = 0.5
 # A glint's height above its brightest surroundings is at least this share of its height above the darkest ones.
 RING_SHARE = 0.4
 MOST_PEAKS = 80  # maxima that are examined, brightest first
-
-_COS, _SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.arange(12) * (np.pi / 6.0))
-# Sample points of a ring: three circles, each turned against the previous one.
-_RING_STEPS = np.repeat((0.1, 0.5, 0.9), 24)
+# Directions of the sample points of a ring: three circles, each turned against the previous one.
 _RING_ANGLE = (np.arange(72) % 24 + np.repeat((0.0, 1.0 / 3.0, 2.0 / 3.0), 24)) * (np.pi / 12.0)
 _RING_COS, _RING_SIN = np.cos(_RING_ANGLE), np.sin(_RING_ANGLE)
 
@@ -106,38 +104,44 @@ def detect_spots(
     )  # fmt: skip
 
 
-def _sampled(smooth: Image, xy: Floats, x: Floats, y: Floats) -> Singles:
-    """Levels (n, k) of the pixels nearest to the peaks xy (n, 2) plus the offsets x and y, (n, k) each."""
-    height, width = smooth.shape
-    column = np.rint(np.minimum(np.maximum(xy[:, :1] + x, 0.0), width - 1.0)).astype(np.intp)
-    row = np.rint(np.minimum(np.maximum(xy[:, 1:] + y, 0.0), height - 1.0)).astype(np.intp)
-    return np.asarray(np.take(smooth, row * width + column), dtype=np.float32)
+@inlined
+def _level(image: Image, x: float, y: float) -> float:
+    """Level of the pixel nearest to a point."""
+    column = int(np.rint(min(max(x, 0.0), image.shape[1] - 1.0)))
+    return image[int(np.rint(min(max(y, 0.0), image.shape[0] - 1.0))), column]
 
 
-@twin
+@inlined
+def _is_free(xy: Floats, disc: Floats, outer: float, k: int, x: float, y: float) -> bool:
+    """Whether a point on the ring of spot k lies in the disc of no other spot."""
+    for m in range(disc.size):
+        apart2 = (xy[m, 0] - xy[k, 0]) ** 2 + (xy[m, 1] - xy[k, 1]) ** 2
+        if 0.0 < apart2 < (outer + disc[m]) ** 2 and (x - xy[m, 0]) ** 2 + (y - xy[m, 1]) ** 2 <= disc[m] ** 2:
+            return False
+    return True
+
+
+@compiled
 def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
     """Height (n,) of each peak above the brightest tenth of a ring around it. Pixels of other spots are left out.
 
     Skin, lashes and the gaps between lashes have many peaks, with equally bright ones beside them.
     """
-    inner, outer, disc = 2.2 * width + 1.0, 3.5 * width + 2.0, 2.5 * width + 1.0
-    radius = inner[:, None] + (outer - inner)[:, None] * _RING_STEPS
-    x, y = radius * _RING_COS, radius * _RING_SIN
-    at_x, at_y = xy[:, :1] + x, xy[:, 1:] + y
-    free = (at_x > -0.5) & (at_y > -0.5) & (at_x < smooth.shape[1] - 0.5) & (at_y < smooth.shape[0] - 0.5)
-    ring = free.sum(axis=1)
-    apart2 = ((xy[:, None] - xy) ** 2).sum(axis=-1)
-    to, by = np.nonzero((apart2 < (outer[:, None] + disc) ** 2) & (apart2 > 0.0))
-    if to.size:
-        clear = (at_x[to] - xy[by, :1]) ** 2 + (at_y[to] - xy[by, 1:]) ** 2 > (disc[by] ** 2)[:, None]
-        first = np.flatnonzero(np.diff(to, prepend=-1))
-        free[to[first]] &= np.logical_and.reduceat(clear, first, axis=0)
-    count = free.sum(axis=1)
-    level = np.sort(np.where(free, _sampled(smooth, xy, x, y), np.float32(np.inf)), axis=1)
-    told = np.flatnonzero(count > 0.25 * ring)
-    out = np.full(width.size, np.inf)
-    brightest = level[told, np.rint(0.9 * (count[told] - 1)).astype(np.intp)]
-    out[told] = smooth[xy[told, 1].astype(np.intp), xy[told, 0].astype(np.intp)] - brightest
+    out, level, disc = np.full(width.size, np.inf), np.empty(72), 2.5 * width + 1.0
+    for k in range(width.size):
+        inner, outer, ring, count = 2.2 * width[k] + 1.0, 3.5 * width[k] + 2.0, 0, 0
+        for i in range(72):
+            radius = inner + (outer - inner) * (0.1 + 0.4 * (i // 24))
+            x, y = xy[k, 0] + radius * _RING_COS[i], xy[k, 1] + radius * _RING_SIN[i]
+            if -0.5 < x < smooth.shape[1] - 0.5 and -0.5 < y < smooth.shape[0] - 0.5:
+                ring += 1
+                if _is_free(xy, disc, outer, k, x, y):
+                    level[count] = _level(smooth, x, y)
+                    count += 1
+        if count > 0.25 * ring:
+            rank = int(np.rint(0.9 * (count - 1)))
+            brightest = select(level[:count], rank)
+            out[k] = smooth[int(xy[k, 1]), int(xy[k, 0])] - brightest
     return out
 
 
@@ -151,40 +155,50 @@ def optics_sigma(blur_px: float) -> float:
     return math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0))
 
 
-@twin
+@compiled
 def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
     """Whether the level falls by at least a third of the height in 9 of 12 directions, 2.5 sigma from the peak.
 
     This rejects strips of sclera and the corners between lid and iris. A glint beside another one or on an edge passes.
     """
-    reach = (2.5 * width + 1.5)[:, None]
-    top = np.take(smooth, (xy[:, 1] * smooth.shape[1] + xy[:, 0]).astype(np.intp))
-    fallen = top[:, None] - _sampled(smooth, xy, reach * _COS, reach * _SIN) > 0.33 * height[:, None]
-    return np.asarray(fallen.sum(axis=1) >= 9)
+    out = np.empty(width.size, dtype=np.bool_)
+    for k in range(width.size):
+        reach, fallen = 2.5 * width[k] + 1.5, 0
+        top = smooth[int(xy[k, 1]), int(xy[k, 0])]
+        for i in range(12):
+            x, y = reach * math.cos(i * (math.pi / 6.0)), reach * math.sin(i * (math.pi / 6.0))
+            fallen += top - _level(smooth, xy[k, 0] + x, xy[k, 1] + y) > 0.33 * height[k]
+        out[k] = fallen >= 9
+    return out
 
 
-@twin
+@compiled
 def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> Indices:
     """Indices of the maxima xy (n, 2) that are spots of their own, in the given order.
 
     Two maxima count as one spot unless the level between them falls by `dip` below the lower one, or they are farther
     apart than `size`. The flat tops of clipped spots have several maxima, and so have wide spots with noise.
     """
-    gap = xy[:, None] - xy
-    one, other = np.nonzero(np.tril((gap**2).sum(axis=-1) <= size**2, -1))
-    rival: dict[int, list[int]] = {}
-    if one.size:
-        t = np.linspace(0.0, 1.0, 2 * size)
-        way = xy[other] - xy[one]
-        between = _sampled(smooth, xy[one], way[:, :1] * t, way[:, 1:] * t)
-        same = between.min(axis=1) >= np.minimum(between[:, 0], between[:, -1]) - dip
-        for i, k in zip(one[same].tolist(), other[same].tolist(), strict=True):
-            rival.setdefault(i, []).append(k)
-    kept: dict[int, None] = {}
+    kept, count = np.empty(xy.shape[0], dtype=np.int64), 0
     for i in range(xy.shape[0]):
-        if not any(k in kept for k in rival.get(i, ())):
-            kept[i] = None
-    return np.array(list(kept), dtype=np.intp)
+        alone = True
+        for m in range(count):
+            k = kept[m]
+            if (xy[i, 0] - xy[k, 0]) ** 2 + (xy[i, 1] - xy[k, 1]) ** 2 > size**2:
+                continue
+            least, first, last = np.inf, 0.0, 0.0
+            for j in range(2 * size):
+                t = j / (2 * size - 1.0)
+                last = _level(smooth, xy[i, 0] + t * (xy[k, 0] - xy[i, 0]), xy[i, 1] + t * (xy[k, 1] - xy[i, 1]))
+                first = last if j == 0 else first
+                least = min(least, last)
+            if least >= min(first, last) - dip:
+                alone = False
+                break
+        if alone:
+            kept[count] = i
+            count += 1
+    return kept[:count].copy()
 
 
 def _no_spots() -> Spots:
@@ -198,35 +212,47 @@ def _opening(half: Image, size: int) -> Image:
     return as_image(cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)))
 
 
-@twin
+@inlined
+def _highest(image: Image, y: int, x: int) -> bool:
+    """Whether no neighbour of a pixel is brighter."""
+    for j in range(max(y - 1, 0), min(y + 2, image.shape[0])):
+        for i in range(max(x - 1, 0), min(x + 2, image.shape[1])):
+            if image[j, i] > image[y, x]:
+                return False
+    return True
+
+
+@compiled
 def _maxima(smooth: Image, half: Image, opened: Image, threshold: float) -> tuple[Indices, Singles]:
     """Find local maxima that exceed the opened level by the threshold: flat indices (n,), and heights above it (n,)."""
-    blocks = np.flatnonzero(half - opened > LEAST_OF_BLOCK * threshold)
-    width, columns = smooth.shape[1], half.shape[1]
-    row, column = np.divmod(blocks, columns)
-    first = 2 * (row * width + column)
-    level = np.take(opened, blocks)
-    flat, height = np.empty((4, blocks.size), dtype=np.intp), np.empty((4, blocks.size), np.float32)
-    top = cv2.dilate(smooth, np.ones((3, 3), np.uint8))
-    for i, shift in enumerate((0, 1, width, width + 1)):
-        np.add(first, shift, out=flat[i])
-        height[i] = np.take(smooth, flat[i])
-    high = (height - level > threshold) & (height >= np.take(top, flat))
-    return flat[high], (height - level)[high]
+    columns, size, n = half.shape[1], smooth.shape[1], 0
+    blocks = np.empty(half.size, dtype=np.int64)
+    for y in range(half.shape[0]):
+        for x in range(columns):
+            if half[y, x] - opened[y, x] > LEAST_OF_BLOCK * threshold:
+                blocks[n] = y * columns + x
+                n += 1
+    flat, height, found = np.empty(4 * n, dtype=np.int64), np.empty(4 * n, dtype=np.float32), 0
+    for shift in range(4):
+        for k in range(n):
+            row, column = blocks[k] // columns, blocks[k] % columns
+            y, x = 2 * row + shift // 2, 2 * column + shift % 2
+            above = smooth[y, x] - opened[row, column]
+            if above > threshold and _highest(smooth, y, x):
+                flat[found], height[found] = y * size + x, above
+                found += 1
+    return flat[:found].copy(), height[:found].copy()
 
 
-@twin
+@compiled
 def _widths(smooth: Image, opened: Image, xy: Floats, height: Floats, size: int) -> Floats:
     """Estimate sigma = sqrt(area above half height / (2 pi ln 2)) in a window of the opening's size."""
-    step, (rows, columns) = np.arange(-(size // 2), size // 2 + 1), smooth.shape
-    x, y = xy.astype(np.intp).T[:, :, None] + step
-    column, row = np.minimum(np.maximum(x, 0), columns - 1), np.minimum(np.maximum(y, 0), rows - 1)
-    inside = (column == x)[:, None, :] & (row == y)[:, :, None]
-    flat = (row * smooth.shape[1])[:, :, None] + column[:, None, :]
-    flat_half = ((row >> 1) * opened.shape[1])[:, :, None] + (column >> 1)[:, None, :]
-    hat = np.take(smooth, flat) - np.take(opened, flat_half)
-    high = hat > (0.5 * height).astype(np.float32)[:, None, None]
-    area = (high & inside).reshape(height.size, -1).sum(axis=1)
-    out = np.sqrt(np.maximum(area, 1) / (2.0 * math.pi * math.log(2.0)))
-    sharp: Floats = np.sqrt(np.maximum(out**2 - SMOOTH_PX**2, 0.3))
-    return np.clip(sharp, 0.5, MAX_SIGMA_PX)
+    out = np.empty(height.size)
+    for k in range(height.size):
+        x, y, area, limit = int(xy[k, 0]), int(xy[k, 1]), 0, np.float32(0.5 * height[k])
+        for j in range(max(y - size // 2, 0), min(y + size // 2 + 1, smooth.shape[0])):
+            for i in range(max(x - size // 2, 0), min(x + size // 2 + 1, smooth.shape[1])):
+                area += smooth[j, i] - opened[j >> 1, i >> 1] > limit
+        square = max(area, 1) / (2.0 * math.pi * math.log(2.0)) - SMOOTH_PX**2
+        out[k] = min(max(math.sqrt(max(square, 0.3)), 0.5), MAX_SIGMA_PX)
+    return out

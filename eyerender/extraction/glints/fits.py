@@ -1,16 +1,12 @@
-"""The result of fitting bright spots, as a batch; the profile of a spot."""
+"""The result of fitting bright spots, as a batch."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.special import erf
 
 from ...arrays import Bools, Floats, Indices
-
-_ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -72,10 +68,3 @@ def no_spots() -> SpotFit:
         clipped=np.zeros(0, dtype=np.intp),
         converged=np.zeros(0, dtype=bool),
     )
-
-
-def profile(x: Floats, centre: float, sigma: float) -> Floats:
-    """Mean over the pixel of exp(-(x - c)^2 / (2 s^2))."""
-    scale = math.sqrt(0.5) / sigma
-    low = (x - 0.5 - centre) * scale
-    return np.asarray(sigma * _ROOT_HALF_PI * (erf(low + scale) - erf(low)))

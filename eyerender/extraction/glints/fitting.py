@@ -7,19 +7,18 @@ abandoned spot is not subtracted from the others' windows.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
-from scipy.special import ndtr
 
-from ...arrays import Bools, Floats, Indices
-from ..compiled import twin
+from ...arrays import Bools, Floats
+from ...jit import compiled, inlined
 from ..preprocessing import Image
 from .fits import SpotFit, no_spots
 from .gaussian_model import PARAMETERS, SAME_LIGHT, WITH_EDGE, Descent, Limits, descend, lost, prior, promising
-from .windows import Others, SpotPixels, cut, window_radius
+from .windows import SpotPixels, Windows, cut, light_of_others, shining_pairs, window_radius
 
 # Rounds of several steps each. A spot that still moves by WANDERING_PX after PATIENCE rounds is abandoned. The second
 # numbers are for spots whose fit is promising or whose misfit still falls.
@@ -72,14 +71,12 @@ def fit_spots(
     apart, radius = _distance(start_px), window_radius(width_px)
     touching = apart < 1.35 * (radius[:, None] + radius)
     theta = _start(pixels, start_px, width_px, height_dn, touching)
-    others = Others.of(pixels, theta, touching, noise) if touching.any() else None
+    pairs = shining_pairs(pixels, theta, touching, noise)
     rest = pixels.data - pixels.known
-    light = np.zeros(rest.size)
-    if others is not None:
-        light = others.light(theta, rest.size)
+    light = light_of_others(pixels.windows, theta, pairs, rest.size)
     theta[:, 5] = _ring_level(pixels, rest - light)
-    found = descend(pixels, theta, rest - light, others, limits)
-    if others is None and bool(found.settled.all()):
+    found = descend(pixels, theta, rest - light, pairs, limits)
+    if not pairs.size and bool(found.settled.all()):
         return FittedSpots(report(pixels, found, rest, limits), pixels, found.theta, rest)
     begun, n = theta[:, :2].copy(), width_px.size
     gone, settled = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -87,7 +84,7 @@ def fit_spots(
     for turn in range(TURNS[1]):
         if turn > 0:
             part, rows = pixels.taken(live), pixels.rows(live)
-            among = Others.of(part, theta[live], touching[np.ix_(live, live)], noise)
+            among = shining_pairs(part, theta[live], touching[np.ix_(live, live)], noise)
             found = descend(part, theta[live], (rest - light)[rows], among, limits)
         theta[live], gram[live], used[live] = found.theta, found.gram, found.used
         moved, done, falling = np.zeros(n), np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -96,8 +93,8 @@ def fit_spots(
         likely = falling | promising(theta, gram, used, noise)
         turns, patience = np.where(likely, TURNS[1], TURNS[0]), np.where(likely, PATIENCE[1], PATIENCE[0])
         gone |= lost(theta, begun) | (~done & (moved > WANDERING_PX) & (turn + 1 >= patience))
-        if others is not None:
-            before, light = light, others.light(theta, rest.size, ~gone)
+        if pairs.size:
+            before, light = light, light_of_others(pixels.windows, theta, pairs[~gone[pairs[:, 1]]], rest.size)
             done &= pixels.most(np.abs(light - before)) <= SAME_LIGHT * noise
         live = np.flatnonzero(~gone & ~done & (turn + 1 < turns))
         if live.size == 0:
@@ -175,9 +172,9 @@ def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blu
     """Convert the end of a descent to a fit; `rest` (P,) is the image minus B and the other spots' light."""
     theta, noise = ended.theta, limits.noise_dn
     penalty = prior(limits, blur_px is not None)
-    windows = (pixels.first, pixels.plane, pixels.centre)
     blur = 1.0 if blur_px is None else blur_px
-    covariance, level, misfit, moments = _reported(*windows, theta, ended.gram, ended.used, rest, noise, penalty, blur)
+    ended_at = (np.ascontiguousarray(theta), ended.gram, ended.used)
+    covariance, level, misfit, moments = _reported(pixels.windows, *ended_at, rest, noise, penalty, blur)
     return SpotFit(
         xy_px=theta[:, :2].copy(),
         covariance=covariance,
@@ -191,39 +188,52 @@ def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blu
     )
 
 
-@twin
+@inlined
+def _bright_moments(plane: Floats, begin: int, end: int, rest: Floats, level: float, out: Floats) -> None:
+    """Write the second moments (2, 2) of the part of a spot's pixels above a third of their height over a level."""
+    top = 0.0
+    for i in range(begin, end):
+        top = max(top, rest[i] - level)
+    total = x = y = xx = xy = yy = 0.0
+    for i in range(begin, end):
+        weight, dx, dy = max(rest[i] - level - 0.35 * top, 0.0), plane[1, i], plane[2, i]
+        total, x, y = total + weight, x + weight * dx, y + weight * dy
+        xx, xy, yy = xx + weight * dx * dx, xy + weight * dx * dy, yy + weight * dy * dy
+    total = max(total, 1e-12)
+    x, y = x / total, y / total
+    out[0, 0], out[1, 1] = xx / total - x * x, yy / total - y * y
+    out[0, 1] = out[1, 0] = xy / total - x * y
+
+
+@compiled
 def _reported(
-    first: Indices, plane: Floats, centre: Floats, theta: Floats, gram: Floats, used: Floats, rest: Floats,
+    windows: Windows, theta: Floats, gram: Floats, used: Floats, rest: Floats,
     noise: float, penalty: Floats, blur_px: float,
 ) -> tuple[Floats, Floats, Floats, Floats]:  # fmt: skip
     """Compute covariance (n, 2, 2), level at the centre beyond B (n,), misfit (n,) and moments (n, 2, 2) of fits."""
-    k = theta.shape[1]
-    data_cost = np.maximum(gram[:, k, k] - np.einsum("nk,nk->n", theta @ penalty, theta), 0.0)
-    inverse = np.linalg.inv(gram[:, :k, :k] + 1e-9 * np.eye(k))
-    # A misfit beyond the noise counts as more noise.
-    scale = np.maximum(data_cost / np.maximum(used - k, 1.0), 1.0)
-    at = theta[:, :2] - centre
-    level = theta[:, 5] + (theta[:, 6:8] * at).sum(axis=1)
-    if k == WITH_EDGE:
-        height, turn, offset = theta[:, 8:].T
-        level += height * ndtr((at[:, 0] * np.cos(turn) + at[:, 1] * np.sin(turn) - offset) / blur_px)
-    misfit = np.sqrt(data_cost / np.maximum(used, 1.0)) * noise
-    moments = np.zeros((level.size, 2, 2))
-    moments[:, 0, 0], moments[:, 1, 1] = np.exp(2.0 * theta[:, 3:5]).T
-    odd = misfit > UNEXPLAINED * noise
-    patch = rest - level.repeat(np.diff(first))
-    moments[odd] = _bright_moments(first, plane, patch)[odd]
-    return inverse[:, :2, :2] * scale[:, None, None], level, misfit, moments
-
-
-def _bright_moments(first: Indices, plane: Floats, patch: Floats) -> Floats:
-    """Second moments (n, 2, 2) of the part of each patch above a third of its highest level (at least 0)."""
-    out = np.empty((first.size - 1, 2, 2))
-    for k, (begin, end) in enumerate(pairwise(first.tolist())):
-        dx, dy = plane[1:, begin:end]
-        weight = np.maximum(patch[begin:end] - 0.35 * max(float(patch[begin:end].max(initial=0.0)), 0.0), 0.0)
-        weight /= max(float(weight.sum()), 1e-12)
-        x, y = weight @ dx, weight @ dy
-        out[k, 0, 0], out[k, 1, 1] = weight @ (dx * dx) - x * x, weight @ (dy * dy) - y * y
-        out[k, 0, 1] = out[k, 1, 0] = weight @ (dx * dy) - x * y
-    return out
+    first, plane, centre, _ = windows
+    n, k = theta.shape
+    covariance, moments, level, misfit = np.empty((n, 2, 2)), np.zeros((n, 2, 2)), np.empty(n), np.empty(n)
+    for s in range(n):
+        own, pull, matrix = theta[s], 0.0, gram[s, :k, :k].copy()
+        for j in range(k):
+            matrix[j, j] += 1e-9
+            for m in range(k):
+                pull += own[j] * penalty[j, m] * own[m]
+        cost = max(gram[s, k, k] - pull, 0.0)
+        # A misfit beyond the noise counts as more noise.
+        scale = max(cost / max(used[s] - k, 1.0), 1.0)
+        for j in range(2):
+            unit = np.zeros(k)
+            unit[j] = scale
+            covariance[s, j] = np.linalg.solve(matrix, unit)[:2]
+        x, y = own[0] - centre[s, 0], own[1] - centre[s, 1]
+        level[s] = own[5] + own[6] * x + own[7] * y
+        if k == WITH_EDGE:
+            t = (x * math.cos(own[9]) + y * math.sin(own[9]) - own[10]) / blur_px
+            level[s] += own[8] * 0.5 * math.erfc(-t * math.sqrt(0.5))
+        misfit[s] = math.sqrt(cost / max(used[s], 1.0)) * noise
+        moments[s, 0, 0], moments[s, 1, 1] = math.exp(2.0 * own[3]), math.exp(2.0 * own[4])
+        if misfit[s] > UNEXPLAINED * noise:
+            _bright_moments(plane, first[s], first[s + 1], rest, level[s], moments[s])
+    return covariance, level, misfit, moments

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
-from scipy.special import ndtr
 
 from ...arrays import Bools, Floats, Indices
-from ..compiled import twin
-from .windows import Grid, Others, SpotPixels, Windows
+from ...jit import compiled, inlined
+from ..products import add_products
+from .windows import SpotPixels, Windows, light_of_others, profile
 
 PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; with an edge also h, p, o
 LOST_PX = 12.0  # a spot that becomes wider or moves farther is not a glint
@@ -35,9 +34,9 @@ _FREE = np.inf
 _LEAST = np.array([-_FREE, -_FREE, -5.0, math.log(0.2), math.log(0.2), *[-_FREE] * 6])
 _MOST = np.array([_FREE, _FREE, 15.0, math.log(30.0), math.log(30.0), *[_FREE] * 6])
 _STRIDE = np.array([1.5, 1.5, 0.7, 0.7, 0.7, _FREE, _FREE, _FREE, _FREE, 0.5, 1.5])  # largest step of each parameter
-_BOUNDS = {edge: np.stack([_LEAST, _MOST, _STRIDE])[:, : WITH_EDGE if edge else PARAMETERS] for edge in (False, True)}
-_ALONE = np.zeros((0, 2), dtype=np.intp)
-_DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
+_EDGE_BOUNDS = np.stack([_LEAST, _MOST, _STRIDE])
+_BOUNDS = {True: _EDGE_BOUNDS, False: _EDGE_BOUNDS[:, :PARAMETERS].copy()}
+ALONE = np.zeros((0, 2), dtype=np.intp)  # no pairs of spots
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,17 +75,24 @@ class Descent:
     falling: Bools
 
 
+@compiled
 def lost(theta: Floats, start: Floats) -> Bools:
     """Whether spots (n,) have grown or moved more than a glint can."""
-    wide = theta[:, 3:5].max(axis=1) > math.log(LOST_PX)
-    away = theta[:, :2] - start
-    return np.asarray(wide | ((away * away).sum(axis=1) > LOST_PX**2))
+    out = np.empty(theta.shape[0], dtype=np.bool_)
+    for s in range(out.size):
+        wide = max(theta[s, 3], theta[s, 4]) > math.log(LOST_PX)
+        out[s] = wide or (theta[s, 0] - start[s, 0]) ** 2 + (theta[s, 1] - start[s, 1]) ** 2 > LOST_PX**2
+    return out
 
 
+@compiled
 def promising(theta: Floats, gram: Floats, used: Floats, noise: float) -> Bools:
     """Whether the fit roughly explains spots (n,) (see ROUGH and ROUGH_SHARE)."""
-    misfit = noise * np.sqrt(gram[:, -1, -1] / np.maximum(used, 1.0))
-    return np.asarray(misfit < np.maximum(ROUGH * noise, ROUGH_SHARE * np.exp(theta[:, 2])))
+    out, k = np.empty(theta.shape[0], dtype=np.bool_), theta.shape[1]
+    for s in range(out.size):
+        misfit = noise * math.sqrt(gram[s, k, k] / max(used[s], 1.0))
+        out[s] = misfit < max(ROUGH * noise, ROUGH_SHARE * math.exp(theta[s, 2]))
+    return out
 
 
 def slopes(pixels: SpotPixels, theta: Floats, rest: Floats, blur_px: float | None = None) -> Floats:
@@ -98,55 +104,46 @@ def slopes(pixels: SpotPixels, theta: Floats, rest: Floats, blur_px: float | Non
         rest: (P,) image minus everything that is not fitted.
         blur_px: blur of the edges, if the spots have edges of their own.
     """
-    about = (pixels.first, pixels.plane, pixels.centre, pixels.radius)
-    return _spot_rows(*about, theta, rest, 1.0 if blur_px is None else blur_px)
+    return _spot_rows(pixels.windows, theta, rest, 1.0 if blur_px is None else blur_px)
 
 
-@twin
-def _spot_rows(
-    first: Indices, plane: Floats, centre: Floats, radius: Floats, theta: Floats, rest: Floats, blur_px: float
-) -> Floats:
+@compiled
+def _spot_rows(windows: Windows, theta: Floats, rest: Floats, blur_px: float) -> Floats:
     """Compute `slopes` from the parts of `SpotPixels`."""
-    spot = np.arange(radius.size).repeat(np.diff(first))
-    _, dx, dy = plane
-    across, along = Grid.of(radius, spot, dx, dy).profiles(
-        theta[:, :2] - centre, np.exp(theta[:, 3:5]), np.exp(theta[:, 2])
-    )
-    out = np.empty((theta.shape[1] + 1, rest.size))
-    np.multiply(across[0], along[1], out=out[0])
-    np.multiply(across[1:], along[1], out=out[2:4])
-    np.multiply(across[1], along[::2], out=out[1:5:3])
-    out[5:8] = plane
-    own = theta[:, 5:].T.take(spot, axis=1)
-    np.subtract(rest, out[2], out=out[-1])
-    out[-1] -= np.einsum("kp,kp->p", own[:3], plane)
-    if theta.shape[1] == WITH_EDGE:
-        cos, sin = np.cos(own[4]), np.sin(own[4])
-        t = (dx * cos + dy * sin - own[5]) / blur_px
-        bell = own[3] * (_DENSITY / blur_px) * np.exp(-0.5 * t * t)
-        out[8] = ndtr(t)
-        np.multiply(bell, dy * cos - dx * sin, out=out[9])
-        np.negative(bell, out=out[10])
-        out[-1] -= own[3] * out[8]
+    first, plane, centre, radius = windows
+    n, size = theta.shape
+    out = np.empty((size + 1, rest.size))
+    for k in range(n):
+        half = math.ceil(radius[k] + 0.5)
+        across, along = np.empty((2 * half + 1, 3)), np.empty((2 * half + 1, 3))
+        x, y, height = theta[k, 0] - centre[k, 0], theta[k, 1] - centre[k, 1], math.exp(theta[k, 2])
+        wide, high = math.exp(theta[k, 3]), math.exp(theta[k, 4])
+        for j in range(2 * half + 1):
+            across[j, 0], across[j, 1], across[j, 2] = profile(j - half - 0.5 - x, wide)
+            along[j, 0], along[j, 1], along[j, 2] = profile(j - half - 0.5 - y, high)
+        for i in range(first[k], first[k + 1]):
+            dx, dy = plane[1, i], plane[2, i]
+            p, q = across[int(dx) + half], along[int(dy) + half]
+            out[0, i], out[1, i], out[2, i] = height * p[0] * q[1], height * p[1] * q[0], height * p[1] * q[1]
+            out[3, i], out[4, i] = height * p[2] * q[1], height * p[1] * q[2]
+            out[5, i], out[6, i], out[7, i] = 1.0, dx, dy
+            out[size, i] = rest[i] - out[2, i] - theta[k, 5] - theta[k, 6] * dx - theta[k, 7] * dy
+        if size == WITH_EDGE:
+            _add_edge(first[k], first[k + 1], plane, theta[k], blur_px, out)
     return out
 
 
-def _products(first: Indices, rows: Floats) -> Floats:
-    """Products (n, K + 1, K + 1) of rows (K + 1, P), summed over the pixels first[i] to first[i + 1] of each spot."""
-    out = np.empty((first.size - 1, rows.shape[0], rows.shape[0]))
-    for k, (begin, end) in enumerate(pairwise(first.tolist())):
-        np.matmul(rows[:, begin:end], rows[:, begin:end].T, out=out[k])
-    return out
-
-
-def _solved(gram: Floats, damping: Floats) -> Floats:
-    """Damped steps (n, K) of the normal equations gram (n, K + 1, K + 1), whose last column is the right side."""
-    k = gram.shape[1] - 1
-    matrix = gram[:, :k, :k].copy()
-    diagonal = matrix.reshape(-1, k * k)[:, :: k + 1]
-    diagonal *= 1.0 + damping[:, None]
-    diagonal += 1e-9
-    return np.asarray(np.linalg.solve(matrix, gram[:, :k, k:])[..., 0])
+@inlined
+def _add_edge(begin: int, end: int, plane: Floats, theta: Floats, blur_px: float, out: Floats) -> None:
+    """Write the derivatives by the parameters of a spot's own edge and subtract the edge from the residual."""
+    height, cos, sin, offset = theta[8], math.cos(theta[9]), math.sin(theta[9]), theta[10]
+    for i in range(begin, end):
+        dx, dy = plane[1, i], plane[2, i]
+        t = (dx * cos + dy * sin - offset) / blur_px
+        bell = height * math.exp(-0.5 * t * t) / (math.sqrt(2.0 * math.pi) * blur_px)
+        out[8, i] = 0.5 * math.erfc(-t * math.sqrt(0.5))
+        out[9, i], out[10, i] = bell * (dy * cos - dx * sin), -bell
+        out[11, i] -= height * out[8, i]
 
 
 def prior(limits: Limits, edge: bool) -> Floats:
@@ -160,9 +157,10 @@ def prior(limits: Limits, edge: bool) -> Floats:
     out[3, 4] = out[4, 3] = -1.0 / ROUND_SD**2
     out[6, 6] = out[7, 7] = 1.0 / limits.slope_dn**2
     out[8, 8], out[10, 10] = 1e-5, 1e-2
-    return out if edge else out[:PARAMETERS, :PARAMETERS]
+    return out if edge else out[:PARAMETERS, :PARAMETERS].copy()
 
 
+@inlined
 def _gram(
     first: Indices, clip: Bools, rows: Floats, theta: Floats, noise: float, penalty: Floats
 ) -> tuple[Floats, Floats]:
@@ -172,38 +170,85 @@ def _gram(
         (n, K + 1, K + 1) products, and (n,) number of pixels that count. A clipped pixel does not count where the model
         is brighter than the clip level.
     """
-    used = np.diff(first).astype(np.float64)
-    if clip.size:
-        idle = clip & (rows[-1] <= 0.0)
-        rows *= ~idle
-        used -= np.diff(np.concatenate([[0], np.cumsum(idle)])[first])
-    k = theta.shape[1]
-    out = _products(first, rows)
-    out *= 1.0 / noise**2
-    pull = theta @ penalty
-    out[:, :k, :k] += penalty
-    out[:, :k, k] -= pull
-    pull *= theta
-    out[:, k, k] += pull.sum(axis=1)
-    return out, used
+    n, k = theta.shape
+    gram, used = np.zeros((n, k + 1, k + 1)), np.empty(n)
+    for i in range(clip.size):
+        if clip[i] and rows[k, i] <= 0.0:
+            rows[:, i] = 0.0
+    for s in range(n):
+        used[s] = first[s + 1] - first[s]
+        for i in range(first[s], min(first[s + 1], clip.size)):
+            used[s] -= clip[i] and rows[5, i] == 0.0
+        add_products(rows, first[s], first[s + 1], gram[s])
+        for j in range(k + 1):
+            for m in range(j + 1):
+                gram[s, j, m] /= noise * noise
+                gram[s, m, j] = gram[s, j, m]
+        for j in range(k):
+            pull = 0.0
+            for m in range(k):
+                gram[s, j, m] += penalty[j, m]
+                pull += theta[s, m] * penalty[m, j]
+            gram[s, j, k] -= pull
+            gram[s, k, k] += pull * theta[s, j]
+    return gram, used
 
 
-def _dimmed(first: Indices, rows: Floats, gram: Floats, light: Floats, noise: float) -> None:
+@inlined
+def _step(gram: Floats, damping: float, theta: Floats, bounds: Floats, step: Floats, trial: Floats) -> float:
+    """Write the damped step (K,) of a spot and where it leads (K,), both limited; return the gain that it promises."""
+    k, gain = theta.size, 0.0
+    matrix, pull = gram[:k, :k].copy(), gram[:k, k].copy()
+    for j in range(k):
+        matrix[j, j] = matrix[j, j] * (1.0 + damping) + 1e-9
+    step[:] = np.linalg.solve(matrix, pull)
+    for j in range(k):
+        gain += step[j] * pull[j]
+        step[j] = min(max(step[j], -bounds[2, j]), bounds[2, j])
+        trial[j] = min(max(theta[j] + step[j], bounds[0, j]), bounds[1, j])
+    return gain
+
+
+@inlined
+def _finish(step: Floats, trial: Floats, theta: Floats) -> None:
+    """Take the last steps (n, K) of spots, unless they are large."""
+    for s in range(theta.shape[0]):
+        if np.abs(step[s]).max() < 1.0:
+            theta[s] = trial[s]
+
+
+@inlined
+def _progress(theta: Floats, middle: Floats, gram: Floats, cost: Floats) -> tuple[Floats, Bools]:
+    """How far each spot (n,) moved since the middle of the steps, and whether its squared misfit halved."""
+    n, k = theta.shape
+    moved, falling = np.empty(n), np.empty(n, np.bool_)
+    for s in range(n):
+        moved[s] = max(abs(theta[s, 0] - middle[s, 0]), abs(theta[s, 1] - middle[s, 1]))
+        falling[s] = gram[s, k, k] < 0.5 * cost[s]
+    return moved, falling
+
+
+@inlined
+def _dim(first: Indices, rows: Floats, gram: Floats, light: Floats, noise: float) -> None:
     """Subtract more light (P,) of other spots from the residual; changes the products in place."""
-    k = gram.shape[1] - 1
-    for product, (begin, end) in zip(gram, pairwise(first.tolist()), strict=True):
-        row = rows[:, begin:end]
-        part = light[begin:end] * row[5]  # 0 in pixels that do not count
-        taken = row @ part
-        product[:, k] -= taken * (1.0 / noise**2)
-        product[k, k] += (part @ part - taken[k]) * (1.0 / noise**2)
+    n, k = gram.shape[0], gram.shape[1] - 1
+    for s in range(n):
+        square = taken = 0.0
+        for i in range(first[s], first[s + 1]):
+            square += (light[i] * rows[5, i]) ** 2  # 0 in pixels that do not count
+        for j in range(k + 1):
+            taken = 0.0
+            for i in range(first[s], first[s + 1]):
+                taken += rows[j, i] * light[i] * rows[5, i]
+            gram[s, j, k] -= taken / noise**2
+        gram[s, k, k] += (square - taken) / noise**2
 
 
 def descend(
     pixels: SpotPixels,
     theta: Floats,
     rest: Floats,
-    others: Others | None,
+    pairs: Indices,
     limits: Limits,
     blur_px: float | None = None,
     steps: int = STEPS,
@@ -216,20 +261,18 @@ def descend(
         pixels: P pixels of n spots.
         theta: (n, K) start.
         rest: (P,) image minus B and minus the other spots' light at the start.
-        others: which of these spots shine into each other's windows; None if none do.
+        pairs: (m, 2) the spots of a window, and those that shine into it.
         limits: noise, clip level and the prior of the slope.
         blur_px: blur of the edges, if the spots have edges of their own.
         steps: how many at most.
     """
     edge = blur_px is not None
-    pairs = _ALONE if others is None else others.pairs
     clip = pixels.clip if pixels.clipped else pixels.clip[:0]
-    windows = (pixels.first, pixels.plane, pixels.centre, pixels.radius)
     about = (limits.noise_dn, prior(limits, edge), 1.0 if blur_px is None else blur_px, steps, _BOUNDS[edge])
-    return Descent(*_descended(windows, theta, rest, clip, pairs, *about))
+    return Descent(*_descended(pixels.windows, np.ascontiguousarray(theta), rest, clip, pairs, *about))
 
 
-@twin
+@compiled
 def _descended(
     windows: Windows, theta: Floats, rest: Floats, clip: Bools, pairs: Indices,
     noise: float, penalty: Floats, blur_px: float, steps: int, bounds: Floats,
@@ -251,47 +294,44 @@ def _descended(
     Returns:
         The parts of `Descent`.
     """
-    first, own = windows[0], np.arange(theta.shape[0]).repeat(np.diff(windows[0]))
-    others, k = Others.shining(windows, pairs) if pairs.size else None, theta.shape[1]
-    theta, start, middle, cost = theta.copy(), theta[:, :2], theta[:, :2], np.full(theta.shape[0], np.inf)
-    rows = _spot_rows(*windows, theta, rest, blur_px)
+    first, (n, k) = windows[0], theta.shape
+    rest, theta, start = rest.copy(), theta.copy(), theta[:, :2].copy()
+    middle, cost = start.copy(), np.full(n, np.inf)
+    rows = _spot_rows(windows, theta, rest, blur_px)
     gram, used = _gram(first, clip, rows, theta, noise, penalty)
-    damping, over = np.full(theta.shape[0], 1e-2), np.zeros(theta.shape[0], dtype=bool)
-    held = np.zeros(0) if others is None else others.light(theta, rest.size)
-    stalled = over.copy()
-    enough = SMALL_GAIN[0] if others is None else SMALL_GAIN[1]
-    least, most, stride = bounds
+    damping, step, trial = np.full(n, 1e-2), np.empty((n, k)), np.empty((n, k))
+    over, stalled, better = np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    held, shared = light_of_others(windows, theta, pairs, rest.size), pairs.shape[0] > 0
+    enough = SMALL_GAIN[1] if shared else SMALL_GAIN[0]
     for turn in range(steps):
-        step = _solved(gram, damping)
-        gain = (step * gram[:, :k, k]).sum(axis=1)
-        step = np.minimum(np.maximum(step, -stride), stride)
-        trial = np.minimum(np.maximum(theta + step, least), most)
-        over = gain < enough * np.maximum(gram[:, k, k] / np.maximum(used, 1.0), 1.0)
-        if turn >= STEPS // 2:
-            over |= (damping > 1e5) | lost(theta, start)
-            stalled &= ~promising(theta, gram, used, noise)
-        if (over | stalled if turn >= STEPS // 2 else over).all():
-            theta = np.where((np.abs(step) < 1.0).all(axis=1)[:, None], trial, theta)
+        late, ended = turn >= STEPS // 2, True
+        away, likely = lost(theta, start), promising(theta, gram, used, noise)
+        for s in range(n):
+            gain = _step(gram[s], damping[s], theta[s], bounds, step[s], trial[s])
+            over[s] = gain < enough * max(gram[s, k, k] / max(used[s], 1.0), 1.0)
+            over[s] = over[s] or (late and (damping[s] > 1e5 or away[s]))
+            stalled[s] = stalled[s] and not (late and likely[s])
+            ended = ended and (over[s] or (late and stalled[s]))
+        if ended:
+            _finish(step, trial, theta)
             break
-        rows = _spot_rows(*windows, trial, rest, blur_px)
+        rows = _spot_rows(windows, trial, rest, blur_px)
         new, new_used = _gram(first, clip, rows, trial, noise, penalty)
-        better = new[:, k, k] <= gram[:, k, k] * (1.0 + 1e-12)
-        stalled = better & (new[:, k, k] > STALLED * gram[:, k, k])
-        if better.all():
-            theta, gram, used = trial, new, new_used
-            damping = np.maximum(0.1 * damping, 1e-7)
-        else:
-            np.copyto(theta, trial, where=better[:, None])
-            np.copyto(gram, new, where=better[:, None, None])
-            np.copyto(used, new_used, where=better)
-            damping = np.where(better, np.maximum(0.1 * damping, 1e-7), 8.0 * damping)
-        if others is not None and turn % 2 == 1:
-            change = others.light(theta, rest.size) - held
-            if not better.all():
-                change *= better[own]
-            held, rest = held + change, rest - change
-            _dimmed(first, rows, gram, change, noise)
+        for s in range(n):
+            better[s] = new[s, k, k] <= gram[s, k, k] * (1.0 + 1e-12)
+            stalled[s] = better[s] and new[s, k, k] > STALLED * gram[s, k, k]
+            damping[s] = max(0.1 * damping[s], 1e-7) if better[s] else 8.0 * damping[s]
+            if better[s]:
+                theta[s], gram[s], used[s] = trial[s], new[s], new_used[s]
+        if shared and turn % 2 == 1:
+            change = light_of_others(windows, theta, pairs, rest.size) - held
+            for s in range(n):
+                change[first[s] : first[s + 1]] *= better[s]
+            held += change
+            rest -= change
+            _dim(first, rows, gram, change, noise)
         if turn + 1 == steps // 2:
-            middle, cost = theta[:, :2].copy(), gram[:, k, k].copy()
-    moved = np.abs(theta[:, :2] - middle).max(axis=1)
-    return theta, gram, used, over, moved, gram[:, k, k] < 0.5 * cost
+            middle[:] = theta[:, :2]
+            cost[:] = gram[:, k, k]
+    moved, falling = _progress(theta, middle, gram, cost)
+    return theta, gram, used, over, moved, falling

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices, Singles
-from ..compiled import twin
+from ...arrays import Bools, Floats, Indices
+from ...jit import compiled, inlined
 from ..preprocessing import DN, Image
+from ..products import add_products
 
 # Largest misfit as a share of the height and of the scatter; smallest fitted peak as a share of the detected height.
 # Glints of the development images (rendered and ideal) reach 0.20 and 0.63, and 0.85.
@@ -19,40 +19,8 @@ LEAST_PEAK = 0.75
 MOST_CLIPPED = 1  # clipped pixels; a spot with more is not judged
 NARROWEST_PX = 0.9  # a narrower spot is mostly a single pixel
 EXPLAINED = 2.0  # a misfit below this many standard deviations of the noise is accepted
+PIXEL = 1.0 / 12.0  # variance of a pixel, px^2
 LONGEST = 2.5  # largest elongation of the bright patch; glints, and two that touch, reach 2.0
-
-
-def about(xy: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Indices, Singles, Bools]:
-    """Find the pixels around n peak pixels xy (n, 2) up to `reach` (n,) px.
-
-    Returns:
-        Flat index (n, k), offset (2, k), and whether the pixel lies in the image and within reach (n, k). A pixel
-        outside the image has the index of the nearest one inside.
-    """
-    dx, dy, away2, offset = _disc(math.ceil(float(reach.max(initial=0.0))))
-    x, y = xy.astype(np.intp).T[:, :, None]
-    within = away2 <= (reach**2)[:, None]
-    half, (width, height) = int(dx.max()), (shape[1], shape[0])
-    if (
-        x.min(initial=half) < half
-        or y.min(initial=half) < half
-        or (x.max(initial=0) + half >= width)
-        or (y.max(initial=0) + half >= height)
-    ):
-        column, row = np.minimum(np.maximum(x + dx, 0), width - 1), np.minimum(np.maximum(y + dy, 0), height - 1)
-        within &= (column == x + dx) & (row == y + dy)
-        return row * width + column, offset, within
-    return y * width + x + (dy * width + dx), offset, within
-
-
-@lru_cache(maxsize=32)
-def _disc(radius: int) -> tuple[Indices, Indices, Indices, Singles]:
-    """Offsets dx and dy, squared distance (k,) of the pixels within a radius, and dx and dy as (2, k)."""
-    step = np.arange(-radius, radius + 1)
-    away2 = (step * step)[:, None] + step * step
-    row, column = np.nonzero(away2 <= radius**2)
-    dx, dy = step[column], step[row]
-    return dx, dy, away2[row, column], np.stack([dx, dy]).astype(np.float32)
 
 
 def bell_shaped(
@@ -87,73 +55,95 @@ def bell_shaped(
     return _bells(linear, xy, width, height, noise_dn, clip_dn, index)
 
 
-@twin
+@inlined
+def _owns(xy: Floats, k: int, reach: float, dx: float, dy: float) -> bool:
+    """Whether a pixel beside spot k is nearer to it than to any other."""
+    for m in range(xy.shape[0]):
+        gx, gy = xy[m, 0] - xy[k, 0], xy[m, 1] - xy[k, 1]
+        apart2 = gx * gx + gy * gy
+        if 0.0 < apart2 < 4.0 * reach * reach and gx * dx + gy * dy > 0.5 * apart2:
+            return False
+    return True
+
+
+@inlined
+def _patch(linear: Image, xy: Floats, k: int, reach: float, clip_dn: float, out: Floats) -> int:
+    """Write the offsets and levels of a spot's own pixels; returns how many, -1 for a clipped spot."""
+    half, count, clipped = math.ceil(reach), 0, 0
+    x, y = int(xy[k, 0]), int(xy[k, 1])
+    for dy in range(-half, half + 1):
+        for dx in range(-half, half + 1):
+            i, j = x + dx, y + dy
+            if dx * dx + dy * dy > reach * reach or not (0 <= i < linear.shape[1] and 0 <= j < linear.shape[0]):
+                continue
+            if linear[j, i] >= clip_dn:
+                clipped += 1
+            elif _owns(xy, k, reach, dx, dy):
+                out[count, 0], out[count, 1], out[count, 2] = dx, dy, linear[j, i]
+                count += 1
+    return -1 if clipped > MOST_CLIPPED else count
+
+
+@inlined
+def _elongation(pixels: Floats, tall: float) -> float:
+    """Ratio of the standard deviations along and across a patch (n, 3) of offsets and levels.
+
+    Only the part above a third of the height counts.
+    """
+    top, total, x, y, xx, xy, yy = pixels[:, 2].max() - 0.65 * tall, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(pixels.shape[0]):
+        dx, dy, weight = pixels[i, 0], pixels[i, 1], max(pixels[i, 2] - top, 0.0)
+        total, x, y = total + weight, x + weight * dx, y + weight * dy
+        xx, xy, yy = xx + weight * dx * dx, xy + weight * dx * dy, yy + weight * dy * dy
+    x, y = x / total, y / total
+    xx, xy, yy = xx / total - x * x, xy / total - x * y, yy / total - y * y
+    mean, gap = 0.5 * (xx + yy) + PIXEL, math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+    return math.sqrt((mean + gap) / max(mean - gap, 1e-3))
+
+
+@inlined
+def _is_bell(pixels: Floats, sigma: float, tall: float, noise_dn: float) -> bool:
+    """Whether the levels of a patch (n, 3) of offsets and levels form a bell."""
+    n, mean = pixels.shape[0], 0.0
+    terms, gram = np.empty((8, n)), np.zeros((8, 8))
+    for i in range(n):
+        mean += pixels[i, 2] / n
+    for i in range(n):
+        u, v = pixels[i, 0] / sigma, pixels[i, 1] / sigma
+        g = math.exp(-0.5 * (u * u + v * v))
+        terms[0, i], terms[1, i], terms[2, i], terms[3, i] = g, g * u, g * v, g * (u * u + v * v)
+        terms[4, i], terms[5, i], terms[6, i], terms[7, i] = 1.0, u, v, pixels[i, 2] - mean
+    add_products(terms, 0, n, gram)
+    matrix = np.empty((7, 7))
+    for j in range(7):
+        for m in range(j + 1):
+            matrix[j, m] = matrix[m, j] = gram[j, m]
+        matrix[j, j] += 1e-6  # it keeps the matrix regular where half of the pixels belong to another spot
+    found = np.linalg.solve(matrix, gram[7, :7])
+    cost = 0.0
+    for i in range(n):
+        left = -terms[7, i]
+        for j in range(7):
+            left += found[j] * terms[j, i]
+        cost += left * left
+    misfit, scatter = math.sqrt(cost / n), math.sqrt(gram[7, 7] / n)
+    good = misfit < MISFIT_OF_HEIGHT * min(tall, DN) and misfit < MISFIT_OF_SCATTER * scatter
+    good = (good and found[0] > LEAST_PEAK * tall) or misfit <= EXPLAINED * noise_dn
+    return good and _elongation(pixels, tall) <= LONGEST
+
+
+@compiled
 def _bells(
     linear: Image, xy: Floats, width: Floats, height: Floats, noise_dn: float, clip_dn: float, index: Indices
 ) -> Bools:
     """Judge the spots with these indices (m,) (see `bell_shaped`)."""
-    out = np.ones(index.size, dtype=bool)
-    sigma, tall = np.maximum(width[index], NARROWEST_PX), height[index]  # a narrower one is mostly its pixel
-    reach = 2.2 * sigma + 1.0
-    at, offset, use = about(xy[index], reach, linear.shape)
-    patch = np.take(linear, at)
-    clipped = patch >= clip_dn
-    judged = np.ones(index.size, dtype=bool)
-    if clipped.any():
-        # Of other spots only the flanks remain, which do not show the height.
-        judged = (use & clipped).sum(axis=1) <= MOST_CLIPPED
-        use &= ~clipped
-    _nearest(use, offset, xy[index], xy, reach)
-    count = use.sum(axis=1)
-    judged &= count >= 12
-    if not judged.any():
-        return out
-    if not judged.all():
-        use, patch, sigma, tall, count = use[judged], patch[judged], sigma[judged], tall[judged], count[judged]
-    weight = use.astype(np.float32)
-    u, v = (part * (1.0 / sigma).astype(np.float32)[:, None] for part in offset)
-    r2 = u * u + v * v
-    g = np.exp(np.float32(-0.5) * r2) * weight
-    terms = np.empty((g.shape[0], 7, g.shape[1]), np.float32)
-    terms[:, 0], terms[:, 1], terms[:, 2], terms[:, 3] = g, g * u, g * v, g * r2
-    terms[:, 4], terms[:, 5], terms[:, 6] = weight, u * weight, v * weight
-    level = patch * weight
-    level -= (level.sum(axis=1) / count).astype(np.float32)[:, None] * weight
-    # The ridge keeps the matrix regular where half of the pixels belong to another spot.
-    matrix = (terms @ terms.transpose(0, 2, 1)).astype(np.float64) + 1e-6 * np.eye(7)
-    found = np.linalg.solve(matrix, (terms @ level[:, :, None]).astype(np.float64))
-    rest = (found.transpose(0, 2, 1).astype(np.float32) @ terms)[:, 0] - level
-    misfit, scatter = (np.sqrt(np.einsum("nk,nk->n", part, part) / count) for part in (rest, level))
-    good = (misfit < MISFIT_OF_HEIGHT * np.minimum(tall, DN)) & (misfit < MISFIT_OF_SCATTER * scatter)
-    good &= found[:, 0, 0] > LEAST_PEAK * tall
-    good |= misfit <= EXPLAINED * noise_dn
-    out[judged] = good & (_elongation(np.where(use, patch, -np.inf), tall, offset) <= LONGEST)
+    out = np.ones(index.size, dtype=np.bool_)
+    for m in range(index.size):
+        k = index[m]
+        sigma = max(width[k], NARROWEST_PX)
+        reach = 2.2 * sigma + 1.0
+        pixels = np.empty(((2 * math.ceil(reach) + 1) ** 2, 3))
+        count = _patch(linear, xy, k, reach, clip_dn, pixels)
+        if count >= 12:
+            out[m] = _is_bell(pixels[:count], sigma, height[k], noise_dn)
     return out
-
-
-def _elongation(patch: Singles, tall: Floats, offset: Singles) -> Floats:
-    """Ratio (m,) of the standard deviations along and across each patch (m, k).
-
-    Only the part above a third of the height counts.
-    """
-    weight = np.maximum(patch - (patch.max(axis=1) - 0.65 * tall).astype(np.float32)[:, None], np.float32(0.0))
-    dx, dy = offset
-    terms = np.stack([np.ones_like(dx), dx, dy, dx * dx, dx * dy, dy * dy], axis=1)
-    total, x, y, xx, xy, yy = (weight @ terms).astype(np.float64).T
-    x, y = x / total, y / total
-    xx, xy, yy = xx / total - x * x, xy / total - x * y, yy / total - y * y
-    mean = 0.5 * (xx + yy) + 1.0 / 12.0  # with a pixel's own
-    gap = np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    return np.asarray(np.sqrt((mean + gap) / np.maximum(mean - gap, 1e-3)))
-
-
-def _nearest(use: Bools, offset: Singles, own: Floats, xy: Floats, reach: Floats) -> None:
-    """Clear in `use` (m, k) the pixels that lie nearer to another of the spots `xy` than to the patch's own."""
-    gx, gy = (xy[None] - own[:, None]).transpose(2, 0, 1)
-    apart2 = gx * gx + gy * gy
-    near, other = np.nonzero((apart2 < (4.0 * reach**2)[:, None]) & (apart2 > 0.0))
-    if near.size:
-        toward = np.stack([gx[near, other], gy[near, other]], axis=-1).astype(np.float32)
-        nearer = toward @ offset <= 0.5 * apart2[near, other].astype(np.float32)[:, None]
-        first = np.flatnonzero(np.diff(near, prepend=-1))
-        use[near[first]] &= np.logical_and.reduceat(nearer, first, axis=0)

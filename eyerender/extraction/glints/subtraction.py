@@ -8,12 +8,12 @@ import numpy as np
 
 from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse
-from ..compiled import twin
+from ...jit import compiled
 from ..preprocessing import Image, Part, Prepared
 from ..pupil.glare import around
 from .detection import Spots
-from .fits import SpotFit, profile
-from .windows import LARGEST_PX
+from .fits import SpotFit
+from .windows import LARGEST_PX, profile
 
 # In noise standard deviations: the largest residual of a spot whose light is subtracted; the light above which a pixel
 # is left out even so; the faintest light that matters.
@@ -44,7 +44,6 @@ def affected_pixels(prepared: Prepared, part: Part, spots: Spots, which: Bools |
     return _covered(part.linear, prepared.clip_dn, xy - np.array(part.corner), radius)
 
 
-@twin
 def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools:
     """Mask (h, w) of the clipped pixels and those nearer to a place (n, 2) than its radius (n,)."""
     mask = linear >= clip_dn
@@ -80,21 +79,27 @@ def subtract_spots(part: Part, noise_dn: float, fit: SpotFit, which: Bools, abou
     return Part(linear, part.corner), bright
 
 
-@twin
+@compiled
 def _subtracted(linear: Image, spots: Floats, radius: Floats, limit: float) -> tuple[Image, Bools]:
     """Subtract the light of spots (n, 5: centre, two sigma, amplitude) within radius (n,).
 
     Returns:
         The image (h, w), and the mask (h, w) of pixels where the light of one exceeds the limit.
     """
-    linear, bright = linear.copy(), np.zeros(linear.shape, dtype=bool)
-    for (x, y, wide, high, amplitude), far in zip(spots.tolist(), radius.tolist(), strict=True):
-        rows, columns = _window(x, y, far, linear.shape)
-        gx = profile(np.arange(columns.start, columns.stop), x, wide)
-        light = amplitude * gx * profile(np.arange(rows.start, rows.stop), y, high)[:, None]
-        linear[rows, columns] -= light.astype(np.float32)
-        bright[rows, columns] |= light > limit
-    return linear, bright
+    height, width = linear.shape
+    out, bright = linear.copy(), np.zeros(linear.shape, dtype=np.bool_)
+    for k in range(radius.size):
+        cx, cy, wide, high, amplitude = spots[k]
+        x0, x1 = max(0, math.floor(cx - radius[k])), min(width, math.ceil(cx + radius[k]) + 1)
+        y0, y1 = max(0, math.floor(cy - radius[k])), min(height, math.ceil(cy + radius[k]) + 1)
+        across = np.array([amplitude * profile(x - 0.5 - cx, wide)[1] for x in range(x0, x1)])
+        for y in range(y0, y1):
+            along = profile(y - 0.5 - cy, high)[1]
+            for x in range(x0, x1):
+                light = across[x - x0] * along
+                out[y, x] -= np.float32(light)
+                bright[y, x] |= light > limit
+    return out, bright
 
 
 def _reach(sigma: Floats, peak: Floats, noise_dn: float) -> Floats:

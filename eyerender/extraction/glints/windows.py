@@ -10,10 +10,9 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from ...arrays import Bools, Floats, Indices
-from ..compiled import twin
+from ...jit import compiled, inlined
 from ..preprocessing import Image
 
 Windows = tuple[Indices, Floats, Floats, Floats]  # first, plane, centre and radius of SpotPixels
@@ -57,6 +56,11 @@ class SpotPixels:
     clipped: bool
 
     @property
+    def windows(self) -> Windows:
+        """First, plane, centre and radius, for compiled functions."""
+        return self.first, self.plane, self.centre, self.radius
+
+    @property
     def count(self) -> Floats:
         """Number (n,) of each spot's pixels."""
         return np.asarray(self.first[1:] - self.first[:-1], dtype=np.float64)
@@ -94,7 +98,7 @@ class SpotPixels:
             first=_starts(count),
             spot=np.arange(spots.size).repeat(count),
             middle_dn=self.middle_dn[spots],
-            plane=self.plane[:, rows],
+            plane=self.plane.take(rows, axis=1),
             data=self.data[rows],
             known=self.known[rows],
             clip=clip[: rows.size],
@@ -158,7 +162,7 @@ def cut(
     )
 
 
-@twin
+@compiled
 def _windows(linear: Image, start: Floats, centre: Floats, radius: Floats) -> tuple[Indices, Indices, Floats, Floats]:
     """Find the pixels (P,) within `radius` (n,) of `start` (n, 2).
 
@@ -166,144 +170,77 @@ def _windows(linear: Image, start: Floats, centre: Floats, radius: Floats) -> tu
         Where each spot's pixels begin (n + 1,), the spot of each pixel (P,), 1 and the offset from the spot's middle
         pixel `centre` (3, P), and the levels (P,).
     """
-    rows, columns = linear.shape
-    half = math.ceil(float(radius.max()) + 0.5)
-    step = np.arange(-half, half + 1.0)
-    off = (centre - start)[:, :, None] + step
-    off *= off
-    inside = off[:, 1, :, None] + off[:, 0, None, :] <= (radius**2)[:, None, None]
-    x, y = centre[:, :1] + step, centre[:, 1:] + step
-    inside &= ((x >= 0) & (x < columns))[:, None, :] & ((y >= 0) & (y < rows))[:, :, None]
-    spot, row, column = np.nonzero(inside)
-    dx, dy = step[column], step[row]
-    data = np.take(linear, ((centre[spot, 1] + dy) * columns + centre[spot, 0] + dx).astype(np.intp))
-    first = _starts(np.bincount(spot, minlength=radius.size))
-    return first, spot, np.stack([np.ones_like(dx), dx, dy]), data.astype(np.float64)
+    n, size = radius.size, 0
+    for k in range(n):
+        size += (2 * math.ceil(radius[k] + 0.5) + 1) ** 2
+    first, spot = np.zeros(n + 1, dtype=np.int64), np.empty(size, dtype=np.int64)
+    plane, data, count = np.empty((3, size)), np.empty(size), 0
+    for k in range(n):
+        half = math.ceil(radius[k] + 0.5)
+        off_x, off_y, square = centre[k, 0] - start[k, 0], centre[k, 1] - start[k, 1], radius[k] ** 2
+        for dy in range(-half, half + 1):
+            for dx in range(-half, half + 1):
+                x, y = int(centre[k, 0]) + dx, int(centre[k, 1]) + dy
+                if (off_y + dy) ** 2 + (off_x + dx) ** 2 > square:
+                    continue
+                if 0 <= x < linear.shape[1] and 0 <= y < linear.shape[0]:
+                    spot[count], plane[1, count], plane[2, count], data[count] = k, dx, dy, linear[y, x]
+                    count += 1
+        first[k + 1] = count
+    plane[0] = 1.0
+    return first, spot[:count].copy(), plane[:, :count].copy(), data[:count].copy()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Grid:
-    """Borders of the columns and rows of n windows, so that a spot's profile is computed once per column and row.
+def shining_pairs(pixels: SpotPixels, theta: Floats, pairs: Bools, noise_dn: float) -> Indices:
+    """Pairs (m, 2) of a window and a spot whose light there rises above a small fraction of the noise.
 
-    Attributes:
-        edges: (2 E,) from the windows' middles: the columns' borders of one window after the other, then the rows'.
-        owner: (2 E,) the window of each border; those of rows are counted from n.
-        column: (P,) the border before each pixel's column.
-        row: (P,) the border before each pixel's row.
-        split: E.
+    Args:
+        pixels: the pixels of all windows.
+        theta: (n, 5 or more) x, y, ln A, ln sx, ln sy.
+        pairs: (n, n) whether the second spot may shine into the first's window.
+        noise_dn: standard deviation of the noise.
     """
-
-    edges: Floats
-    owner: Indices
-    column: Indices
-    row: Indices
-    split: int
-
-    @staticmethod
-    def of(radius: Floats, spot: Indices, dx: Floats, dy: Floats) -> Grid:
-        """Make the grid from the radius (n,) of the windows, and the window and offset of every pixel (P,)."""
-        n, half = radius.size, np.ceil(radius + 0.5).astype(np.intp)
-        size = np.tile(2 * half + 2, 2)
-        middle = np.cumsum(size) - size + np.tile(half, 2)
-        owner = np.repeat(np.arange(2 * n), size)
-        edges = np.asarray(np.arange(owner.size) - middle[owner] - 0.5, dtype=np.float64)
-        column, row = middle[spot] + dx.astype(np.intp), middle[n + spot] + dy.astype(np.intp)
-        return Grid(edges, owner, column, row, owner.size // 2)
-
-    def profiles(self, at: Floats, sigma: Floats, amplitude: Floats) -> tuple[Floats, Floats]:
-        """Profiles of the spots across the pixels' columns, times the amplitude, and along their rows, (3, P) each.
-
-        Each has the derivative by its centre, the value, and the derivative by ln sigma.
-
-        Args:
-            at: (n, 2) centres of the spots from the windows' middles.
-            sigma: (n, 2).
-            amplitude: (n,).
-        """
-        owner = self.owner
-        parts = profile(self.edges, at.T.ravel()[owner], sigma.T.ravel()[owner])
-        # The profiles along the rows are not multiplied.
-        across = parts[:, : self.split] * amplitude[owner[: self.split]]
-        return across.take(self.column, axis=1), parts.take(self.row, axis=1)
+    to, by = np.nonzero(pairs)
+    gap = np.hypot(*(pixels.centre[to] - theta[by, :2]).T) - pixels.radius[to] - 2.0
+    wide2 = np.exp(2.0 * theta[by, 3:5].max(axis=1)) * 1.5 + 0.1  # room for changes during the fit
+    shines = theta[by, 2] - 0.5 * np.maximum(gap, 0.0) ** 2 / wide2 > math.log(1e-3 * noise_dn)
+    return np.stack([to[shines], by[shines]], axis=1)
 
 
-def profile(edges: Floats, centre: Floats | float, sigma: Floats) -> Floats:
-    """Pixel means of a Gaussian profile and their derivatives.
-
-    The mean of exp(-(x - c)^2 / (2 s^2)) is taken between every edge and the next, 1 px on. Where an edge is the last
-    of a window, the next belongs to another window and the value has no meaning.
+@inlined
+def profile(low: float, sigma: float) -> tuple[float, float, float]:
+    """Integral of exp(-x^2 / (2 s^2)) over the pixel from `low` to `low` + 1, relative to the centre.
 
     Returns:
-        (3, E - 1): the derivative by c, the value, and the derivative by ln s.
+        The derivative by the centre, the value, and the derivative by ln s.
     """
-    u = (edges - centre) / sigma
-    tail = np.exp(-0.5 * u * u)
-    sums = erf(u * _ROOT_HALF)
-    scale = sigma[:-1]
-    out = np.empty((3, edges.size - 1))
-    np.subtract(tail[:-1], tail[1:], out=out[0])
-    np.subtract(sums[1:], sums[:-1], out=out[1])
-    out[1] *= scale * _ROOT_HALF_PI
-    tail *= u
-    np.subtract(tail[:-1], tail[1:], out=out[2])
-    out[2] *= scale
-    out[2] += out[1]
+    first, last = low / sigma, (low + 1.0) / sigma
+    tail_first, tail_last = math.exp(-0.5 * first * first), math.exp(-0.5 * last * last)
+    value = sigma * _ROOT_HALF_PI * (math.erf(last * _ROOT_HALF) - math.erf(first * _ROOT_HALF))
+    return tail_first - tail_last, value, value + sigma * (first * tail_first - last * tail_last)
+
+
+@compiled
+def light_of_others(windows: Windows, theta: Floats, pairs: Indices, count: int) -> Floats:
+    """Light (count,) of other spots in every spot's pixels.
+
+    Args:
+        windows: first, plane, centre and radius of `SpotPixels`.
+        theta: (n, 5 or more) x, y, ln A, ln sx, ln sy.
+        pairs: (m, 2) the spots of a window, and those that shine into it.
+        count: number of pixels.
+    """
+    first, plane, centre, radius = windows
+    out = np.zeros(count)
+    for i in range(pairs.shape[0]):
+        to, by = pairs[i]
+        half = math.ceil(radius[to] + 0.5)
+        across, along = np.empty(2 * half + 1), np.empty(2 * half + 1)
+        x, y, height = theta[by, 0] - centre[to, 0], theta[by, 1] - centre[to, 1], math.exp(theta[by, 2])
+        wide, high = math.exp(theta[by, 3]), math.exp(theta[by, 4])
+        for j in range(2 * half + 1):
+            across[j] = height * profile(j - half - 0.5 - x, wide)[1]
+            along[j] = profile(j - half - 0.5 - y, high)[1]
+        for j in range(first[to], first[to + 1]):
+            out[j] += across[int(plane[1, j]) + half] * along[int(plane[2, j]) + half]
     return out
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Others:
-    """Pairs of spots in which one spot's light reaches into the other's window.
-
-    Attributes:
-        pairs: (m, 2) the spot of a window, and the one that shines into it.
-        by: (m,) the second of them.
-        rows: (Q,) the pixels that it reaches, pair after pair.
-        pair: (Q,) the pair of each of these pixels.
-        grid: the windows of the pairs.
-        centre: (m, 2) the middles of these windows.
-    """
-
-    pairs: Indices
-    by: Indices
-    rows: Indices
-    pair: Indices
-    grid: Grid
-    centre: Floats
-
-    @staticmethod
-    def of(pixels: SpotPixels, theta: Floats, pairs: Bools, noise_dn: float) -> Others | None:
-        """Find the pairs, or None where no light rises above a small fraction of the noise.
-
-        Args:
-            pixels: the pixels of all windows.
-            theta: (n, 5 or more) x, y, ln A, ln sx, ln sy.
-            pairs: (n, n) whether the second spot may shine into the first's window.
-            noise_dn: standard deviation of the noise.
-        """
-        to, by = np.nonzero(pairs)
-        gap = np.hypot(*(pixels.centre[to] - theta[by, :2]).T) - pixels.radius[to] - 2.0
-        wide2 = np.exp(2.0 * theta[by, 3:5].max(axis=1)) * 1.5 + 0.1  # room for changes during the fit
-        shines = theta[by, 2] - 0.5 * np.maximum(gap, 0.0) ** 2 / wide2 > math.log(1e-3 * noise_dn)
-        to, by = to[shines], by[shines]
-        if to.size == 0:
-            return None
-        windows = (pixels.first, pixels.plane, pixels.centre, pixels.radius)
-        return Others.shining(windows, np.stack([to, by], axis=1))
-
-    @staticmethod
-    def shining(windows: Windows, pairs: Indices) -> Others:
-        """Make the pairs (m, 2) of a window and the spot that shines into it."""
-        first, plane, centre, radius = windows
-        to, by = pairs.T
-        count = first[to + 1] - first[to]
-        rows, pair = _ranges(first[to], count), np.arange(to.size).repeat(count)
-        grid = Grid.of(radius[to], pair, plane[1, rows], plane[2, rows])
-        return Others(pairs, by, rows, pair, grid, centre[to])
-
-    def light(self, theta: Floats, pixels: int, shining: Bools | None = None) -> Floats:
-        """Light (pixels,) of other spots, all or those `shining` (n,), in every spot's pixels."""
-        own = theta[self.by]
-        amplitude = np.exp(own[:, 2]) if shining is None else np.exp(own[:, 2]) * shining[self.by]
-        across, along = self.grid.profiles(own[:, :2] - self.centre, np.exp(own[:, 3:5]), amplitude)
-        return np.asarray(np.bincount(self.rows, weights=across[1] * along[1], minlength=pixels), dtype=np.float64)

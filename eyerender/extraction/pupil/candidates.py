@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Bools, Floats
-from ...geometry.ellipse import Ellipse, points_on_ellipse
-from ..compiled import twin
+from ...arrays import Bools, Floats, Indices
+from ...geometry.ellipse import Ellipse
+from ...jit import compiled, inlined
 from ..preprocessing import Image, Prepared, as_image
 from ..settings import Shape
-from ..statistics import median, quantile
+from ..statistics import quantile_of
 from .glare import Cleared, around
 
 LEVELS = 20  # thresholds at even grey levels
@@ -176,96 +176,145 @@ def _blob_ellipse(m: dict[str, float], least: float, most: float, shape: Shape) 
 
 
 def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -> list[Candidate]:
-    best = _best_blobs(blobs, _ring_levels(small, blobs, noise, ANGLES), noise)[:most]
+    best = _best_blobs(blobs, _ring_levels(small, blobs, noise), noise)[:most]
     return [
         Candidate(Ellipse((row[:2] + 0.5) * factor - 0.5, row[2:4] * factor, angle), inside, step, score)
         for row, (angle, inside, step, score) in zip(best, best[:, 4:].tolist(), strict=True)
     ]
 
 
-@twin
+@compiled
 def _best_blobs(blobs: Floats, levels: Floats, noise: float) -> Floats:
     """Find different blobs of `_sweep` that stand out: at most MOST_BLOBS, best first.
 
     Returns:
         Ellipse (x, y, a, b, angle), level inside, step and score of each, (k, 8).
     """
-    typical, enclosed, edge_level, spread = levels[:, 1:].T
-    strength = np.maximum(typical, 0.0) / (np.maximum(typical, 0.0) + 8.0 * noise + 4.0)
-    uniform = 1.0 / (1.0 + (spread / np.maximum(typical, 1e-6)) ** 2)
-    score = enclosed**2 * strength * uniform * np.minimum(blobs[:, 5], 1.0) ** 2
-    eligible = (typical >= max(2.5 * noise, 0.5)) & (enclosed >= 0.3)
-    kept: list[int] = []
-    for i in np.argsort(-score, kind="stable").tolist():
-        if eligible[i] and not any(_same(blobs[i], blobs[j]) for j in kept):
-            kept.append(i)
-        if len(kept) >= MOST_BLOBS:
+    n = blobs.shape[0]
+    score, kept, count = np.empty(n), np.empty(MOST_BLOBS, dtype=np.int64), 0
+    for i in range(n):
+        typical, spread = levels[i, 1], levels[i, 4]
+        strength = max(typical, 0.0) / (max(typical, 0.0) + 8.0 * noise + 4.0)
+        uniform = 1.0 / (1.0 + (spread / max(typical, 1e-6)) ** 2)
+        score[i] = levels[i, 2] ** 2 * strength * uniform * min(blobs[i, 5], 1.0) ** 2
+    for i in _descending(score):
+        new = levels[i, 1] >= max(2.5 * noise, 0.5) and levels[i, 2] >= 0.3
+        for k in range(count):
+            new = new and not _same(blobs[i], blobs[kept[k]])
+        if new:
+            kept[count] = i
+            count += 1
+        if count == MOST_BLOBS:
             break
+    kept = kept[:count]
     final = score[kept]
-    for k, i in enumerate(kept):
-        for m, j in enumerate(kept):
-            (x, y, a, b), (other_x, other_y, other_a, other_b) = blobs[i, :4].tolist(), blobs[j, :4].tolist()
-            inner = other_a * other_b < 0.6 * a * b and math.hypot(x - other_x, y - other_y) < 0.6 * b
-            darker = edge_level[i] - edge_level[j] > max(0.1 * typical[i], 2.0 * noise)
+    for k in range(count):
+        for m in range(count):
             # The iris contains the pupil, so a blob that contains a darker enclosed blob is not the pupil.
-            if inner and darker and enclosed[j] > 0.55 and typical[j] > 0.12 * typical[i]:
+            if _inside(blobs[kept[m]], blobs[kept[k]]) and _core(levels[kept[m]], levels[kept[k]], noise):
                 final[k] = min(final[k], 0.5 * final[m])
-    order = np.argsort(-final, kind="stable")
-    return np.column_stack([blobs[kept, :5], levels[kept, :2], final])[order]
+    out = np.empty((count, 8))
+    for row, k in enumerate(_descending(final)):
+        out[row, :5], out[row, 5:7], out[row, 7] = blobs[kept[k], :5], levels[kept[k], :2], final[k]
+    return out
 
 
-@twin
-def _ring_levels(small: Image, blobs: Floats, noise: float, angles: int) -> Floats:
+@inlined
+def _descending(values: Floats) -> Indices:
+    """Indices (n,) of values from the largest down; equal ones in their order."""
+    out = np.empty(values.size, dtype=np.int64)
+    for i in range(values.size):
+        k = i
+        while k > 0 and values[out[k - 1]] < values[i]:
+            out[k] = out[k - 1]
+            k -= 1
+        out[k] = i
+    return out
+
+
+@inlined
+def _inside(inner: Floats, outer: Floats) -> bool:
+    """Whether one blob of `_sweep` is well inside another one."""
+    near = math.hypot(outer[0] - inner[0], outer[1] - inner[1]) < 0.6 * outer[3]
+    return near and inner[2] * inner[3] < 0.6 * outer[2] * outer[3]
+
+
+@inlined
+def _core(inner: Floats, outer: Floats, noise: float) -> bool:
+    """Whether the levels (5,) of a blob, as of `_ring_levels`, show it as the dark core of another one."""
+    darker = outer[3] - inner[3] > max(0.1 * outer[1], 2.0 * noise)
+    return darker and inner[2] > 0.55 and inner[1] > 0.12 * outer[1]
+
+
+@compiled
+def _ring_levels(small: Image, blobs: Floats, noise: float) -> Floats:
     """Levels (n, 5) of blobs (n, 6): inside, step to a ring outside, share of that ring, near the edge, scatter."""
-    centre, axes, angle = blobs[:, :2], blobs[:, 2:4], blobs[:, 4]
-    near_in = _sample(small, centre, axes * 0.65, angle, angles)
-    deep_in = _sample(small, centre, axes * 0.4, angle, angles)
-    near_out = _sample(small, centre, axes * 1.15 + 1.5, angle, angles)
-    step = near_out - near_in
-    within = np.concatenate([near_in, deep_in], axis=1)
-    inside, typical, edge_level = (np.median(part, axis=1) for part in (within, step, near_in))
-    enclosed = np.mean(step > np.maximum(0.35 * typical, 2.0 * noise)[:, None], axis=1)
-    return np.stack([inside, typical, enclosed, edge_level, np.std(within, axis=1)], axis=1)
+    out = np.empty((blobs.shape[0], 5))
+    within, step = np.empty((2, ANGLES)), np.empty(ANGLES)
+    for k in range(blobs.shape[0]):
+        ellipse = (blobs[k, 0], blobs[k, 1], blobs[k, 2], blobs[k, 3], blobs[k, 4])
+        _levels_along(small, ellipse, 1.5, 0, within, step)
+        typical = quantile_of(step, 0.5)
+        out[k, 0], out[k, 1], out[k, 3] = quantile_of(within.ravel(), 0.5), typical, quantile_of(within[0], 0.5)
+        out[k, 2] = np.mean(step > max(0.35 * typical, 2.0 * noise))
+        out[k, 4] = np.std(within)
+    return out
+
+
+@inlined
+def _levels_along(
+    image: Image, ellipse: tuple[float, ...], away: float, box: int, within: Floats, step: Floats
+) -> None:
+    """Write levels along .65 and .4 of an ellipse (2, ANGLES), and steps from .65 to a ring outside (ANGLES,).
+
+    Levels are means of the pixels nearest to a point, up to `box` to each side. The ring is `away` px outside 1.15 of
+    the ellipse (cx, cy, a, b, angle).
+    """
+    x, y, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    for i in range(ANGLES):
+        turn_cos, turn_sin = math.cos(2.0 * math.pi * i / ANGLES), math.sin(2.0 * math.pi * i / ANGLES)
+        p, q = a * turn_cos, b * turn_sin
+        u, v = p * cos - q * sin, p * sin + q * cos
+        within[0, i] = _mean_about(image, x + 0.65 * u, y + 0.65 * v, box)
+        within[1, i] = _mean_about(image, x + 0.4 * u, y + 0.4 * v, box)
+        p, q = (1.15 * a + away) * turn_cos, (1.15 * b + away) * turn_sin
+        step[i] = _mean_about(image, x + p * cos - q * sin, y + p * sin + q * cos, box) - within[0, i]
+
+
+@inlined
+def _mean_about(image: Image, x: float, y: float, box: int) -> float:
+    """Mean of the pixels up to `box` to each side of the one nearest to a point; outside the frame, its border's."""
+    column, row, total = int(np.rint(x)), int(np.rint(y)), 0.0
+    for j in range(row - box, row + box + 1):
+        for i in range(column - box, column + box + 1):
+            total += image[min(max(j, 0), image.shape[0] - 1), min(max(i, 0), image.shape[1] - 1)]
+    return total / (2 * box + 1) ** 2
 
 
 def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
     """Make a candidate of a known place, with the levels of the image there; None where it is no darker inside."""
     about = ellipse.numbers()
-    inside, step = _levels_about(prepared.linear, about, ANGLES)
+    inside, step = _levels_about(prepared.linear, about)
     return Candidate(ellipse, inside, step) if step > prepared.noise_dn else None
 
 
-@twin
-def _levels_about(linear: Image, ellipse: tuple[float, ...], angles: int) -> tuple[float, float]:
+@compiled
+def _levels_about(linear: Image, ellipse: tuple[float, ...]) -> tuple[float, float]:
     """Level inside an ellipse (cx, cy, a, b, angle), and the step from its outer part to a ring outside.
 
     They are medians of the means of 3 x 3 pixels along ellipses.
     """
-    centre, axes, angle = np.array([ellipse[:2]]), np.array([ellipse[2:4]]), np.array(ellipse[4:])
-    near, deep, outside = (
-        _sample(linear, centre, scaled, angle, angles, box=1) for scaled in (0.65 * axes, 0.4 * axes, 1.15 * axes + 3.0)
-    )
-    return float(np.median(np.concatenate([near, deep]))), float(np.median(outside - near))
+    within, step = np.empty((2, ANGLES)), np.empty(ANGLES)
+    _levels_along(linear, ellipse, 3.0, 1, within, step)
+    return quantile_of(within.ravel(), 0.5), quantile_of(step, 0.5)
 
 
-def _sample(small: Image, centre: Floats, axes: Floats, angle: Floats, count: int, box: int = 0) -> Floats:
-    """Levels (n, count) along n ellipses: means of the nearest pixels, up to `box` of them to each side.
-
-    Outside the frame its border is repeated.
-    """
-    points = np.rint(points_on_ellipse(centre, axes, angle, count)).astype(np.intp)
-    out = np.zeros(points.shape[:-1])
-    for y in range(-box, box + 1):
-        for x in range(-box, box + 1):
-            column = np.minimum(np.maximum(points[..., 0] + x, 0), small.shape[1] - 1)
-            out += small[np.minimum(np.maximum(points[..., 1] + y, 0), small.shape[0] - 1), column]
-    return out / (2 * box + 1) ** 2
-
-
+@inlined
 def _same(first: Floats, second: Floats) -> bool:
     """Whether two blobs of `_sweep` are the same object at two thresholds."""
     near = math.hypot(first[0] - second[0], first[1] - second[1]) < 0.35 * min(first[3], second[3])
-    return bool(near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65)
+    return near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +353,7 @@ def inspect_interior(cleared: Cleared, ellipse: Ellipse, blur_px: float, noise_d
     return Interior(darker, 1.2533 * noise_dn * math.sqrt(1.0 / core + 1.0 / ring), spread)
 
 
-@twin
+@compiled
 def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float) -> tuple[float, int, int, float]:
     """Statistics of the pixels inside an ellipse (cx, cy, a, b, angle), up to the share `end` of its axes.
 
@@ -312,16 +361,36 @@ def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float
         Median of the ring below `end` minus that of the middle, the pixels of each, and the interquartile range of all.
     """
     cx, cy, a, b, angle = ellipse
-    dx, dy = np.arange(crop.shape[1])[None, :] - cx, np.arange(crop.shape[0])[:, None] - cy
     cos, sin = math.cos(angle), math.sin(angle)
-    radius2 = ((dx * cos + dy * sin) / a) ** 2 + ((dy * cos - dx * sin) / b) ** 2
-    # Where glints cover most of the middle, the level around them must do.
-    if np.count_nonzero(hidden & (radius2 < 0.35**2)) < 0.5 * np.count_nonzero(radius2 < 0.35**2):
-        radius2 = np.where(hidden, np.inf, radius2)
-    core, ring = crop[radius2 < 0.35**2], crop[(radius2 > (end - 0.25) ** 2) & (radius2 < end**2)]
-    inside = crop[radius2 < max(end, 0.5) ** 2]
-    between = quantile(inside, 0.75) - quantile(inside, 0.25) if inside.size >= 8 else 0.0
-    return median(ring) - median(core), core.size, ring.size, between
+    core, ring, inside = np.empty(crop.size), np.empty(crop.size), np.empty(crop.size)
+    whole = max(end, 0.5) ** 2
+    low, high = (end - 0.25) ** 2, end**2
+    n_core = n_ring = n_inside = 0
+    for shown in (True, False):
+        middle = covered = n_core = n_ring = n_inside = 0
+        for y in range(crop.shape[0]):
+            for x in range(crop.shape[1]):
+                p, q = ((x - cx) * cos + (y - cy) * sin) / a, ((y - cy) * cos - (x - cx) * sin) / b
+                square = p * p + q * q
+                if square < 0.35**2:
+                    middle += 1
+                    covered += hidden[y, x]
+                if shown and hidden[y, x]:
+                    continue
+                if square < 0.35**2:
+                    core[n_core] = crop[y, x]
+                    n_core += 1
+                if low < square < high:
+                    ring[n_ring] = crop[y, x]
+                    n_ring += 1
+                if square < whole:
+                    inside[n_inside] = crop[y, x]
+                    n_inside += 1
+        if covered < 0.5 * middle:
+            break
+    inside = inside[:n_inside]
+    spread = quantile_of(inside, 0.75) - quantile_of(inside, 0.25) if n_inside >= 8 else 0.0
+    return quantile_of(ring[:n_ring], 0.5) - quantile_of(core[:n_core], 0.5), n_core, n_ring, spread
 
 
 def find_inside(prepared: Prepared, cleared: Cleared, ellipse: Ellipse, shape: Shape) -> list[Candidate]:

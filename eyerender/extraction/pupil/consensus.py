@@ -6,20 +6,19 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ...arrays import Bools, Floats
-from ...geometry.ellipse import Ellipse, fit_ellipse_direct, from_cv2, signed_distance
-from ..compiled import twin
+from ...geometry.ellipse import Ellipse
+from ...jit import compiled, inlined
 from ..settings import Shape
-from ..statistics import median
+from ..statistics import quantile_of
+from .algebraic import direct_fits, taubin_fit
 from .candidates import Candidate
 from .covariance import EdgeSums, edge_covariance, hidden_part, to_axes, towards_round
-from .edge_model import NEAR, longest_gap, sectors_at
 from .edges import EdgePoints
+from .places import SECTORS, holding, relative_to, sector_at
 
-SECTORS = 48  # sectors of the outline, to measure support
 PIECES = 16  # arcs are cut at these sectors, to separate a lid margin from the boundary it joins
 SAMPLES = 240
 POINTS_PER_PIECE = 3
@@ -130,25 +129,33 @@ def _sane(a: Any, b: Any, candidate: Candidate, shape: Shape) -> Any:
     return alike & (a <= shape.most_px) & (b >= 0.8 * shape.least_px)
 
 
-@twin
+@compiled
 def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) -> Floats:
     """Score (m,) of every ellipse (m, 5).
 
     The score counts nearby points with an agreeing normal, weighted by closeness, per length.
     """
-    cos, sin = np.cos(fits[:, 4:]), np.sin(fits[:, 4:])
-    a, b = fits[:, 2:3], fits[:, 3:4]
-    dx, dy = points[:, 0] - fits[:, :1], points[:, 1] - fits[:, 1:2]
-    p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
-    radius = np.sqrt(p * p + q * q)
-    nx, ny = p / a, q / b
-    slope = np.sqrt(nx * nx + ny * ny)
-    distance = (radius - 1.0) * radius / slope
-    agree = (nx * cos - ny * sin) * normals[:, 0] + (nx * sin + ny * cos) * normals[:, 1] > 0.9 * slope
-    closeness = np.maximum(1.0 - (distance / tolerance) ** 2, 0.0)
-    # The score is per length of outline, so that a large loose ellipse does not win by points of other edges.
-    score: Floats = np.einsum("mn,mn->m", closeness, agree) / np.sqrt(np.pi * (a + b)[:, 0])
-    return score
+    out = np.zeros(fits.shape[0])
+    for m in range(fits.shape[0]):
+        cx, cy, a, b, angle = fits[m]
+        cos, sin = math.cos(angle), math.sin(angle)
+        total = 0.0
+        for i in range(points.shape[0]):
+            dx, dy = points[i, 0] - cx, points[i, 1] - cy
+            p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
+            radius2 = p * p + q * q
+            nx, ny = p / a, q / b
+            slope2 = nx * nx + ny * ny
+            # The distance is (radius - 1) radius / slope.
+            radius = math.sqrt(radius2)
+            distance2 = (radius - 1.0) ** 2 * radius2 / slope2
+            if distance2 >= tolerance * tolerance:
+                continue
+            along = (nx * cos - ny * sin) * normals[i, 0] + (nx * sin + ny * cos) * normals[i, 1]
+            if along > 0.9 * math.sqrt(slope2):
+                total += 1.0 - distance2 / (tolerance * tolerance)
+        out[m] = total / math.sqrt(math.pi * (a + b))
+    return out
 
 
 def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float) -> BoundaryFit | str:
@@ -172,13 +179,12 @@ def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float)
     sums = EdgeSums.of(ellipse, kept)
     covariance = edge_covariance(sums, residual)
     if gap > CUT:
-        held = np.zeros(SECTORS, dtype=bool)
-        held[sectors_at(tuple(found.tolist()), kept[:, 0], kept[:, 1], NEAR)] = True
+        held = holding(ellipse.numbers(), kept)
         ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, held, residual))
     return BoundaryFit(ellipse, inliers, kept, support, gap, residual, sums, to_axes(covariance, ellipse))
 
 
-@twin
+@compiled
 def _settled(
     points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float
 ) -> tuple[int, Floats, Bools, Floats, Floats]:
@@ -198,92 +204,80 @@ def _settled(
         How many points were selected (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points
         (n,), the points (n, 2) as moved, and (3,) support, gap and residual as in `BoundaryFit`.
     """
-    ellipse, inliers, moved = Ellipse.of(start), np.zeros(points.shape[0], dtype=bool), points
+    n = points.shape[0]
+    ellipse, moved, nothing = start.copy(), np.empty((n, 2)), np.zeros(3)
+    distance, chosen, inliers = np.empty(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     for turn in range(5):
-        distance, outward, curvature = relative_to(ellipse, points)
-        shift = np.minimum(0.5 * sigma_px**2 * curvature, 0.15 * float(ellipse.semi_axes_px[1]))
-        moved, distance = points + shift[:, None] * outward, distance + shift
-        agree = np.einsum("nk,nk->n", outward, normals) > 0.9
         reach = 2.0 * tolerance if turn == 0 else tolerance
-        chosen = (np.abs(distance) < reach) & agree
-        if turn >= 1 and chosen.sum() >= 8:
-            spread = 1.4826 * median(np.abs(distance[chosen] - median(distance[chosen])))
-            chosen &= np.abs(distance) < max(3.5 * spread, 0.1)
-        if chosen.sum() < 8:
-            return int(chosen.sum()), start, chosen, moved, np.zeros(3)
-        same = bool((chosen == inliers).all()) and turn > 1
-        inliers = chosen
-        fitted = ams_fit(moved[inliers])
-        if fitted is None:
-            return -1, start, inliers, moved, np.zeros(3)
-        ellipse = fitted
+        count = _select(points, normals, ellipse, sigma_px, reach, turn >= 1, moved, distance, chosen)
+        if count < 8:
+            return count, ellipse, chosen, moved, nothing
+        same = turn > 1
+        for i in range(n):
+            same = same and chosen[i] == inliers[i]
+            inliers[i] = chosen[i]
+        if not taubin_fit(moved[inliers], ellipse):
+            return -1, ellipse, inliers, moved, nothing
         if same:
             break
-    found = np.array(ellipse.numbers())
-    distance = signed_distance(ellipse, moved[inliers])
-    seen = np.array([*outline_support(ellipse, moved[inliers]), np.sqrt(np.mean(distance**2))])
-    return int(inliers.sum()), found, inliers, moved, seen
+    return count, ellipse, inliers, moved, _seen(ellipse, moved[inliers])
 
 
-def ams_fit(points: Floats) -> Ellipse | None:
-    """Apply cv2.fitEllipseAMS relative to the points' mean and scale, because OpenCV computes in float32."""
-    mean = points.mean(axis=0)
-    scale = float(np.abs(points - mean).max())
-    if not scale > 0.0:
-        return None
-    try:
-        rect = cv2.fitEllipseAMS(((points - mean) / scale).astype(np.float32))
-    except cv2.error:
-        return None
-    (cx, cy), (width, height), degrees = rect
-    if not (math.isfinite(cx + cy + width + height) and 0.0 < width < 50.0 and 0.0 < height < 50.0):
-        return None
-    unit = from_cv2(((cx, cy), (width, height), degrees))
-    return Ellipse(unit.centre_px * scale + mean, unit.semi_axes_px * scale, unit.angle_rad)
+@inlined
+def _select(
+    points: Floats, normals: Floats, start: Floats, sigma_px: float, reach: float, clipped: bool,
+    moved: Floats, distance: Floats, chosen: Bools,
+) -> int:  # fmt: skip
+    """Move points by the curvature shift and choose those near an ellipse; returns how many were chosen.
 
-
-def outline_support(ellipse: Ellipse, points: Floats) -> tuple[float, float]:
-    """Share of the outline that holds points, and share of the longest gap.
-
-    The outline is divided into SECTORS (equal steps of the parameter). The second value is the share of the longest run
-    of sectors without a point.
+    The arguments are those of `_settled`, the largest distance of a point, whether outliers are clipped, and what
+    receives the points as moved (n, 2), their distances (n,) and whether they are chosen (n,).
     """
-    held = np.zeros(SECTORS, dtype=bool)
-    held[(turn_of(points, ellipse) * SECTORS).astype(np.intp) % SECTORS] = True
-    return float(held.mean()), longest_gap(held)
+    ellipse, n, count = (start[0], start[1], start[2], start[3], start[4]), points.shape[0], 0
+    for i in range(n):
+        away, nx, ny, curvature = relative_to(ellipse, points[i, 0], points[i, 1])
+        shift = min(0.5 * sigma_px * sigma_px * curvature, 0.15 * start[3])
+        moved[i, 0], moved[i, 1] = points[i, 0] + shift * nx, points[i, 1] + shift * ny
+        distance[i] = away + shift
+        chosen[i] = abs(distance[i]) < reach and nx * normals[i, 0] + ny * normals[i, 1] > 0.9
+        count += chosen[i]
+    if clipped and count >= 8:
+        some = distance[chosen]
+        limit = max(3.5 * 1.4826 * quantile_of(np.abs(some - quantile_of(some, 0.5)), 0.5), 0.1)
+        count = 0
+        for i in range(n):
+            chosen[i] = chosen[i] and abs(distance[i]) < limit
+            count += chosen[i]
+    return count
 
 
-@twin
+@inlined
+def _seen(numbers: Floats, points: Floats) -> Floats:
+    """Share of an outline that holds points (n, 2), that of the longest gap, and the root mean square distance, (3,).
+
+    The gap is the longest run of sectors (equal steps of the ellipse's parameter t) without a point.
+    """
+    ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
+    cos, sin = math.cos(ellipse[4]), math.sin(ellipse[4])
+    held, square = np.zeros(SECTORS, dtype=np.bool_), 0.0
+    for i in range(points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        dx, dy = x - ellipse[0], y - ellipse[1]
+        held[sector_at((dx * cos + dy * sin) / ellipse[2], (dy * cos - dx * sin) / ellipse[3])] = True
+        square += relative_to(ellipse, x, y)[0] ** 2 / points.shape[0]
+    run = longest = full = 0
+    for k in range(2 * SECTORS):
+        run = 0 if held[k % SECTORS] else run + 1
+        longest = max(longest, run)
+        full += held[k % SECTORS]
+    return np.array([0.5 * full / SECTORS, min(longest, SECTORS) / SECTORS, math.sqrt(square)])
+
+
+@compiled
 def median_off(ellipse: tuple[float, ...], points: Floats, sigma_px: float) -> float:
     """Median distance of edge points (n, 2), moved outward by the curvature shift, from (cx, cy, a, b, angle)."""
-    distance, _, curvature = relative_to(Ellipse.of(ellipse), points)
-    return median(np.abs(distance + 0.5 * sigma_px**2 * curvature))
-
-
-def relative_to(ellipse: Ellipse, points: Floats) -> tuple[Floats, Floats, Floats]:
-    """Signed distance (n,), outward normal (n, 2) and curvature of the outline (n,) at points near an ellipse."""
-    a, b = ellipse.semi_axes_px.tolist()
-    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    dx, dy = points[:, 0] - ellipse.centre_px[0], points[:, 1] - ellipse.centre_px[1]
-    p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b
-    radius = np.maximum(np.sqrt(p * p + q * q), 1e-12)
-    u, v = p / a, q / b
-    slope = np.maximum(np.sqrt(u * u + v * v), 1e-12)
-    normals = np.stack([u * cos - v * sin, u * sin + v * cos], axis=-1) / slope[:, None]
-    # With (cos t, sin t) = (p, q) / radius: a b / (a^2 sin^2 t + b^2 cos^2 t)^1.5, and slope is its root over a b.
-    return (radius - 1.0) * radius / slope, normals, (radius / slope) ** 3 / (a * b) ** 2
-
-
-@twin
-def direct_fits(points: Floats) -> Floats:
-    """Direct ellipses (m, 5) through points (m, k, 2): centre, semi-axes and angle; NaN where there is none."""
-    fit = fit_ellipse_direct(points)
-    return np.column_stack([fit.centre_px, fit.semi_axes_px, fit.angle_rad])
-
-
-def turn_of(points: Floats, ellipse: Ellipse) -> Floats:
-    """Position (n,) of points along the outline, 0..1 by the ellipse's parameter."""
-    dx, dy = (points - ellipse.centre_px).T
-    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    a, b = ellipse.semi_axes_px
-    return np.asarray(np.arctan2((dy * cos - dx * sin) / b, (dx * cos + dy * sin) / a) / (2.0 * np.pi) + 0.5)
+    off = np.empty(points.shape[0])
+    for i in range(off.size):
+        distance, _, _, curvature = relative_to(ellipse, points[i, 0], points[i, 1])
+        off[i] = abs(distance + 0.5 * sigma_px * sigma_px * curvature)
+    return quantile_of(off, 0.5)

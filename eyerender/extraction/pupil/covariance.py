@@ -13,8 +13,8 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse
-from ..compiled import twin
-from .edge_model import SECTORS, Place, sector_of
+from ...jit import compiled, inlined
+from .places import BLOCK, COS_T, COS_U, NX, NY, SECTORS, SIN_T, SIN_U, Place, places, sector_at
 
 SHAPE = 5  # number of parameters
 GROUPS = SECTORS // 3  # each is longer than the noise's correlation
@@ -30,25 +30,6 @@ ROUGHER = 3.0
 # Standard deviation of the difference of a pupil's semi-axes, and of what turns them, in its radius: 0.034 to 0.101 in
 # six rows of rendered development images (gaze of 6 to 18 degrees), 0.067 in all.
 ELONGATION = 0.07
-
-
-def gram(slopes: Floats) -> Floats:
-    """Products S S^T of (p, n), computed in blocks of columns.
-
-    For all columns at once, BLAS would start threads and take several times as long.
-    """
-    columns = max(1, 200_000 // slopes.shape[0] ** 2)
-    out = np.zeros((slopes.shape[0], slopes.shape[0]))
-    for start in range(0, slopes.shape[1], columns):
-        block = slopes[:, start : start + columns]
-        out += block @ block.T
-    return out
-
-
-def project(slopes: Floats, residual: Floats) -> Floats:
-    """Products S r of (p, n), without BLAS for the same reason as in `gram`."""
-    out: Floats = np.einsum("pn,n->p", slopes, residual)
-    return out
 
 
 def distance_slopes(ellipse: Ellipse, place: Place) -> Floats:
@@ -95,21 +76,35 @@ class EdgeSums:
     @staticmethod
     def of(ellipse: Ellipse, points: Floats) -> EdgeSums:
         """Sum over points (n, 2)."""
-        return EdgeSums(*_edge_sums(ellipse.numbers(), points, GROUPS))
+        return EdgeSums(*_edge_sums(ellipse.numbers(), points))
 
 
-@twin
-def _edge_sums(ellipse: tuple[float, ...], points: Floats, groups: int) -> tuple[Floats, Floats, Floats, Indices]:
+@inlined
+def slopes_at(cos: float, sin: float, c: float, s: float, nx: float, ny: float, row: Floats) -> None:
+    """Write `distance_slopes` at one place into row (5,); cos and sin are those of the ellipse's angle."""
+    row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos
+    row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
+
+
+@compiled
+def _edge_sums(ellipse: tuple[float, ...], points: Floats) -> tuple[Floats, Floats, Floats, Indices]:
     """The sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle)."""
-    about = Ellipse.of(ellipse)
-    place = Place.of(about, points[:, 0], points[:, 1])
-    slopes = distance_slopes(about, place)
-    group = sector_of(place) // (SECTORS // groups)
-
-    def sums(rows: Floats) -> Floats:
-        return np.array([np.bincount(group, weights=row, minlength=groups) for row in rows], dtype=np.float64)
-
-    return gram(slopes), sums(slopes * place.distance), sums(slopes), np.bincount(group, minlength=groups)
+    cos, sin = math.cos(ellipse[4]), math.sin(ellipse[4])
+    matrix, scores, slopes = np.zeros((SHAPE, SHAPE)), np.zeros((SHAPE, GROUPS)), np.zeros((SHAPE, GROUPS))
+    number, row, place, flat = np.zeros(GROUPS, dtype=np.int64), np.empty(SHAPE), np.empty(8 * BLOCK), points.T.copy()
+    for start in range(0, points.shape[0], BLOCK):
+        count = min(BLOCK, points.shape[0] - start)
+        places(ellipse, flat[0], flat[1], start, count, place)
+        for i in range(count):
+            slopes_at(cos, sin, place[COS_T + i], place[SIN_T + i], place[NX + i], place[NY + i], row)
+            k = sector_at(place[COS_U + i], place[SIN_U + i]) * GROUPS // SECTORS
+            number[k] += 1
+            for j in range(SHAPE):
+                scores[j, k] += row[j] * place[i]
+                slopes[j, k] += row[j]
+                for m in range(SHAPE):
+                    matrix[j, m] += row[j] * row[m]
+    return matrix, scores, slopes, number
 
 
 def edge_covariance(sums: EdgeSums, residual_px: float) -> Floats:
@@ -117,17 +112,11 @@ def edge_covariance(sums: EdgeSums, residual_px: float) -> Floats:
 
     Neighbouring edge points share noise (through the filter) and texture. `sector_excess` accounts for that.
     """
-    return _of_edges(sums.matrix, sums.scores, sums.count, residual_px)
-
-
-@twin
-def _of_edges(matrix: Floats, scores: Floats, count: Indices, residual_px: float) -> Floats:
-    """Covariance by the sums of `EdgeSums`."""
-    inverse = _inverse(matrix)
+    inverse = _inverse(sums.matrix)
     plain = inverse * max(residual_px, 1e-4) ** 2
     # n / (n - 5) for the fitted parameters.
-    groups = max(int(np.count_nonzero(count)), SHAPE + 1)
-    excess = sector_excess(plain, inverse, scores) * groups / (groups - SHAPE)
+    groups = max(int(np.count_nonzero(sums.count)), SHAPE + 1)
+    excess = sector_excess(plain, inverse, sums.scores) * groups / (groups - SHAPE)
     return np.asarray(plain * max(excess, 1.0) * SELECTION)
 
 
@@ -191,14 +180,8 @@ def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
     that hold points were displaced independently by 1 px. A real boundary is uneven, so the hidden
     part of an outline is the more uncertain the larger this is.
     """
-    return max(_along_outline(ellipse.numbers(), _followed(sums.matrix, sums.slopes)), 1e-3)
-
-
-@twin
-def _followed(matrix: Floats, slopes: Floats) -> Floats:
-    """Covariance (5, 5) that independent displacements of the groups of 1 px cause, by the sums of `EdgeSums`."""
-    moved = _inverse(matrix) @ slopes
-    return np.asarray(moved @ moved.T)
+    moved = _inverse(sums.matrix) @ sums.slopes
+    return max(_along_outline(ellipse.numbers(), moved @ moved.T), 1e-3)
 
 
 def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
@@ -209,12 +192,20 @@ def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
     return _along_outline(ellipse.numbers(), covariance * (scale[:, None] * scale))
 
 
-@twin
+@compiled
 def _along_outline(ellipse: tuple[float, ...], covariance: Floats) -> float:
     """Root mean square of the boundary's standard deviation, by the covariance (5, 5) of centre and shape matrix."""
-    about = Ellipse.of(ellipse)
-    slopes = distance_slopes(about, Place.middles(about, 32))
-    return math.sqrt(max(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1], 0.0))
+    _, _, a, b, angle = ellipse
+    cos, sin, total, row, count = math.cos(angle), math.sin(angle), 0.0, np.empty(SHAPE), 32
+    for k in range(count):
+        t = 2.0 * math.pi * ((k + 0.5) / count - 0.5) - angle
+        c, s = math.cos(t), math.sin(t)
+        height = math.hypot(b * c, a * s)
+        slopes_at(cos, sin, c, s, b * c / height, a * s / height, row)
+        for j in range(SHAPE):
+            for m in range(SHAPE):
+                total += row[j] * covariance[j, m] * row[m]
+    return math.sqrt(max(total / count, 0.0))
 
 
 def _inverse(matrix: Floats) -> Floats:

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from ...arrays import Bools, Bytes, Floats, Indices
-from ..compiled import twin
+from ...jit import compiled, inlined
 from ..preprocessing import Image, as_image
-from ..statistics import median, quantile
+from ..statistics import median, quantile_of
 from .candidates import Candidate
 from .glare import Cleared, around
 
@@ -120,7 +120,7 @@ def find_edges(
     )
 
 
-@twin
+@compiled
 def _ridges(
     gx: Image, gy: Image, magnitude: Image, covered: Bytes, ellipse: tuple[float, ...], half_band: float, floor: float
 ) -> tuple[Floats, Floats, Floats, Indices, Indices]:
@@ -129,33 +129,76 @@ def _ridges(
     Returns:
         Points (n, 2), normals (n, 2), squared widths of the profile along the normal (n,), rows and columns (n,).
     """
-    strong = (magnitude > floor) & (covered == 0)
-    strong[[0, -1], :] = False
-    strong[:, [0, -1]] = False
-    # The coarse tests come first, so that the others work on few pixels.
-    at = np.flatnonzero(strong)
-    row, column = at // magnitude.shape[1], at % magnitude.shape[1]
-    dx, dy, here = gx[row, column], gy[row, column], magnitude[row, column]
-    u, v, radius = _outward(ellipse, column, row)
-    gate = np.flatnonzero((np.abs(radius - 1.0) < half_band) & (dx * u + dy * v > 0.7 * here))
-    row, column, dx, dy, here = row[gate], column[gate], dx[gate], dy[gate], here[gate]
-    level = np.abs(dx) >= np.abs(dy)
-    step_x, step_y = level.astype(np.intp), (~level).astype(np.intp)
-    before = magnitude[row - step_y, column - step_x]
-    after = magnitude[row + step_y, column + step_x]
-    ridge = (here > before) & (here >= after) & (here > WEAK * _typical(here))
-    row, column, dx, dy, here, level = (value[ridge] for value in (row, column, dx, dy, here, level))
-    logs = [np.log(np.maximum(value, 1e-3).astype(np.float64)) for value in (before[ridge], here, after[ridge])]
-    bend = np.minimum(logs[0] - 2.0 * logs[1] + logs[2], -1e-4)
-    offset = np.clip(0.5 * (logs[0] - logs[2]) / bend, -0.75, 0.75)
-    points = np.stack([column + np.where(level, offset, 0.0), row + np.where(level, 0.0, offset)], axis=-1)
-    normals = np.stack([dx, dy], axis=-1).astype(np.float64) / here[:, None]
+    cx, cy, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    height, width = magnitude.shape
+    reach_x = (1.0 + half_band) * math.sqrt((a * cos) ** 2 + (b * sin) ** 2) + 1.0
+    reach_y = (1.0 + half_band) * math.sqrt((a * sin) ** 2 + (b * cos) ** 2) + 1.0
+    x0, x1 = max(1, int(cx - reach_x)), min(width - 1, int(cx + reach_x) + 2)
+    y0, y1 = max(1, int(cy - reach_y)), min(height - 1, int(cy + reach_y) + 2)
+    inner2, outer2 = max(1.0 - half_band, 0.0) ** 2, (1.0 + half_band) ** 2
+    size = max(x1 - x0, 0) * max(y1 - y0, 0)
+    row, column, here = np.empty(size, dtype=np.int32), np.empty(size, dtype=np.int32), np.empty(size)
+    n = 0
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            strength = magnitude[y, x]
+            if not strength > floor or covered[y, x]:
+                continue
+            p, q = ((x - cx) * cos + (y - cy) * sin) / a, ((y - cy) * cos - (x - cx) * sin) / b
+            radius2 = p * p + q * q
+            if (radius2 <= inner2 and half_band < 1.0) or radius2 >= outer2:
+                continue
+            u, v = p * (cos / a) - q * (sin / b), p * (sin / a) + q * (cos / b)
+            if gx[y, x] * u + gy[y, x] * v > 0.7 * strength * max(math.sqrt(u * u + v * v), 1e-12):
+                row[n], column[n], here[n] = y, x, strength
+                n += 1
+    # A ridge has more flank than crest, so an upper quantile_of is the level of strong edges.
+    least = WEAK * quantile_of(here[:n], 0.9) if n else 0.0
+    found = 0
+    for i in range(n):
+        y, x, strength = row[i], column[i], here[i]
+        before, after = _beside(gx, gy, magnitude, y, x)
+        if strength > before and strength >= after and strength > least:
+            row[found], column[found] = y, x
+            found += 1
+    points, normals, widths = np.empty((found, 2)), np.empty((found, 2)), np.empty(found)
+    for i in range(found):
+        widths[i] = _vertex(gx, gy, magnitude, row[i], column[i], points[i], normals[i])
+    return points, normals, widths, row[:found].copy(), column[:found].copy()
+
+
+@inlined
+def _vertex(gx: Image, gy: Image, magnitude: Image, y: int, x: int, point: Floats, normal: Floats) -> float:
+    """Write the sub-pixel place of a ridge and its normal; returns the squared width of the profile."""
+    level = abs(gx[y, x]) >= abs(gy[y, x])
+    strength, (before, after) = magnitude[y, x], _beside(gx, gy, magnitude, y, x)
+    first, middle, last = math.log(max(before, 1e-3)), math.log(max(strength, 1e-3)), math.log(max(after, 1e-3))
+    bend = min(first - 2.0 * middle + last, -1e-4)
+    offset = min(max(0.5 * (first - last) / bend, -0.75), 0.75)
+    point[0], point[1] = (x + offset, float(y)) if level else (float(x), y + offset)
+    normal[0], normal[1] = float(gx[y, x]) / strength, float(gy[y, x]) / strength
     # The logarithm of a Gaussian bends by -1 / sigma^2 along the normal, less along the axis.
-    lean = np.where(level, np.abs(normals[:, 0]), np.abs(normals[:, 1]))
-    return points, normals, lean**2 / -bend, row, column
+    lean = abs(normal[0]) if level else abs(normal[1])
+    return lean * lean / -bend
 
 
-@twin
+@inlined
+def _beside(gx: Image, gy: Image, magnitude: Image, y: int, x: int) -> tuple[float, float]:
+    """Gradient's magnitude at the pixels before and after one, along the gradient's larger component."""
+    if abs(gx[y, x]) >= abs(gy[y, x]):
+        return magnitude[y, x - 1], magnitude[y, x + 1]
+    return magnitude[y - 1, x], magnitude[y + 1, x]
+
+
+@inlined
+def nearest(image: Image, x: float, y: float) -> float:
+    """Level of the pixel nearest to a point; outside the frame its border is repeated."""
+    column = min(max(int(np.rint(x)), 0), image.shape[1] - 1)
+    return image[min(max(int(np.rint(y)), 0), image.shape[0] - 1), column]
+
+
+@compiled
 def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, limits: tuple[float, ...]) -> Bools:
     """Whether there is pupil behind points and iris ahead of them.
 
@@ -166,11 +209,17 @@ def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, l
     the last limit.
     """
     pupil, dark, iris, clear, bright, rise = limits
-    behind, near, ahead, far = (_nearest(smooth, points + away * depth * normals) for away in (-1.0, 0.5, 1.0, 1.5))
-    above = behind - np.float32(pupil)
-    mirrored = (above >= dark) & (above < iris) & (ahead - behind > clear)
-    base = np.where(mirrored, behind, np.float32(pupil))
-    return np.asarray(((above < dark) | mirrored) & (near - base < bright) & (far - ahead < rise))
+    out = np.empty(points.shape[0], dtype=np.bool_)
+    for i in range(out.size):
+        x, y, u, v = points[i, 0], points[i, 1], depth * normals[i, 0], depth * normals[i, 1]
+        behind, ahead = nearest(smooth, x - u, y - v), nearest(smooth, x + u, y + v)
+        mirrored = behind - pupil >= dark and behind - pupil < iris and ahead - behind > clear
+        out[i] = (
+            (behind - pupil < dark or mirrored)
+            and nearest(smooth, x + 0.5 * u, y + 0.5 * v) - (behind if mirrored else pupil) < bright
+            and nearest(smooth, x + 1.5 * u, y + 1.5 * v) - ahead < rise
+        )
+    return out
 
 
 def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:
@@ -206,24 +255,3 @@ def _filters(sigma: float) -> tuple[Floats, Floats]:
     smooth = np.exp(-0.5 * (t / sigma) ** 2)
     smooth /= smooth.sum()
     return smooth, t * smooth / (t * t * smooth).sum()
-
-
-def _outward(ellipse: tuple[float, ...], column: Indices, row: Indices) -> tuple[Floats, Floats, Floats]:
-    """Unit outward normal of the concentric ellipses at pixels (n,), and the radius in units of the semi-axes."""
-    cx, cy, a, b, angle = ellipse
-    cos, sin, x, y = math.cos(angle), math.sin(angle), column - cx, row - cy
-    p, q = (x * cos + y * sin) / a, (y * cos - x * sin) / b
-    u, v = p * (cos / a) - q * (sin / b), p * (sin / a) + q * (cos / b)
-    length = np.maximum(np.sqrt(u * u + v * v), 1e-12)
-    return u / length, v / length, np.sqrt(p * p + q * q)
-
-
-def _typical(strength: Image) -> float:
-    """Level of strong edges: an upper percentile, because a ridge has more flank than crest."""
-    return quantile(strength, 0.9) if strength.size else 0.0
-
-
-def _nearest(image: Image, points: Floats) -> Image:
-    column = np.clip(np.rint(points[:, 0]).astype(np.intp), 0, image.shape[1] - 1)
-    row = np.clip(np.rint(points[:, 1]).astype(np.intp), 0, image.shape[0] - 1)
-    return image[row, column]

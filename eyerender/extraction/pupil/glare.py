@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ...arrays import Bools, Bytes
+from ...arrays import Bools
 from ...geometry.ellipse import Ellipse
-from ..compiled import twin
+from ...jit import compiled, inlined
 from ..preprocessing import Image, as_image
-from .edge_model import Place
+from .places import SECTORS
 
 # A glint is brighter than the iris by this share of the step and stands out of its surroundings by that share of it.
 # The texture of an iris reaches a third of the step.
@@ -72,25 +72,37 @@ class Cleared:
         return Cleared(linear, (x, y), patch, mask)
 
 
-@twin
+@inlined
+def _beside(
+    ellipse: tuple[float, ...], k: int, away: float, linear: Image, corner: tuple[int, int], patch: Image
+) -> float:
+    """Level at the pixel `away` outside an ellipse, in the middle of sector k."""
+    cx, cy, a, b, angle = ellipse
+    cos, sin, t = math.cos(angle), math.sin(angle), 2.0 * math.pi * ((k + 0.5) / SECTORS - 0.5) - angle
+    c, s = math.cos(t), math.sin(t)
+    nx, ny = b * c, a * s
+    height = math.sqrt(nx * nx + ny * ny)
+    p, q = a * c + away * nx / height, b * s + away * ny / height
+    column = min(max(int(np.rint(cx + p * cos - q * sin)), 0), linear.shape[1] - 1)
+    row = min(max(int(np.rint(cy + p * sin + q * cos)), 0), linear.shape[0] - 1)
+    i, j = row - corner[1], column - corner[0]
+    if 0 <= i < patch.shape[0] and 0 <= j < patch.shape[1]:
+        return patch[i, j]
+    return linear[row, column]
+
+
+@compiled
 def levels_beside(
-    ellipse: tuple[float, ...], away_px: float, sectors: int, linear: Image, corner: tuple[int, int], patch: Image
+    ellipse: tuple[float, ...], away_px: float, linear: Image, corner: tuple[int, int], patch: Image
 ) -> Image:
-    """Levels (sectors,) at the pixels `away_px` outside an ellipse (cx, cy, a, b, angle), in the middle of each sector.
+    """Levels (SECTORS,) at the pixels `away_px` outside an ellipse (cx, cy, a, b, angle), in the middle of each sector.
 
     Outside the frame its border is repeated. The part of the image from `corner` on is replaced by `patch`, unless that
     is empty.
     """
-    about = Ellipse.of(ellipse)
-    place = Place.middles(about, sectors)
-    cos, sin = math.cos(about.angle_rad), math.sin(about.angle_rad)
-    normal = np.stack([place.nx * cos - place.ny * sin, place.nx * sin + place.ny * cos], axis=-1)
-    x, y = np.rint(about.points_at(place.cos_t, place.sin_t) + away_px * normal).astype(np.intp).T
-    x, y = np.clip(x, 0, linear.shape[1] - 1), np.clip(y, 0, linear.shape[0] - 1)
-    out: Image = np.asarray(linear[y, x], dtype=np.float32)
-    column, row = x - corner[0], y - corner[1]
-    here = (column >= 0) & (row >= 0) & (column < patch.shape[1]) & (row < patch.shape[0])
-    out[here] = patch[row[here], column[here]]
+    out = np.empty(SECTORS, dtype=np.float32)
+    for k in range(SECTORS):
+        out[k] = _beside(ellipse, k, away_px, linear, corner, patch)
     return out
 
 
@@ -123,14 +135,9 @@ def without_glare(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: fl
     side = 2 * math.ceil(max(11.0, b) / 4.0) + 1
     opened = cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     level = as_image(cv2.resize(opened, (crop.shape[1], crop.shape[0]), interpolation=cv2.INTER_LINEAR))
-    glint = _standing_out(crop, level, bright, STANDS_OUT * step_dn + NOISE * noise_dn)
+    by = STANDS_OUT * step_dn + NOISE * noise_dn
+    glint = ((crop > bright) & (crop - level > by)).astype(np.uint8)
     if not np.count_nonzero(glint):
         return Cleared(linear)
     wide = cv2.dilate(glint, _DISC).view(bool)
     return Cleared(linear, (columns.start, rows.start), np.where(wide, level, crop), wide)
-
-
-@twin
-def _standing_out(crop: Image, level: Image, bright: float, by: float) -> Bytes:
-    """1 where a pixel is brighter than a level everywhere and than the level around it by `by`, else 0."""
-    return ((crop > bright) & (crop - level > by)).astype(np.uint8)

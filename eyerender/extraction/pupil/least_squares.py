@@ -8,14 +8,26 @@ step of the other parameters therefore eliminates all displacements (Schur's com
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Indices
-from ..compiled import twin
-from .covariance import SHAPE, distance_slopes, gram, reshaped
-from .edge_model import NEAR, EdgeModel, Place, Profile, harmonics
+from ...jit import compiled, inlined, summing
+from ..products import add_products
+from .covariance import SHAPE
+from .edge_model import (
+    BY_DISTANCE,
+    BY_KURTOSIS,
+    BY_SIGMA,
+    RAMP,
+    RAMP_BY_DISTANCE,
+    RAMP_BY_SIGMA,
+    EdgeModel,
+    profiles,
+    turn_harmonics,
+)
+from .places import BLOCK, COS_T, COS_U, NX, NY, SECTORS, SIN_T, SIN_U, places
 
 # Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
 FIXED = SHAPE + 7
@@ -26,6 +38,9 @@ FIXED = SHAPE + 7
 HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
 KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
 STILL_PX = 1.5e-2  # a fit ends with a step smaller than this
+
+
+_Sums = tuple[Floats, float, Floats, Floats, Floats, Floats]  # the parts of `Sums`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,16 +67,28 @@ class Pixels:
         return Pixels(*_grouped(x, y, level, sector, use, seen))
 
 
-@twin
+@compiled
 def _grouped(
-    x: Floats, y: Floats, level: Floats, sector: Indices, use: Bools, seen: Bools
+    x: Floats, y: Floats, level: Floats, bins: Indices, use: Bools, seen: Bools
 ) -> tuple[Floats, Floats, Floats, Indices, Indices]:
     """Compute the parts of `Pixels`."""
-    chosen = np.nonzero(use & seen[sector])[0]
-    chosen = chosen[np.argsort(sector[chosen].astype(np.uint8), kind="stable")]  # a radix sort
-    sector = sector[chosen]
-    new = np.diff(sector, prepend=-1) > 0
-    return x[chosen], y[chosen], level[chosen], np.cumsum(new) - 1, sector[new]
+    count, first = np.zeros(SECTORS, dtype=np.int64), np.empty(SECTORS, dtype=np.int64)
+    for i in range(x.size):
+        count[bins[i]] += use[i] and seen[bins[i]]
+    sector, rank, n, k = np.empty(SECTORS, dtype=np.int64), np.empty(SECTORS, dtype=np.int64), 0, 0
+    for s in range(SECTORS):
+        first[s], n = n, n + count[s]
+        if count[s]:
+            sector[k], rank[s] = s, k
+            k += 1
+    out, index = np.empty((3, n)), np.empty(n, dtype=np.int64)
+    for i in range(x.size):
+        s = bins[i]
+        if use[i] and seen[s]:
+            at = first[s]
+            out[0, at], out[1, at], out[2, at], index[at] = x[i], y[i], level[i], rank[s]
+            first[s] += 1
+    return out[0], out[1], out[2], index, sector[:k].copy()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,9 +114,7 @@ class Prior:
 
     def of_all(self, size: int) -> Floats:
         """Weight (size,) of every parameter except the displacements."""
-        out = np.zeros(size)
-        out[7], out[8], out[9:11], out[FIXED:] = self.weights
-        return out
+        return _held(size, self.weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,28 +145,101 @@ class Sums:
         return Sums(*_pixel_sums(pixels.x, pixels.y, pixels.level, pixels.index, model.numbers(), displaced))
 
 
-@twin
+@inlined
+def _rows(
+    place: Floats, edge: Floats, level: Floats, start: int, count: int, numbers: Floats,
+    basis: Floats, rows: Floats, residual: Floats, steep: Floats,
+) -> None:  # fmt: skip
+    """Write the derivatives of the level by the parameters, the residuals, and the derivatives by the distance.
+
+    Args:
+        place: (8 BLOCK,) of `places`.
+        edge: (7 BLOCK,) of `profiles`.
+        level: (n,) levels of all pixels.
+        start: first pixel of the block.
+        count: number of pixels in it.
+        numbers: (p,) the model (see `EdgeModel.numbers`).
+        basis: (2 BLOCK,) scratch memory for the harmonics.
+        rows: (p BLOCK,) receives the derivatives, parameter after parameter in the order of `numbers`.
+        residual: (BLOCK,) receives the residuals.
+        steep: (BLOCK,) receives the derivatives by the distance.
+    """
+    cos, sin = math.cos(numbers[4]), math.sin(numbers[4])
+    inner_dn, slope, _, lean_x, lean_y = numbers[6:11]
+    outer = numbers[11:]
+    residual[:count], basis[:count], basis[BLOCK : BLOCK + count] = outer[0], 1.0, 0.0
+    for i in range(count):
+        rows[11 * BLOCK + i] = edge[i]
+    for j in range(1, outer.size, 2):
+        turn_harmonics(place, count, basis)
+        first = (11 + j) * BLOCK
+        for i in range(count):
+            rows[first + i], rows[first + BLOCK + i] = basis[i] * edge[i], basis[BLOCK + i] * edge[i]
+            residual[i] += outer[j] * basis[i] + outer[j + 1] * basis[BLOCK + i]
+    for i in range(count):
+        cu, su = place[COS_U + i], place[SIN_U + i]
+        inner = inner_dn + lean_x * cu + lean_y * su
+        step, within = residual[i] - inner, 1.0 - edge[i]
+        steep[i] = step * edge[BY_DISTANCE + i] + slope * edge[RAMP_BY_DISTANCE + i]
+        residual[i] = level[start + i] - (inner + step * edge[i] + slope * edge[RAMP + i])
+        rows[5 * BLOCK + i] = step * edge[BY_SIGMA + i] + slope * edge[RAMP_BY_SIGMA + i]
+        rows[6 * BLOCK + i], rows[7 * BLOCK + i] = within, edge[RAMP + i]
+        rows[8 * BLOCK + i] = step * edge[BY_KURTOSIS + i]
+        rows[9 * BLOCK + i], rows[10 * BLOCK + i] = within * cu, within * su
+    for i in range(count):
+        c, s, nx, ny = place[COS_T + i], place[SIN_T + i], place[NX + i], place[NY + i]
+        rows[i], rows[BLOCK + i] = (ny * sin - nx * cos) * steep[i], (-nx * sin - ny * cos) * steep[i]
+        rows[2 * BLOCK + i], rows[3 * BLOCK + i] = -nx * c * steep[i], -ny * s * steep[i]
+        rows[4 * BLOCK + i] = (-nx * s - ny * c) * steep[i]
+
+
+@summing
+def _add_weighted(
+    rows: Floats, begin: int, end: int, residual: Floats, steep: Floats, k: int, pull: Floats, across: Floats
+) -> None:
+    """Add the sums of rows (p, n), weighted by two values, from `begin` to `end`, to columns k of (p, q)."""
+    for j in range(rows.shape[0]):
+        first = second = 0.0
+        for i in range(begin, end):
+            first += rows[j, i] * residual[i]
+            second += rows[j, i] * steep[i]
+        pull[j, k] += first
+        across[j, k] += second
+
+
+@compiled
 def _pixel_sums(
     x: Floats, y: Floats, level: Floats, index: Indices, numbers: Floats, displaced: Floats
 ) -> tuple[Floats, float, Floats, Floats, Floats, Floats]:
     """Compute the parts of `Sums` for the model of these numbers (see `EdgeModel.numbers`)."""
-    model = EdgeModel.of(numbers)
-    place = Place.of(model.ellipse, x, y, steps=NEAR)
-    expected, slopes, steepness = jacobian(model, replace(place, distance=place.distance + displaced[index]))
-    residual = level - expected
-    first = np.searchsorted(index, np.arange(displaced.size))
-
-    def sums(values: Floats) -> Floats:
-        return np.asarray(np.add.reduceat(values, first, axis=-1), dtype=np.float64)
-
-    return (
-        gram(slopes),
-        float(residual @ residual),
-        sums(slopes * residual),
-        sums(slopes * steepness),
-        sums(steepness * residual),
-        sums(steepness * steepness),
-    )
+    ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
+    sectors, size = displaced.size, numbers.size
+    matrix, basis, place, edge = np.zeros((size, size)), np.empty(2 * BLOCK), np.empty(8 * BLOCK), np.empty(7 * BLOCK)
+    flat, residual, steep = np.empty(size * BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    rows, pull, across = flat.reshape(size, BLOCK), np.zeros((size, sectors)), np.zeros((size, sectors))
+    along, square, cost = np.zeros(sectors), np.zeros(sectors), 0.0
+    for start in range(0, x.size, BLOCK):
+        count = min(BLOCK, x.size - start)
+        places(ellipse, x, y, start, count, place)
+        for i in range(count):
+            place[i] += displaced[index[start + i]]
+        profiles(place, count, numbers[5], numbers[8], edge)
+        _rows(place, edge, level, start, count, numbers, basis, flat, residual, steep)
+        add_products(rows, 0, count, matrix)
+        begin = 0
+        while begin < count:  # the pixels of a sector follow each other
+            k, end = index[start + begin], begin
+            while end < count and index[start + end] == k:
+                cost += residual[end] * residual[end]
+                along[k] += steep[end] * residual[end]
+                square[k] += steep[end] * steep[end]
+                end += 1
+            _add_weighted(rows, begin, end, residual, steep, k, pull, across)
+            begin = end
+    for j in range(size):
+        for m in range(j):
+            matrix[m, j] = matrix[j, m]
+    return matrix, cost, pull, across, along, square
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -164,29 +262,37 @@ class Normal:
     along: Floats
     inverse: Floats
 
-    def displaced_by(self, step: Floats) -> Floats:
-        """Change (k,) of the displacements with a step of the parameters."""
-        return np.asarray((self.along - step @ self.across) * self.inverse)
-
     @staticmethod
     def of(sums: Sums, displaced: Floats, prior: Prior) -> Normal:
         """Eliminate the displacements (k,) from the sums."""
-        matrix, vector, cost = sums.matrix, sums.pull.sum(axis=1), sums.cost
-        if math.isinf(prior.displacement):
-            none = np.zeros(displaced.size)
-            across = np.zeros(sums.across.shape)
-            return Normal(matrix=matrix, vector=vector, cost=cost, across=across, along=none, inverse=none)
-        along = sums.along - prior.displacement * displaced
-        inverse = 1.0 / (sums.square + prior.displacement)
-        taken = sums.across * inverse
-        return Normal(
-            matrix=matrix - taken @ sums.across.T,
-            vector=vector - taken @ along,
-            cost=cost + prior.displacement * float(displaced @ displaced),
-            across=sums.across,
-            along=along,
-            inverse=inverse,
-        )
+        parts = (sums.matrix, sums.cost, sums.pull, sums.across, sums.along, sums.square)
+        matrix, vector, cost, along, inverse = _eliminated(parts, displaced, prior.displacement)
+        return Normal(matrix=matrix, vector=vector, cost=cost, across=sums.across, along=along, inverse=inverse)
+
+
+@compiled
+def _eliminated(sums: _Sums, displaced: Floats, displacement: float) -> tuple[Floats, Floats, float, Floats, Floats]:
+    """Compute the parts of `Normal`, but `across`, from those of `Sums` and the prior's weight (see `Prior`)."""
+    matrix, cost, pull, across, along, square = sums
+    size, sectors = across.shape
+    vector, products = np.zeros(size), np.zeros((size, size))
+    rest, inverse, root = np.zeros(sectors), np.zeros(sectors), np.zeros((size, sectors))
+    if not math.isinf(displacement):
+        for k in range(sectors):
+            inverse[k] = 1.0 / (square[k] + displacement)
+            rest[k] = along[k] - displacement * displaced[k]
+            cost += displacement * displaced[k] ** 2
+            for j in range(size):
+                root[j, k] = across[j, k] * math.sqrt(inverse[k])
+    add_products(root, 0, sectors, products)
+    reduced = matrix.copy()
+    for j in range(size):
+        for k in range(sectors):
+            vector[j] += pull[j, k] - across[j, k] * inverse[k] * rest[k]
+        for m in range(j + 1):
+            reduced[j, m] -= products[j, m]
+            reduced[m, j] = reduced[j, m]
+    return reduced, vector, cost, rest, inverse
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,52 +304,6 @@ class Solution:
     sums: Sums
 
 
-def jacobian(model: EdgeModel, place: Place) -> tuple[Floats, Floats, Floats]:
-    """Model levels and their derivatives.
-
-    Returns:
-        The levels (n,), their derivatives (FIXED + 2 K, n) by the parameters in the order of FIXED, and their
-        derivative by the distance (n,).
-    """
-    profile = Profile.of(place.distance, place.curvature, model.sigma_px, model.kurtosis)
-    basis = harmonics(place.cos_u, place.sin_u, (model.outer.size - 1) // 2)
-    inner = model.inner(place)
-    step = model.outer @ basis - inner
-    out = np.empty((FIXED - 1 + basis.shape[0], place.distance.size))
-    by_distance = step * profile.edge_by_distance + model.slope * profile.ramp_by_distance
-    np.multiply(distance_slopes(model.ellipse, place), by_distance, out=out[:SHAPE])
-    out[5] = step * profile.edge_by_sigma + model.slope * profile.ramp_by_sigma
-    out[6] = 1.0 - profile.edge
-    out[7] = profile.ramp
-    out[8] = step * profile.edge_by_kurtosis
-    np.multiply(out[6], place.cos_u, out=out[9])
-    np.multiply(out[6], place.sin_u, out=out[10])
-    np.multiply(basis, profile.edge, out=out[11:])
-    return inner + step * profile.edge + model.slope * profile.ramp, out, by_distance
-
-
-def _values(model: EdgeModel) -> Floats:
-    """Parameters that have a prior, at their places; the others are 0."""
-    return np.concatenate([np.zeros(7), [model.slope, model.kurtosis, *model.lean, 0.0], model.outer[1:]])
-
-
-def moved(model: EdgeModel, step: Floats) -> EdgeModel:
-    """Apply a step of the parameters to a model."""
-    sigma, inner, slope, kurtosis, lean_x, lean_y = step[SHAPE:11].tolist()
-    blur = min(max(model.sigma_px + sigma, 0.5 * model.sigma_px, 0.3), max(2.0 * model.sigma_px, 0.3))
-    tails = min(max(model.kurtosis + kurtosis, KURTOSIS_LIMITS[0]), KURTOSIS_LIMITS[1])
-    lean = (model.lean[0] + lean_x, model.lean[1] + lean_y)
-    return EdgeModel(
-        ellipse=reshaped(model.ellipse, step),
-        inner_dn=model.inner_dn + inner,
-        outer=model.outer + step[11:],
-        sigma_px=blur,
-        slope=model.slope + slope,
-        kurtosis=tails,
-        lean=lean,
-    )
-
-
 def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
     """Fit the model with at most `steps` Gauss-Newton steps; displaced (k,) is the start of the displacements."""
     about = (pixels.x, pixels.y, pixels.level, pixels.index)
@@ -253,7 +313,44 @@ def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, st
     return Solution(EdgeModel.of(numbers), displaced, Sums(*sums))
 
 
-@twin
+@compiled
+def _held(size: int, weights: Floats) -> Floats:
+    """Weight (size,) of the square of every parameter, by those of the priors (4,)."""
+    out = np.zeros(size)
+    out[7], out[8], out[9:11], out[FIXED:] = weights[0], weights[1], weights[2], weights[3]
+    return out
+
+
+@inlined
+def _step(matrix: Floats, vector: Floats, held: Floats, numbers: Floats, damping: float) -> Floats:
+    """Solve the damped normal equations with the priors' weights, for parameters of equal scale."""
+    size = vector.size
+    scaled, scale, right = matrix.copy(), np.empty(size), np.empty(size)
+    for j in range(size):
+        scaled[j, j] += held[j]
+        scale[j] = math.sqrt(max(scaled[j, j], 1e-12))
+        right[j] = (vector[j] - held[j] * numbers[j]) / scale[j]
+    for j in range(size):
+        for m in range(size):
+            scaled[j, m] /= scale[j] * scale[m]
+        scaled[j, j] += damping
+    return np.linalg.solve(scaled, right) / scale
+
+
+@inlined
+def _moved(numbers: Floats, step: Floats) -> Floats:
+    """Apply a step of the parameters to the numbers of a model; the shape matrix's eigenvectors give the new axes."""
+    out = numbers + step
+    a, b, mixed = out[2], out[3], step[4]
+    mean, apart = 0.5 * (a + b), math.sqrt(0.25 * (a - b) ** 2 + mixed * mixed)
+    out[2], out[3] = max(mean + apart, 0.5), max(mean - apart, 0.5)
+    out[4] = (numbers[4] + 0.5 * math.atan2(2.0 * mixed, a - b)) % math.pi
+    out[5] = min(max(out[5], 0.5 * numbers[5], 0.3), max(2.0 * numbers[5], 0.3))
+    out[8] = min(max(out[8], KURTOSIS_LIMITS[0]), KURTOSIS_LIMITS[1])
+    return out
+
+
+@compiled
 def _gauss_newton(
     x: Floats, y: Floats, level: Floats, index: Indices, numbers: Floats, displaced: Floats,
     weights: Floats, displacement: float, steps: int,
@@ -274,45 +371,37 @@ def _gauss_newton(
     Returns:
         The numbers, the displacements, and the parts of `Sums`.
     """
-    pixels, model = Pixels(x, y, level, index, index[:0]), EdgeModel.of(numbers)
-    prior = Prior(weights, 0.0, displacement)
-    found = _descended(pixels, model, displaced, prior, steps)
-    sums = found.sums
-    parts = (sums.matrix, sums.cost, sums.pull, sums.across, sums.along, sums.square)
-    return found.model.numbers(), found.displaced, parts
-
-
-def _descended(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
-    sums = Sums.of(pixels, model, displaced)
-    held = prior.of_all(sums.matrix.shape[0])
-    diagonal = np.arange(held.size)
-    normal = Normal.of(sums, displaced, prior)
-    cost = normal.cost + float(held @ _values(model) ** 2)
-    damping = 1e-4
+    sums = _pixel_sums(x, y, level, index, numbers, displaced)
+    matrix, vector, cost, along, inverse = _eliminated(sums, displaced, displacement)
+    held, damping = _held(numbers.size, weights), 1e-4
+    for j in range(held.size):
+        cost += held[j] * numbers[j] ** 2
     for _ in range(steps):
-        matrix, vector = normal.matrix.copy(), normal.vector - held * _values(model)
-        matrix[diagonal, diagonal] += held
-        scale = np.sqrt(np.maximum(matrix[diagonal, diagonal], 1e-12))
-        matrix /= scale[:, None] * scale
-        matrix[diagonal, diagonal] += damping
-        step = np.linalg.solve(matrix, vector / scale) / scale
-        largest = float(np.abs(step[:SHAPE]).max())
+        step = _step(matrix, vector, held, numbers, damping)
+        largest = np.abs(step[:SHAPE]).max()
         if largest > 3.0:
             step *= 3.0 / largest
-        further = normal.displaced_by(step)
-        trial, trial_displaced = moved(model, step), displaced + further
-        if largest < STILL_PX and abs(float(step[SHAPE])) < 10.0 * STILL_PX and damping < 1e-3:
+        trial, trial_displaced = _moved(numbers, step), displaced.copy()
+        for k in range(along.size):
+            further = along[k]
+            for j in range(step.size):
+                further -= step[j] * sums[3][j, k]
+            trial_displaced[k] += further * inverse[k]
+        if largest < STILL_PX and abs(step[SHAPE]) < 10.0 * STILL_PX and damping < 1e-3:
             # Another step would be several times smaller, and so small a step hardly changes a sum.
-            return Solution(trial, trial_displaced, sums)
-        trial_sums = Sums.of(pixels, trial, trial_displaced)
-        trial_normal = Normal.of(trial_sums, trial_displaced, prior)
-        trial_cost = trial_normal.cost + float(held @ _values(trial) ** 2)
+            return trial, trial_displaced, sums
+        trial_sums = _pixel_sums(x, y, level, index, trial, trial_displaced)
+        reduced = _eliminated(trial_sums, trial_displaced, displacement)
+        trial_cost = reduced[2]
+        for j in range(held.size):
+            trial_cost += held[j] * trial[j] ** 2
         if trial_cost <= cost:
-            model, displaced, sums, normal = trial, trial_displaced, trial_sums, trial_normal
             gained, cost = cost - trial_cost, trial_cost
+            numbers, displaced, sums = trial, trial_displaced, trial_sums
+            matrix, vector, _, along, inverse = reduced
             damping *= 0.1
             if gained < 1e-7 * cost:
                 break
         else:
             damping = min(max(damping * 30.0, 1e-3), 1e6)
-    return Solution(model, displaced, sums)
+    return numbers, displaced, sums

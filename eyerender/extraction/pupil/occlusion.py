@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Indices
-from ..compiled import twin
-from ..statistics import median
+from ...jit import compiled, inlined
+from ..statistics import quantile_of
 from .consensus import UNEVEN
-from .edge_model import NEAR, SECTORS, EdgeModel, Place, sector_of
+from .edge_model import BY_DISTANCE, RAMP, RAMP_BY_DISTANCE, EdgeModel, outer_levels, profiles
+from .places import BLOCK, COS_U, CURVATURE, SECTORS, SIN_U, places, sector_at
 
 OUTLIER = 5.0  # pixels with a larger residual, in standard deviations, are left out
 LINEAR = 0.1  # a displacement below this share of the blur changes the levels linearly
@@ -69,33 +70,26 @@ def visible_part(
     return Visible(*_visible(x, y, level, use, seen, sectors, model.numbers(), displaced, noise_dn))
 
 
-@twin
-def _visible(
-    x: Floats, y: Floats, level: Floats, use: Bools, seen: Bools, sectors: Bools, numbers: Floats, displaced: Floats,
-    noise_dn: float,
-) -> tuple[Bools, Bools, float, Floats, Indices]:  # fmt: skip
-    """Compute the parts of `Visible`."""
-    bins, residual, whole, weight = _displacements(x, y, level, use, numbers, displaced)
-    told = seen & (weight > 0.1 * float(weight.max(initial=0.0)))
-    by_noise = noise_dn**2 / np.maximum(weight, 1e-9)
-    uneven2 = 0.0
-    if told.any():
-        uneven2 = max((1.4826 * median(np.abs(whole[told]))) ** 2 - 1.3 * median(by_noise[told]), 0.0)
-    scale = max(1.4826 * median(np.abs(residual[use & seen[bins]])), noise_dn, 1e-3)
-    new_use = np.abs(residual) < OUTLIER * scale
-    total = np.maximum(np.bincount(bins, minlength=SECTORS), 1)
-    capped = np.minimum((residual / scale) ** 2, OUTLIER**2)
-    mean_square = np.bincount(bins, weights=capped, minlength=SECTORS) / total
-    outliers = np.bincount(bins, weights=~new_use, minlength=SECTORS) / total
-    usual = max(median(mean_square[seen]), 1.0)
-    explained = (mean_square < np.where(sectors, 5.0, 2.5) * usual) & (outliers < np.where(sectors, 0.25, 0.1))
-    radius = math.sqrt(numbers[2] * numbers[3])
-    likely2 = np.where(sectors, max(uneven2, (UNEVEN * radius) ** 2), uneven2) + by_noise
-    explained &= np.abs(whole) < FARTHEST * np.sqrt(likely2)
-    likely = np.where(explained, whole * uneven2 / (uneven2 + by_noise), 0.0)
-    return new_use, explained, math.sqrt(uneven2), likely, bins
+@inlined
+def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
+    """Sector of each pixel (n,), and its distance, curvature, inner level and step (4, n)."""
+    ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
+    bins, out = np.empty(x.size, dtype=np.int64), np.empty((4, x.size))
+    place, basis, outer = np.empty(8 * BLOCK), np.empty(2 * BLOCK), np.empty(BLOCK)
+    for start in range(0, x.size, BLOCK):
+        count = min(BLOCK, x.size - start)
+        places(ellipse, x, y, start, count, place)
+        outer_levels(place, count, numbers[11:], basis, outer)
+        for i in range(count):
+            cu, su = place[COS_U + i], place[SIN_U + i]
+            inner = numbers[6] + numbers[9] * cu + numbers[10] * su
+            bins[start + i] = sector_at(cu, su)
+            out[0, start + i], out[1, start + i] = place[i], place[CURVATURE + i]
+            out[2, start + i], out[3, start + i] = inner, outer[i] - inner
+    return bins, out
 
 
+@inlined
 def _displacements(
     x: Floats, y: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
 ) -> tuple[Indices, Floats, Floats, Floats]:
@@ -104,20 +98,86 @@ def _displacements(
     Returns:
         The sector of each pixel (n,), its residual (n,), the displacements (SECTORS,) and their weights (SECTORS,).
     """
-    model = EdgeModel.of(numbers)
-    place = Place.of(model.ellipse, x, y, steps=NEAR)
-    bins, whole = sector_of(place), displaced
+    bins, look = _look(x, y, numbers)
+    sigma, slope, n = numbers[5], numbers[7], x.size
+    place, edge, residual, steep = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(n), np.empty(n)
+    whole, weight, further = displaced.copy(), np.empty(SECTORS), np.empty(SECTORS)
     for _ in range(2):  # the levels are not linear in a displacement as large as the blur
-        expected, slope = model.level_and_slope(replace(place, distance=place.distance + whole[bins]))
-        residual = level - expected
-        counted = slope * use
-        weight = np.bincount(bins, weights=counted * slope, minlength=SECTORS).astype(np.float64)
-        further = np.bincount(bins, weights=counted * residual, minlength=SECTORS) / np.maximum(weight, 1e-9)
-        further = np.where(weight > 1e-9, np.minimum(np.maximum(further, -model.sigma_px), model.sigma_px), 0.0)
-        whole = whole + further
-        if float(np.abs(further).max()) < LINEAR * model.sigma_px:
+        weight[:], further[:] = 0.0, 0.0
+        for start in range(0, n, BLOCK):
+            count = min(BLOCK, n - start)
+            for i in range(count):
+                place[i], place[CURVATURE + i] = look[0, start + i] + whole[bins[start + i]], look[1, start + i]
+            profiles(place, count, sigma, numbers[8], edge)
+            for i in range(count):
+                step = look[3, start + i]
+                steep[start + i] = step * edge[BY_DISTANCE + i] + slope * edge[RAMP_BY_DISTANCE + i]
+                expected = look[2, start + i] + step * edge[i] + slope * edge[RAMP + i]
+                residual[start + i] = level[start + i] - expected
+        for i in range(n):
+            if use[i]:
+                weight[bins[i]] += steep[i] ** 2
+                further[bins[i]] += steep[i] * residual[i]
+        largest = 0.0
+        for k in range(SECTORS):
+            further[k] = min(max(further[k] / weight[k], -sigma), sigma) if weight[k] > 1e-9 else 0.0
+            whole[k] += further[k]
+            largest = max(largest, abs(further[k]))
+        if largest < LINEAR * sigma:
             break
-    return bins, residual - slope * further[bins], whole, weight
+    for i in range(n):
+        residual[i] -= steep[i] * further[bins[i]]
+    return bins, residual, whole, weight
+
+
+@inlined
+def _uneven2(seen: Bools, whole: Floats, weight: Floats, by_noise: Floats) -> float:
+    """Variance of the displacements of the sectors that are seen and told by their pixels, beyond noise."""
+    least, n = 0.1 * weight.max(), 0
+    size, noise = np.empty(SECTORS), np.empty(SECTORS)
+    for k in range(SECTORS):
+        if seen[k] and weight[k] > least:
+            size[n], noise[n] = abs(whole[k]), by_noise[k]
+            n += 1
+    if n == 0:
+        return 0.0
+    return max((1.4826 * quantile_of(size[:n], 0.5)) ** 2 - 1.3 * quantile_of(noise[:n], 0.5), 0.0)
+
+
+@compiled
+def _visible(
+    x: Floats, y: Floats, level: Floats, use: Bools, seen: Bools, sectors: Bools, numbers: Floats, displaced: Floats,
+    noise_dn: float,
+) -> tuple[Bools, Bools, float, Floats, Indices]:  # fmt: skip
+    """Compute the parts of `Visible`."""
+    bins, residual, whole, weight = _displacements(x, y, level, use, numbers, displaced)
+    by_noise = noise_dn**2 / np.maximum(weight, 1e-9)
+    uneven2 = _uneven2(seen, whole, weight, by_noise)
+    some, n = np.empty(x.size), 0
+    for i in range(x.size):
+        if use[i] and seen[bins[i]]:
+            some[n] = abs(residual[i])
+            n += 1
+    scale = max(1.4826 * quantile_of(some[:n], 0.5), noise_dn, 1e-3)
+    new_use = np.abs(residual) < OUTLIER * scale
+    total, square, outliers = np.zeros(SECTORS), np.zeros(SECTORS), np.zeros(SECTORS)
+    for i in range(x.size):
+        k = bins[i]
+        total[k] += 1.0
+        square[k] += min((residual[i] / scale) ** 2, OUTLIER**2)
+        outliers[k] += not new_use[i]
+    total = np.maximum(total, 1.0)
+    square, outliers = square / total, outliers / total
+    usual = max(quantile_of(square[seen], 0.5), 1.0)
+    explained, likely = np.empty(SECTORS, dtype=np.bool_), np.zeros(SECTORS)
+    uneven = (UNEVEN * math.sqrt(numbers[2] * numbers[3])) ** 2
+    for k in range(SECTORS):
+        often, rarely, far2 = (5.0, 0.25, max(uneven2, uneven)) if sectors[k] else (2.5, 0.1, uneven2)
+        explained[k] = square[k] < often * usual and outliers[k] < rarely
+        explained[k] = explained[k] and abs(whole[k]) < FARTHEST * math.sqrt(far2 + by_noise[k])
+        if explained[k]:
+            likely[k] = whole[k] * uneven2 / (uneven2 + by_noise[k])
+    return new_use, explained, math.sqrt(uneven2), likely, bins
 
 
 def clear_of_lids(seen: Bools, model: EdgeModel) -> Bools:

@@ -14,12 +14,11 @@ import numpy as np
 
 from ...arrays import Floats
 from ...geometry.ellipse import Ellipse
-from ..compiled import twin
+from ...jit import compiled
 from ..preprocessing import Image
-from ..statistics import median
-from .consensus import relative_to
-from .edge_model import NEAR, SECTORS, sectors_at
+from ..statistics import quantile_of
 from .glare import NO_PATCH, levels_beside
+from .places import SECTORS, holding, relative_to
 
 if TYPE_CHECKING:
     from .search import Found
@@ -66,7 +65,7 @@ def outline_of(found: Found, ellipse: Ellipse) -> Outline:
     )
 
 
-@twin
+@compiled
 def _along(
     ellipse: tuple[float, ...], points: Floats, others: Floats, linear: Image, corner: tuple[int, int], patch: Image,
     away: tuple[float, float], levels: tuple[float, float],
@@ -88,17 +87,21 @@ def _along(
         points whose outside is shaded, and whose inside is not dark; those without points that have an edge on a bright
         inside. What is dark there is told by the median step of the sectors with points.
     """
-    held = np.zeros(SECTORS, dtype=bool)
-    held[sectors_at(ellipse, points[:, 0], points[:, 1], NEAR)] = True
-    inside, outside = (levels_beside(ellipse, side * away[0], SECTORS, linear, corner, patch) for side in (-1.0, 1.0))
-    step = median((outside - inside)[held]) if held.any() else 0.0
-    pale = inside > levels[0] + DARK * step
-    distance, _, _ = relative_to(Ellipse.of(ellipse), others)
-    return (
-        int(np.count_nonzero(~held & (inside < levels[1]) & (outside < levels[1]))),
-        int(np.count_nonzero(distance > away[1])),
-        int(np.count_nonzero(distance < -away[1])),
-        int(np.count_nonzero(held & (outside < levels[0] + SHADED * step))),
-        int(np.count_nonzero(held & pale)),
-        int(np.count_nonzero(~held & pale & (outside - inside > DARK * step))),
-    )
+    held, (pupil, dark) = holding(ellipse, points), levels
+    inside = levels_beside(ellipse, -away[0], linear, corner, patch)
+    outside = levels_beside(ellipse, away[0], linear, corner, patch)
+    step = quantile_of((outside - inside)[held].astype(np.float64), 0.5) if held.any() else 0.0
+    hollow = beyond = within = shaded = pale = mirrored = 0
+    for k in range(SECTORS):
+        bright = inside[k] > pupil + DARK * step
+        if held[k]:
+            shaded += outside[k] < pupil + SHADED * step
+            pale += bright
+        else:
+            hollow += inside[k] < dark and outside[k] < dark
+            mirrored += bright and outside[k] - inside[k] > DARK * step
+    for i in range(others.shape[0]):
+        distance = relative_to(ellipse, others[i, 0], others[i, 1])[0]
+        beyond += distance > away[1]
+        within += distance < -away[1]
+    return hollow, beyond, within, shaded, pale, mirrored

@@ -9,13 +9,14 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse
-from ..compiled import twin
+from ...jit import compiled
 from ..preprocessing import Image, Part
-from .consensus import direct_fits
+from .algebraic import direct_fits
 from .covariance import SHAPE, distance_slopes, hidden_part, sector_excess, to_axes, towards_round
-from .edge_model import NEAR, SECTORS, EdgeModel, Place, longest_gap, sectors_at
+from .edge_model import EdgeModel, longest_gap
 from .least_squares import FIXED, Normal, Pixels, Prior, Solution, Sums, fitted
 from .occlusion import clear_of_lids, visible_part
+from .places import SECTORS, Place, sectors_at
 
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
 # side of the iris more, by a few hundredths of the step. Noise hides that from a test, but it shifts the centre.
@@ -204,21 +205,30 @@ def _near_boundary(
     return _band(part.linear, masked, part.corner, ellipse.numbers(), outer, inner)
 
 
-@twin
+@compiled
 def _band(
     linear: Image, masked: Bools, corner: tuple[int, int], ellipse: tuple[float, ...],
     outer: tuple[float, float], inner: tuple[float, float],
 ) -> tuple[Floats, Floats, Floats, Indices]:  # fmt: skip
     """Pixels (x, y, level, sector) of a part of an image between two ellipses of these semi-axes about another one."""
     cx, cy, _, _, angle = ellipse
-    dx = np.arange(corner[0], corner[0] + linear.shape[1])[None, :] - cx
-    dy = np.arange(corner[1], corner[1] + linear.shape[0])[:, None] - cy
-    cos, sin = math.cos(angle), math.sin(angle)
-    p, q = dx * cos + dy * sin, dy * cos - dx * sin
-    out2, in2 = ((p / axes[0]) ** 2 + (q / axes[1]) ** 2 for axes in (outer, inner))
-    row, column = np.nonzero((out2 < 1.0) & (in2 > 1.0) & ~masked)
-    x, y = (column + corner[0]).astype(np.float64), (row + corner[1]).astype(np.float64)
-    return x, y, linear[row, column].astype(np.float64), sectors_at(ellipse, x, y, NEAR)
+    cos, sin, reach = math.cos(angle), math.sin(angle), outer[0] + 2.0
+    left, top = corner
+    x0, x1 = max(left, math.floor(cx - reach)), min(left + linear.shape[1], math.ceil(cx + reach) + 1)
+    y0, y1 = max(top, math.floor(cy - reach)), min(top + linear.shape[0], math.ceil(cy + reach) + 1)
+    size, n = max(x1 - x0, 0) * max(y1 - y0, 0), 0
+    x, y, level = np.empty(size), np.empty(size), np.empty(size)
+    for row in range(y0, y1):
+        for column in range(x0, x1):
+            dx, dy = column - cx, row - cy
+            p, q = dx * cos + dy * sin, dy * cos - dx * sin
+            if (p / outer[0]) ** 2 + (q / outer[1]) ** 2 >= 1.0 or masked[row - top, column - left]:
+                continue
+            if (p / inner[0]) ** 2 + (q / inner[1]) ** 2 > 1.0:
+                x[n], y[n], level[n] = column, row, linear[row - top, column - left]
+                n += 1
+    x, y = x[:n].copy(), y[:n].copy()
+    return x, y, level[:n].copy(), sectors_at(ellipse, x, y)
 
 
 def _padded(outer: Floats, order: int) -> Floats:

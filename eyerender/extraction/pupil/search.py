@@ -14,17 +14,18 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from ...arrays import Bools, Floats
+from ...arrays import Bools
 from ...geometry.ellipse import Ellipse, iou
-from ..compiled import twin
+from ...jit import compiled, inlined
 from ..preprocessing import Prepared, as_image
 from ..result import Goodness, PupilResult
 from ..settings import Shape
 from .candidates import Candidate, Interior, candidate_at, find_candidates, find_inside, inspect_interior
 from .consensus import BoundaryFit, fit_boundary
-from .edge_model import SECTORS, EdgeModel, Place, sector_of
+from .edge_model import EdgeModel
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glare import Cleared, without_glare
+from .places import holding
 from .scoring import confidence, goodness_of
 
 SURE = 0.9  # a hypothesis of this confidence ends the search
@@ -78,7 +79,9 @@ class Found:
     @cached_property
     def sectors(self) -> Bools:
         """Sectors (SECTORS,) with an edge point, and gaps of up to two sectors between them."""
-        return _held(self.boundary.ellipse.numbers(), self.edges.points_px[self.boundary.inliers])
+        hit = holding(self.boundary.ellipse.numbers(), self.edges.points_px[self.boundary.inliers])
+        grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
+        return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
 
     @cached_property
     def goodness(self) -> Goodness:
@@ -106,19 +109,33 @@ class Found:
         return inside.darker_dn if abs(inside.darker_dn) > limit else 0.0
 
 
-@twin
-def _held(ellipse: tuple[float, ...], points: Floats) -> Bools:
-    """Sectors (SECTORS,) of an ellipse that hold points (n, 2), and gaps of up to two sectors between them."""
-    hit = np.zeros(SECTORS, dtype=bool)
-    hit[sector_of(Place.of(Ellipse.of(ellipse), points[:, 0], points[:, 1]))] = True
-    grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
-    return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
+@inlined
+def _chord(ellipse: tuple[float, ...], y: float) -> tuple[float, float]:
+    """Ends of the horizontal chord of an ellipse at a height."""
+    cx, cy, a, b, angle = ellipse
+    cos, sin, dy = math.cos(angle), math.sin(angle), y - cy
+    square, mixed = (cos / a) ** 2 + (sin / b) ** 2, cos * sin * (1.0 / (a * a) - 1.0 / (b * b)) * dy
+    root = math.sqrt(max(mixed * mixed - square * (((sin / a) ** 2 + (cos / b) ** 2) * dy * dy - 1.0), 0.0))
+    return cx - (mixed + root) / square, cx - (mixed - root) / square
 
 
-@twin
+@compiled
 def _overlap(first: tuple[float, ...], second: tuple[float, ...]) -> float:
     """Intersection over union of two ellipses (cx, cy, a, b, angle), to about 0.001."""
-    return iou(Ellipse.of(first), Ellipse.of(second), nodes=128)
+    nodes = 128
+    high_1 = math.sqrt((first[2] * math.sin(first[4])) ** 2 + (first[3] * math.cos(first[4])) ** 2)
+    high_2 = math.sqrt((second[2] * math.sin(second[4])) ** 2 + (second[3] * math.cos(second[4])) ** 2)
+    low, high = max(first[1] - high_1, second[1] - high_2), min(first[1] + high_1, second[1] + high_2)
+    if low >= high:
+        return 0.0
+    common = 0.0
+    for k in range(nodes):
+        t = (k + 0.5) * (math.pi / nodes) - 0.5 * math.pi
+        y = 0.5 * (low + high) + 0.5 * (high - low) * math.sin(t)
+        (left_1, right_1), (left_2, right_2) = _chord(first, y), _chord(second, y)
+        common += max(min(right_1, right_2) - max(left_1, left_2), 0.0) * math.cos(t)
+    common *= 0.5 * (high - low) * math.pi / nodes
+    return common / (math.pi * (first[2] * first[3] + second[2] * second[3]) - common)
 
 
 def search(work: Prepared, shape: Shape, prior: Ellipse | None = None) -> Found | PupilResult:
