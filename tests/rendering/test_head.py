@@ -343,7 +343,7 @@ REFUSED = [
     ({"right_eye": None}, "right_eye: missing"),
     ({"up": [0.0, 0.0, 2.0]}, "up: must not be zero or parallel"),
     ({"file": "none.obj"}, "none.obj: no such file"),
-    ({"file": "text.ply"}, "text.ply: is not a readable mesh"),
+    ({"file": "text.ply"}, "text.ply: is not a PLY file that can be read (its header does not begin or end)"),
     ({"file": "empty.obj"}, "empty.obj: "),
     ({"file": "hole.obj"}, "not finite"),
     ({"file": "head.stl"}, "head.stl: must end with .obj or .ply"),
