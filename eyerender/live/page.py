@@ -6,14 +6,14 @@ import asyncio
 import html
 import secrets
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fastapi import Response
-from nicegui import app, ui
+from fastapi import Request, Response
+from nicegui import Client, app, ui
 
 from ..analytic.observer import trace
 from ..errors import EyerenderError, one_line
@@ -28,6 +28,8 @@ from .rig_view import RigView
 from .setup import Setup, directions, named
 from .source import python_source
 
+MAX_TABS = 20
+"""Pages at a time, those included whose WebSocket has not connected yet. Each takes some megabytes."""
 STYLE = Path(__file__).with_name("page.css")
 Change = Callable[[Setup], Setup]
 
@@ -89,10 +91,14 @@ class Knob:
 
 @dataclass(eq=False)
 class Studio:
-    """What all tabs share: the scene as it was loaded, the painter, and the pictures to fetch."""
+    """What all tabs share: the scene as it was loaded, the painter, and the pictures to fetch.
+
+    A page whose WebSocket does not connect within `connect_s` is deleted.
+    """
 
     scene: Scene
     painter: Painter
+    connect_s: float
     tabs: dict[str, Tab] = field(default_factory=dict)
 
     def register(self) -> None:
@@ -105,11 +111,31 @@ class Studio:
                 return Response(status_code=404)
             return Response(tab.shown.data, media_type=tab.shown.kind, headers={"Cache-Control": "no-store"})
 
+        @app.exception_handler(404)  # type: ignore[untyped-decorator]
+        async def missing(_request: Request, _error: Exception) -> Response:
+            # NiceGUI's own answer is a page, which would be kept for a minute.
+            return Response("404: no such page\n", 404, media_type="text/plain")
+
         @ui.page("/", title=f"{self.scene.name} · eyerender live", response_timeout=30)  # type: ignore[untyped-decorator]
-        def page() -> None:
+        def page() -> Response | None:
+            client = ui.context.client
+            if len(Client.instances) > MAX_TABS:
+                client.delete()
+                wait = f"{self.connect_s:.0f}"
+                reason = f"503: too many tabs: {MAX_TABS} are open; close one, wait {wait} s and try again\n"
+                return Response(reason, 503, {"Retry-After": wait}, "text/plain")
             tab = Tab(self)
             self.tabs[tab.key] = tab
-            ui.context.client.on_delete(tab.close)
+            client.on_connect(tab.wake)
+            client.on_disconnect(lambda: None if client.has_socket_connection else tab.rest())
+            client.on_delete(tab.close)
+            asyncio.get_running_loop().call_later(self.connect_s, lambda: None if tab.woken else _delete(client))
+            return None
+
+
+def _delete(client: Client) -> None:
+    if not client.is_deleted:
+        client.delete()
 
 
 class Tab:
@@ -118,6 +144,8 @@ class Tab:
     def __init__(self, studio: Studio) -> None:
         self.key = secrets.token_urlsafe(16)
         self.shown: Shown | None = None
+        self.woken = False  # whether its page has ever connected
+        self._awake = False  # whether it is connected
         self._studio, self._loop = studio, asyncio.get_event_loop()
         self._setup = Setup.of(studio.scene)
         self._orders = 0
@@ -128,20 +156,30 @@ class Tab:
         self._drawn = Strokes()
         self._quiet = False
         self._build()
-        studio.painter.open(self.key, self._deliver)
         self._apply(lambda setup: setup)
         self._look_at_rig()
         self._refresh()
 
     def _deliver(self, shown: Shown) -> None:
         """Take a picture from the painter's thread to the loop's."""
-        self._loop.call_soon_threadsafe(self._receive, shown)
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._receive, shown)
+
+    def wake(self) -> None:
+        """Order a picture: the page has connected, for the first time or again."""
+        self.woken = self._awake = True
+        self._studio.painter.open(self.key, self._deliver)
+        self._order()
+
+    def rest(self) -> None:
+        """Free the pictures: the page has disconnected."""
+        self._studio.painter.drop(self.key)
+        self._awake, self.shown = False, None
 
     def close(self) -> None:
         """Free what the tab holds."""
-        self._studio.painter.drop(self.key)
+        self.rest()
         self._studio.tabs.pop(self.key, None)
-        self.shown = None
 
     # What the page consists of
 
@@ -355,7 +393,7 @@ class Tab:
 
     def _receive(self, shown: Shown) -> None:
         """Show a picture that the painter made."""
-        if self.key not in self._studio.tabs:
+        if not self._awake:
             return
         self._wait.set_visibility(False)
         if shown.problem:

@@ -202,6 +202,7 @@ class Painter:
         """Forget a tab and its pictures."""
         with self._changed:
             self._tabs.pop(key, None)
+            self._changed.notify()  # a thread that waits holds the tabs that it has looked at
 
     def close(self) -> None:
         """Stop after the present band."""
@@ -231,6 +232,7 @@ class Painter:
                 canvas.samples = self.goal
             if fresh:
                 canvas.since = time.monotonic()
+            del work, tab, canvas  # they hold what a tab that is closed while this thread waits should free
 
     def _next(self) -> tuple[_Tab, _Canvas, bool] | None:
         """Wait for work: the oldest order without a preview, else the rested tab with the fewest samples."""

@@ -5,8 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
+import signal
 import socket
+import sys
+import threading
 from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import NoReturn
 
 import uvicorn
 from fastapi import FastAPI
@@ -21,7 +27,11 @@ from .painter import Painter
 
 HOST = "127.0.0.1"
 RECONNECT_S = 20.0
-"""How long a tab may be away, on a slow line or a busy machine, before what it holds is freed."""
+"""How long a tab may be away, on a slow line or a busy machine, before it is deleted."""
+_CLOSING_S = 0.4
+"""How long open connections may take to close at the end."""
+_ENDING_S = 1.2
+"""When the process ends after Ctrl-C at the latest, whatever is connected, computed or rendered."""
 
 
 def serve(
@@ -32,7 +42,7 @@ def serve(
     threads: int | None = None,
     announce: Callable[[str], None] = print,
 ) -> None:
-    """Show a scene on a page of this machine until it is interrupted.
+    """Show a scene on a page of this machine. An interrupt ends the process, with exit code 130.
 
     Args:
         scene: the scene.
@@ -47,11 +57,27 @@ def serve(
     """
     with _listening(port) as listener:
         painter = Painter(backend, threads)
-        painter.start()
+        deadline = threading.Timer(_ENDING_S, _end)
+        deadline.daemon = True
         try:
-            _run(Studio(scene, painter), listener, announce)
+            painter.start()
+            _run(Studio(scene, painter, connect_s=RECONNECT_S), listener, announce, deadline)
+        except KeyboardInterrupt:
+            _end()
         finally:
+            deadline.cancel()
             painter.close()
+
+
+def _end() -> NoReturn:
+    """End the process at once.
+
+    Python's own end would unload Mitsuba and LLVM, and wait for a running kernel, which cannot be interrupted.
+    """
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+    print("interrupted", file=sys.stderr, flush=True)
+    os._exit(128 + signal.SIGINT)
 
 
 @contextlib.contextmanager
@@ -70,7 +96,7 @@ def _listening(port: int) -> Iterator[socket.socket]:
         listener.close()
 
 
-def _run(studio: Studio, listener: socket.socket, announce: Callable[[str], None]) -> None:
+def _run(studio: Studio, listener: socket.socket, announce: Callable[[str], None], deadline: threading.Timer) -> None:
     token = new_token()
     inner = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
     studio.register()
@@ -89,22 +115,27 @@ def _run(studio: Studio, listener: socket.socket, announce: Callable[[str], None
         access_log=False,  # the addresses hold the token
         server_header=False,
         proxy_headers=False,
-        timeout_graceful_shutdown=1,
+        timeout_graceful_shutdown=_CLOSING_S,
         ws_max_size=2**20,
         h11_max_incomplete_event_size=2**16,
     )
-    server = _Server(config, lambda: announce(f"http://{HOST}:{listener.getsockname()[1]}/{token}/"))
+    server = _Server(config, lambda: announce(f"http://{HOST}:{listener.getsockname()[1]}/{token}/"), deadline)
     asyncio.run(server.serve(sockets=[listener]))
 
 
 class _Server(uvicorn.Server):
-    """A server that tells when it listens."""
+    """A server that tells when it listens, and starts `deadline` when a signal ends it."""
 
-    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], None], deadline: threading.Timer) -> None:
         super().__init__(config)
-        self._ready = ready
+        self._ready, self._deadline = ready, deadline
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         if self.started:
             self._ready()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        if not self.should_exit:
+            self._deadline.start()
+        super().handle_exit(sig, frame)
