@@ -148,22 +148,35 @@ def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def _publish(stage: Path, final: Path) -> None:
-    """Replace the content of a folder by that of a staged folder."""
+    """Replace the content of a folder by that of a staged folder.
+
+    If that fails, nothing is left that could be taken for a result: what has moved is removed again. The old content
+    stays as long as none of it has been removed.
+    """
     sync_tree(stage)
     new = _names(stage)
     old = _listed(final) or set()
-    # From here on the folder can be recognised at every moment.
-    _mark(final, old | new)
-    _empty(final, old, keep=stage.name)
-    for entry in sorted(stage.iterdir(), key=lambda p: p.name == DATASET):
-        if entry.name == DATASET:
-            sync_folder(final)
-        os.rename(entry, final / entry.name)
-    sync_folder(final)
-    if not new.isdisjoint(_SIGNS):  # its own files identify it
-        (final / MARKER).unlink()
-    else:
-        _mark(final, new)
+    is_whole = any(True for _ in _made_here(final, old, strict=False))  # the old content, if there is any
+    try:
+        # From here on the folder can be recognised at every moment.
+        _mark(final, old | new)
+        is_whole = False
+        _empty(final, old, keep=stage.name)
+        for entry in sorted(stage.iterdir(), key=lambda p: p.name == DATASET):
+            if entry.name == DATASET:
+                sync_folder(final)
+            os.rename(entry, final / entry.name)
+        sync_folder(final)
+        if not new.isdisjoint(_SIGNS):  # its own files identify it
+            (final / MARKER).unlink()
+        else:
+            _mark(final, new)
+    except BaseException:
+        if not is_whole:
+            with suppress(OSError):
+                _empty(final, old | new)
+                (final / MARKER).unlink(missing_ok=True)
+        raise
 
 
 def _mark(folder: Path, names: Set[str]) -> None:

@@ -6,6 +6,7 @@ Archive: Images, Masks, Masks_noSkin (n, h, w); pupil_loc (n, 2); Fits/pupil, Fi
 
 from __future__ import annotations
 
+import io
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,34 @@ from scipy.io import savemat
 
 from ...arrays import Floats
 from ...errors import InputError
+from ...files import write_bytes
 from .item import Item, Items
+
+_MAT_TEXT = b"MATLAB 5.0 MAT-file".ljust(116)
+
+
+class _Archive(io.FileIO):
+    """A file for HDF5, which can neither go on nor close after a failed write: the error waits for `check`."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w+")
+        self._error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all of the data, or keep the error and pretend."""
+        rest = memoryview(data).cast("B")
+        count = len(rest)
+        try:
+            while self._error is None and len(rest):
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self._error = error
+        return count
+
+    def check(self) -> None:
+        """Raise the error of an earlier write, if there was one."""
+        if self._error is not None:
+            raise self._error
 
 
 def write(items: Items, out: Path) -> None:
@@ -30,16 +58,13 @@ def write(items: Items, out: Path) -> None:
     (out / "All").mkdir()
     (out / "MasterKey").mkdir()
     archives: dict[str, Any] = {}
+    files: dict[str, _Archive] = {}
     done = dict.fromkeys(items.splits, 0)
     try:
         for split, n in items.images_by_split.items():
-            file = archives[split] = h5py.File(out / "All" / f"{items.name}_{split}.h5", "w")
-            for name in ("Images", "Masks", "Masks_noSkin"):
-                file.create_dataset(name, (n, h, w), dtype="u1" if name == "Images" else "i1", chunks=(1, h, w))
-            file.create_dataset("pupil_loc", (n, 2), dtype="f8")
-            for name in ("pupil", "iris"):
-                file.create_dataset(f"Fits/{name}", (n, 5), dtype="f8")
-            file.create_dataset("Info", (n,), dtype=f"S{items.file_name_bytes}")
+            files[split] = _Archive(out / "All" / f"{items.name}_{split}.h5")
+            archives[split] = h5py.File(files[split], "w")
+            _lay_out(archives[split], (n, h, w), items.file_name_bytes)
         for item in items:
             file, k = archives[item.split], done[item.split]
             done[item.split] += 1
@@ -49,20 +74,45 @@ def write(items: Items, out: Path) -> None:
                 file[f"Fits/{name}"][k] = fit
             file["pupil_loc"][k] = fits["pupil"][:2]
             file["Info"][k] = item.entry.name.encode()
+            files[item.split].check()
         for split, file in archives.items():
-            archive = f"{items.name}_{split}"
-            key = {
-                "dataset": items.name,
-                "subset": split,
-                "archive": np.full(done[split], archive),
-                "resolution": np.tile([h, w], (done[split], 1)),
-                "pupil_loc": file["pupil_loc"][...],
-                "Info": np.char.decode(file["Info"][...], "utf-8"),
-            }
-            savemat(out / "MasterKey" / f"{archive}.mat", key)
+            _write_key(out / "MasterKey", file, items.name, split)
     finally:
         for file in archives.values():
             file.close()
+        for raw in files.values():
+            raw.close()
+    for raw in files.values():
+        raw.check()
+
+
+def _lay_out(file: Any, shape: tuple[int, int, int], name_bytes: int) -> None:
+    """Make the arrays of an archive."""
+    n = shape[0]
+    for name in ("Images", "Masks", "Masks_noSkin"):
+        file.create_dataset(name, shape, dtype="u1" if name == "Images" else "i1", chunks=(1, *shape[1:]))
+    file.create_dataset("pupil_loc", (n, 2), dtype="f8")
+    for name in ("pupil", "iris"):
+        file.create_dataset(f"Fits/{name}", (n, 5), dtype="f8")
+    file.create_dataset("Info", (n,), dtype=f"S{name_bytes}")
+
+
+def _write_key(folder: Path, file: Any, dataset: str, split: str) -> None:
+    """Write the key of a split's archive."""
+    archive = f"{dataset}_{split}"
+    n, h, w = file["Images"].shape
+    key = {
+        "dataset": dataset,
+        "subset": split,
+        "archive": np.full(n, archive),
+        "resolution": np.tile([h, w], (n, 1)),
+        "pupil_loc": file["pupil_loc"][...],
+        "Info": np.char.decode(file["Info"][...], "utf-8"),
+    }
+    content = io.BytesIO()
+    savemat(content, key)
+    # SciPy's text at the beginning holds the time; the same dataset must give the same bytes.
+    write_bytes(folder / f"{archive}.mat", _MAT_TEXT + content.getvalue()[len(_MAT_TEXT) :], sync=False)
 
 
 def fit_of(item: Item, part: str) -> Floats:
