@@ -30,7 +30,7 @@ fingerprint() {
       cat "$root/pyproject.toml" "$root/constraints.txt"; } | checksum
 }
 
-# There are five set-ups: run, live (the extra `live` too), test (`test`), all (`test` and `ray`), and docs, which has an
+# There are five set-ups: run, live (the extra `live` too), test (`test`), all (`test`, `ray` and `fuzz`), and docs, which has an
 # environment of its own. Each leaves the stamps of those that it holds.
 is_set_up() {
     [ -x "$venv/bin/python" ] && [ -f "$venv/.stamp-$1" ] && [ "$(cat "$venv/.stamp-$1")" = "$(fingerprint)" ]
@@ -131,7 +131,7 @@ set_up() {
     printf '%s\n' "$root" >"$venv/.place" && : >"$venv/.incomplete" || die "cannot write to $venv"
     find_pip
     case $1 in
-        all) wanted="$root[test,ray]" stamps="all test run" size="1.6 GB" ;;
+        all) wanted="$root[test,ray,fuzz]" stamps="all test run" size="1.6 GB" ;;
         test) wanted="$root[test]" stamps="test run" size="1.3 GB" ;;
         live) wanted="$root[live]" stamps="live run" size="1 GB" ;;
         docs) wanted="$root[docs]" stamps="docs run" size="1 GB" ;;

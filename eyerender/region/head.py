@@ -281,14 +281,20 @@ def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
     if not found:
         raise InputError("holds no triangles", source=source)
     for name, mesh in found.items():
-        v, f = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-        if not np.all(np.isfinite(v)):
-            raise InputError(f"object {shown(name)} holds coordinates that are not finite", source=source)
-        if f.min() < 0 or f.max() >= len(v):
-            raise InputError(f"object {shown(name)} has faces without vertices", source=source)
+        _check(mesh, shown(name), source)
     if kind == ".ply" or not options.keys() & {"split_objects", "split_groups"}:
         return {path.stem: next(iter(found.values()))}
     return found
+
+
+def _check(mesh: trimesh.Trimesh, name: str, source: str) -> None:
+    v, f = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if v.shape[1:] != (3,):
+        raise InputError(f"object {name} has vertices without three coordinates", source=source)
+    if not np.all(np.isfinite(v)):
+        raise InputError(f"object {name} holds coordinates that are not finite", source=source)
+    if f.min() < 0 or f.max() >= len(v):
+        raise InputError(f"object {name} has faces without vertices", source=source)
 
 
 def _named(spec: Head, part: str, objects: dict[str, Any], source: str) -> tuple[str, ...]:

@@ -1,0 +1,408 @@
+"""Readers of files that other people made, for fuzzing: `python -m tests.fuzz.readers NAME SECONDS SEED FOLDER`.
+
+A reader takes the path of a file. Its seeds are whole files, from which the fuzzer starts. Run as a program, this
+module fuzzes one reader with atheris (libFuzzer), which keeps inputs that reach new code. A case must end in success or
+with an `EyerenderError` of one line. Anything else, and a case that takes too long, ends the process with an exit code
+that is not 0, and leaves the input in the folder.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+LONGEST_BYTES = 8192
+
+
+@dataclass(frozen=True)
+class Reader:
+    """How a file with a name is read; `folder` lays out what must be beside it."""
+
+    name: str
+    read: Callable[[Path], Any]
+    seeds: Callable[[], list[bytes]]
+    beside: Callable[[Path], Any] | None = None
+
+    def case(self, data: bytes, folder: Path) -> Any:
+        """Read a file with some content, in a folder of its own."""
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        if self.beside is not None:
+            self.beside(folder)
+        (folder / self.name).write_bytes(data)
+        return self.read(folder / self.name)
+
+
+def _scene(path: Path) -> Any:
+    from eyerender.scene.spec import SceneSpec
+
+    return SceneSpec.load(path)
+
+
+def _dataset(path: Path) -> Any:
+    from eyerender.dataset.spec import DatasetSpec
+
+    return DatasetSpec.load(path)
+
+
+def _eye(path: Path) -> Any:
+    from eyerender.eye.catalogue import load_eye
+
+    return load_eye(path)
+
+
+def _shipped(kind: str) -> list[bytes]:
+    from eyerender.dataset.spec import shipped_datasets
+    from eyerender.eye.catalogue import FOLDER
+    from eyerender.scene import shipped_scenes
+
+    paths = {"scene": shipped_scenes().values(), "dataset": shipped_datasets().values(), "eye": FOLDER.glob("*.yaml")}
+    found = [path.read_bytes() for path in paths[kind]]
+    return sorted((data for data in found if len(data) < LONGEST_BYTES), key=len)[:6]
+
+
+def _records(path: Path) -> Any:
+    from eyerender.gaze.records import load_observations
+
+    return load_observations(path, "guestrin2006")
+
+
+def _record_seeds() -> list[bytes]:
+    from eyerender.analytic.observer import trace
+    from eyerender.scene import load_scene
+
+    found = trace(load_scene("guestrin2006"), boundary_points=6)
+    records = list(found.take([0, 1]).records())
+    line = json.dumps(records[0]).encode()
+    return [line, line + b"\n" + line, json.dumps({"schema": "eyerender/features/1", "records": records[:1]}).encode()]
+
+
+def _table(path: Path) -> Any:
+    from eyerender.gaze.records import load_observations
+
+    columns = {"format": 1, "pupil": ["x", "y"], "glints": [["gx", "gy"], None]}
+    return load_observations(path, "guestrin2006", columns=columns)
+
+
+def _folder(path: Path) -> Any:
+    from eyerender.imagefolder import ImageFolder
+
+    folder = ImageFolder.load(path.parent)
+    for entry in folder:
+        with suppress_input():
+            entry.mask()
+        entry.labels  # noqa: B018
+    return folder.truth()
+
+
+def _folder_seeds() -> list[bytes]:
+    record = json.loads(_record_seeds()[0])
+    line: dict[str, Any] = {"schema": "eyerender/image/3", "file_name": "images/a.png", "mask_file_name": "masks/a.png"}
+    line |= {"window_px": {"x0": 0, "y0": 0, "width": 4, "height": 4}, "bit_depth": 8, "gamma": 1.0}
+    both: list[dict[str, Any]] = [{"records": [record], "labels": {}}, {"records": []}]
+    return [json.dumps({**line, **more}).encode() for more in both]
+
+
+def _beside_metadata(folder: Path) -> None:
+    from eyerender.imagefile import write_png
+
+    (folder / "dataset.json").write_text(json.dumps({"schema": "eyerender/dataset/1"}), encoding="utf-8")
+    for kind in ("images", "masks"):
+        (folder / kind).mkdir()
+        write_png(folder / kind / "a.png", np.zeros((4, 4), np.uint8))
+
+
+def suppress_input() -> Any:
+    from eyerender.errors import InputError
+
+    return suppress(InputError)
+
+
+def _image(path: Path) -> Any:
+    from eyerender.imagefile import read_any_image
+
+    return read_any_image(path)
+
+
+def _png_seeds() -> list[bytes]:
+    from eyerender.imagefile import png_bytes
+
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    return [png_bytes(grey), png_bytes(grey.astype(np.uint16) * 999), png_bytes(np.dstack([grey] * 3))]
+
+
+def _map(path: Path) -> Any:
+    from eyerender.rendering.environment import read_map
+
+    return read_map(path)
+
+
+def _npy_seeds() -> list[bytes]:
+    out = []
+    for data in (np.ones((4, 8)), np.ones((4, 8, 3), np.float32)):
+        file = BytesIO()
+        np.save(file, data)
+        out.append(file.getvalue())
+    return out
+
+
+def _hdr_seeds() -> list[bytes]:
+    return [b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 4 +X 8\n" + bytes(range(128))]
+
+
+def _pfm_seeds() -> list[bytes]:
+    return [b"Pf\n8 4\n-1.0\n" + np.ones(32, np.float32).tobytes()]
+
+
+def _exr_seeds() -> list[bytes]:
+    import tempfile
+
+    from eyerender.backends.choose import choose_backend
+
+    choose_backend("llvm")
+    from eyerender.rendering.exr import write_exr
+
+    with tempfile.TemporaryDirectory() as folder:
+        write_exr(Path(folder) / "a.exr", np.ones((4, 8), np.float32))
+        return [(Path(folder) / "a.exr").read_bytes()]
+
+
+def _opencv(path: Path) -> Any:
+    from eyerender.rig.opencv import read_opencv
+
+    return read_opencv(path)
+
+
+def _matrix(rows: int, columns: int, values: list[float]) -> str:
+    return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: {values}\n"
+
+
+def _opencv_yaml_seeds() -> list[bytes]:
+    camera = _matrix(3, 3, [800.0, 0.0, 320.0, 0.0, 800.0, 240.0, 0.0, 0.0, 1.0])
+    text = f"image_width: 640\nimage_height: 480\ncamera_matrix: {camera}"
+    return [f"%YAML:1.0\n---\n{text}distortion_coefficients: {_matrix(1, 5, [0.1, 0.0, 0.0, 0.0, 0.0])}".encode()]
+
+
+def _opencv_xml_seeds() -> list[bytes]:
+    matrix = '<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt><data>800. 0. 320. 0. 800. '
+    size = "<image_width>640</image_width><image_height>480</image_height>"
+    text = f'<?xml version="1.0"?><opencv_storage>{size}{matrix}240. 0. 0. 1.</data></camera_matrix></opencv_storage>'
+    return [text.encode()]
+
+
+def _topography(layout: str) -> Callable[[Path], Any]:
+    def read(path: Path) -> Any:
+        from eyerender.eye.parts import TopographySpec
+        from eyerender.eye.topography import read_topography
+
+        axes = {"x": "nasal", "y": "up", "z": "in", "unit": "mm"}
+        return read_topography(TopographySpec.from_mapping({"path": path.name, "layout": layout, **axes}), path.parent)
+
+    return read
+
+
+def _points() -> list[tuple[float, float, float]]:
+    at = np.linspace(-4, 4, 17)
+    return [(x, y, 7.8 - float(np.sqrt(7.8**2 - x * x - y * y))) for x in at for y in at]
+
+
+def _points_seeds() -> list[bytes]:
+    return [("\n".join(f"{x:.2f},{y:.2f},{z:.3f}" for x, y, z in _points())).encode()]
+
+
+def _matrix_seeds() -> list[bytes]:
+    at = np.linspace(-4, 4, 17)
+    rows = [[7.8 - float(np.sqrt(7.8**2 - x * x - y * y)) for x in at] for y in at]
+    head = "," + ",".join(f"{x:.2f}" for x in at)
+    lines = [f"{y:.2f}," + ",".join(f"{z:.3f}" for z in row) for y, row in zip(at, rows, strict=True)]
+    return ["\n".join([head, *lines]).encode()]
+
+
+def _head(path: Path) -> Any:
+    from eyerender.region.head import load_head
+    from eyerender.region.headspec import Head
+
+    data = {"file": path.name, "unit": "mm", "licence": "none", "right_eye": [75.0, 75.0, 100.0]}
+    return load_head(Head.from_mapping(data).resolved(path.parent))
+
+
+def _mesh(kind: str) -> Callable[[], list[bytes]]:
+    def seeds() -> list[bytes]:
+        import trimesh
+
+        box = trimesh.creation.box(extents=(150.0, 150.0, 200.0))
+        data = box.export(file_type=kind)
+        data = data.encode() if isinstance(data, str) else data
+        return [data, box.export(file_type="ply", encoding="ascii")] if kind == "ply" else [data]
+
+    return seeds
+
+
+def _synteyes(path: Path) -> Any:
+    from eyerender.population.synteyes import SyntEyes
+
+    return SyntEyes.load(path)
+
+
+def _synteyes_seeds() -> list[bytes]:
+    from eyerender.population.synteyes import _LENS_TERMS, _SHAPES
+
+    arrays = {name: np.ones(shape) for name, shape in _SHAPES.items()} | {_LENS_TERMS: np.ones(10)}
+    arrays["weights_orig"] = np.array([0.5, 0.5]).reshape(_SHAPES["weights_orig"])
+    file = BytesIO()
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    return [file.getvalue()]
+
+
+def _estimator(path: Path) -> Any:
+    from eyerender.gaze.store import load_calibration
+
+    return load_calibration(path)
+
+
+def _estimator_seeds() -> list[bytes]:
+    from tests.fuzz.test_records import calibration
+
+    return [json.dumps(calibration(name)).encode() for name in ("regression", "homography")]
+
+
+def _cached_map(path: Path) -> Any:
+    from eyerender.region.mapcache import _decoded
+
+    return _decoded(path.read_bytes())
+
+
+def _cached_map_seeds() -> list[bytes]:
+    from eyerender.region.mapcache import SCHEMA, _checksum
+
+    data = np.ones((4, 4), np.float32)
+    header = {"schema": SCHEMA, "dtype": "float32", "shape": [4, 4], "blake2b": _checksum(data.data)}
+    return [json.dumps(header).encode() + b"\n" + data.tobytes()]
+
+
+def _done(path: Path) -> Any:
+    from eyerender.dataset.shard import verify
+
+    place = path.parent / "shards" / "00000"
+    place.mkdir(parents=True, exist_ok=True)
+    (place / "done.json").write_bytes(path.read_bytes())
+    return list(verify(path.parent, 0))
+
+
+def _done_seeds() -> list[bytes]:
+    files = {"shards/00000/lines.jsonl": {"bytes": 0, "sha256": "0"}}
+    done = {"schema": "eyerender/shard/1", "shard": 0, "samples": [0, 1], "images": 1, "images_saturated": 0}
+    more = {
+        "digest": "",
+        "versions": {},
+        "backend": {"name": "llvm", "device": "cpu"},
+        "cpu": "",
+        "rejections": [],
+        "given_up": [],
+    }
+    return [json.dumps({**done, **more, "files": files}).encode()]
+
+
+def _run_file(path: Path) -> Any:
+    from eyerender.dataset.assemble import verify_dataset
+    from eyerender.dataset.runfile import refuse_taken
+
+    refuse_taken(path.parent)
+    (path.parent / "dataset.json").write_bytes(path.read_bytes())
+    return list(verify_dataset(path.parent))
+
+
+def _run_file_seeds() -> list[bytes]:
+    spec = {"count": 1, "shard_size": 1}
+    both = {"digest": "x", "spec": spec, "files": {}, "versions": {}}
+    sums = {"metadata.jsonl": {"bytes": 0, "sha256": ""}}
+    return [
+        json.dumps({"schema": "eyerender/run/1", **both}).encode(),
+        json.dumps({"schema": "eyerender/dataset/1", **both, "checksums": sums}).encode(),
+    ]
+
+
+def _benchmark(path: Path) -> Any:
+    from eyerender.benchmark.folder import load_labelled
+
+    return load_labelled(path.parent)
+
+
+def _study(path: Path) -> Any:
+    from eyerender.study.images import read_images
+
+    return read_images(path.parent)
+
+
+READERS: dict[str, Reader] = {
+    "scene": Reader("a.yaml", _scene, lambda: _shipped("scene")),
+    "dataset": Reader("a.yaml", _dataset, lambda: _shipped("dataset")),
+    "eye": Reader("a.yaml", _eye, lambda: _shipped("eye")),
+    "records": Reader("a.json", _records, _record_seeds),
+    "table": Reader("a.csv", _table, lambda: [b"x,y,gx,gy\n320.5,240,300,200\n1,2,,nan\n"]),
+    "folder": Reader("metadata.jsonl", _folder, _folder_seeds, _beside_metadata),
+    "benchmark": Reader("metadata.jsonl", _benchmark, _folder_seeds, _beside_metadata),
+    "study": Reader("metadata.jsonl", _study, _folder_seeds, _beside_metadata),
+    "png": Reader("a.png", _image, _png_seeds),
+    "exr": Reader("a.exr", _map, _exr_seeds),
+    "hdr": Reader("a.hdr", _map, _hdr_seeds),
+    "pfm": Reader("a.pfm", _map, _pfm_seeds),
+    "npy": Reader("a.npy", _map, _npy_seeds),
+    "opencv-yaml": Reader("a.yaml", _opencv, _opencv_yaml_seeds),
+    "opencv-xml": Reader("a.xml", _opencv, _opencv_xml_seeds),
+    "topography-points": Reader("a.csv", _topography("points"), _points_seeds),
+    "topography-matrix": Reader("a.csv", _topography("matrix"), _matrix_seeds),
+    "ply": Reader("a.ply", _head, _mesh("ply")),
+    "obj": Reader("a.obj", _head, _mesh("obj")),
+    "synteyes": Reader("a.npz", _synteyes, _synteyes_seeds),
+    "estimator": Reader("a.json", _estimator, _estimator_seeds),
+    "cached-map": Reader("a.map", _cached_map, _cached_map_seeds),
+    "shard": Reader("a.json", _done, _done_seeds),
+    "run": Reader("run.json", _run_file, _run_file_seeds),
+}
+
+
+def main(name: str, seconds: str, seed: str, place: str) -> None:
+    """Fuzz one reader."""
+    import atheris
+
+    from tests.support.fuzzing import proper
+
+    reader, folder = READERS[name], Path(place)
+    with atheris.instrument_imports(include=["eyerender"]):
+        seeds = reader.seeds()
+        for data in seeds:  # imports what the reader needs, so that it is instrumented
+            proper(lambda data=data: reader.case(data, folder / "case"))  # type: ignore[misc]
+    (folder / "corpus").mkdir()
+    for k, data in enumerate(seeds):
+        (folder / "corpus" / str(k)).write_bytes(data)
+    options = {"seed": seed, "max_len": str(LONGEST_BYTES), "len_control": "0", "artifact_prefix": f"{folder}/"}
+    options |= {"rss_limit_mb": "0", "malloc_limit_mb": "0", "timeout": "60"}
+    runs, end = itertools.count(), time.monotonic() + float(seconds)
+
+    def one(data: bytes) -> None:
+        count = next(runs)
+        if time.monotonic() > end:
+            print(f"{count} runs", flush=True)
+            os._exit(0)  # libFuzzer's own end does not join the threads of Mitsuba
+        proper(lambda: reader.case(data, folder / "case"))
+
+    atheris.Setup(["fuzz", *(f"-{key}={value}" for key, value in options.items()), str(folder / "corpus")], one)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
