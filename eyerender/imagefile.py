@@ -11,7 +11,7 @@ import warnings
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,16 +41,7 @@ def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> N
     durable.
     """
     with written(path, sync=sync) as file:
-        encode_png(file, image)
-
-
-def encode_png(target: Path | BinaryIO, image: NDArray[Any]) -> None:
-    """Write an image like `write_png`, to a file or a buffer."""
-    data = png_bytes(image)
-    if isinstance(target, Path):
-        target.write_bytes(data)
-    else:
-        target.write(data)
+        file.write(png_bytes(image))
 
 
 def png_bytes(image: NDArray[Any]) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +13,7 @@ from .analytic.observer import trace
 from .backends.choose import BackendChoice
 from .capture import EyeImage, check_windows, make_renderer, render_job, render_windows
 from .errors import InputError, Warn
-from .imagefile import Writer, encode_png, preview
+from .imagefile import Writer, png_bytes, preview
 from .imagefolder import FRAME, write_dataset
 from .labels import image_labels, seen_labels
 from .observation import EYES
@@ -47,9 +46,7 @@ class LabelledImage(EyeImage):
 
     def _repr_png_(self) -> bytes:
         """The picture as notebooks show it."""
-        buffer = io.BytesIO()
-        encode_png(buffer, preview(self.counts, self.scene.spec.sensor.full_scale_dn))
-        return buffer.getvalue()
+        return png_bytes(preview(self.counts, self.scene.spec.sensor.full_scale_dn))
 
 
 @overload

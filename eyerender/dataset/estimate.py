@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import time
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import Warn
-from ..imagefile import encode_png
+from ..imagefile import png_bytes
 from .maker import Maker
 from .options import RunOptions
 from .plan import Plan
@@ -108,9 +107,9 @@ def measured_rate(plan: Plan, maker: Maker) -> Rate:
                 continue
             began = time.perf_counter()
             made = maker.make(sample)
-            pictures = [picture for image in made.images for picture in image.pictures.values()]
+            size = sum(len(png_bytes(picture)) for image in made.images for picture in image.pictures.values())
             # Metadata is stored in the shards and in the assembled file.
-            size = sum(map(_bytes, pictures)) + 2 * sum(len(json.dumps(image.line)) for image in made.images)
+            size += 2 * sum(len(json.dumps(image.line)) for image in made.images)
             times.append(time.perf_counter() - began)
             sizes.append(size)
             images.append(len(made.images))
@@ -127,9 +126,3 @@ def measured_rate(plan: Plan, maker: Maker) -> Rate:
     )
     keep_rate(plan, rate)
     return rate
-
-
-def _bytes(image: Any) -> int:
-    buffer = io.BytesIO()
-    encode_png(buffer, image)
-    return buffer.tell()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..arrays import Bytes
-from ..imagefile import encode_png
+from ..imagefile import png_bytes
 from ..report.page import Card, Figure, Page, Section, Table, write_page
 from ..report.style import ANALYTIC, IMAGE, figure, svg
 from .compare import FolderFigures
@@ -103,9 +102,7 @@ def _montage(f: FolderFigures) -> list[Figure]:
     count = min(len(f.tiles), _TILES)
     sheet = montage([f.tiles[k * len(f.tiles) // count] for k in range(count)])
     height, width = sheet.shape
-    buffer = io.BytesIO()
-    encode_png(buffer, sheet)
-    data = base64.b64encode(buffer.getvalue()).decode()
+    data = base64.b64encode(png_bytes(sheet)).decode()
     picture = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}">'
         f'<image href="data:image/png;base64,{data}" width="{width}" height="{height}"/></svg>'

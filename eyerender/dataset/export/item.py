@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from ...arrays import Bytes, Floats, Ints
 from ...errors import InputError
 from ...files import read_bytes
 from ...geometry.ellipse import Ellipse, signed_distance
-from ...imagefile import encode_png, read_image
+from ...imagefile import png_bytes, read_image
 from ...imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
 from .encoding import RAW, Encoding
 
@@ -78,10 +77,8 @@ class Item:
         """
         if self.encoding.keeps(self.bit_depth, self.entry.gamma):
             return read_bytes(path, follow=False)
-        buffer = io.BytesIO()
         counts = _integers(read_image(path)[0], path)
-        encode_png(buffer, self.encoding.apply(counts, self.bit_depth, self.entry.gamma))
-        return buffer.getvalue()
+        return png_bytes(self.encoding.apply(counts, self.bit_depth, self.entry.gamma))
 
     def exported_line(self) -> dict[str, Any]:
         """Line of metadata for the exported image."""
