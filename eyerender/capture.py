@@ -100,7 +100,7 @@ def render_windows(
     check_windows(scene)
     if renderer is None:
         renderer = make_renderer(backend, threads)
-    images = (begun.image() for begun in one_behind(begin_windows(frames, renderer)))
+    images = (begun.image() for begun in one_behind(begin_each([frames], renderer)))
     yield from followed_by(images, len(frames), progress)
 
 
@@ -131,22 +131,19 @@ class BegunImage:
         )
 
 
-def begin_windows(frames: Frames, renderer: Renderer, *, highlights: bool = False) -> Iterator[BegunImage]:
-    """Trace the rows of `frames` in order; their images are made in a second thread, beside the tracing of the next.
-
-    highlights: whether to find the highlights of wet and oily surfaces.
-
-    Raises:
-        InputError: the scene's windows cannot be rendered.
-    """
-    return begin_each([frames], renderer, highlights=highlights)
-
-
 def begin_each(many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False) -> Iterator[BegunImage]:
-    """Do as `begin_windows` for the rows of many frames.
+    """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
 
     The next frames are fetched before the last of these are traced, because what NumPy alone makes of them is made
     beside that. Where fetching fails, these are traced first.
+
+    Args:
+        many: the frames, one scene after the other.
+        renderer: what traces them.
+        highlights: whether to find the highlights of wet and oily surfaces.
+
+    Raises:
+        InputError: a scene's windows cannot be rendered.
     """
     steps = _steps(many, highlights)
     step = next(steps, None)
