@@ -367,17 +367,6 @@ def from_cv2(rotated_rect: tuple[tuple[float, float], tuple[float, float], float
     return Ellipse(np.array([cx, cy]), np.array([0.5 * width, 0.5 * height]), math.radians(degrees))
 
 
-def to_cv2(ellipse: Ellipse) -> tuple[tuple[float, float], tuple[float, float], float]:
-    """Convert to OpenCV's form.
-
-    The minor axis comes first, as from `cv2.fitEllipse`: width = 2 b, its angle in [0, 180) degrees.
-    """
-    a, b = ellipse.semi_axes_px.tolist()
-    degrees = math.degrees(float(wrap_angle(ellipse.angle_rad + 0.5 * math.pi)))
-    cx, cy = ellipse.centre_px.tolist()
-    return (cx, cy), (2.0 * b, 2.0 * a), degrees
-
-
 def signed_distance(ellipse: Ellipse, points: ArrayLike) -> Floats:
     """First-order (Sampson) signed distance F / |grad F| of points (..., 2) to the boundary, px; positive outside."""
     p = np.asarray(points, dtype=np.float64) - ellipse.centre_px
