@@ -26,13 +26,14 @@ from ..arrays import ArrayValue, Bools, Floats, Statuses, frozen
 from ..errors import InputError
 from ..geometry.surfaces import Xyz, components, join
 from ..geometry.transforms import normalize
+from ..optics.interface import dot
 from ..optics.solve import apparent_points
 from ..optics.trace import trace
 from ..status import Status
 from .batch import CHUNK_POINTS, chunks, groups
 from .landmarks import path_to_retina
 from .model import EyeModel
-from .pose import Poses, Turning, into_eye
+from .pose import Poses, Turning, into_eye, split
 
 LineOfSightKind = Literal["chief_ray", "entrance_window"]
 
@@ -126,7 +127,7 @@ def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
     The equations are e1.(q - p) = e2.(q - p) = 0, where q is the target as the turned eye sees it.
     """
     point, direction = eye.chief_ray.point_mm, eye.chief_ray.direction
-    azimuth, elevation, miss, ahead = _turn_line(eye, components(target_mm), _split(point), _split(direction))
+    azimuth, elevation, miss, ahead = _turn_line(eye, components(target_mm), split(point), split(direction))
     status = _status(target_mm, azimuth=azimuth, elevation=elevation, residual=miss)
     status[(status == Status.OK) & ~(ahead > 0.0)] = Status.TARGET_TOO_NEAR
     poses = Poses.listing(azimuth, elevation)
@@ -151,11 +152,11 @@ def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[
     for step in range(_STEPS):
         seen, by_azimuth, by_elevation = _seen(eye, target, azimuth, elevation)
         gap = (seen[0] - point[0], seen[1] - point[1], seen[2] - point[2])
-        r1, r2 = _dot(e1, gap), _dot(e2, gap)
+        r1, r2 = dot(e1, gap), dot(e2, gap)
         if step and not np.max(np.abs(r1) + np.abs(r2)) > _SETTLED_MM:
             break
-        a, b = _dot(e1, by_azimuth), _dot(e1, by_elevation)
-        c, d = _dot(e2, by_azimuth), _dot(e2, by_elevation)
+        a, b = dot(e1, by_azimuth), dot(e1, by_elevation)
+        c, d = dot(e2, by_azimuth), dot(e2, by_elevation)
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = 1.0 / (a * d - b * c)
             turn, lift = (d * r1 - b * r2) * scale, (a * r2 - c * r1) * scale
@@ -166,9 +167,9 @@ def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[
             # Newton converges quadratically, so the remaining error is below rounding. It is measured here.
             seen, _, _ = _seen(eye, target, azimuth, elevation)
             gap = (seen[0] - point[0], seen[1] - point[1], seen[2] - point[2])
-            r1, r2 = _dot(e1, gap), _dot(e2, gap)
+            r1, r2 = dot(e1, gap), dot(e2, gap)
             break
-    return azimuth, elevation, np.hypot(r1, r2), _dot(direction, gap)
+    return azimuth, elevation, np.hypot(r1, r2), dot(direction, gap)
 
 
 def _seen(eye: EyeModel, target: Xyz, azimuth: Floats, elevation: Floats) -> tuple[Xyz, Xyz, Xyz]:
@@ -176,10 +177,8 @@ def _seen(eye: EyeModel, target: Xyz, azimuth: Floats, elevation: Floats) -> tup
 
     Listing's torsion is included.
     """
-    rotation = eye.rotation
-    ca, ce, ct = (
-        _split(c) for c in (rotation.azimuth_centre_mm, rotation.elevation_centre_mm, rotation.torsion_centre_mm)
-    )
+    r = eye.rotation
+    ca, ce, ct = (split(c) for c in (r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm))
     cos_a, sin_a, cos_e, sin_e = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     whole = 1.0 + cos_a * cos_e
     sin_t = -sin_a * sin_e / whole
@@ -248,9 +247,9 @@ def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floa
     direction = normalize(centre - seen)
     traced = trace(path_to_retina(eye), 1.0, seen, direction)
     lost = lost | (traced.status != Status.OK)
-    first, second = _tangents(_split(eye.chief_ray.direction))
+    first, second = _tangents(split(eye.chief_ray.direction))
     gap = traced.points_mm[-1] - eye.fovea_mm
-    miss = np.stack([_dot(first, _split(gap)), _dot(second, _split(gap))], axis=-1)
+    miss = np.stack([dot(first, split(gap)), dot(second, split(gap))], axis=-1)
     return np.where(lost[:, None], 0.0, miss), traced.points_mm[1], -direction, lost
 
 
@@ -307,14 +306,6 @@ def _tangents(direction: Xyz) -> tuple[Xyz, Xyz]:
     scale = 1.0 / np.sqrt(x * x + y * y)
     e1 = (-y * scale, x * scale, 0.0 * x)
     return e1, (-z * e1[1], z * e1[0], x * e1[1] - y * e1[0])
-
-
-def _dot(a: Xyz, b: Xyz) -> Floats:
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
-
-
-def _split(vector: Floats) -> Xyz:
-    return vector[..., 0], vector[..., 1], vector[..., 2]
 
 
 _SETTLED_MM = 1e-11

@@ -57,11 +57,6 @@ def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) ->
     return np.asarray(-np.arcsin(np.sin(azimuth) * np.sin(elevation) / (1.0 + np.cos(azimuth) * np.cos(elevation))))
 
 
-def rotation_matrices(poses: Poses) -> Floats:
-    """Rotation matrices M, (n, 3, 3)."""
-    return np.asarray(rotation_z(poses.azimuth_rad) @ rotation_y(-poses.elevation_rad) @ rotation_x(poses.torsion_rad))
-
-
 def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
     """Rigid motion of the eye: x_turned = M x + t in the eye frame.
 
@@ -102,7 +97,8 @@ class Turning(NamedTuple):
 
 def into_eye(turning: Turning, eye: EyeModel, point: Xyz) -> Xyz:
     """Transform points (n,) around the eye into the frame of the turned eye: the inverse of the rigid motion."""
-    ca, ce, ct = (_split(c) for c in _centres(eye))
+    r = eye.rotation
+    ca, ce, ct = (split(c) for c in (r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm))
     (cos_a, sin_a), (cos_e, sin_e), (cos_t, sin_t) = turning
     x, y, z = point[0] - ca[0], point[1] - ca[1], point[2] - ca[2]
     x, y = cos_a * x + sin_a * y, cos_a * y - sin_a * x
@@ -113,13 +109,9 @@ def into_eye(turning: Turning, eye: EyeModel, point: Xyz) -> Xyz:
     return x + ct[0], y + ct[1], z + ct[2]
 
 
-def _centres(eye: EyeModel) -> tuple[Floats, Floats, Floats]:
-    r = eye.rotation
-    return r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm
-
-
-def _split(centre: Floats) -> tuple[Floats, Floats, Floats]:
-    return centre[..., 0], centre[..., 1], centre[..., 2]
+def split(vector: Floats) -> Xyz:
+    """Components of vectors (..., 3), as views."""
+    return vector[..., 0], vector[..., 1], vector[..., 2]
 
 
 def _apply(matrix: Floats, vector: Floats) -> Floats:
@@ -128,4 +120,4 @@ def _apply(matrix: Floats, vector: Floats) -> Floats:
 
 def _about(matrix: Floats, centre: Floats) -> Floats:
     """Translation c - R c of a rotation about the point c."""
-    return np.asarray(centre - (matrix @ centre[..., None])[..., 0])
+    return np.asarray(centre - _apply(matrix, centre))

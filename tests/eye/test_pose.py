@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from eyerender.eye.batch import stack_eyes
 from eyerender.eye.catalogue import load_eye
-from eyerender.eye.pose import Poses, Turning, into_eye, listing_torsion, rigid_motion, rotation_matrices
+from eyerender.eye.pose import Poses, Turning, into_eye, listing_torsion, rigid_motion
 from eyerender.geometry.surfaces import components, join
 from tests.support.paths import load
 
@@ -19,14 +19,14 @@ def poses(seed=0, count=100):
 
 def test_listing_makes_the_shortest_rotation_to_the_gaze():
     """Torsion-free: the rotation vector is across both +x and the gaze."""
-    turned = rotation_matrices(poses())
+    turned, _ = rigid_motion(poses(), load_eye("E2").build())
     axis = Rotation.from_matrix(turned).as_rotvec()
     assert np.abs(axis[:, 0]).max() < 1e-14
     assert np.abs(np.sum(axis * turned[:, :, 0], axis=1)).max() < 1e-14
 
 
 def test_azimuth_turns_left_and_elevation_up():
-    turned = rotation_matrices(Poses.from_degrees([10.0, 0.0], [0.0, 10.0]))
+    turned, _ = rigid_motion(Poses.from_degrees([10.0, 0.0], [0.0, 10.0]), load_eye("E2").build())
     assert np.allclose(turned[0, :, 0], [np.cos(np.radians(10)), np.sin(np.radians(10)), 0.0])
     assert np.allclose(turned[1, :, 0], [np.cos(np.radians(10)), 0.0, np.sin(np.radians(10))])
 
