@@ -272,35 +272,29 @@ def _equator_radius(front: Surface, back: Surface) -> float:
 def mirrored_eye(eye: EyeModel) -> EyeModel:
     """Mirror an eye to the other side: every point (x, y, z) -> (x, -y, z)."""
     side: Literal["right", "left"] = "left" if eye.side == "right" else "right"
-    return EyeModel(
-        name=eye.name,
+    stop, centres, ray = eye.stop, eye.rotation, eye.chief_ray
+
+    def flipped(points: Floats) -> Floats:
+        return read_only(flip_y(points))
+
+    return replace(
+        eye,
         side=side,
-        wavelength_nm=eye.wavelength_nm,
         front=tuple(s.mirrored() for s in eye.front),
-        front_indices=eye.front_indices,
         back=tuple(s.mirrored() for s in eye.back),
-        back_indices=eye.back_indices,
-        back_rims_mm=eye.back_rims_mm,
-        back_passing=eye.back_passing,
         retina=eye.retina.mirrored(),
-        stop=Stop(
-            flip_y(eye.stop.centre_mm),
-            mirror_rotation(eye.stop.rotation),
-            eye.stop.semi_axes_mm,
-            -eye.stop.handed,
-            eye.stop.contour,
+        stop=replace(
+            stop, centre_mm=flip_y(stop.centre_mm), rotation=mirror_rotation(stop.rotation), handed=-stop.handed
         ),
-        limbus_radius_mm=eye.limbus_radius_mm,
-        iris_root_radius_mm=eye.iris_root_radius_mm,
-        sclera=Sphere(read_only(flip_y(eye.sclera.centre_mm)), eye.sclera.radius_mm),
+        sclera=replace(eye.sclera, centre_mm=flipped(eye.sclera.centre_mm)),
         rotation=RotationCentres(
-            read_only(flip_y(eye.rotation.azimuth_centre_mm)),
-            read_only(flip_y(eye.rotation.elevation_centre_mm)),
-            read_only(flip_y(eye.rotation.torsion_centre_mm)),
+            flipped(centres.azimuth_centre_mm),
+            flipped(centres.elevation_centre_mm),
+            flipped(centres.torsion_centre_mm),
         ),
-        fovea_mm=read_only(flip_y(eye.fovea_mm)),
-        incident_node_mm=read_only(flip_y(eye.incident_node_mm)),
-        chief_ray=LineOfSight(read_only(flip_y(eye.chief_ray.point_mm)), read_only(flip_y(eye.chief_ray.direction))),
+        fovea_mm=flipped(eye.fovea_mm),
+        incident_node_mm=flipped(eye.incident_node_mm),
+        chief_ray=LineOfSight(flipped(ray.point_mm), flipped(ray.direction)),
         lens_gradient=None if eye.lens_gradient is None else eye.lens_gradient.mirrored(),
     )
 
