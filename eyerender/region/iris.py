@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from ..arrays import Singles
 from ..spec import Spec
+from .contour import step
 from .noise import band_noise, nearest_two
 
 RADIAL, ANGULAR = 256, 1024
@@ -84,11 +85,6 @@ def _noise(
     return np.asarray(field / field.std(dtype=float).astype(np.float32))
 
 
-def _step(x: Any, low: float, high: float) -> Any:
-    s = np.clip((x - low) / (high - low), 0, 1)
-    return s * s * (3 - 2 * s)
-
-
 def iris_maps(iris: DrawnPattern) -> Singles:
     """Relative albedo and height (mm) of an iris, (2, RADIAL, ANGULAR).
 
@@ -106,7 +102,7 @@ def iris_maps(iris: DrawnPattern) -> Singles:
         + 0.019 * _noise(rng, (1, ANGULAR), (0, 1), (9, 30), True)
     )
     off = s - collarette
-    ciliary = _step(off, -0.02, 0.05)
+    ciliary = step(off, -0.02, 0.05)
     # Fibres are angular noise that is elongated along the radius; a slow sideways warp bends its columns.
     warp = 3.0 * _noise(rng, shape, (0, 2.2), (0, 14)) + 0.8 * _noise(rng, shape, (0, 6), (0, 60))
     albedo, height = _fibres(fibrous, np.float32(rng.uniform(0.3, 1.6)) * warp, ciliary, iris.fibres)
@@ -117,7 +113,7 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     height += iris.collarette * (0.06 * crest - 0.06 * (1 - ciliary) + 0.03 * np.exp(-((off / 0.12) ** 2)))
     albedo += iris.collarette * (0.06 * crest + 0.05 * (1 - ciliary))
     slow = _noise(rng, shape, (0, 2.0), (0, 5))
-    albedo += 0.045 * slow + 0.035 * _noise(rng, shape, (0, 14), (0, 60)) - 0.04 * _step(s, 0.72, 1.0)
+    albedo += 0.045 * slow + 0.035 * _noise(rng, shape, (0, 14), (0, 60)) - 0.04 * step(s, 0.72, 1.0)
     height += 0.02 * slow
     # The stroma is a felt of collagen, whose grain shows in every iris.
     albedo += grained.uniform(0.052, 0.085) * _noise(grained, shape, (8, 32), (50, 200))
@@ -135,7 +131,7 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     albedo /= np.sum(albedo * area) / np.sum(np.broadcast_to(area, shape))
     # Tissue has no edges as sharp as those between cells of the lattice.
     height = ndimage.gaussian_filter(height, _SOFT, mode=("nearest", "wrap"))
-    height *= _step(s, 0.0, 0.10) * (1 - _step(s, 0.90, 1.0))
+    height *= step(s, 0.0, 0.10) * (1 - step(s, 0.90, 1.0))
     return np.stack([albedo, height]).astype(np.float32)
 
 
@@ -174,7 +170,7 @@ def _furrows(rng: np.random.Generator, s: NDArray[Any], turn: NDArray[Any]) -> S
         start, span = rng.uniform(0, 1), rng.uniform(0.35, 0.95)
         wave = 0.008 * np.sin(2 * np.pi * (turn * rng.integers(2, 6) + rng.uniform()))
         along = np.mod(turn - start, 1.0)
-        mask = _step(along, 0.0, 0.08) * (1 - _step(along, span - 0.08, span))
+        mask = step(along, 0.0, 0.08) * (1 - step(along, span - 0.08, span))
         d = (s - place - wave) / rng.uniform(0.010, 0.024)
         out += mask * rng.uniform(0.4, 1.0) * (np.exp(-(d**2)) - 0.4 * np.exp(-((d - 1.8) ** 2)))
     return out
@@ -210,10 +206,10 @@ def _crypts(
     gap = second - first
     sector = np.clip(0.72 + 0.5 * _noise(rng, (1, turn.shape[1]), (0, 1), (0, 5), True), 0.05, 1.35)
     away, spread = off[rows], rng.uniform(0.07, 0.2)
-    zone = np.exp(-(((away - 0.05) / spread) ** 2)) * sector + 0.2 * _step(away, 0.08, 0.2) * (s[rows] < 0.8)
+    zone = np.exp(-(((away - 0.05) / spread) ** 2)) * sector + 0.2 * step(away, 0.08, 0.2) * (s[rows] < 0.8)
     nearest, next_ = one.astype(np.intp) % count, two.astype(np.intp) % count
     trabeculae = np.maximum(pale[nearest], pale[next_]) * np.exp(-((gap / 0.055) ** 2))
     depth = out.copy()
-    depth[rows] = np.clip(strength * zone * deep[nearest] * _step(gap, 0.02, 0.16), 0, 0.85)
+    depth[rows] = np.clip(strength * zone * deep[nearest] * step(gap, 0.02, 0.16), 0, 0.85)
     out[rows] = min(strength, 1.0) * zone * trabeculae
     return depth, out

@@ -216,7 +216,7 @@ def _skin(spec: Region, globe: Globe, c: Contour, lash_line: Floats) -> Floats:
         x = x + _fullness(spec, c, y, z)
     # Where the lids leave the globe, the canthi lie in a hollow, which is deeper the wider the gap is.
     x = x + start * np.exp(-((v / (2.2 + 0.8 * np.maximum(-start - 1.2, 0))) ** 2))
-    strength = _fold_strength(c)
+    strength = np.where(c.upper > 0, step(np.sin(c.angle), 0.12, 0.75), 0.0)
     lift, drop = _fold(spec, c, v, crease, strength)
     x = x + lift
     z = z - drop * c.upper
@@ -266,12 +266,6 @@ def _crease(spec: Region, c: Contour) -> Floats:
     arch = 0.72 + 0.28 * np.abs(np.sin(c.angle)) ** 1.5
     upper = step(np.sin(c.angle), -0.3, 0.3)
     return np.asarray((5.5 + upper * (middle - 5.5)) * arch)
-
-
-def _fold_strength(c: Contour) -> Floats:
-    upper = step(np.sin(c.angle), 0.12, 0.75)
-    lower = 0.0 * upper
-    return np.where(c.upper > 0, upper, lower)
 
 
 def _distances(crease: Floats, length: Floats) -> Floats:

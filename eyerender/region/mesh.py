@@ -148,11 +148,13 @@ def _margins(fissure: Contour) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=16)
 def _layout(upper_count: int, lash_count: int, brow_count: int, mirrored: bool) -> RegionLayout:
+    tear_uv = _grid_uv(np.arange(COLUMNS + 1) / COLUMNS, np.full(TEAR_ROWS, band_row(TEAR)))
+    brow_uv = np.tile([0.5, band_row(BROW)], (brow_count * len(BROW_PLACES) * 3, 1))
     parts = [
         (sheet_faces(), _sheet_uv()),
         (tube_faces(lash_count, SEGMENTS + 1), _lash_uv(upper_count, lash_count)),
-        (tube_faces(brow_count, len(BROW_PLACES), pointed=True), _brow_uv(brow_count)),
-        (_tear_faces(), _tear_uv()),
+        (tube_faces(brow_count, len(BROW_PLACES), pointed=True), brow_uv),
+        (_tear_faces(), tear_uv),
     ]
     faces, uv, start = [], [], 0
     for f, t in parts:
@@ -231,17 +233,9 @@ def _grid_uv(u: Floats, v: Floats) -> Floats:
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
-def _tear_uv() -> Floats:
-    return _grid_uv(np.arange(COLUMNS + 1) / COLUMNS, np.full(TEAR_ROWS, band_row(TEAR)))
-
-
 def _lash_uv(upper_count: int, count: int) -> Floats:
     """Coordinates of lashes, upper ones first: u runs from root to tip in the half of the band of its lid."""
     along = LASH_U[0] + LASH_U[1] * np.arange(SEGMENTS + 1) / SEGMENTS
     lower = np.where(np.arange(count) < upper_count, 0.0, 0.5)
     u = np.repeat((lower[:, None] + along).reshape(-1), 3)
     return np.stack([u, np.full_like(u, band_row(LASH))], axis=-1)
-
-
-def _brow_uv(count: int) -> Floats:
-    return np.tile([0.5, band_row(BROW)], (count * len(BROW_PLACES) * 3, 1)).reshape(-1, 2)

@@ -7,46 +7,21 @@ from functools import lru_cache
 import numpy as np
 from scipy import fft
 
-from ..arrays import Floats, Singles
-from .noise import band_noise
-
-Texture = Singles
-
-
-def _noise(
-    rng: np.random.Generator,
-    shape: tuple[int, int],
-    rows: tuple[float, float],
-    columns: tuple[float, float],
-    periodic_rows: bool = False,
-) -> Singles:
-    """Gaussian noise of unit variance, band-passed: `rows`, `columns` are (low, high) cycles over the whole extent."""
-    h, w = shape
-    if periodic_rows:
-        return band_noise(rng, shape, columns, rows)
-    field = band_noise(rng, (2 * h, w), columns, (2 * rows[0], 2 * rows[1]))[:h]
-    return np.asarray(field / field.std(dtype=float).astype(np.float32))
+from ..arrays import Floats, Singles, sealed
+from .noise import band_noise, gain
 
 
 def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) -> Floats:
     """Isotropic Gaussian noise of unit variance on a periodic square, `low` to `high` cycles."""
     f = np.hypot((np.fft.fftfreq(size) * size)[:, None], (np.fft.rfftfreq(size) * size)[None, :])
-    keep = np.exp(-((f / high) ** 2))
-    if low > 0:
-        keep *= 1 - np.exp(-((f / low) ** 2))
+    keep = gain(f, low, high)
     keep[0, 0] = 0
     field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((size, size))) * keep, s=(size, size))
     return np.asarray(field / field.std())
 
 
-def _sealed(texture: Floats) -> Texture:
-    out: Texture = texture.astype(np.float32)
-    out.flags.writeable = False
-    return out
-
-
 @lru_cache(maxsize=4)
-def sclera_texture(seed: int, size: int = 768) -> Texture:
+def sclera_texture(seed: int, size: int = 768) -> Singles:
     """Relative albedo (size, size) of the globe's front, azimuthal equidistant to 108 degrees from the pole.
 
     It has slow unevenness and conjunctival vessels, which are faint at 850 nm. The vessels run in from the fornices,
@@ -55,12 +30,12 @@ def sclera_texture(seed: int, size: int = 768) -> Texture:
     rng = np.random.default_rng((0x5C1E, seed))
     shade = (
         1
-        + 0.025 * _noise(rng, (size, size), (0, 5), (0, 5), True)
-        + 0.012 * _noise(rng, (size, size), (10, 40), (10, 40), True)
+        + 0.025 * band_noise(rng, (size, size), (0, 5), (0, 5))
+        + 0.012 * band_noise(rng, (size, size), (10, 40), (10, 40))
     )
     vessels = _vessels(rng, size)
     texture = shade * (1 - np.clip(vessels, 0, 0.3))
-    return _sealed(texture / texture.mean(dtype=float))
+    return sealed((texture / texture.mean(dtype=float)).astype(np.float32))
 
 
 def _vessels(rng: np.random.Generator, size: int) -> Singles:
@@ -104,15 +79,15 @@ def _vessels(rng: np.random.Generator, size: int) -> Singles:
     for k, width in enumerate((2.2, 1.4, 0.9)):
         some = layers == k
         layer = np.bincount(places[some].astype(int), weights[some], minlength=size * size)
-        gain = 0.16 * width * np.exp(-2 * (np.pi * width) ** 2 * f2)
+        share = 0.16 * width * np.exp(-2 * (np.pi * width) ** 2 * f2)
         if width > 1:  # wider vessels have a soft halo
-            gain += 0.25 * np.exp(-2 * (np.pi * 5.0) ** 2 * f2)
-        blurred += gain.astype(np.float32) * fft.rfft2(layer.reshape(size, size).astype(np.float32))
+            share += 0.25 * np.exp(-2 * (np.pi * 5.0) ** 2 * f2)
+        blurred += share.astype(np.float32) * fft.rfft2(layer.reshape(size, size).astype(np.float32))
     return np.asarray(fft.irfft2(blurred, s=(size, size)))
 
 
 @lru_cache(maxsize=4)
-def skin_texture(seed: int, size: int = 768) -> Texture:
+def skin_texture(seed: int, size: int = 768) -> Singles:
     """Relative albedo (size, size) of a periodic tile of skin: slow unevenness, the net of furrows, pores."""
     rng = np.random.default_rng((0x5817, seed))
     slow = 0.025 * _even_noise(rng, size, 0, 3)
@@ -120,4 +95,4 @@ def skin_texture(seed: int, size: int = 768) -> Texture:
     net = 0.055 * (np.minimum(net, 1.0) - 0.6)
     grain = 0.02 * _even_noise(rng, size, 90, 180)
     texture = np.clip(1 + slow + net + grain, 0.5, 1.5)
-    return _sealed(texture / texture.mean())
+    return sealed((texture / texture.mean()).astype(np.float32))
