@@ -230,8 +230,8 @@ def join(point: Xyz) -> Floats:
 
 def fit(value: Floats | float, ndim: int) -> Floats | float:
     """Reshape a parameter () or (n,) to broadcast with points that have `ndim` axes, the batch axis first."""
-    if isinstance(value, float):
-        return value
+    if isinstance(value, float | int):
+        return float(value)
     if value.ndim == 0:
         return float(value)
     return value.reshape(value.shape + (1,) * (ndim - value.ndim))

@@ -101,3 +101,19 @@ def _stacked(first: Floats, second: Floats) -> Floats:
 def dot(a: Xyz, b: Xyz) -> Floats:
     """Scalar product a.b."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def unit(vector: Xyz) -> Xyz:
+    """Unit vector v / |v|."""
+    scale = 1.0 / np.sqrt(dot(vector, vector))
+    return vector[0] * scale, vector[1] * scale, vector[2] * scale
+
+
+def minus(a: Xyz, b: Xyz) -> Xyz:
+    """Difference a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def moved(point: Xyz, way: Xyz, distance: FloatLike) -> Xyz:
+    """Point p + t w at the distance t along w."""
+    return point[0] + distance * way[0], point[1] + distance * way[1], point[2] + distance * way[2]

@@ -25,7 +25,7 @@ import numpy as np
 from ..arrays import Bools, FloatLike, Floats, Indices, Statuses
 from ..geometry.surfaces import Xyz, fit
 from ..status import Status, mark
-from .interface import dot
+from .interface import dot, minus, moved, unit
 from .trace import BEHIND_MM, Crossing, inside_rim
 
 SETTLED_MM = 1e-12
@@ -112,7 +112,7 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
     """
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *target, *aim)))
     source, target = _spread(source, shape), _spread(target, shape)
-    direction = _unit(_minus(_spread(aim, shape), source))
+    direction = unit(minus(_spread(aim, shape), source))
     shot = _shoot(path, n_start, source, direction, target)
     for _ in range(_FAST_STEPS):
         if not ((shot.status == Status.OK) & ~_settled(shot, 1.0)).any():
@@ -158,7 +158,7 @@ def correct(
         aim: (m,) points at which they are aimed first.
         steps: largest number of undamped Newton steps.
     """
-    direction = _unit(_minus(aim, source))
+    direction = unit(minus(aim, source))
     shot = _shoot(path, n_start, source, direction, target)
     for _ in range(steps):
         if not ((shot.status == Status.OK) & ~_settled(shot, 1.0)).any():
@@ -216,7 +216,7 @@ def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction:
         for crossing in path:
             if crossing.through is None:
                 lead = -dot(point, way)
-                near = _moved(point, way, lead)
+                near = moved(point, way, lead)
                 hit = crossing.surface.hit(near, way, crossing.inward)
                 step = hit.distance + lead
                 met = hit.ok & (step > -BEHIND_MM)
@@ -253,10 +253,10 @@ def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction:
             )
             hessian = crossing.surface.hessian_at(hit.point)
             for k in (0, 1):
-                move = _moved(moves[k], turns[k], step)
-                move = _moved(move, way, dot(normal, move) / cosine)
+                move = moved(moves[k], turns[k], step)
+                move = moved(move, way, dot(normal, move) / cosine)
                 bend = hessian.times(move)
-                bend = _moved(bend, normal, -dot(normal, bend))
+                bend = moved(bend, normal, -dot(normal, bend))
                 tilt = (bend[0] * scale, bend[1] * scale, bend[2] * scale)
                 change = slope * -(dot(turns[k], normal) + dot(way, tilt))
                 turned = (
@@ -273,10 +273,10 @@ def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction:
                 index = np.where(skip, index, after)
             first = point if first is None else first
             turning = point if crossing.reflects or turning is None else turning
-        gap = _minus(target, point)
+        gap = minus(target, point)
         along = dot(gap, way)
-        miss = _moved(gap, way, -along)
-        a1, a2 = _moved(moves[0], turns[0], along), _moved(moves[1], turns[1], along)
+        miss = moved(gap, way, -along)
+        a1, a2 = moved(moves[0], turns[0], along), moved(moves[1], turns[1], along)
         residual = np.sqrt(dot(miss, miss)) * nearness(along)
         determinant = _triple(way, a1, a2)
     mark(status, ~np.isfinite(residual), Status.MISSED)
@@ -307,7 +307,7 @@ def _stepped(direction: Xyz, shot: _Shot, fraction: Floats | float) -> Xyz:
     usable = np.isfinite(first) & np.isfinite(second)
     first, second = np.where(usable, first, 0.0), np.where(usable, second, 0.0)
     e1, e2 = _basis(direction)
-    return _unit(_moved(_moved(direction, e1, first), e2, second))
+    return unit(moved(moved(direction, e1, first), e2, second))
 
 
 def _rescue(
@@ -332,8 +332,8 @@ def _rescue(
     done = np.zeros(frame.shape, dtype=bool)
     # For an aim at the target itself, all blends are the same.
     for blend in (0.0,) if all(map(np.array_equal, few_aim, few_target)) else (0.0, 0.5, -0.5, 1.0):
-        aimed = _moved(few_aim, _minus(few_target, few_aim), np.full(frame.shape, blend))
-        way = _unit(_minus(aimed, few_source))
+        aimed = moved(few_aim, minus(few_target, few_aim), np.full(frame.shape, blend))
+        way = unit(minus(aimed, few_source))
         trial = _shoot(few_path, few_start, few_source, way, few_target)
         way, trial = _guarded(few_path, few_start, few_source, few_target, way, trial, done)
         better = ~done & _better(trial, best)
@@ -353,17 +353,17 @@ def _guarded(
         if not active.any():
             break
         fraction = np.ones(active.shape)
-        moved = np.zeros(active.shape, dtype=bool)
+        gone = np.zeros(active.shape, dtype=bool)
         for _ in range(_RETREATS):
-            trial_way = _stepped(way, shot, np.where(active & ~moved, fraction, 0.0))
+            trial_way = _stepped(way, shot, np.where(active & ~gone, fraction, 0.0))
             trial = _shoot(path, n_start, source, trial_way, target)
-            accept = active & ~moved & (trial.status == Status.OK) & (trial.residual_mm < shot.residual_mm)
+            accept = active & ~gone & (trial.status == Status.OK) & (trial.residual_mm < shot.residual_mm)
             way, shot = _choose(~accept, way, trial_way), _choose(~accept, shot, trial)
-            moved |= accept
-            if (moved | ~active).all():
+            gone |= accept
+            if (gone | ~active).all():
                 break
             fraction = fraction * 0.5
-        if not moved.any():
+        if not gone.any():
             break
     return way, shot
 
@@ -443,19 +443,6 @@ def _basis(direction: Xyz) -> tuple[Xyz, Xyz]:
         (-sign * y, 1.0 + sign * y * y * a, sign * b),
         (-z, b, sign + z * z * a),
     )
-
-
-def _unit(vector: Xyz) -> Xyz:
-    scale = 1.0 / np.sqrt(dot(vector, vector))
-    return vector[0] * scale, vector[1] * scale, vector[2] * scale
-
-
-def _minus(a: Xyz, b: Xyz) -> Xyz:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-def _moved(point: Xyz, way: Xyz, distance: Floats | float) -> Xyz:
-    return point[0] + distance * way[0], point[1] + distance * way[1], point[2] + distance * way[2]
 
 
 def _triple(a: Xyz, b: Xyz, c: Xyz) -> Floats:

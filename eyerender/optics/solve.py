@@ -21,7 +21,7 @@ from ..geometry.graphs import Graph, graphs_of
 from ..geometry.surfaces import Surface, Xyz, components, fit, join, shift, turn, turn_back
 from ..status import Status, mark
 from .fermat import stationary_path
-from .interface import dot
+from .interface import dot, minus, moved, unit
 from .shooting import RESIDUAL_LIMIT_MM, Connection, connect, nearness, taken
 from .trace import Crossing, cross, inside_rim, outward_path, trace
 
@@ -154,7 +154,7 @@ def refracted_rays(
     plain = not np.any(origin) and np.array_equal(rotation, np.broadcast_to(np.eye(3), rotation.shape))
     inner = target if plain else turn_back(rotation, shift(target, origin, -1.0))
     outer = viewpoint if plain else turn_back(rotation, shift(viewpoint, origin, -1.0))
-    ladder = [n_outside, *(_spread_index(n, ndim) for n in indices)]
+    ladder = [n_outside, *(fit(n, ndim) for n in indices)]
     points = stationary_path(graphs, ladder, outer, inner, _paraxial_start(graphs, ladder, outer, inner)).points
     first = points[0] if plain else shift(turn(rotation, points[0]), origin, 1.0)
     return _launched(
@@ -214,7 +214,7 @@ def _confirmed(
     `hopeless` rays are not searched: if they meet the surface at all, they meet it beyond its rim.
     """
     with np.errstate(all="ignore"):
-        way = _unit((first[0] - viewpoint[0], first[1] - viewpoint[1], first[2] - viewpoint[2]))
+        way = unit(minus(first, viewpoint))
         gradient = path[0].surface.gradient_at(first)
         found = np.asarray(dot(gradient, way) < 0.0)
         index, end, passes = cross(path[0], gradient, way, n_start)
@@ -225,9 +225,9 @@ def _confirmed(
             index, end, passes = cross(crossing, hit.gradient, end, index)
             found &= hit.ok & passes
             point = hit.point
-        gap = (target[0] - point[0], target[1] - point[1], target[2] - point[2])
+        gap = minus(target, point)
         along = dot(gap, end)
-        miss = (gap[0] - along * end[0], gap[1] - along * end[1], gap[2] - along * end[2])
+        miss = moved(gap, end, -along)
         residual = np.sqrt(dot(miss, miss))
         reach: FloatLike = SURE_MM
         if path[0].reflects:
@@ -381,27 +381,14 @@ def mirror_start(surface: Surface, source: Xyz, viewpoint: Xyz) -> Xyz:
     trace = np.asarray(hessian.xx) + np.asarray(hessian.yy) + np.asarray(hessian.zz)
     radius = 2.0 * size / (trace - dot(normal, hessian.times(normal)))
     centre = join((apex[0] - radius * normal[0], apex[1] - radius * normal[1], apex[2] - radius * normal[2]))
-    to_source, to_viewpoint = _unit(shift(source, centre, -1.0)), _unit(shift(viewpoint, centre, -1.0))
+    to_source, to_viewpoint = unit(shift(source, centre, -1.0)), unit(shift(viewpoint, centre, -1.0))
     bisector = (to_source[0] + to_viewpoint[0], to_source[1] + to_viewpoint[1], to_source[2] + to_viewpoint[2])
     reach = fit(np.asarray(radius), ndim) / np.sqrt(np.maximum(dot(bisector, bisector), 1e-300))
-    guess = shift((reach * bisector[0], reach * bisector[1], reach * bisector[2]), centre, 1.0)
-    return (
-        np.broadcast_to(guess[0], shape),
-        np.broadcast_to(guess[1], shape),
-        np.broadcast_to(guess[2], shape),
-    )
+    x, y, z = shift((reach * bisector[0], reach * bisector[1], reach * bisector[2]), centre, 1.0)
+    return np.broadcast_to(x, shape), np.broadcast_to(y, shape), np.broadcast_to(z, shape)
 
 
 def apex_of(surface: Surface) -> Floats:
     """Point of the sheet on its local axis, (..., 3)."""
     zero = np.zeros(surface.batch_shape)
     return surface.to_eye(np.stack([surface.sag(zero, zero), zero, zero], axis=-1))
-
-
-def _spread_index(n: FloatLike, ndim: int) -> FloatLike:
-    return n if isinstance(n, float) else fit(np.asarray(n, dtype=np.float64), ndim)
-
-
-def _unit(vector: Xyz) -> Xyz:
-    scale = 1.0 / np.sqrt(dot(vector, vector))
-    return vector[0] * scale, vector[1] * scale, vector[2] * scale

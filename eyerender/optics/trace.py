@@ -12,7 +12,7 @@ from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
 from ..geometry.surfaces import Surface, Xyz, components, fit, join
 from ..status import Status, mark
 from .gradient import GradientMedium
-from .interface import dot, reflect, refract
+from .interface import dot, moved, reflect, refract, unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,8 +93,7 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
             # A distant origin loses digits in the quadratic. The foot of the perpendicular from the eye's origin does
             # not.
             lead = -dot(point, direction)
-            near = (point[0] + lead * direction[0], point[1] + lead * direction[1], point[2] + lead * direction[2])
-            hit = crossing.surface.hit(near, direction, crossing.inward)
+            hit = crossing.surface.hit(moved(point, direction, lead), direction, crossing.inward)
             step = hit.distance + lead
             met = hit.ok & (step > -BEHIND_MM)
         else:
@@ -107,16 +106,16 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
         if crossing.beyond_rim is None:
             step = np.where(within, step, 0.0)
             passes = passes | ~within
-            moved = tuple(np.where(within, new, old) for new, old in zip(hit.point, point, strict=True))
+            there = tuple(np.where(within, new, old) for new, old in zip(hit.point, point, strict=True))
             turned = tuple(np.where(within, new, old) for new, old in zip(way, direction, strict=True))
             after = np.where(within, after, index)
         else:
-            moved, turned = hit.point, way
+            there, turned = hit.point, way
             mark(status, ~met, Status.MISSED)
             mark(status, met & ~within, crossing.beyond_rim)
         mark(status, ~passes, Status.TOTAL_REFLECTION)
         length = length + index * step
-        point, direction = (moved[0], moved[1], moved[2]), (turned[0], turned[1], turned[2])
+        point, direction = (there[0], there[1], there[2]), (turned[0], turned[1], turned[2])
         index = after
         points.append(point)
         ways.append(direction)
@@ -132,8 +131,7 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
 def cross(crossing: Crossing, gradient: Xyz, direction: Xyz, n_before: FloatLike) -> tuple[FloatLike, Xyz, Bools]:
     """Index after, direction after, and whether light passes, at a point with half gradient `gradient`."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1.0 / np.sqrt(dot(gradient, gradient))
-        normal = (gradient[0] * scale, gradient[1] * scale, gradient[2] * scale)
+        normal = unit(gradient)
         if crossing.reflects:
             way = reflect(direction, normal)
             return n_before, way, np.ones(way[0].shape, dtype=bool)
