@@ -22,15 +22,13 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from ..errors import BackendError, EyerenderError, InputError
+from ..errors import EyerenderError, InputError
 from .pool import RECYCLE_IMAGES, TRIES, Events, caller_hidden, end_of, signals_held
 from .shard import Staged, cpu_family, write_shard
-from .worker import Job
+from .worker import FAILURES, Job, failure
 
 # These variables locate a libLLVM or a GPU's driver on the driver's machine, and so on the others, installed alike.
 PASSED_ON = ("DRJIT_LIBLLVM_PATH", "DRJIT_LIBCUDA_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "XDG_CACHE_HOME")
-
-_FAILURES = {"backend": BackendError, "input": InputError, "disk": EyerenderError}
 
 
 class ShardActor:
@@ -48,15 +46,9 @@ class ShardActor:
                 self._maker = self._job.maker()
             counted = []
             staged = write_shard(self._maker, Path(self._job.folder), shard, lambda _s, images: counted.append(images))
-        except BackendError as error:
-            return {"ok": False, "kind": "backend", "reason": str(error)}
-        except OSError as error:
-            reason = f"{self._job.folder}: cannot be written ({error.strerror or error})"
-            return {"ok": False, "kind": "disk", "reason": reason}
-        except InputError as error:
-            return {"ok": False, "kind": "input", "reason": str(error)}
-        except EyerenderError as error:
-            return {"ok": False, "kind": "disk", "reason": str(error)}
+        except (EyerenderError, OSError) as error:
+            kind, reason = failure(error, Path(self._job.folder))
+            return {"ok": False, "kind": kind, "reason": reason}
         self._made += staged.images
         name = f"{os.uname().nodename}:{os.getpid()}"
         spent = self._made >= known
@@ -258,7 +250,7 @@ class _Driver:
                     self._again(job.shard, reason, pending, tries, lost, events)
                     continue
                 if not answer["ok"]:
-                    raise _FAILURES[answer["kind"]](answer["reason"])
+                    raise FAILURES[answer["kind"]](answer["reason"])
                 if answer["worker"] not in known:
                     known.add(answer["worker"])
                     events.ready(answer["backend"], answer["worker"])

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -169,7 +170,7 @@ class Plan:
             if name not in eyes:
                 raise InputError("no sample uses this eye", source=source, path=f"eye_parameters.{name}")
             for path in spec.eye_parameters[name]:
-                _set(_copy(eyes[name]), path, 0.0, f"eye_parameters.{name}", source)
+                _set(deepcopy(eyes[name]), path, 0.0, f"eye_parameters.{name}", source)
         _ = plan.scene_template, plan.eye_template
         return plan
 
@@ -321,27 +322,23 @@ class Plan:
     def _identify(self, subject: int) -> tuple[int, tuple[str, ...]]:
         reasons: list[str] = []
         for attempt in range(self.spec.attempts):
-            if self.spec.population is not None:
-                try:
+            turn = Turn(sample=0, subject=subject, sequence=0, attempt=0, subject_attempt=attempt)
+            tree = {} if self.spec.population is not None else self._scene_of(turn)[0]
+            try:
+                if self.spec.population is not None:
                     person = self.person_of(subject, attempt).chosen()
                     for side in SIDES:
                         person.eye(side).build()
-                except InputError as error:
-                    reasons.append(error.reason if not error.path else f"{error.path}: {error.reason}")
-                    continue
-                return attempt, tuple(reasons)
-            turn = Turn(sample=0, subject=subject, sequence=0, attempt=0, subject_attempt=attempt)
-            tree, _ = self._scene_of(turn)
-            try:
-                eye, _, modified = self._eye_of(tree, turn)
-                if modified:
-                    _eye(json.dumps(eye, sort_keys=True)).build()
+                else:
+                    eye, _, modified = self._eye_of(tree, turn)
+                    if modified:
+                        _eye(json.dumps(eye, sort_keys=True)).build()
             except InputError as error:
                 reasons.append(error.reason if not error.path else f"{error.path}: {error.reason}")
-                if not self.eye_template.draws:
+                if self.spec.population is None and not self.eye_template.draws:
                     break
-                continue
-            return attempt, tuple(reasons)
+            else:
+                return attempt, tuple(reasons)
         raise InputError(f"its eye cannot be made: {reasons[-1]}", source=self.source, path=f"subject {subject}")
 
     def person_of(self, subject: int, attempt: int) -> PersonChoice:
@@ -358,7 +355,7 @@ class Plan:
         values, drawn = self.eye_template.values(turn)
         eye_part = tree.get("eye")
         model = eye_part.get("model", "E2") if isinstance(eye_part, Mapping) else "E2"
-        eye = _copy(self.eyes[model])
+        eye = deepcopy(dict(self.eyes[model]))
         mine = values["eye_parameters"].get(model, {})
         for path, value in mine.items():
             _set(eye, path, value, f"eye_parameters.{model}", self.source)
@@ -412,12 +409,6 @@ def _sorted(node: Any) -> Any:
     if isinstance(node, Mapping):
         return {key: _sorted(node[key]) for key in sorted(node)}
     return [_sorted(value) for value in node] if isinstance(node, list | tuple) else node
-
-
-def _copy(node: Any) -> Any:
-    if isinstance(node, Mapping):
-        return {key: _copy(value) for key, value in node.items()}
-    return [_copy(value) for value in node] if isinstance(node, list | tuple) else node
 
 
 def _set(tree: Any, path: str, value: Any, prefix: str, source: str) -> None:

@@ -15,9 +15,9 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from ..errors import BackendError, EyerenderError, InputError
+from ..errors import EyerenderError
 from .shard import Staged
-from .worker import Job, work
+from .worker import FAILURES, Job, work
 
 TRIES = 3
 HOPELESS = 3  # if so many shards are given up before any is made, the others would fail too
@@ -123,7 +123,9 @@ class LocalPool:
             self._start()
         for worker in self._workers:
             if worker.is_ready and worker.shard is None and pending:
-                self._give(worker, pending.popleft())
+                worker.shard, worker.heard = pending.popleft(), time.monotonic()
+                with suppress(OSError):  # a worker that has just died is noticed when its pipe is read
+                    worker.pipe.send(worker.shard)
 
     def _start(self) -> None:
         ours, theirs = self._context.Pipe()
@@ -132,11 +134,6 @@ class LocalPool:
             process.start()
         theirs.close()
         self._workers.append(_Worker(process, ours, f"{process.pid}", time.monotonic()))
-
-    def _give(self, worker: _Worker, shard: int) -> None:
-        worker.shard, worker.heard = shard, time.monotonic()
-        with suppress(OSError):  # a worker that has just died is noticed when its pipe is read
-            worker.pipe.send(shard)
 
     def _listen(self, worker: _Worker, events: Events) -> str | None:
         """Receive a worker's messages; return the reason why it must be ended, if there is one."""
@@ -171,12 +168,8 @@ class LocalPool:
             events.staged(Staged(**message[1]), worker.name)
             self._made += 1
             worker.shard = None
-        elif kind == "failed" and message[1] == "backend":
-            raise BackendError(message[2])
-        elif kind == "failed" and message[1] == "input":
-            raise InputError(message[2])
-        elif kind == "failed" and message[1] == "disk":
-            raise EyerenderError(message[2])
+        elif message[1] in FAILURES:
+            raise FAILURES[message[1]](message[2])
         else:
             return str(message[2])
         return None

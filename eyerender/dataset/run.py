@@ -7,11 +7,10 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from ..errors import EyerenderError, InputError, Warn
 from ..files import make_folder, remove_file
@@ -23,7 +22,7 @@ from ..progress import Progress, Say
 from .assemble import assemble, damage
 from .options import RunOptions
 from .plan import Plan
-from .pool import NO_SHARD, Events, LocalPool
+from .pool import NO_SHARD, LocalPool
 from .rates import Rate, keep_rate, now
 from .realise import frames_of
 from .runfile import LOG, begin, refuse_taken
@@ -40,14 +39,10 @@ from .shard import (
 from .spec import DatasetSpec
 from .worker import Job
 
+if TYPE_CHECKING:
+    from .cluster import RayEngine
+
 MEMORY_A_WORKER = 0.9e9  # bytes, measured resident size with head-room
-
-
-class Engine(Protocol):
-    """Makes shards in some way."""
-
-    def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
-        """Make shards, and return those that were given up, with the reasons."""
 
 
 def generate(
@@ -203,7 +198,9 @@ class _Run:
             remove_file(self.folder / DATASET)  # a folder that has one is complete
         self.total = sum(len(spec.shard_samples(s)) for s in todo)
         if todo:
-            self._note_backends(done)
+            for shard in sorted(done):
+                with suppress(InputError):  # a damaged shard of another part
+                    self._mixed(read_done(self.folder, shard), old=True)
             self._log("start", shards=len(todo), finished=len(done & mine), part=f"{k}/{n}", engine=self.options.engine)
             self.progress(0, self.total, "samples")
             try:
@@ -258,7 +255,7 @@ class _Run:
             self.repaired(f"shard {shard} is made again: {problem}")
         self.verified |= shards - damaged.keys()
 
-    def _engine(self, shards: int) -> Engine:
+    def _engine(self, shards: int) -> LocalPool | RayEngine:
         options = self.options
         workers, threads = worker_count(options, shards)
         job = Job.of(self.plan, self.frames, self.folder, options.backend, threads)
@@ -341,11 +338,6 @@ class _Run:
         if self.rejected:
             note += f", {self.rejected} attempts redrawn, {self.given_up} samples given up"
         self.progress(samples, self.total, note)
-
-    def _note_backends(self, done: set[int]) -> None:
-        for shard in sorted(done):
-            with suppress(InputError):  # a damaged shard of another part
-                self._mixed(read_done(self.folder, shard), old=True)
 
     def _mixed(self, made_by: dict[str, Any], *, old: bool = False) -> None:
         """Warn if shards of different backends or processors are combined: their bytes may differ in rounding."""

@@ -16,6 +16,9 @@ from .maker import Maker
 from .plan import Plan
 from .shard import write_shard
 
+FAILURES: dict[str, type[EyerenderError]] = {"backend": BackendError, "input": InputError, "disk": EyerenderError}
+"""What the parent raises for each kind of failure; one of another kind may be tried again."""
+
 
 @dataclass(frozen=True, slots=True)
 class Job:
@@ -71,14 +74,17 @@ def work(pipe: Connection, job: Job) -> None:
 
         try:
             pipe.send(("done", asdict(write_shard(maker, folder, shard, alive))))
-        except OSError as error:
-            pipe.send(("failed", "disk", f"{folder}: cannot be written ({error.strerror or error})"))
-        except InputError as error:
-            pipe.send(("failed", "input", str(error)))
-        except EyerenderError as error:
-            pipe.send(("failed", "disk", str(error)))
         except Exception as error:
-            pipe.send(("failed", "error", f"{type(error).__name__}: {error}"))
+            pipe.send(("failed", *failure(error, folder)))
+
+
+def failure(error: Exception, folder: Path) -> tuple[str, str]:
+    """Kind and reason of an error while a shard is made: one of `FAILURES`, or `error` for a defect."""
+    if isinstance(error, OSError):
+        return "disk", f"{folder}: cannot be written ({error.strerror or error})"
+    if isinstance(error, EyerenderError):
+        return next(kind for kind, known in FAILURES.items() if isinstance(error, known)), str(error)
+    return "error", f"{type(error).__name__}: {error}"
 
 
 def _die_with_parent() -> None:

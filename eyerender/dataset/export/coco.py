@@ -109,7 +109,7 @@ def _instance(category: int, inside: Bools, ellipse: Ellipse | None) -> dict[str
         "area": len(u),
         "bbox": box,
         "iscrowd": 0,
-        "ellipse": None if ellipse is None else _ellipse(ellipse),
+        "ellipse": None if ellipse is None else ellipse.numbers(),
     }
 
 
@@ -124,8 +124,3 @@ def _glint(light: int, x: float, y: float, visible: bool) -> dict[str, Any]:
         "segmentation": [[x - 1, y - 1, x + 2, y - 1, x + 2, y + 2, x - 1, y + 2]],
         "light": light,
     }
-
-
-def _ellipse(ellipse: Ellipse) -> list[float]:
-    """Centre, semi-axes and angle of the amodal outline."""
-    return [*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad]

@@ -118,6 +118,4 @@ def _write_key(folder: Path, file: Any, dataset: str, split: str) -> None:
 def fit_of(item: Item, part: str) -> Floats:
     """Amodal outline as x, y, a, b, angle, or -1 five times."""
     ellipse = item.ellipse(part)
-    if ellipse is None:
-        return np.full(5, -1.0)
-    return np.array([*ellipse.centre_px, *ellipse.semi_axes_px, ellipse.angle_rad])
+    return np.full(5, -1.0) if ellipse is None else np.array(ellipse.numbers())

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from ...files import read_bytes, write_bytes
-from ...geometry.ellipse import Ellipse
 from .item import Item, Items
 
 _COLUMNS = (
@@ -51,7 +50,8 @@ def row_of(item: Item, lights: int) -> dict[str, Any]:
     }
     for part in ("pupil", "iris"):
         for kind in ("amodal", "visible"):
-            values = _flat(item.ellipse(part, kind))
+            ellipse = item.ellipse(part, kind)
+            values = [None] * len(_ELLIPSE) if ellipse is None else ellipse.numbers()
             row |= {f"{part}_{kind}_{key}": value for key, value in zip(_ELLIPSE, values, strict=True)}
         row[f"{part}_visible_fraction"] = labels[part]["visible_fraction"]
     spots = {light: (x, y, int(visible)) for light, x, y, visible in item.glints()}
@@ -66,9 +66,3 @@ def row_of(item: Item, lights: int) -> dict[str, Any]:
                 row[f"{frame}_{name}_{axis}"] = number
     row["pupil_diameter_mm"] = line["parameters"]["pupil_diameter_mm"]
     return row
-
-
-def _flat(ellipse: Ellipse | None) -> list[float | None]:
-    if ellipse is None:
-        return [None] * 5
-    return [*ellipse.centre_px.tolist(), *ellipse.semi_axes_px.tolist(), ellipse.angle_rad]
