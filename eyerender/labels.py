@@ -22,7 +22,7 @@ from .eye.model import EyeModel
 from .geometry.ellipse import fit_ellipse_direct
 from .imagefolder import IRIS, PUPIL
 from .observation import EYES, Observations
-from .rig.camera import PinholeCamera, Window
+from .rig.camera import PinholeCamera, Window, in_window
 from .scene import Frames, Scene
 from .status import Status
 
@@ -261,7 +261,7 @@ def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeIma
                 "status": Status(glints.status[row, slot]).label,
                 "reason": glints.reason[row, slot] or None,
                 "xy_px": xy[row].tolist() if found else None,
-                "in_window": found and _inside(view.window, xy[row]),
+                "in_window": found and bool(in_window(view.window, xy[row])),
             }
         )
     return out
@@ -273,17 +273,11 @@ def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any
     spot = table.xy_px[k]
     lit = bool(np.isfinite(spot).all())
     return {
-        "visible": lit and bool(table.visible[k]) and _inside(image.window, spot),
+        "visible": lit and bool(table.visible[k]) and bool(in_window(image.window, spot)),
         "hidden_by": hidden_by,
         "visible_share": float(table.share[k]),
         "spot_xy_px": spot.tolist() if lit else None,
     }
-
-
-def _inside(window: Window, xy: Floats) -> bool:
-    """Whether a place (2,) in full-sensor pixels lies in a window."""
-    x0, y0, w, h = window
-    return bool(x0 - 0.5 <= xy[0] <= x0 + w - 0.5 and y0 - 0.5 <= xy[1] <= y0 + h - 0.5)
 
 
 def _share(value: float) -> float | None:

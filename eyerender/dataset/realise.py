@@ -11,15 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..analytic.observer import trace
-from ..arrays import Bools, Floats
 from ..capture import check_windows
 from ..errors import EyerenderError, InputError, InputWarning
 from ..observation import Observations
 from ..outfolder import refuse_non_empty
-from ..rig.camera import Window
+from ..rig.camera import Window, in_window
 from ..scene import Frames, Scene
 from .plan import Plan, Sample
 from .spec import DatasetSpec
@@ -186,14 +183,8 @@ def windows_of(scene: Scene, observations: Observations) -> list[Window]:
 
 
 def _require_pupils(scene: Scene, found: Observations) -> None:
-    for row, (x0, y0, w, h) in enumerate(windows_of(scene, found)):
+    for row, window in enumerate(windows_of(scene, found)):
         if not found.pupil.ok[row]:
             raise InputError(f"no apparent pupil: {found.pupil.reason[row]}")
-        inside = _inside(found.pupil.points_px[row], x0=x0, y0=y0, w=w, h=h)
-        if not inside.all():
+        if not in_window(window, found.pupil.points_px[row]).all():
             raise InputError("the apparent pupil leaves the window")
-
-
-def _inside(xy: Floats, *, x0: int, y0: int, w: int, h: int) -> Bools:
-    x, y = xy[:, 0], xy[:, 1]
-    return np.asarray((x >= x0 - 0.5) & (x <= x0 + w - 0.5) & (y >= y0 - 0.5) & (y <= y0 + h - 0.5))

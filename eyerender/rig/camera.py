@@ -28,6 +28,8 @@ Pixels = Annotated[int, Field(gt=0, le=65536)]
 Window = tuple[int, int, int, int]
 """A part of a sensor: its first column and row, its width and its height (px)."""
 
+_PLACE = {"position_mm", "look_at_mm", "pan_deg", "tilt_deg"}
+_LENS = {"focal_length_px", "focal_length_mm", "sensor_mm", "principal_point_px"}
 # The columns are the camera's right, down and forward axes at rest, in the world (x to the screen, y left, z up).
 _REST = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -170,22 +172,9 @@ class Camera(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        placed = {
-            k
-            for k in (
-                "position_mm",
-                "look_at_mm",
-                "pan_deg",
-                "tilt_deg",
-                "focal_length_px",
-                "focal_length_mm",
-                "sensor_mm",
-                "principal_point_px",
-            )
-            if getattr(self, k) is not None
-        }
+        placed = {name for name in (*_PLACE, *_LENS) if getattr(self, name) is not None}
         if isinstance(self.calibration, CalibrationFile):
-            wrong = sorted(placed & {"focal_length_px", "focal_length_mm", "sensor_mm", "principal_point_px"})
+            wrong = sorted(placed & _LENS)
             if wrong or any(self.distortion):
                 raise ValueError(f"the calibration file gives the lens; remove {', '.join(wrong) or 'distortion'}")
             if self.position_mm is None and (placed or self.roll_deg != 0):
@@ -328,9 +317,14 @@ class PinholeCamera(ArrayValue):
 
     def in_image(self, pixels: ArrayLike) -> Bools:
         """Whether pixels (..., 2) lie on the sensor; the far edges of its outer pixels are at -0.5 and W - 0.5."""
-        p = np.asarray(pixels, dtype=float)
-        w, h = self.resolution_px
-        return np.asarray((p[..., 0] >= -0.5) & (p[..., 0] <= w - 0.5) & (p[..., 1] >= -0.5) & (p[..., 1] <= h - 0.5))
+        return in_window((0, 0, *self.resolution_px), pixels)
+
+
+def in_window(window: Window, pixels: ArrayLike) -> Bools:
+    """Whether pixels (..., 2) lie in a window (x0, y0, width, height), whose outer pixels end half a pixel out."""
+    p = np.asarray(pixels, dtype=float)
+    x, y, (x0, y0, w, h) = p[..., 0], p[..., 1], window
+    return np.asarray((x >= x0 - 0.5) & (x <= x0 + w - 0.5) & (y >= y0 - 0.5) & (y <= y0 + h - 0.5))
 
 
 def distort(x: Floats, y: Floats, k: Floats) -> tuple[Floats, Floats]:
