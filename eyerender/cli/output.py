@@ -12,6 +12,7 @@ from typing import Any
 
 from ..errors import InputWarning
 from ..files import write_json
+from ..progress import Progress
 
 
 def say(text: str) -> None:
@@ -55,29 +56,18 @@ def emit(data: dict[str, Any], text: str, target: str | None, heed: Heed | None 
     print(text)
 
 
-class Steps:
-    """Progress of counted work: a bar on a terminal, a plain line about every two seconds elsewhere."""
-
-    def __init__(self, advance: Any, what: str) -> None:
-        self._advance = advance
-        self.what = what
-
-    def __call__(self, done: int, total: int, note: str = "") -> None:
-        """Show that `done` of `total` are done."""
-        self._advance(done, total, note)
-
-
 @contextmanager
-def progress(what: str) -> Iterator[Steps]:
-    """Show progress on stderr while the block runs."""
+def progress(what: str) -> Iterator[Progress]:
+    """Show progress on stderr while the block runs: a bar on a terminal, else a line about every two seconds."""
     if sys.stderr.isatty():
         from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bars
 
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True), transient=False) as bar:
+        with Bars(*columns, console=Console(stderr=True), transient=False) as bar:
             task = bar.add_task(what, total=None)
-            yield Steps(lambda d, t, n: bar.update(task, completed=d, total=t, description=n or what), what)
+            yield lambda done, total, note: bar.update(task, completed=done, total=total, description=note or what)
         return
     last = [time.monotonic() - 10.0]
 
@@ -89,4 +79,4 @@ def progress(what: str) -> Iterator[Steps]:
             last[0] = now
             say(f"{what}: {done}/{total}{' ' + note if note else ''}")
 
-    yield Steps(line, what)
+    yield line
