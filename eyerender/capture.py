@@ -188,6 +188,8 @@ def render_job(frames: Frames, row: int) -> RenderJob:
     camera, head = int(index.camera[row]), int(index.head[row])
     eye = scene.eye(EYES[index.eye[row]])
     M, t = eye_motion(frames, row)
+    # Each image has its own seed, a pure function of the scene's seed, the frame and the eye.
+    seeds = np.random.SeedSequence([scene.spec.seed, int(index.frame[row]), int(index.eye[row])])
     return RenderJob(
         eye=eye,
         M=M,
@@ -203,7 +205,7 @@ def render_job(frames: Frames, row: int) -> RenderJob:
         mesh_edge_mm=scene.spec.image.mesh_edge_mm if scene.spec.image.surfaces == "mesh" else None,
         interreflection=scene.spec.image.interreflection,
         wavelength_nm=scene.spec.wavelength_nm,
-        seed=image_seed(scene.spec.seed, int(index.frame[row]), int(index.eye[row])),
+        seed=int(seeds.generate_state(1, np.uint64)[0]),
         apex_mm=index.eye_position_mm[row] + index.head_mm[row],
         focus_dpt=focus_dpt(frames, row),
     )
@@ -276,11 +278,6 @@ def make_renderer(backend: BackendChoice = "auto", threads: int | None = None) -
     from .rendering.renderer import Renderer
 
     return Renderer(chosen)
-
-
-def image_seed(seed: int, frame: int, eye: int) -> int:
-    """Seed of one image: a pure function of the scene's seed, the frame and the eye."""
-    return int(np.random.SeedSequence([seed, frame, eye]).generate_state(1, np.uint64)[0])
 
 
 def noiseless(image: EyeImage) -> NDArray[Any]:

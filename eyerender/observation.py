@@ -161,12 +161,7 @@ class Observations(ArrayValue):
 
     def take(self, rows: Any) -> Observations:
         """Select rows (indices, a slice or a mask)."""
-        return Observations(
-            index=self.index.take(rows),
-            pose=self.pose.take(rows),
-            pupil=self.pupil.take(rows),
-            glints=self.glints.take(rows),
-        )
+        return Observations(**{part.name: getattr(self, part.name).take(rows) for part in fields(self)})
 
     def with_targets(self, target_mm: ArrayLike) -> Observations:
         """Replace the targets by (n, 3) or (3,) mm in the world, NaN where there is none."""

@@ -259,16 +259,13 @@ class StreamDataset(IterableDataset[Any]):
 
     def _items(self, index: int, workers: int) -> Iterator[Any]:
         if self._maker is None:
-            self._maker = self._made(workers)
+            from .dataset.maker import Maker
+
+            threads = self.threads or max(1, usable_cpus() // workers)
+            self._maker = Maker(self.plan, self.frames, backend=self.backend, threads=threads)
         for image in self._maker.make(index).images:
             item = _item(self.parts, image.line, image.pictures.get, f"sample {index}")
             yield item if self.transform is None else self.transform(item)
-
-    def _made(self, workers: int) -> Maker:
-        from .dataset.maker import Maker
-
-        threads = self.threads or max(1, usable_cpus() // workers)
-        return Maker(self.plan, self.frames, backend=self.backend, threads=threads)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_maker": None}

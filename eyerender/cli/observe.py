@@ -55,7 +55,7 @@ def features(
     observed, seen = AnalyticObserver(points).observe_in_detail(loaded.frames(), purkinje=purkinje or (1,))
     data: dict[str, Any] = {
         "schema": "eyerender/features/1",
-        "rig": loaded.rig_mapping(),
+        "rig": loaded.rig.to_mapping(),
         "records": list(observed.records(record)),
     }
     if purkinje:

@@ -17,10 +17,6 @@ from .parts import Side
 __all__ = ["EyeModel", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
 
 
-def _no_contour() -> Floats:
-    return read_only(np.zeros((2, 0)))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop(ArrayValue):
     """The aperture stop (the anatomical pupil): an ellipse, or a contour about one.
@@ -40,7 +36,7 @@ class Stop(ArrayValue):
     rotation: Floats
     semi_axes_mm: Floats
     handed: Floats
-    contour: Floats = field(default_factory=_no_contour)
+    contour: Floats = field(default_factory=lambda: np.zeros((2, 0)))
 
     def __post_init__(self) -> None:
         for name in ("centre_mm", "rotation", "semi_axes_mm", "handed", "contour"):

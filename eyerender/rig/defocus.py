@@ -61,12 +61,8 @@ def confusion_of(lens: Lens, camera: PinholeCamera, sensor: Sensor, nearness: Fl
     """The same of points whose inverse depths (1/mm) are given."""
     if lens.focus_mm is None:
         return np.zeros(np.shape(nearness))
-    return np.asarray(strength_px_mm(camera, sensor) * np.abs(nearness - 1 / lens.focus_mm))
-
-
-def strength_px_mm(camera: PinholeCamera, sensor: Sensor) -> float:
-    """Diameter of a circle of confusion (px) per difference from the inverse distance in focus (1/mm)."""
-    return float(camera.K[0, 0]) ** 2 * sensor.pixel_pitch_um * 1e-3 / sensor.f_number
+    strength_px_mm = float(camera.K[0, 0]) ** 2 * sensor.pixel_pitch_um * 1e-3 / sensor.f_number
+    return np.asarray(strength_px_mm * np.abs(nearness - 1 / lens.focus_mm))
 
 
 def checked(diameter_px: float) -> float:

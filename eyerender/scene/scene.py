@@ -520,10 +520,6 @@ class Scene:
         width, height = (16 * math.ceil(side_mm * scale / 16) for side_mm in EYE_WINDOW_MM)
         return min(width, w), min(height, h)
 
-    def rig_mapping(self) -> dict[str, Any]:
-        """Rig as `features --json` writes it (docs/formats.md)."""
-        return self.rig.to_mapping()
-
 
 def _put(data: dict[str, Any], path: str, value: Any) -> None:
     """Set the value at a dotted path of a mapping, making the mappings on the way."""

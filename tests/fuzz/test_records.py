@@ -42,7 +42,7 @@ def features(name: str = "regression") -> dict[str, Any]:
         data["rig"]["lights"] = [{**light, "position_mm": place} for place in places]
     scene = Scene.of(SceneSpec.from_mapping(data))
     found = trace(scene, boundary_points=8)
-    return {"schema": "eyerender/features/1", "rig": scene.rig_mapping(), "records": list(found.records())}
+    return {"schema": "eyerender/features/1", "rig": scene.rig.to_mapping(), "records": list(found.records())}
 
 
 @cache

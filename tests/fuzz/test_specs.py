@@ -57,7 +57,7 @@ def use_scene(scene: Scene) -> None:
     if len(scene.frames()) > FEW:
         return
     found = trace(scene, boundary_points=12)
-    strict_json([list(found.records()), scene.rig_mapping()])
+    strict_json([list(found.records()), scene.rig.to_mapping()])
     for x0, y0, width, height in scene.windows().values():
         assert min(x0, y0) >= 0
         assert min(width, height) >= 1
