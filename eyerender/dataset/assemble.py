@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -119,13 +119,21 @@ def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
     if any(problem.startswith(f"{DATASET}: ") for problem in problems):
         return
     dataset = read_json(folder / DATASET, limit=MAX_FILE_BYTES, follow=False)
-    spec = dataset.get("spec")
-    count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
-    if not (isinstance(count, int) and isinstance(size, int) and 0 < count <= MAX_COUNT and size > 0):
+    shards = shards_of(dataset)
+    if shards is None:
         yield f"{DATASET}: spec: has no count and shard_size"
         return
-    for shard in range(-(-count // size)):
+    for shard in shards:
         yield from verify(folder, shard, dataset.get("digest"), quick=quick)
+
+
+def shards_of(dataset: Mapping[str, Any]) -> range | None:
+    """Shards that the spec in a dataset.json asks for; None where it does not say."""
+    spec = dataset.get("spec")
+    count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
+    if isinstance(count, int) and isinstance(size, int) and 0 < count <= MAX_COUNT and size > 0:
+        return range(-(-count // size))
+    return None
 
 
 def _lines(folder: Path, shards: Iterable[int], take: Callable[[dict[str, Any]], None]) -> Iterator[bytes]:

@@ -5,7 +5,6 @@ Only a few bytes are kept of each line.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +18,7 @@ from ...imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ...observation import Observations
 from ...status import Status
 from .problems import WRONG, Problems
+from .shards import hashed
 from .truth import DatasetTruth, SceneTruth
 
 # Labels that every image of a dataset has, whatever it shows.
@@ -78,14 +78,14 @@ class Lines:
         A line that cannot be read raises one of `WRONG`.
         """
         line = entry.line
-        self._names[number] = _hash(line["file_name"])
+        self._names[number] = hashed(str(line["file_name"]).encode())
         if self._truth is not None:
             for key, value in self._truth.whose(line).items():
                 if line.get(key) != value:
                     yield f"{key} is {shown(line.get(key))}, not {value!r}"
         if "subject" not in line:
             return
-        self._subjects[number], self._splits[number] = line["subject"], _hash(line["split"])
+        self._subjects[number], self._splits[number] = line["subject"], hashed(str(line["split"]).encode())
         if self._shape is None:
             self._first, self._shape = line, _Shape.of(line)
         if not self._shape.fits(line):
@@ -195,7 +195,3 @@ def _collect(node: Any, path: str, found: set[str], nulls: set[str]) -> None:
                 _collect(value, f"{path}[]", found, nulls)
     elif node is None:
         nulls |= {f"{path}.", f"{path}["}
-
-
-def _hash(text: Any) -> np.uint64:
-    return np.uint64(int.from_bytes(hashlib.blake2b(str(text).encode(), digest_size=8).digest(), "big"))

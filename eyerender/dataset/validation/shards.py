@@ -22,9 +22,8 @@ from ...files import opened, parse_json, shown
 from ...imagefolder import METADATA
 from ...jsonlines import MAX_BYTES, MAX_LINE_BYTES
 from ...progress import Progress
-from ..assemble import damage
+from ..assemble import damage, shards_of
 from ..shard import LINES, SHARDS, finished, shard_name, verify
-from ..spec import MAX_COUNT
 from .problems import SHOWN, Problems, differences
 
 _EXACT_INTEGER = 2**53
@@ -42,11 +41,9 @@ def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: P
     for k, shard in enumerate(there):
         problems.extend(verify(folder, shard, digest if isinstance(digest, str) else None, quick=quick))
         step(k + 1, len(there), "shards")
-    spec = dataset.get("spec")
-    count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
-    if not (isinstance(count, int) and isinstance(size, int) and 0 < count <= MAX_COUNT and size > 0):
+    asked = shards_of(dataset)
+    if asked is None:
         return  # then the plan cannot be read either
-    asked = range(-(-count // size))
     known = frozenset(there)
     missing = len(asked) - sum(shard in asked for shard in there)
     problems.extend(f"{SHARDS}/{shard_name(s)}: missing" for s in islice((s for s in asked if s not in known), SHOWN))
@@ -62,7 +59,7 @@ def compare_lines(folder: Path, problems: Problems) -> None:
     """
     mine = [folder / METADATA]
     theirs = [folder / SHARDS / shard_name(shard) / LINES for shard in sorted(finished(folder))]
-    hashes = [np.fromiter((_hash(raw) for _, raw in _lines(files)), dtype=np.uint64) for files in (mine, theirs)]
+    hashes = [np.fromiter((hashed(raw) for _, raw in _lines(files)), dtype=np.uint64) for files in (mine, theirs)]
     a = _values(mine, np.flatnonzero(~np.isin(hashes[0], hashes[1])))
     b = _values(theirs, np.flatnonzero(~np.isin(hashes[1], hashes[0])))
     _, at, to = np.intersect1d(a["name"], b["name"], return_indices=True)
@@ -90,7 +87,7 @@ def _values(files: Sequence[Path], numbers: Ints) -> NDArray[np.void]:
         for number, line in _objects(files, numbers):
             with suppress(RecursionError):  # nested too deeply for a line; another check reports it
                 values = json.dumps(_plain(line), sort_keys=True)
-                yield number, _hash(str(line.get("file_name")).encode()), _hash(values.encode())
+                yield number, hashed(str(line.get("file_name")).encode()), hashed(values.encode())
 
     return np.fromiter(rows(), dtype=[("number", np.int64), ("name", np.uint64), ("value", np.uint64)])
 
@@ -132,5 +129,6 @@ def _plain(node: Any) -> Any:
     return float(node) if whole else node
 
 
-def _hash(data: bytes) -> int:
+def hashed(data: bytes) -> int:
+    """Hash of 64 bits."""
     return int.from_bytes(hashlib.blake2b(data, digest_size=8).digest(), "big")
