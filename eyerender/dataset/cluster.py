@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -29,6 +29,10 @@ from .worker import FAILURES, Job, failure
 
 # These variables locate a libLLVM or a GPU's driver on the driver's machine, and so on the others, installed alike.
 PASSED_ON = ("DRJIT_LIBLLVM_PATH", "DRJIT_LIBCUDA_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "XDG_CACHE_HOME")
+
+
+Send = Callable[..., None]
+"""Takes the name and the arguments of an event."""
 
 
 class ShardActor:
@@ -124,7 +128,7 @@ def drive(pipe: Connection, driver: _Driver, shards: list[int]) -> None:
     os.dup2(silence, 2)
     threading.Thread(target=_end_with, args=(pipe,), daemon=True).start()
     try:
-        message: tuple[Any, ...] = ("end", driver.run(deque(shards), _Sender(pipe)))
+        message: tuple[Any, ...] = ("end", driver.run(deque(shards), lambda *event: pipe.send(event)))
     except EyerenderError as error:
         message = ("failed", error)
     except Exception as error:
@@ -166,25 +170,6 @@ def _members(session: int) -> Iterator[int]:
                 yield int(place.name)
 
 
-class _Sender:
-    """Sends the events of an engine to another process."""
-
-    def __init__(self, pipe: Connection) -> None:
-        self.pipe = pipe
-
-    def ready(self, backend: dict[str, Any], worker: str) -> None:
-        self.pipe.send(("ready", backend, worker))
-
-    def sample(self, shard: int, samples: int, images: int) -> None:
-        self.pipe.send(("sample", shard, samples, images))
-
-    def staged(self, staged: Staged, worker: str) -> None:
-        self.pipe.send(("staged", staged, worker))
-
-    def retry(self, shard: int, reason: str, tries: int) -> None:
-        self.pipe.send(("retry", shard, reason, tries))
-
-
 @dataclass(slots=True)
 class _Held:
     actor: Any
@@ -201,7 +186,7 @@ class _Driver:
     address: str | None
     timeout_s: float
 
-    def run(self, pending: deque[int], events: Events) -> dict[int, str]:
+    def run(self, pending: deque[int], send: Send) -> dict[int, str]:
         """Make shards as the engine does, with the same errors."""
         ray: Any = import_module("ray")
         variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
@@ -218,11 +203,11 @@ class _Driver:
             raise InputError(f"the cluster cannot be reached ({reason})", source="--address") from None
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray has set a handler
         try:
-            return self._run(ray, pending, events)
+            return self._run(ray, pending, send)
         finally:
             ray.shutdown()
 
-    def _run(self, ray: Any, pending: deque[int], events: Events) -> dict[int, str]:
+    def _run(self, ray: Any, pending: deque[int], send: Send) -> dict[int, str]:
         resources = ray.cluster_resources()
         gpus = int(resources.get("GPU", 0)) if self.job.backend != "llvm" else 0
         cpus = int(resources.get("CPU", 1))
@@ -247,16 +232,16 @@ class _Driver:
                     answer = ray.get(task)
                 except ray.exceptions.RayError as error:
                     reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-                    self._again(job.shard, reason, pending, tries, lost, events)
+                    self._again(job.shard, reason, pending, tries, lost, send)
                     continue
                 if not answer["ok"]:
                     raise FAILURES[answer["kind"]](answer["reason"])
                 if answer["worker"] not in known:
                     known.add(answer["worker"])
-                    events.ready(answer["backend"], answer["worker"])
+                    send("ready", answer["backend"], answer["worker"])
                 staged = Staged(**answer["staged"])
-                events.sample(staged.shard, answer["samples"], staged.images)
-                events.staged(staged, answer["worker"])
+                send("sample", staged.shard, answer["samples"], staged.images)
+                send("staged", staged, answer["worker"])
                 if answer["spent"]:
                     idle.remove(job.actor)
                     ray.kill(job.actor)
@@ -274,11 +259,16 @@ class _Driver:
 
     @staticmethod
     def _again(
-        shard: int, reason: str, pending: deque[int], tries: Counter[int], lost: dict[int, str], events: Events
+        shard: int,
+        reason: str,
+        pending: deque[int],
+        tries: Counter[int],
+        lost: dict[int, str],
+        send: Send,
     ) -> None:
         tries[shard] += 1
         if tries[shard] >= TRIES:
             lost[shard] = reason
         else:
             pending.appendleft(shard)
-        events.retry(shard, reason, tries[shard])
+        send("retry", shard, reason, tries[shard])

@@ -58,7 +58,6 @@ class Connection:
         end: unit direction in the last medium.
         residual_mm: by how much the traced ray misses the target. For a target more than `FAR_MM` from the last surface
             it is measured at `FAR_MM`.
-        tube_mm2_sr: |det|.
         status: (...,).
     """
 
@@ -68,7 +67,6 @@ class Connection:
     turning: Xyz
     end: Xyz
     residual_mm: Floats
-    tube_mm2_sr: Floats
     status: Statuses
 
 
@@ -138,7 +136,7 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
             mark(status, ~inside_rim(crossing, point), crossing.beyond_rim)
     found: dict[str, Any] = {
         "start": direction, "first": shot.first, "last": shot.last, "turning": shot.turning, "end": shot.end,
-        "residual_mm": shot.residual_mm, "tube_mm2_sr": np.abs(shot.determinant), "status": status,
+        "residual_mm": shot.residual_mm, "status": status,
     }  # fmt: skip
     return Connection(**(found if shape else {name: _each(np.squeeze, value) for name, value in found.items()}))
 

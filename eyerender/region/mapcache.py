@@ -153,7 +153,7 @@ def _trim(place: Path, limit: float) -> None:
     """Remove what was not used for longest where the maps take more than `limit` bytes, and stale temporary files."""
     now = time.time()
     files = []
-    for path in _entries(place):
+    for path in list(place.iterdir()):
         with suppress(OSError):
             state = path.stat()
             if path.name.endswith(PART) and now - state.st_mtime > _STALE_S:
@@ -168,8 +168,3 @@ def _trim(place: Path, limit: float) -> None:
             with suppress(OSError):
                 path.unlink()
             size -= bytes_
-
-
-def _entries(place: Path) -> Iterator[Path]:
-    with suppress(OSError):
-        yield from place.iterdir()

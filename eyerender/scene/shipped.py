@@ -82,11 +82,7 @@ def load_scene(
         elif path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
             raise InputError(f"no such scene file; shipped scenes: {', '.join(shipped)}", source=str(scene))
     refuse_folder(path, "a scene file, or the name of a shipped scene")
-    spec = SceneSpec.load(path)
-    if spp is not None:
-        spec = spec.with_spp(spp)
+    spec = SceneSpec.load(path).with_image(spp=spp, surfaces=surfaces)
     if seed is not None:
         spec = spec.replaced("--seed", {"seed": seed})
-    if surfaces is not None:
-        spec = spec.with_surfaces(surfaces)
     return Scene.of(spec, base=path.parent, eye=eye, source=str(path))

@@ -323,17 +323,17 @@ class SceneSpec(FileSpec):
                 f"{count} observations of {lights} lights make {count * lights} glints; a scene may have {MAX_GLINTS}"
             )
 
-    def with_spp(self, spp: int) -> Self:
-        """Copy with other samples per pixel.
+    def with_image(self, **changes: Any) -> Self:
+        """Copy with other values of `image`; a None changes nothing.
 
         Raises:
-            InputError: naming the option --spp.
+            InputError: naming the option, such as --spp.
         """
-        return self.replaced("--spp", {"image": {**self.to_mapping()["image"], "spp": spp}})
-
-    def with_surfaces(self, surfaces: Surfaces) -> Self:
-        """Copy with the cornea in closed form or as a mesh."""
-        return self.replaced("--surfaces", {"image": {**self.to_mapping()["image"], "surfaces": surfaces}})
+        spec = self
+        for name, value in changes.items():
+            if value is not None:
+                spec = spec.replaced(f"--{name}", {"image": {**spec.to_mapping()["image"], name: value}})
+        return spec
 
 
 def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -86,7 +86,7 @@ class StudyImages:
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:
     """One shot per eye; with `facing` one per eye and head position, the cameras turned to the eye."""
-    data = (scene.spec if spp is None else scene.spec.with_spp(spp)).to_mapping()
+    data = scene.spec.with_image(spp=spp).to_mapping()
     data["sensor"]["noise"] = noise
     index, out = scene.index(), []
     heads = scene.spec.subject.head_positions_mm
