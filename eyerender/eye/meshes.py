@@ -18,9 +18,7 @@ mm inside the sclera. The renderer itself intersects the surfaces in closed form
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -285,17 +283,3 @@ def _closed(*parts: tuple[Patch, int]) -> Any:
     mesh = _trimesh(np.concatenate(vertices), np.concatenate(faces))
     mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=9)
     return mesh
-
-
-def crossing(eye: EyeModel, meshes: EyeMeshes, tolerance_mm: float = 1e-6) -> Sequence[str]:
-    """Names of refracting patches that intersect the next surface outside them; empty for a valid eye."""
-    eye = shelled(eye)
-    order: list[tuple[str, Surface]] = [("cornea_front", eye.front[0])]
-    if len(eye.front) > 1:
-        order.append(("cornea_back", eye.front[-1]))
-    order += [("lens_front" if k == 0 else f"lens_shell_{k}_front", eye.back[k]) for k in range(len(eye.back) // 2)]
-    bad = []
-    for (_, outer), (name, _) in pairwise(order):
-        if np.any(outer.implicit(meshes.patches[name].vertices) > tolerance_mm):
-            bad.append(name)
-    return bad

@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 import eyerender as er
 from eyerender.analytic.features import features
 from eyerender.errors import InputError
-from eyerender.eye.meshes import crossing, eye_meshes
+from eyerender.eye.meshes import eye_meshes
 from eyerender.eye.parts import TopographySpec, ZernikeSpec
 from eyerender.eye.pose import Poses
 from eyerender.eye.topography import read_topography
@@ -31,6 +31,7 @@ from tests.support.corneas import (
     measured_shapes,
     zernike_of,
 )
+from tests.support.eye_meshes import crossing
 
 LIGHTS = np.array([[580.0, -60.0, -150.0], [590.0, 80.0, -140.0], [600.0, 5.0, 160.0]])
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from eyerender.eye.meshes import crossing, eye_meshes
+from eyerender.eye.meshes import eye_meshes
 from eyerender.rendering.export import bake_meshes, export_scene
+from tests.support.eye_meshes import crossing
 from tests.support.render_rigs import eye_of, job_of, remote_rig
 
 EYES = ["E1", "E2", "E3", "E4", "E5", "E5-published"]
