@@ -31,7 +31,7 @@ from .worker import FAILURES, Job, failure
 PASSED_ON = ("DRJIT_LIBLLVM_PATH", "DRJIT_LIBCUDA_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "XDG_CACHE_HOME")
 
 
-Send = Callable[..., None]
+SendEvent = Callable[..., None]
 """Takes the name and the arguments of an event."""
 
 
@@ -186,7 +186,7 @@ class _Driver:
     address: str | None
     timeout_s: float
 
-    def run(self, pending: deque[int], send: Send) -> dict[int, str]:
+    def run(self, pending: deque[int], send: SendEvent) -> dict[int, str]:
         """Make shards as the engine does, with the same errors."""
         ray: Any = import_module("ray")
         variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
@@ -207,7 +207,7 @@ class _Driver:
         finally:
             ray.shutdown()
 
-    def _run(self, ray: Any, pending: deque[int], send: Send) -> dict[int, str]:
+    def _run(self, ray: Any, pending: deque[int], send: SendEvent) -> dict[int, str]:
         resources = ray.cluster_resources()
         gpus = int(resources.get("GPU", 0)) if self.job.backend != "llvm" else 0
         cpus = int(resources.get("CPU", 1))
@@ -264,7 +264,7 @@ class _Driver:
         pending: deque[int],
         tries: Counter[int],
         lost: dict[int, str],
-        send: Send,
+        send: SendEvent,
     ) -> None:
         tries[shard] += 1
         if tries[shard] >= TRIES:
