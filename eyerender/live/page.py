@@ -7,7 +7,7 @@ import html
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -194,7 +194,7 @@ class Tab:
             with ui.element("div").classes("buttons"):
                 _button("Save YAML", self._save_yaml)
                 _button("Save Python", self._save_python)
-                _button("Start again", self._restart)
+                _button("Start again", lambda: self._apply(lambda _: Setup.of(self._studio.scene), refresh=True))
         with ui.element("div").classes("desk"):
             with ui.element("section").classes("picture"):
                 self._build_picture()
@@ -233,7 +233,7 @@ class Tab:
             self._eye = _choice("Eye", {eye: eye for eye in eyes}, lambda v: self._show(eye=v))
             self._camera = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), lambda v: self._show(camera=v))
             heads = {k: f"{k}" for k in range(len(spec.subject.head_positions_mm))}
-            self._head = _choice("Head", heads, self._move_head)
+            self._head = _choice("Head", heads, lambda v: self._apply(lambda s: s.with_head(v), refresh=True))
         group.set_visibility(any(box.visible for box in (self._eye, self._camera, self._head)))
         with _group("Gaze"):
             name = "target" if spec.targets is not None else "pose"
@@ -254,7 +254,9 @@ class Tab:
         with _group("Camera"):
             self._chosen = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), self._choose_camera)
             self._camera_place = [Knob(axis, "mm", 0.5, lambda _: self._move_camera()) for axis in AXES]
-            self._aim = _button("Aim at the eye", self._aim_camera)
+            self._aim = _button(
+                "Aim at the eye", lambda: self._apply(lambda s: s.with_camera_aimed(self._lens), refresh=True)
+            )
 
     # What the knobs do
 
@@ -282,21 +284,9 @@ class Tab:
         if refresh:
             self._refresh()
 
-    def _show(self, *, eye: str | None = None, camera: int | None = None) -> None:
-        def change(setup: Setup) -> Setup:
-            return Setup(
-                setup.origin,
-                setup.scene,
-                setup.eye if eye is None else eye,
-                setup.camera if camera is None else camera,
-                setup.fixation,
-                setup.head,
-            )
-
-        self._apply(change, refresh=True)
-
-    def _move_head(self, head: int) -> None:
-        self._apply(lambda setup: setup.with_head(head), refresh=True)
+    def _show(self, **fields: Any) -> None:
+        """Show another eye, or the picture of another camera."""
+        self._apply(lambda setup: replace(setup, **fields), refresh=True)
 
     def _follow(self, fixation: int) -> None:
         if fixation >= 0:
@@ -323,12 +313,6 @@ class Tab:
         place = [knob.value for knob in self._camera_place]
         self._apply(lambda setup: setup.with_camera_at(self._lens, place))
         self._refresh_light()  # rings move with their camera
-
-    def _aim_camera(self) -> None:
-        self._apply(lambda setup: setup.with_camera_aimed(self._lens), refresh=True)
-
-    def _restart(self) -> None:
-        self._apply(lambda _: Setup.of(self._studio.scene), refresh=True)
 
     def _look_at_rig(self) -> None:
         self._rig.look_at_rig(self._drawn, apex_mm(self._frames, self._row))

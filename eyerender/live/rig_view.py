@@ -68,18 +68,15 @@ class RigView:
         self._look(apex_mm - np.array([6.0, 0, 0]), 70.0, np.array([0.75, -0.6, 0.35]))
 
     def look_from(self, place_mm: Floats, target_mm: Floats) -> None:
-        """Look from a camera's place along its axis."""
-        self._move(place_mm, target_mm)
+        """Look from a place, such as a camera's, at another one."""
+        (x, y, z), (u, v, w) = _CM * place_mm, _CM * target_mm
+        self._scene.move_camera(x=x, y=y, z=z, look_at_x=u, look_at_y=v, look_at_z=w, duration=0.4)
 
     def _draw_at(self, fps: int) -> None:
         self._scene.props["fps"] = fps
 
     def _look(self, middle: Floats, distance: float, way: Floats) -> None:
-        self._move(middle + distance * way / np.linalg.norm(way), middle)
-
-    def _move(self, place: Floats, target: Floats) -> None:
-        (x, y, z), (u, v, w) = _CM * place, _CM * target
-        self._scene.move_camera(x=x, y=y, z=z, look_at_x=u, look_at_y=v, look_at_z=w, duration=0.4)
+        self.look_from(middle + distance * way / np.linalg.norm(way), middle)
 
 
 def _packed(drawn: Strokes) -> list[str]:

@@ -41,13 +41,9 @@ class Thumbnail:
 
 def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: Sequence[Thumbnail] = ()) -> None:
     """Write one self-contained HTML file from the bench's JSON, its rows (per extractor and image), and thumbnails."""
-    write_page(path, bench_page(data, rows, thumbnails))
-
-
-def bench_page(data: Row, rows: Sequence[Row], thumbnails: Sequence[Thumbnail] = ()) -> Page:
-    """Make the page."""
     entries, edge = data["extractors"], data["edge"]
     best = [e for e in entries if e["summary"]["right"]]
+    varying = [name for name in data["factors"] if any(e["breakdown"].get(name) for e in entries)]
     cards = [Card(f"{data['with_pupil']} of {data['images']}", "images that show a pupil")]
     if edge["n"]:
         text = f"noise / pupil-iris step (DN of 8 bits) / sigma of the blurred edge (px), medians; {edge['source']}"
@@ -76,8 +72,8 @@ def bench_page(data: Row, rows: Sequence[Row], thumbnails: Sequence[Thumbnail] =
                 "every quantity that varies in this folder. Noise, blur and contrast are the folder's own figures if "
                 "it states them; otherwise they are measured along the true outline."
             ],
-            [f for name in data["factors"] for f in _factor_figure(data, name)],
-            [_factor_table(data, name) for name in data["factors"] if _has(entries, name)],
+            [Figure(factor_figure(data, name), f"By {data['factors'][name]['what']}.") for name in varying],
+            [_factor_table(data, name) for name in varying],
         ),
         Section("Failures", figures=_thumbnail_figures(thumbnails), tables=(_failure_table(entries),)),
         Section("How this was made", _how(data), tables=(_convention_table(entries),)),
@@ -85,7 +81,7 @@ def bench_page(data: Row, rows: Sequence[Row], thumbnails: Sequence[Thumbnail] =
     if data["not_run"]:
         table = Table(("extractor", "why"), [(e["name"], e["reason"]) for e in data["not_run"]], "Not run", wide=(1,))
         sections[3] = replace(sections[3], tables=(_failure_table(entries), table))
-    return Page(f"{data['folder']}: extractors compared", lead, cards, sections)
+    write_page(path, Page(f"{data['folder']}: extractors compared", lead, cards, sections))
 
 
 def _thumbnail_figures(thumbnails: Sequence[Thumbnail]) -> list[Figure]:
@@ -249,16 +245,6 @@ def _error_figures(data: Row, rows: Sequence[Row]) -> list[Figure]:
     return out
 
 
-def _factor_figure(data: Row, name: str) -> list[Figure]:
-    if not _has(data["extractors"], name):
-        return []
-    return [Figure(factor_figure(data, name), f"By {data['factors'][name]['what']}.")]
-
-
-def _has(entries: Sequence[Row], name: str) -> bool:
-    return any(e["breakdown"].get(name) for e in entries)
-
-
 def _pupil_table(entries: Sequence[Row]) -> Table:
     header = (
         "extractor", "right", "centre error: median", "95 %", "bias x", "bias y", "efficiency", "bias a", "bias b",
@@ -271,8 +257,8 @@ def _pupil_table(entries: Sequence[Row]) -> Table:
         rows.append(
             (
                 e["name"], f"{s['right']} of {s['with_pupil']}", _px(s["centre_px"]["median"]),
-                _px(s["centre_px"]["p95"]), *(_signed(v) for v in (*bias,)), _number(s["efficiency"]["value"], 2),
-                *(_signed(v) for v in (*axes,)), _px(s["boundary_px"]["median"]), _number(s["iou"]["median"], 4),
+                _px(s["centre_px"]["p95"]), *map(_signed, bias), _number(s["efficiency"]["value"], 2),
+                *map(_signed, axes), _px(s["boundary_px"]["median"]), _number(s["iou"]["median"], 4),
                 _time(s["time"]),
             )
         )  # fmt: skip

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..comparison import Comparison
-from ..files import write_text
 from ..imagefolder import ImageEntry, versions
 from ..observation import EYES
 from ..scene import Scene
 from .overlay import eye_picture
+from .page import write_template
 from .style import ANALYTIC, IMAGE, TARGET, figure, svg
 
 
@@ -31,23 +30,20 @@ def write_report(
     path: Path, scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry], timings: Sequence[Timing] = ()
 ) -> None:
     """Write one self-contained HTML file."""
-    environment = Environment(
-        loader=PackageLoader("eyerender.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    page = environment.get_template("comparison.html.j2").render(
-        scene=scene.spec,
-        scene_yaml=scene.spec.to_yaml(),
-        data=comparison.to_mapping(),
-        rows=_rows(comparison),
-        pictures=_pictures(scene, comparison, entries),
+    values = {
+        "scene": scene.spec,
+        "scene_yaml": scene.spec.to_yaml(),
+        "data": comparison.to_mapping(),
+        "rows": _rows(comparison),
+        "pictures": _pictures(scene, comparison, entries),
         # A grid of targets is listed column by column; other lists are filled row by row.
-        grid=scene.spec.targets.grid if scene.spec.targets and scene.spec.targets.grid else (3, None),
-        feature_figure=feature_figure(comparison),
-        gaze_figure=gaze_figure(scene, comparison),
-        timings=timings,
-        versions=versions(),
-    )
-    write_text(path, page)
+        "grid": scene.spec.targets.grid if scene.spec.targets and scene.spec.targets.grid else (3, None),
+        "feature_figure": feature_figure(comparison),
+        "gaze_figure": gaze_figure(scene, comparison),
+        "timings": timings,
+        "versions": versions(),
+    }
+    write_template(path, "comparison.html.j2", values)
 
 
 def feature_figure(comparison: Comparison) -> str:
@@ -81,30 +77,20 @@ def gaze_figure(scene: Scene, comparison: Comparison) -> str | None:
     None without a screen or estimates.
     """
     screen = scene.rig.screen
-    parts = [
+    parts = (
         (comparison.gaze_truth, ANALYTIC, "s", "analytic features"),
         (comparison.gaze_found, IMAGE, "o", "features from the images"),
-    ]
-    shown = [p for p in parts if p[0] is not None]
+    )
+    shown = [(errors, *look) for errors, *look in parts if errors is not None]
     if screen is None or not shown:
         return None
     with figure(8.4, 5.0) as (fig, ax):
-        targets = shown[0][0].target_mm - screen.centre_mm  # type: ignore[union-attr]
-        ax.scatter(targets @ screen.right, targets @ screen.up, marker="+", s=120, color=TARGET, label="target")
+        ax.scatter(*screen.flat(shown[0][0].target_mm).T, marker="+", s=120, color=TARGET, label="target")
+        hollow: dict[str, Any] = {"s": 34, "facecolor": "none", "linewidth": 1.4}
         for errors, colour, marker, name in shown:
-            points = errors.point_mm - screen.centre_mm  # type: ignore[union-attr]
-            mean = errors.mean_deg  # type: ignore[union-attr]
+            mean = errors.mean_deg
             label = f"{name}, mean {mean:.3f} deg" if mean is not None else f"{name}, no estimate"
-            ax.scatter(
-                points @ screen.right,
-                points @ screen.up,
-                marker=marker,
-                s=34,
-                facecolor="none",
-                edgecolor=colour,
-                linewidth=1.4,
-                label=label,
-            )
+            ax.scatter(*screen.flat(errors.point_mm).T, marker=marker, edgecolor=colour, label=label, **hollow)
         w, h = screen.size_mm
         ax.plot(np.array([-1, 1, 1, -1, -1]) * w / 2, np.array([-1, -1, 1, 1, -1]) * h / 2, color="#aaaaaa", lw=1)
         ax.set(aspect="equal", xlabel="on the screen, to the subject's right (mm)", ylabel="up (mm)")
@@ -125,17 +111,8 @@ def _pictures(scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry
         axis = truth.pupil.semi_axes_px[row, 0] if truth.pupil.ok[row] else np.nan
         width = int(np.clip(2 * np.ceil(4.6 * axis), 64, image.shape[1])) if np.isfinite(axis) else image.shape[1]
         crop = (width, min(image.shape[0], width * 3 // 4))
-        picture = eye_picture(
-            image,
-            entry.window[:2],
-            full,
-            truth,
-            found,
-            row,
-            crop_px=crop,
-            scale=max(1, round(400 / width)),
-            title=name,
-        )
+        scale = max(1, round(400 / width))
+        picture = eye_picture(image, entry.window[:2], full, truth, found, row, crop_px=crop, scale=scale, title=name)
         out.setdefault(side, []).append({"svg": picture, "name": name, "error": _error(comparison, row)})
     return out
 

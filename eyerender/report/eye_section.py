@@ -64,21 +64,9 @@ def _draw(ax: Any, eye: EyeModel, across: int) -> None:
     path = np.stack([fovea, eye.stop.centre_mm, los.point_mm, los.point_mm + 5.0 * np.asarray(los.direction)])
     ax.plot(path[:, 0], path[:, across], color="#CC79A7", lw=1.3, label="line of sight")
     ax.plot(fovea[0], fovea[across], "s", color=_RETINA, ms=7, label="fovea")
-    turn = eye.rotation
-    for point, marker, name in (
-        (turn.azimuth_centre_mm, "*", "azimuth centre"),
-        (turn.elevation_centre_mm, "o", "elevation centre"),
-    ):
-        ax.plot(
-            point[0],
-            point[across],
-            marker,
-            color=TARGET,
-            mfc="none" if marker == "o" else TARGET,
-            ms=11 if marker == "*" else 9,
-            ls="none",
-            label=f"{name}",
-        )
+    azimuth, elevation = eye.rotation.azimuth_centre_mm, eye.rotation.elevation_centre_mm
+    ax.plot(azimuth[0], azimuth[across], "*", color=TARGET, ms=11, label="azimuth centre")
+    ax.plot(elevation[0], elevation[across], "o", color=TARGET, mfc="none", ms=9, label="elevation centre")
     ax.set(aspect="equal", xlabel="x, along the optic axis (mm)", xlim=(low, 3.0))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from ..analytic.observer import trace
 from ..arrays import Floats
 from ..observation import EYES, Observations
+from ..rig.camera import PinholeCamera
 from ..scene import Scene
 from .style import ANALYTIC, IMAGE, TARGET, figure
 
@@ -29,9 +30,8 @@ def scene_view(scene: Scene) -> Any:
         seen = trace(scene)
         rows = np.flatnonzero((seen.index.head == 0) & (seen.index.fixation == seen.index.fixation[0]))
         _screen(ax, scene)
-        for k, camera in enumerate(scene.rig.cameras):
+        for k in range(len(scene.rig.cameras)):
             _camera(ax, scene, k)
-            del camera
         lights = np.array([light.position_mm for light in scene.rig.lights])
         ax.scatter(*lights.T, color=_LIGHT, s=40, depthshade=False, label="infrared LED")
         for n, row in enumerate(rows):
@@ -116,31 +116,19 @@ def _eye(ax: Any, scene: Scene, seen: Observations, row: int, *, first: bool) ->
         ax.plot(*np.stack([apex, target]).T, color=_SIGHT, lw=1.4, label="line of sight" if first else None)
     camera = scene.rig.cameras[int(index.camera[row])]
     if seen.pupil.ok[row]:
-        _ray(
-            ax,
-            camera.nodal_point_mm,
-            camera.rays(seen.pupil.centre_px[row]),
-            apex,
-            "-",
-            ANALYTIC,
-            "pupil's ray" if first else None,
-        )
+        _ray(ax, camera, seen.pupil.centre_px[row], apex, "-", ANALYTIC, "pupil's ray" if first else None)
     for j in np.flatnonzero(seen.glints.ok[row]):
-        hit = _ray(
-            ax,
-            camera.nodal_point_mm,
-            camera.rays(seen.glints.xy_px[row, j]),
-            apex,
-            "--",
-            IMAGE,
-            "light to glint to camera" if first and j == 0 else None,
-        )
+        name = "light to glint to camera" if first and j == 0 else None
+        hit = _ray(ax, camera, seen.glints.xy_px[row, j], apex, "--", IMAGE, name)
         light = scene.rig.lights[int(seen.glints.light[row, j])].position_mm
         ax.plot(*np.stack([light, hit]).T, color=IMAGE, lw=1.0, ls="--")
 
 
-def _ray(ax: Any, origin: Floats, direction: Floats, apex: Floats, style: str, colour: str, name: str | None) -> Floats:
-    """Draw a camera's ray up to the plane of the eye's apex across it; returns its end."""
+def _ray(
+    ax: Any, camera: PinholeCamera, pixel: Floats, apex: Floats, style: str, colour: str, name: str | None
+) -> Floats:
+    """Draw the ray of a camera's pixel up to the plane of the eye's apex across it; returns its end."""
+    origin, direction = camera.nodal_point_mm, camera.rays(pixel)
     end = origin + direction * float((apex - origin) @ direction)
     ax.plot(*np.stack([origin, end]).T, color=colour, lw=1.0, ls=style, label=name)
     return np.asarray(end)
