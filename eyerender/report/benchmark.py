@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..geometry.ellipse import Ellipse
 from .page import Card, Figure, Page, Section, Table, write_page
-from .style import TARGET, figure, svg
+from .style import TARGET, figure, legend_above, svg
 
 Row = dict[str, Any]
 
@@ -214,8 +214,7 @@ def factor_figure(data: Row, name: str) -> str:
         axes[1].set(ylabel="share of pupils right", ylim=(-0.03, 1.05))
         for ax in axes:
             ax.set(xlabel=f"{what['what']} ({what['unit']})" if what["unit"] != "1" else what["what"])
-        handles, labels = axes[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=5, frameon=False)
+        legend_above(fig, axes[0], 5)
         return svg(fig)
 
 

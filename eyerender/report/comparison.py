@@ -81,7 +81,7 @@ def gaze_figure(scene: Scene, comparison: Comparison) -> str | None:
         (comparison.gaze_truth, ANALYTIC, "s", "analytic features"),
         (comparison.gaze_found, IMAGE, "o", "features from the images"),
     )
-    shown = [(errors, *look) for errors, *look in parts if errors is not None]
+    shown = [(errors, colour, mark, name) for errors, colour, mark, name in parts if errors is not None]
     if screen is None or not shown:
         return None
     with figure(8.4, 5.0) as (fig, ax):

@@ -40,6 +40,12 @@ def figure(width: float, height: float, columns: int = 1, rows: int = 1) -> Iter
         yield fig, fig.subplots(rows, columns)
 
 
+def legend_above(fig: Any, panel: Any, columns: int) -> None:
+    """Put the legend of one panel, which is that of all, above the panels."""
+    handles, labels = panel.get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False)
+
+
 def svg(fig: Any) -> str:
     """Convert a figure to an <svg> element for an HTML page, without the XML prologue and without empty panels."""
     _leave_out_empty_panels(fig)

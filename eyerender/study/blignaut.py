@@ -18,7 +18,7 @@ from ..scene import Scene, load_scene
 from ..scene.spec import SceneSpec
 from .authors_estimators import MinimumNormRegression
 from .literature import CALIBRATION_SETS
-from .results import Departure, Row, mean_row
+from .results import Departure, Row, known_mean, mean_row
 
 SCENE = "blignaut2014"
 
@@ -69,8 +69,7 @@ class Outcome:
     @property
     def mean_deg(self) -> float | None:
         """Mean over the targets with an estimate."""
-        good = self.error_deg[np.isfinite(self.error_deg)]
-        return float(good.mean()) if len(good) else None
+        return known_mean(self.error_deg)
 
 
 def scene(eye: str, departures: Collection[str]) -> Scene:
@@ -138,20 +137,13 @@ def best(outcomes: list[Outcome], calibration: str) -> Outcome | None:
 
 def rows_of(outcomes: list[Outcome], **keys: Any) -> list[Row]:
     """One row per function and set."""
-    out = []
-    for o in outcomes:
-        out.append(
-            mean_row(
-                o.error_deg,
-                eye="both",
-                calibration=o.calibration,
-                function=o.function,
-                reason=o.reason,
-                solution=_solution(o),
-                **keys,
-            )
+    keys["eye"] = "both"
+    return [
+        mean_row(
+            o.error_deg, calibration=o.calibration, function=o.function, reason=o.reason, solution=_solution(o), **keys
         )
-    return out
+        for o in outcomes
+    ]
 
 
 def _solution(outcome: Outcome) -> str | None:

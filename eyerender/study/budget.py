@@ -14,24 +14,17 @@ with its mirror image. The interval of E - A is therefore narrower than for inde
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student
 
 from ..arrays import Floats
+from .results import ModelResults
 
 ALGORITHM, EYE, IMAGE, NOISE, BOTH = "algorithm", "eye model", "image", "noise", "image and noise"
 # Observers that may follow ray optics, in this order.
 _STEPS = ("image-noiseless", "image")
-
-
-class Part(Protocol):
-    """Results of a study for one eye model: errors (n,) deg by (protocol, observer) and name of the estimator."""
-
-    eye_model: str
-    errors: dict[tuple[str, str], dict[str, Floats]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +37,7 @@ class Term:
     high_deg: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Budget:
     """Terms of one eye model's error with one estimator; they add up to `total_deg`."""
 
@@ -60,12 +53,8 @@ class Budget:
         """Find a term by its name."""
         return next((term for term in self.terms if term.name == name), None)
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Convert to a mapping for JSON."""
-        return {**asdict(self), "terms": [asdict(term) for term in self.terms]}
 
-
-def budgets(parts: Sequence[Part]) -> list[Budget]:
+def budgets(parts: Sequence[ModelResults]) -> list[Budget]:
     """Budget of each protocol, estimator and eye model; none where there are no errors by ray optics.
 
     The reference is the first eye model of the run, which is E1 by default.
@@ -103,17 +92,9 @@ def _budget(
     for observer, errors in steps.items():
         after = errors[rows]
         if observer != "analytic" or model != reference:
-            terms.append(Term(_name(observer, steps), *paired(after - before)))
+            terms.append(Term(_name(observer, steps), *mean_interval(after - before)))
         before = after
-    return Budget(
-        protocol=protocol,
-        estimator=name,
-        eye_model=model,
-        reference=reference,
-        n=n,
-        terms=tuple(terms),
-        total_deg=float(before.mean()),
-    )
+    return Budget(protocol, name, model, reference, n, tuple(terms), float(before.mean()))
 
 
 def _name(observer: str, steps: Mapping[str, Floats]) -> str:
@@ -125,8 +106,8 @@ def _name(observer: str, steps: Mapping[str, Floats]) -> str:
     return NOISE if "image-noiseless" in steps else BOTH
 
 
-def paired(differences: Floats) -> tuple[float, float, float]:
-    """Mean of paired differences (n,), n >= 2, and its 95 % interval."""
-    n, mean = len(differences), float(differences.mean())
-    half = float(student.ppf(0.975, n - 1) * differences.std(ddof=1) / np.sqrt(n))
+def mean_interval(values: Floats) -> tuple[float, float, float]:
+    """Mean of values (n,), n >= 2, such as paired differences, and its 95 % interval."""
+    n, mean = len(values), float(values.mean())
+    half = float(student.ppf(0.975, n - 1) * values.std(ddof=1) / np.sqrt(n))
     return mean, mean - half, mean + half

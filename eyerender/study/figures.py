@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..report.style import figure, svg
+from ..report.style import figure, legend_above, svg
 
 _LOOK = {
     "E1": ("#E69F00", "o"),
@@ -19,6 +19,8 @@ _LOOK = {
 }
 _OTHER = (("#D55E00", "P"), ("#777777", "X"), ("#F0E442", "h"), ("#000000", "*"))
 _MEASURED = "#222222"
+STYLES = (("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9"), ("P", "#777777"))
+"""Marker and colour of readings and observers, in their order."""
 
 
 def look(model: str, others: Sequence[str] = ()) -> tuple[str, str]:
@@ -48,8 +50,7 @@ def clouds_figure(clouds: Mapping[str, tuple[Floats, Floats]]) -> str:
                 )
             ax.set(aspect="equal", adjustable="datalim", title=title, xlabel="x (px)", ylabel="y (px, down)")
             ax.invert_yaxis()
-        handles, labels = axes[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=len(clouds), frameon=False)
+        legend_above(fig, axes[0], len(clouds))
         return svg(fig)
 
 
@@ -68,14 +69,6 @@ def heads_figure(
         interval: head -> 95 % confidence interval of the participants' mean (deg).
     """
     models = list(dict.fromkeys(m for by_model in own.values() for m in by_model))
-    styles = [
-        ("o", "#0072B2"),
-        ("D", "#D55E00"),
-        ("s", "#009E73"),
-        ("^", "#CC79A7"),
-        ("v", "#56B4E9"),
-        ("P", "#777777"),
-    ]
     highest = [v[h] for by_model in own.values() for v in by_model.values() for h in v]
     top = 1.08 * max([*highest, *(float(v.max()) for v in measured.values()), *(high for _, high in interval.values())])
     with figure(9.6, 4.2, 2) as (fig, axes):
@@ -89,7 +82,7 @@ def heads_figure(
                 marker="_", label="experiment: participants",
             )  # fmt: skip
             for k, (label, by_model) in enumerate(own.items()):
-                marker, colour = styles[k % len(styles)]
+                marker, colour = STYLES[k % len(STYLES)]
                 shift = (k - (len(own) - 1) / 2) * min(0.16, 0.8 / len(own))
                 at = [i for i, m in enumerate(models) if m in by_model]
                 values = [by_model[models[i]][head] for i in at]
@@ -103,8 +96,7 @@ def heads_figure(
             ax.set_xticks([*x, len(models)], [*models, "people"])
             ax.set(title=title, ylabel="mean gaze error (deg)", xlabel="eye model", ylim=(0, top))
             ax.grid(axis="x", visible=False)
-        handles, labels = axes[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+        legend_above(fig, axes[0], 3)
         return svg(fig)
 
 
@@ -132,8 +124,7 @@ def sets_figure(
             ax.minorticks_off()
             ax.set_xticks(x, sets)
             ax.set(title=label, xlabel="calibration set", ylabel="error of the best function (deg)")
-        handles, labels = panels[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=6, frameon=False)
+        legend_above(fig, panels[0], 6)
         return svg(fig)
 
 
@@ -151,8 +142,7 @@ def waterfall_figure(labels: Sequence[str], panels: Mapping[str, Mapping[str, Se
             ax.set_yticks(y, labels if k == 0 else [""] * len(labels))
             ax.set_xlim(left=0)
             ax.set(title=name, xlabel="mean error (deg)")
-        handles, names = np.atleast_1d(axes)[0].get_legend_handles_labels()
-        fig.legend(handles, names, loc="outside upper center", ncols=6, frameon=False)
+        legend_above(fig, np.atleast_1d(axes)[0], 6)
         return svg(fig)
 
 
@@ -185,8 +175,7 @@ def lines_figure(
                 ax.plot(x, values, color=colour, marker=marker, ms=5.5, lw=1.2, label=model)
             ax.set_ylim(bottom=0)
             ax.set(title=name, xlabel=xlabel, ylabel=ylabel)
-        handles, names = np.atleast_1d(axes)[0].get_legend_handles_labels()
-        fig.legend(handles, names, loc="outside upper center", ncols=6, frameon=False)
+        legend_above(fig, np.atleast_1d(axes)[0], 6)
         return svg(fig)
 
 
@@ -203,6 +192,5 @@ def sensitivity_figure(names: Sequence[str], panels: Mapping[str, Mapping[str, S
             ax.set_yticks(y, names if k == 0 else [""] * len(names))
             ax.set_ylim(len(names) - 0.5, -0.5)
             ax.set(title=title, xlabel=xlabel)
-        handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=6, frameon=False)
+        legend_above(fig, np.atleast_1d(axes)[0], 6)
         return svg(fig)

@@ -19,7 +19,7 @@ from ..rig.rig import RigGeometry
 from ..scene import Scene, load_scene
 from ..scene.spec import SceneSpec
 from .authors_estimators import AuthorsGuestrinEizenman
-from .results import Departure, Row, mean_row
+from .results import Departure, Row, known_mean, mean_row
 
 SCENE = "guestrin2006"
 HEADS = ("H1", "H2")
@@ -112,9 +112,12 @@ class Outcome:
 
     def mean_deg(self, head: str) -> float | None:
         """Mean over the fixations and eyes of H1 or H2."""
-        rows = self.rows(head)
-        good = self.error_deg[rows][np.isfinite(self.error_deg[rows])]
-        return float(good.mean()) if len(good) else None
+        return known_mean(self.error_deg[self.rows(head)])
+
+    @property
+    def means(self) -> dict[str, float | None]:
+        """Means of H1 and H2."""
+        return {head: self.mean_deg(head) for head in HEADS}
 
     def rows(self, head: str) -> Any:
         """Whether observations are at the central head position (H1) or the others (H2), (n,) bool."""

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from scipy.stats import t as student
-
 from . import guestrin
 from . import literature as lit
-from .budget import Budget
+from .budget import Budget, mean_interval
 from .figures import heads_figure
 from .page_parts import (
     Apart,
@@ -81,7 +78,7 @@ def _heads_figure(parts: Sequence[GuestrinPart]) -> str | None:
     if not own:
         return None
     measured = {h: lit.guestrin_deg(h) for h in guestrin.HEADS}
-    interval = {h: _interval(v) for h, v in measured.items()}
+    interval = {h: mean_interval(v)[1:] for h, v in measured.items()}
     return heads_figure(own, dict(lit.PAPER_GUESTRIN), measured, interval)
 
 
@@ -90,13 +87,6 @@ def _about_e5(parts: Sequence[GuestrinPart]) -> dict[str, str] | None:
     means = {p.eye_model: p.means["published", "analytic"] for p in parts if ("published", "analytic") in p.means}
     told = {m: f"{v['H1']:.2f}/{v['H2']:.2f} deg" for m, v in means.items() if m.startswith("E5")}
     return told if {"E5", *lit.VARIANTS} <= set(told) else None
-
-
-def _interval(values: np.ndarray) -> tuple[float, float]:
-    """Confidence interval (95 %) of a mean."""
-    n = len(values)
-    half = float(student.ppf(0.975, n - 1) * values.std(ddof=1) / np.sqrt(n))
-    return float(values.mean()) - half, float(values.mean()) + half
 
 
 def _mean_rows(parts: Sequence[GuestrinPart]) -> list[tuple[str, ...]]:

@@ -12,7 +12,6 @@ between two directions is the error.)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,27 +19,16 @@ import numpy as np
 from ..arrays import Bools, Floats
 from ..gaze.estimate import angular_error_deg
 from ..observation import Observations
-from ..rig.rig import RigGeometry
 from ..scene import Scene, load_scene
 from ..scene.spec import SceneSpec
 from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
 from .observing import Observing
-from .results import Finding, Row, mean_row
+from .results import Finding, ModelResults, mean_row
 
 SCENE, PROTOCOL = "head_mounted", "head-mounted"
 AZIMUTHS_DEG = (15.0, 7.5, 0.0, -7.5, -15.0)
 ELEVATIONS_DEG = (12.0, 6.0, 0.0, -6.0, -12.0)
 FEATURES = ("pupil-glint vector", "pupil centre")
-
-
-@dataclass(slots=True)
-class HeadMountedPart:
-    """Results of one eye model: rows; by (protocol, observer) the rig with its observations, and errors (n,) deg."""
-
-    eye_model: str
-    rows: list[Row] = field(default_factory=list)
-    seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
-    errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
 
 
 def scene(eye: str) -> Scene:
@@ -57,10 +45,10 @@ def calibration_rows() -> Bools:
     return np.array([x in a and y in e for y in ELEVATIONS_DEG for x in AZIMUTHS_DEG])
 
 
-def head_mounted_part(eye: str, observings: Sequence[Observing]) -> HeadMountedPart:
+def head_mounted_part(eye: str, observings: Sequence[Observing]) -> ModelResults:
     """Compute the results of one eye model with the given observers."""
     own = scene(eye)
-    out = HeadMountedPart(eye)
+    out = ModelResults(eye)
     learnt = calibration_rows()
     for observing in observings:
         seen = observing.observe(own)

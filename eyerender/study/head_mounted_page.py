@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 from . import head_mounted as h
 from .budget import Budget
-from .head_mounted import HeadMountedPart
 from .observers_compared import FeatureDifference
 from .page_parts import Apart, Report, Values, budget_values, findings_values, number, observers_values
-from .results import Finding
+from .results import Finding, ModelResults
 
 
 def page(
-    parts: Sequence[HeadMountedPart], found: Sequence[Finding], apart: Apart, made_of: Sequence[Budget] = ()
+    parts: Sequence[ModelResults], found: Sequence[Finding], apart: Apart, made_of: Sequence[Budget] = ()
 ) -> Report:
     """Make the report."""
     values: Values = {

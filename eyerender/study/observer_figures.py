@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..report.style import figure, svg
-
-_STYLES = (("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9"), ("P", "#777777"))
+from ..report.style import figure, legend_above, svg
+from .figures import STYLES
 
 # Colour and hatch of the terms of an error budget, which are distinct in grey too.
 _TERMS = {
@@ -27,7 +26,7 @@ def distances_figure(panels: Mapping[str, Mapping[str, Mapping[str, float]]]) ->
     with figure(_width(panels), 3.9, len(panels)) as (fig, axes):
         for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
             for i, (label, values) in enumerate(by.items()):
-                marker, colour = _STYLES[i % len(_STYLES)]
+                marker, colour = STYLES[i % len(STYLES)]
                 at = [j for j, m in enumerate(models) if m in values]
                 x = np.array(at) + _shift(i, len(by))
                 ax.scatter(x, [values[models[j]] for j in at], s=38, marker=marker, color=colour, label=label)
@@ -36,8 +35,7 @@ def distances_figure(panels: Mapping[str, Mapping[str, Mapping[str, float]]]) ->
             ax.set_ylim(0, 1.12 * max((v for values in by.values() for v in values.values()), default=1.0))
             ax.grid(axis="x", visible=False)
             ax.set(title=name, ylabel="median distance (px)" if k == 0 else "", xlabel="eye model")
-        handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=4 if len(panels) > 2 else 2, frameon=False)
+        legend_above(fig, np.atleast_1d(axes)[0], 4 if len(panels) > 2 else 2)
         return svg(fig)
 
 
@@ -48,7 +46,7 @@ def differences_figure(panels: Mapping[str, Mapping[str, Mapping[str, tuple[floa
         for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
             ax.axhline(0, color="#444444", lw=0.8)
             for i, (label, values) in enumerate(by.items()):
-                marker, colour = _STYLES[i % len(_STYLES)]
+                marker, colour = STYLES[i % len(STYLES)]
                 at = [j for j, m in enumerate(models) if m in values]
                 mean, low, high = np.array([values[models[j]] for j in at]).reshape(-1, 3).T
                 ax.errorbar(
@@ -59,8 +57,7 @@ def differences_figure(panels: Mapping[str, Mapping[str, Mapping[str, tuple[floa
             ax.set_xlim(-0.5, len(models) - 0.5)
             ax.grid(axis="x", visible=False)
             ax.set(title=name, ylabel="difference of the gaze error (deg)" if k == 0 else "", xlabel="eye model")
-        handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=4 if len(panels) > 2 else 2, frameon=False)
+        legend_above(fig, np.atleast_1d(axes)[0], 4 if len(panels) > 2 else 2)
         return svg(fig)
 
 

@@ -14,7 +14,7 @@ from ..arrays import Floats
 from ..comparison import feature_errors
 from ..observation import Observations
 from ..rig.rig import RigGeometry
-from .budget import paired
+from .budget import mean_interval
 
 ALL_GLINTS = "all glints"
 
@@ -96,7 +96,7 @@ def gaze(
     d = image_deg[both] - analytic_deg[both]
     return GazeDifference(
         protocol, observer, eye_model, estimator, n, float(analytic_deg[both].mean()), float(image_deg[both].mean()),
-        *paired(d),
+        *mean_interval(d),
     )  # fmt: skip
 
 

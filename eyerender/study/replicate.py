@@ -11,46 +11,31 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..observation import Observations
-from ..rig.rig import RigGeometry
 from ..scene import Scene
 from . import blignaut, guestrin
 from .clouds import Cloud
 from .literature import CALIBRATION_SETS
 from .observing import Observing
-from .results import Row, WaterfallStep
+from .results import ModelResults, WaterfallStep
 
 
 @dataclass(slots=True)
-class GuestrinPart:
-    """Results of one eye model: rows, calibrations with restarts; the others by (protocol, observer).
+class GuestrinPart(ModelResults):
+    """Results of one eye model: calibrations with restarts; means and errors at H1 by (protocol, observer)."""
 
-    `seen` is the rig and its observations, `errors` the errors (n,) by name of the estimator.
-    """
-
-    eye_model: str
-    rows: list[Row] = field(default_factory=list)
     calibrations: list[dict[str, Any]] = field(default_factory=list)
     means: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
-    seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
-    errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
     h1_errors: dict[tuple[str, str], Floats] = field(default_factory=dict)
     waterfall: list[WaterfallStep] = field(default_factory=list)
     misprints: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
-class BlignautPart:
-    """Results of one eye model: rows, outcomes and feature clouds by (protocol, observer), the waterfall.
+class BlignautPart(ModelResults):
+    """Results of one eye model: outcomes and feature clouds by (protocol, observer), the waterfall."""
 
-    `seen` is the rig and its observations, `errors` the errors (f,) by name of the estimator.
-    """
-
-    eye_model: str
-    rows: list[Row] = field(default_factory=list)
     outcomes: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
     centred: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
-    seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
-    errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
     clouds: dict[tuple[str, str], Cloud] = field(default_factory=dict)
     waterfall: list[WaterfallStep] = field(default_factory=list)
 
@@ -68,6 +53,11 @@ class _Scenes:
             scene = self.module.scene(self.eye, key)
             self._seen[key] = scene, self.observing.observe(scene, facing=facing(self.module))
         return self._seen[key]
+
+    def run(self, departures: Collection[str]) -> Any:
+        """Outcome of the study with some departures."""
+        scene, seen = self(departures)
+        return self.module.run(seen, scene.rig, departures)
 
 
 def departures_of(module: Any, protocol: str) -> frozenset[str]:
@@ -105,15 +95,14 @@ def guestrin_part(
             out.errors.setdefault((protocol, observing.kind), {})[f"model-based, {variant}"] = done.error_deg
             if not free:
                 out.seen[protocol, observing.kind] = scene.rig, seen
-                means = {h: done.mean_deg(h) for h in guestrin.HEADS}
-                out.means[protocol, observing.kind] = {h: np.nan if m is None else m for h, m in means.items()}
+                out.means[protocol, observing.kind] = {h: np.nan if m is None else m for h, m in done.means.items()}
                 out.h1_errors[protocol, observing.kind] = done.error_deg[done.rows("H1")]
             if analytic:
                 # The left eye is the right eye's mirror image, and so are its calibrations.
                 for spread in guestrin.restarts(done, scene.rig, departures, starts=starts):
                     out.calibrations.append({**keys, **spread.to_mapping()})
     if analytic and len(protocols) == 2:
-        out.waterfall = _waterfall(eye, guestrin, lambda d: _guestrin_means(scenes, d))
+        out.waterfall = _waterfall(eye, guestrin, lambda d: scenes.run(d).means)
     if analytic and "corrected" in protocols:
         out.misprints = _misprints(eye)
     return out
@@ -139,15 +128,14 @@ def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> B
             out.centred[key] = centred
             out.rows += blignaut.rows_of(centred, variant="centred vector", **keys)
     if observing.kind == "analytic" and len(protocols) == 2:
-
-        def best(departures: Collection[str]) -> dict[str, float | None]:
-            scene, seen = scenes(departures)
-            done = blignaut.run(seen, scene.rig, departures)
-            found = {c: blignaut.best(done, c) for c in CALIBRATION_SETS}
-            return {c: b.mean_deg if b else None for c, b in found.items()}
-
-        out.waterfall = _waterfall(eye, blignaut, best)
+        out.waterfall = _waterfall(eye, blignaut, lambda d: _best_means(scenes.run(d)))
     return out
+
+
+def _best_means(done: list[blignaut.Outcome]) -> dict[str, float | None]:
+    """Mean error of the best function for each set."""
+    found = {c: blignaut.best(done, c) for c in CALIBRATION_SETS}
+    return {c: b.mean_deg if b else None for c, b in found.items()}
 
 
 def _waterfall(eye: str, module: Any, measure: Any) -> list[WaterfallStep]:
@@ -161,12 +149,6 @@ def _waterfall(eye: str, module: Any, measure: Any) -> list[WaterfallStep]:
             WaterfallStep(eye, departure.id, measure(frozenset(left)), measure(module.PUBLISHED - {departure.id}))
         )
     return steps
-
-
-def _guestrin_means(scenes: _Scenes, departures: Collection[str]) -> dict[str, float | None]:
-    scene, seen = scenes(departures)
-    done = guestrin.run(seen, scene.rig, departures)
-    return {h: done.mean_deg(h) for h in guestrin.HEADS}
 
 
 def _misprints(eye: str) -> dict[str, dict[str, Any]]:
@@ -188,7 +170,7 @@ def _misprints(eye: str) -> dict[str, dict[str, Any]]:
             continue
         inside = seen.pupil.in_image & seen.glints.in_image.all(axis=1)
         out[name] = {
-            **{h: done.mean_deg(h) for h in guestrin.HEADS},
+            **done.means,
             "in_image": int(inside.sum()),
             "n": len(seen),
             "missing": int((~np.isfinite(done.error_deg)).sum()),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ import numpy as np
 from ..arrays import Floats
 from ..files import write_json, write_text
 from ..imagefolder import versions
+from ..observation import Observations
+from ..rig.rig import RigGeometry
 
 SUMMARY_SCHEMA = "eyerender/study-summary/1"
 FINDINGS_SCHEMA = "eyerender/study-findings/1"
@@ -42,6 +44,23 @@ class Row:
     in_image: int | None = None
     reason: str | None = None
     solution: str | None = None
+
+
+@dataclass(slots=True)
+class ModelResults:
+    """Results of a study for one eye model.
+
+    Attributes:
+        eye_model: the eye model.
+        rows: mean errors.
+        seen: by (protocol, observer) the rig and its observations.
+        errors: by (protocol, observer) and name of the estimator the errors (n,) deg.
+    """
+
+    eye_model: str
+    rows: list[Row] = field(default_factory=list)
+    seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
+    errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +116,18 @@ def mean_row(error_deg: Floats, **keys: Any) -> Row:
     good = error_deg[np.isfinite(error_deg)]
     n = len(good)
     return Row(
-        mean_deg=float(good.mean()) if n else None,
+        mean_deg=known_mean(error_deg),
         sd_deg=float(good.std(ddof=1)) if n > 1 else None,
         n=n,
         missing=int(len(error_deg) - n),
         **{"variant": None, "head": None, "calibration": None, "function": None, **keys},
     )
+
+
+def known_mean(errors: Floats) -> float | None:
+    """Mean of the errors that are known, which are not NaN; None if there are none."""
+    good = errors[np.isfinite(errors)]
+    return float(good.mean()) if len(good) else None
 
 
 def write_results(
@@ -129,9 +154,13 @@ def write_results(
 def table(kind: type, items: Sequence[Any]) -> str:
     """CSV of dataclasses; empty cells where there is no value."""
     names = [f.name for f in fields(kind)]
+    return csv_text(names, ([getattr(item, name) for name in names] for item in items))
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """CSV of rows; empty cells for None."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    for item in items:
-        writer.writerow(["" if (v := getattr(item, name)) is None else v for name in names])
+    writer.writerow(header)
+    writer.writerows(rows)
     return text.getvalue()

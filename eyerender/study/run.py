@@ -19,7 +19,6 @@ from ..files import read_json, write_json, write_text
 from ..lock import writer_lock
 from ..outfolder import clear, refuse_non_empty
 from ..progress import Progress, Say
-from ..scene import Scene
 from . import blignaut, guestrin, head_mounted, together
 from .conditions import conditions_part
 from .head_mounted import head_mounted_part
@@ -28,12 +27,11 @@ from .literature import MODELS, VARIANTS
 from .observing import ObserverKind, Observing
 from .options import StudyOptions
 from .replicate import blignaut_part, facing, guestrin_part, scenes_of
-from .results import write_results
+from .results import csv_text, write_results
 
 STUDIES = ("guestrin2006", "blignaut2014", "observers", "conditions")
 RUN_SCHEMA = "eyerender/study/1"
 MARKER, REPORT, IMAGES = "study.json", "report.html", "images"
-_MODULES = {"guestrin2006": guestrin, "blignaut2014": blignaut}
 _TOGETHER: dict[str, Callable[..., together.Results]] = {
     "guestrin2006": together.guestrin_results,
     "blignaut2014": together.blignaut_results,
@@ -99,9 +97,12 @@ def run_study(
         if any(kind != "analytic" for kind in kinds):
             made = ImageSettings(folder / IMAGES, options, _noted(progress), say)
             images = _images(name, eyes, protocols, kinds, made)
+        observers = [Observing(kind, None if kind == "analytic" else images) for kind in kinds]
+        # One job compares all observers, or has one of them.
+        together_or_alone = [tuple(observers)] if name == "observers" else [(one,) for one in observers]
         jobs = [
             (observings, eye, told)
-            for observings in _observings(name, kinds, images)
+            for observings in together_or_alone
             for eye, told in _models(name, eyes, protocols, observings)
         ]
         count = options.workers or len(os.sched_getaffinity(0))
@@ -147,22 +148,15 @@ def _images(
     name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[ObserverKind], settings: ImageSettings
 ) -> StudyImages:
     """Images of every scene of a study; missing ones are made."""
-    module = _MODULES.get(name)
-    scenes: list[Scene]
-    if module is None:
+    if name == "observers":
         scenes, turned = [head_mounted.scene(eye) for eye in eyes], False
     else:
+        module = guestrin if name == "guestrin2006" else blignaut
         scenes, turned = scenes_of(module, eyes, protocols), facing(module)
     shots = [
         s for scene in scenes for k in kinds for s in Observing(k).shots(scene, facing=turned, spp=settings.options.spp)
     ]
     return make_images(name, [shot.scene for shot in shots], settings)
-
-
-def _observings(name: str, kinds: Sequence[ObserverKind], images: StudyImages | None) -> list[tuple[Observing, ...]]:
-    """Observers of each job: one by one, or all together where a job compares them."""
-    every = [Observing(kind, None if kind == "analytic" else images) for kind in kinds]
-    return [tuple(every)] if name == "observers" else [(one,) for one in every]
 
 
 def _models(
@@ -243,9 +237,9 @@ def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterato
         done = True
     finally:
         if not done and not same:
-            for empty in (folder / IMAGES,):
-                if empty.is_dir() and not any(empty.iterdir()):
-                    empty.rmdir()
+            images = folder / IMAGES
+            if images.is_dir() and not any(images.iterdir()):
+                images.rmdir()
             if [p.name for p in folder.iterdir()] == [MARKER]:
                 (folder / MARKER).unlink()
             if created and not any(folder.iterdir()):
@@ -253,12 +247,9 @@ def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterato
 
 
 def _waterfall_csv(steps: Sequence[dict[str, Any]]) -> str:
-    lines = ["eye_model,departure,measure,cumulative_deg,alone_deg"]
-    for step in steps:
-        for measure, value in step["errors"].items():
-            cells = [value, step["alone"][measure]]
-            lines.append(
-                f"{step['eye_model']},{step['departure']},{measure},"
-                + ",".join("" if c is None else repr(c) for c in cells)
-            )
-    return "\n".join(lines) + "\n"
+    rows = [
+        (step["eye_model"], step["departure"], measure, value, step["alone"][measure])
+        for step in steps
+        for measure, value in step["errors"].items()
+    ]
+    return csv_text(("eye_model", "departure", "measure", "cumulative_deg", "alone_deg"), rows)

@@ -21,11 +21,10 @@ from . import (
 )
 from .budget import Budget, budgets
 from .conditions import ConditionsPart
-from .head_mounted import HeadMountedPart
 from .literature import VARIANTS
 from .page_parts import Apart, Report
 from .replicate import BlignautPart, GuestrinPart
-from .results import Finding, Row
+from .results import Finding, ModelResults, Row
 
 Results = tuple[list[Row], list[Finding], dict[str, Any], Report]
 
@@ -87,20 +86,16 @@ def conditions_results(parts: Sequence[ConditionsPart], protocols: Sequence[str]
     return rows, found, conditions_page.more(parts), conditions_page.page(parts, found)
 
 
-def observers_results(parts: Sequence[HeadMountedPart], protocols: Sequence[str] = ()) -> Results:
+def observers_results(parts: Sequence[ModelResults], protocols: Sequence[str] = ()) -> Results:
     """Results of observers: effects of images on features and directions."""
     apart, made_of = _observers_apart(parts), _budgets(parts)
     found = head_mounted.findings(*apart)
     more = {**head_mounted.more(), **_as_mappings(apart, made_of)}
-    return (
-        [row for part in parts for row in part.rows],
-        found,
-        more,
-        head_mounted_page.page(parts, found, apart, made_of),
-    )
+    rows = [row for part in parts for row in part.rows]
+    return rows, found, more, head_mounted_page.page(parts, found, apart, made_of)
 
 
-def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart | HeadMountedPart]) -> Apart:
+def _observers_apart(parts: Sequence[ModelResults]) -> Apart:
     """Differences of the observers on the frames that both have seen."""
     features: list[observers_compared.FeatureDifference] = []
     gaze: list[observers_compared.GazeDifference] = []
@@ -120,14 +115,15 @@ def _observers_apart(parts: Sequence[GuestrinPart | BlignautPart | HeadMountedPa
     return features, gaze
 
 
-def _budgets(parts: Sequence[GuestrinPart | BlignautPart | HeadMountedPart]) -> list[Budget]:
+def _budgets(parts: Sequence[ModelResults]) -> list[Budget]:
     """Error budgets of the eye models; the published variants of E5 are not eyes."""
     return budgets([part for part in parts if part.eye_model not in VARIANTS])
 
 
 def _as_mappings(apart: Apart, made_of: Sequence[Budget]) -> dict[str, Any]:
     features, gaze = apart
-    out: dict[str, Any] = {"error_budget": [b.to_mapping() for b in made_of]}
+    budgets_found = [{**asdict(b), "terms": list(map(asdict, b.terms))} for b in made_of]
+    out: dict[str, Any] = {"error_budget": budgets_found}
     if features:
         out["observers"] = {"features": list(map(asdict, features)), "gaze": list(map(asdict, gaze))}
     return out
