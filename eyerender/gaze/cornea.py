@@ -43,30 +43,23 @@ class CorneaCentres(ArrayValue):
     ok: Bools
 
 
-def from_all_glints(
-    origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats, start_mm: Floats | None = None
-) -> CorneaCentres:
+def from_all_glints(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats) -> CorneaCentres:
     """Method A: the k that minimise sum_{i<j} |c_i(k_i) - c_j(k_j)|^2; the centre is the mean of the c_i.
 
-    Damped Gauss-Newton on the m distances of every row at once. The cost is that of the deviations from the mean, which
-    is the same up to the factor m: sum_{i<j} |c_i - c_j|^2 = m sum_i |c_i - mean|^2.
+    Damped Gauss-Newton on the m distances of every row at once, from the best of a coarse search. The cost is that of
+    the deviations from the mean, which is the same up to the factor m:
+    sum_{i<j} |c_i - c_j|^2 = m sum_i |c_i - mean|^2.
 
     Args:
         origin_mm: (..., 3) nodal points.
         glints: (..., m, 3) unit rays, m >= 2.
         light_mm: (m, 3) lights.
         radius_mm: (...) corneal radius.
-        start_mm: (..., m) distances to start from; default: the best of a coarse search.
     """
     m = glints.shape[-2]
     radius = _radii(radius_mm, glints.shape[:-2])
     origin = origin_mm[..., None, :]
-    k = (
-        _coarse(origin, glints=glints, light_mm=light_mm, radius=radius)
-        if start_mm is None
-        else np.array(start_mm, dtype=float)
-    )
-    k = np.broadcast_to(k, (*radius.shape, m)).copy()
+    k = _coarse(origin, glints=glints, light_mm=light_mm, radius=radius)
     c, slope = _mirror_centres(origin, glints=glints, light_mm=light_mm, radius=radius, k=k)
     deviation = c - c.mean(axis=-2, keepdims=True)
     cost = (deviation * deviation).sum(axis=(-1, -2))
@@ -121,10 +114,8 @@ def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple
     return np.where(ok[..., None], b * towards[..., None], np.nan), ok
 
 
-def from_plane(
-    origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats, mirror: int = 0
-) -> CorneaCentres:
-    """Method B: c = O + k_c b, with k_c from the mirror condition of one glint.
+def from_plane(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats) -> CorneaCentres:
+    """Method B: c = O + k_c b, with k_c from the mirror condition of the first glint.
 
     In the plane of camera, light and glint, with e the unit vector normal to b: (c(k) - O) . e = k u.e - R n(k).e = 0.
     Newton's method solves it for the distance k of the mirror point.
@@ -134,19 +125,16 @@ def from_plane(
         glints: (..., m, 3) unit rays, m >= 2.
         light_mm: (m, 3) lights.
         radius_mm: (...) corneal radius.
-        mirror: index of the glint whose mirror condition is used.
     """
     b, ok = line_to_centre(origin_mm, glints, light_mm)
     radius = _radii(radius_mm, b.shape[:-1])
-    u, light = glints[..., mirror, :], light_mm[mirror]
+    u, light = glints[..., 0, :], light_mm[:1]
     e = unit(u - (u * b).sum(axis=-1, keepdims=True) * b)
     side = (u * e).sum(axis=-1)
     k = 80.0 * radius
     origin = origin_mm[..., None, :]
     for step in range(_ITERATIONS):
-        c, slope = _mirror_centres(
-            origin, glints=u[..., None, :], light_mm=light[None, :], radius=radius, k=k[..., None]
-        )
+        c, slope = _mirror_centres(origin, glints=u[..., None, :], light_mm=light, radius=radius, k=k[..., None])
         value = ((c[..., 0, :] - origin_mm) * e).sum(axis=-1)
         # The first step treats the normal as constant, which works from any distance. Newton's steps follow.
         rate = side if step == 0 else (slope[..., 0, :] * e).sum(axis=-1)
@@ -155,7 +143,7 @@ def from_plane(
         k = np.where(k - change > 0, k - change, 0.5 * k)
         if bool(np.all((np.abs(change) <= 1e-13 * np.abs(k)) | ~np.isfinite(change))):
             break
-    c, _ = _mirror_centres(origin, glints=u[..., None, :], light_mm=light[None, :], radius=radius, k=k[..., None])
+    c, _ = _mirror_centres(origin, glints=u[..., None, :], light_mm=light, radius=radius, k=k[..., None])
     off = c[..., 0, :] - origin_mm
     k_c = (off * b).sum(axis=-1)
     residual = np.abs((off * e).sum(axis=-1))

@@ -20,8 +20,8 @@ from ..errors import InputError
 from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry, RigLike
 from .estimate import GazePoints
-from .homography import glints_of, homography, transformed
-from .rays import chosen_lights, screen_of
+from .homography import homography, transformed
+from .rays import chosen_lights, glints_of, screen_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -129,10 +129,8 @@ class GuestrinEizenman:
         return GazeRays.of(centre, axis, reason)
 
     def _centres(self, rays: FeatureRays, rows: Any, radius: Floats) -> CorneaCentres:
-        origin, glints = rays.origin_mm[rows], rays.glints[rows]
-        if self.centre == "plane":
-            return from_plane(origin, glints=glints, light_mm=rays.light_mm, radius_mm=radius)
-        return from_all_glints(origin, glints=glints, light_mm=rays.light_mm, radius_mm=radius)
+        find = from_plane if self.centre == "plane" else from_all_glints
+        return find(rays.origin_mm[rows], glints=rays.glints[rows], light_mm=rays.light_mm, radius_mm=radius)
 
     def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
         """Visual axes (..., 3) of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""

@@ -22,7 +22,7 @@ from ..errors import InputError
 from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry, RigLike
 from .estimate import GazePoints
-from .rays import chosen_lights, screen_of
+from .rays import chosen_lights, glints_of, screen_of
 
 # Corners of the square for the four lights: top left, top right, bottom right, bottom left, u to the right and v up.
 SQUARE = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
@@ -139,17 +139,6 @@ def transformed(H: Floats, points: ArrayLike) -> tuple[Floats, Bools]:
     with np.errstate(invalid="ignore", divide="ignore"):
         finite = np.abs(out[..., 2]) > 1e-12 * size
         return np.where(finite[..., None], out[..., :2] / out[..., 2:], np.nan), np.asarray(finite)
-
-
-def glints_of(observations: Observations, lights: tuple[int, ...]) -> tuple[Floats, Objects]:
-    """Glints (n, m, 2) px of the lights in their order, and why an observation lacks pupil or glint (n,)."""
-    reason = np.full(len(observations), None, dtype=object)
-    reason[~observations.pupil.ok] = "no pupil"
-    places = np.full((len(observations), len(lights), 2), np.nan)
-    for j, light in enumerate(lights):
-        places[:, j], found = observations.glints.of_light(light)
-        reason[(reason == None) & ~found] = f"no glint of light {light}"  # noqa: E711
-    return places, reason
 
 
 def _conditioning(points: Floats) -> Floats:

@@ -53,12 +53,8 @@ def feature_rays(
     wanted = chosen_lights(rig, lights, least)
     camera, reason = camera_of(observations, rig)
     n, m = len(observations), len(wanted)
-    pupil_ok = observations.pupil.ok
-    reason[(reason == None) & ~pupil_ok] = "no pupil"  # noqa: E711  (element by element)
-    places = np.full((n, m, 2), np.nan)
-    for j, light in enumerate(wanted):
-        places[:, j], found = observations.glints.of_light(light)
-        reason[(reason == None) & ~found] = f"no glint of light {light}"  # noqa: E711
+    places, missing = glints_of(observations, wanted)
+    reason = np.where(camera < 0, reason, missing)
     origin, pupil, glints = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, m, 3), np.nan)
     for k in np.unique(camera[camera >= 0]):
         rows = camera == k
@@ -73,6 +69,17 @@ def feature_rays(
         light_mm=frozen(light_mm),
         reason=frozen(reason, object),
     )
+
+
+def glints_of(observations: Observations, lights: tuple[int, ...]) -> tuple[Floats, Objects]:
+    """Glints (n, m, 2) px of the lights in their order, and why an observation lacks pupil or glint (n,)."""
+    reason = np.full(len(observations), None, dtype=object)
+    reason[~observations.pupil.ok] = "no pupil"
+    places = np.full((len(observations), len(lights), 2), np.nan)
+    for j, light in enumerate(lights):
+        places[:, j], found = observations.glints.of_light(light)
+        reason[(reason == None) & ~found] = f"no glint of light {light}"  # noqa: E711  (element by element)
+    return places, reason
 
 
 def chosen_lights(rig: RigGeometry, lights: Sequence[int] | None, least: int) -> tuple[int, ...]:

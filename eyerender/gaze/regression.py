@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..observation import Observations
 from ..rig.rig import RigLike
 from .estimate import GazePoints
-from .rays import screen_of
+from .rays import glints_of, screen_of
 
 Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
 
@@ -149,7 +149,6 @@ class Regression:
             raise InputError("the estimator is not calibrated; call fit first")
         screen = screen_of(rig.build())
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
-        reason = reason.copy()
         x_terms, y_terms = self.terms
         on_screen = np.full((len(observations), 2), np.nan)
         for eye in np.unique(observations.index.eye):
@@ -176,23 +175,20 @@ def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: 
     pixels.
     """
     index, pupil = observations.index, observations.pupil
-    n = len(observations)
-    glint, found = observations.glints.of_light(light)
-    reason = np.full(n, None, dtype=object)
-    reason[~pupil.ok] = "no pupil"
-    reason[pupil.ok & ~found] = f"no glint of light {light}"
+    glints, reason = glints_of(observations, (light,))
+    vectors = pupil.centre_px - glints[:, 0]
     if not normalised:
-        good = pupil.ok & found
-        return np.where(good[:, None], pupil.centre_px - glint, np.nan), reason
+        good = np.asarray(reason == None)  # noqa: E711  (element by element)
+        return np.where(good[:, None], vectors, np.nan), reason
     partner = _partners(index.frame, index.eye)
-    lone = (partner < 0) & (reason == None)  # noqa: E711  (element by element)
+    lone = (partner < 0) & (reason == None)  # noqa: E711
     reason[lone] = "the frame shows one eye; the vector is normalised by the distance of two pupils"
     unit: Bools = (partner >= 0) & ~pupil.ok[partner]
     reason[unit & (reason == None)] = "no pupil of the other eye"  # noqa: E711
     with np.errstate(invalid="ignore"):
         distance = np.linalg.norm(pupil.centre_px - pupil.centre_px[partner], axis=1)
-        v = (pupil.centre_px - glint) / np.where(distance > 0, distance, np.nan)[:, None]
-    good = np.array([r is None for r in reason], dtype=bool)
+        v = vectors / np.where(distance > 0, distance, np.nan)[:, None]
+    good = np.asarray(reason == None)  # noqa: E711
     return np.where(good[:, None], v, np.nan), reason
 
 

@@ -42,7 +42,7 @@ EstimatorName = Literal["regression", "homography", "cross-ratio", "hennessey", 
 NAMES: tuple[str, ...] = get_args(EstimatorName)
 
 
-_BUILT_IN = (Regression, Homography, CrossRatio, GuestrinEizenman, Hennessey, ShihWuLiu)
+BuiltIn = Regression | Homography | CrossRatio | GuestrinEizenman | Hennessey | ShihWuLiu
 
 
 class EstimatorSpec(Spec):
@@ -68,7 +68,7 @@ class EstimatorSpec(Spec):
         if type(estimator) is Regression:
             key = "function" if isinstance(estimator.function, str) else "terms"
             options = {"name": "regression", key: estimator.function, "normalised": estimator.normalised}
-            bare: GazeEstimator = replace(estimator, fits={})
+            bare: BuiltIn = replace(estimator, fits={})
         elif type(estimator) is Homography:
             options, bare = {"name": "homography"}, replace(estimator, homographies={})
         elif type(estimator) is CrossRatio:
@@ -91,7 +91,7 @@ class EstimatorSpec(Spec):
             raise InputError(f"a {type(estimator).__name__} with these options cannot be written to a file")
         return spec
 
-    def build(self) -> GazeEstimator:
+    def build(self) -> BuiltIn:
         """Build the estimator, not calibrated."""
         eye = MEAN_EYE if self.index is None else EyeParameters(index=self.index)
         if self.name == "regression":
@@ -234,7 +234,7 @@ def save_estimator(path: str | Path, estimator: GazeEstimator, rig: RigLike | No
         InputError: the estimator has options that a file cannot store, or its class cannot be stored.
         EyerenderError: the file cannot be written.
     """
-    if not isinstance(estimator, (OwnEstimator, *_BUILT_IN)):
+    if not isinstance(estimator, OwnEstimator | BuiltIn):
         kind = type(estimator)
         estimator = OwnEstimator(f"{kind.__module__}:{kind.__qualname__}", estimator)
     described = _described(estimator)
@@ -276,8 +276,7 @@ def load_calibration(path: str | Path, own: str | None = None) -> tuple[GazeEsti
     if reference is not None or own is not None:
         return _own_calibration(data, reference, own, source), rig
     try:
-        spec = EstimatorSpec.from_mapping(said)
-        estimator = spec.build()
+        estimator = EstimatorSpec.from_mapping(said).build()
     except InputError as error:
         raise error.placed(source=source, under="estimator") from None
     eyes = data.get("eyes")
@@ -352,28 +351,31 @@ class _ModelState(Spec):
     at_bound: Annotated[tuple[str, ...], Field(max_length=5)]
 
 
-def _checked(estimator: GazeEstimator, state: object) -> Spec:
+_STATES: dict[type[BuiltIn], type[Spec]] = {
+    Regression: _RegressionState,
+    Homography: _HomographyState,
+    CrossRatio: _CrossRatioState,
+    GuestrinEizenman: _ModelState,
+    Hennessey: _CorrectionState,
+    ShihWuLiu: _CorrectionState,
+}
+
+
+def _checked(estimator: BuiltIn, state: object) -> Spec:
     """Validate one eye's part of a calibration's file.
 
     Raises:
         InputError: with the path of the key.
     """
-    if isinstance(estimator, Regression):
-        regression = _RegressionState.from_mapping(state)
-        for key, values, terms in zip("ab", (regression.a, regression.b), estimator.terms, strict=True):
+    found = _STATES[type(estimator)].from_mapping(state)
+    if isinstance(estimator, Regression) and isinstance(found, _RegressionState):
+        for key, values, terms in zip("ab", (found.a, found.b), estimator.terms, strict=True):
             if len(values) != len(terms):
                 raise InputError(f"must be {len(terms)} numbers, one for each term", path=key)
-        return regression
-    if isinstance(estimator, Homography):
-        return _HomographyState.from_mapping(state)
-    if isinstance(estimator, CrossRatio):
-        return _CrossRatioState.from_mapping(state)
-    if isinstance(estimator, GuestrinEizenman):
-        return _ModelState.from_mapping(state)
-    return _CorrectionState.from_mapping(state)
+    return found
 
 
-def _state(estimator: GazeEstimator) -> dict[str, Any]:
+def _state(estimator: BuiltIn) -> dict[str, Any]:
     """Calibrated values by eye."""
     found: dict[int, Any]
     if isinstance(estimator, Regression):
@@ -387,15 +389,13 @@ def _state(estimator: GazeEstimator) -> dict[str, Any]:
         found = {e: {"alpha": a.tolist()} for e, a in estimator.alphas.items()}
     elif isinstance(estimator, GuestrinEizenman):
         found = {e: c.to_mapping() for e, c in estimator.calibrations.items()}
-    elif isinstance(estimator, Hennessey | ShihWuLiu):
+    else:
         correction = estimator.correction
         found = {e: {"coefficients": A.tolist()} for e, A in correction.coefficients.items()} if correction else {}
-    else:
-        raise InputError(f"{type(estimator).__name__} cannot be written to a file")
     return {(EYES[e] if e >= 0 else "unknown"): v for e, v in found.items()}
 
 
-def _restored(estimator: GazeEstimator, eyes: dict[int, Any]) -> GazeEstimator:
+def _restored(estimator: BuiltIn, eyes: dict[int, Any]) -> BuiltIn:
     """Restore an estimator with the calibrations of a file by eye, as `_checked` returns them."""
 
     def arrays(key: str) -> dict[int, Floats]:
@@ -415,7 +415,7 @@ def _restored(estimator: GazeEstimator, eyes: dict[int, Any]) -> GazeEstimator:
             parameters, start = EyeParameters(**values.pop("parameters")), EyeParameters(**values.pop("start"))
             found[e] = Calibration(parameters, start, **{**values, "at_bound": state.at_bound})
         return replace(estimator, calibrations=found)
-    if isinstance(estimator, Hennessey | ShihWuLiu) and estimator.recalibration != "none":
+    if estimator.recalibration != "none":
         return replace(estimator, correction=Recalibration(estimator.recalibration, arrays("coefficients")))
     return estimator
 
