@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from .compare import FolderFigures, measure_folder, realism
+from .compare import measure_folder, realism
+from .folder import FolderFigures
 
 __all__ = ["FolderFigures", "measure_folder", "realism"]

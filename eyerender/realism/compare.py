@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,70 +12,15 @@ from ..arrays import Bytes
 from ..errors import InputError
 from ..files import read_json
 from ..progress import Progress, followed
-from .figures import FIGURES, RADIUS_PX, Scaled, measure
-from .folder import Skipped, Source, open_source, pictures
+from .figures import FIGURES, RADIUS_PX, Scaled, measure, ratio
+from .folder import FolderFigures, Skipped, Source, open_source, pictures
 
 SCHEMA = "eyerender/realism/1"
 DEFAULT_LIMIT = 200
 MAX_LIMIT = 10_000
 EXPORT = "export.json"
-_SKIPPED_SHOWN = 50
 _TILE_R = (5.6, 4.2)  # width and height of a tile of the montage, R
 _WHITE = 235.0  # grey level at which a tile shows the 98th percentile of its picture
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FolderFigures:
-    """The figures of a folder.
-
-    Attributes:
-        path: the folder.
-        images: how many images were read.
-        gamma: the images store intensity^(1 / gamma).
-        gamma_from: why this gamma was used: the folder states it, it was given, or neither ("assumed").
-        landmarks: where pupil and iris come from.
-        rows: name and figures of each measured image.
-        skipped: images that could not be measured.
-        tiles: every measured image about its eye, at equal scale.
-    """
-
-    path: str
-    images: int
-    gamma: float
-    gamma_from: str
-    landmarks: str
-    rows: tuple[tuple[str, dict[str, float | None]], ...]
-    skipped: tuple[Skipped, ...]
-    tiles: tuple[Bytes, ...]
-
-    def values(self, name: str) -> list[float]:
-        """Values of a figure in all images that have it."""
-        return [row[name] for _, row in self.rows if row[name] is not None]  # type: ignore[misc]
-
-    def median(self, name: str) -> float | None:
-        """Median of a figure over the images; None where no image has it."""
-        values = self.values(name)
-        return float(np.median(values)) if values else None
-
-    def to_mapping(self) -> dict[str, Any]:
-        """What the JSON holds of the folder."""
-        return {
-            "path": self.path,
-            "images": self.images,
-            "measured": len(self.rows),
-            "skipped": len(self.skipped),
-            "skipped_first": [{"name": s.name, "reason": s.reason} for s in self.skipped[:_SKIPPED_SHOWN]],
-            "landmarks": self.landmarks,
-            "gamma": self.gamma,
-            "gamma_from": self.gamma_from,
-            "figures": {name: _summary(self.values(name)) for name in FIGURES},
-        }
-
-
-def _summary(values: Sequence[float]) -> dict[str, float | int | None]:
-    names, shares = ("q10", "q25", "median", "q75", "q90"), (0.1, 0.25, 0.5, 0.75, 0.9)
-    found = np.quantile(values, shares).tolist() if values else [None] * len(shares)
-    return {"n": len(values), **dict(zip(names, found, strict=True))}
 
 
 def measure_folder(
@@ -168,7 +112,7 @@ def realism(
         raise InputError("give one for all folders, or one for each", source="--gamma")
     each = [gammas[k if len(gammas) > 1 else 0] if gammas else None for k in range(len(folders))]
     found = [measure_folder(f, gamma=g, limit=limit, progress=progress) for f, g in zip(folders, each, strict=True)]
-    ratios = {name: _ratio(found, name) for name in FIGURES} if len(found) == 2 else None
+    ratios = {name: ratio(*(f.median(name) for f in found)) for name in FIGURES} if len(found) == 2 else None
     if output is not None:
         from .page import write
 
@@ -179,8 +123,3 @@ def realism(
         "folders": [f.to_mapping() for f in found],
         "ratios": ratios,
     }
-
-
-def _ratio(found: Sequence[FolderFigures], name: str) -> float | None:
-    first, second = (f.median(name) for f in found)
-    return first / second if first is not None and second else None

@@ -140,9 +140,9 @@ def measure(picture: EyePicture, scaled: Scaled | None = None) -> dict[str, floa
     skin = _level(s, skin_at)
     skin = None if skin is None or skin > s.clip else skin
     found: dict[str, float | None] = {
-        "pupil : iris": _ratio(pupil, iris),
-        "iris : sclera": _ratio(iris, sclera),
-        "skin : sclera": _ratio(skin, sclera),
+        "pupil : iris": ratio(pupil, iris),
+        "iris : sclera": ratio(iris, sclera),
+        "skin : sclera": ratio(skin, sclera),
         "lash : lid skin": _lashes(s),
         "limbal ring : mid iris": _limbal_ring(s),
         "pupil edge (R)": _pupil_edge(s),
@@ -188,7 +188,8 @@ def _level(s: Scaled, at: Bools) -> float | None:
     return median(values) if values.size >= _LEAST_PX else None
 
 
-def _ratio(over: float | None, under: float | None) -> float | None:
+def ratio(over: float | None, under: float | None) -> float | None:
+    """Divide two figures; None where one is unknown or the second is not positive."""
     return over / under if over is not None and under is not None and under > 0 else None
 
 
@@ -200,7 +201,7 @@ def _lashes(s: Scaled) -> float | None:
     if s.parts is None:
         at &= s.rings > 1.0
     values = s.level[at]
-    return _ratio(quantile(values, 0.02), quantile(values, 0.9)) if values.size >= _LEAST_TEXTURE_PX else None
+    return ratio(quantile(values, 0.02), quantile(values, 0.9)) if values.size >= _LEAST_TEXTURE_PX else None
 
 
 def _rays(s: Scaled, radii: Floats, within_deg: float) -> Floats:
@@ -230,7 +231,7 @@ def _limbal_ring(s: Scaled) -> float | None:
     if np.mean(np.isfinite(rays)) < 0.5:
         return None
     profile = _medians(rays)
-    return _ratio(float(np.nanmin(profile[radii >= 0.855])), float(np.nanmedian(profile[radii <= 0.805])))
+    return ratio(float(np.nanmin(profile[radii >= 0.855])), float(np.nanmedian(profile[radii <= 0.805])))
 
 
 def _pupil_edge(s: Scaled) -> float | None:
@@ -322,7 +323,7 @@ def _bright_points(s: Scaled) -> float | None:
 def _fall_off(s: Scaled) -> float | None:
     blurred = ndimage.gaussian_filter(s.level, 0.4 * RADIUS_PX)
     far = blurred[s.rings > 1.9]
-    return _ratio(quantile(far, 0.9), quantile(far, 0.1)) if far.size >= RADIUS_PX**2 else None
+    return ratio(quantile(far, 0.9), quantile(far, 0.1)) if far.size >= RADIUS_PX**2 else None
 
 
 def noise(codes: Singles) -> float | None:

@@ -6,7 +6,7 @@ The files may come from anybody; they are read as untrusted ones are everywhere 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,13 +21,14 @@ from ..files import inside
 from ..geometry.ellipse import Ellipse
 from ..imagefile import read_image
 from ..imagefolder import IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
-from .figures import EyePicture
+from .figures import FIGURES, EyePicture
 from .limbus import iris_extent
 
 ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")
 MAX_FILES = 1_000_000
 _LEAST_RADIUS_PX = 8.0
 _LEAST_MASK_PX = 20
+_SKIPPED_SHOWN = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +57,60 @@ class Source:
     def landmarks(self) -> str:
         """Where pupil and iris come from: masks, or what is found in the picture."""
         return "masks" if self.entries else "found in the picture"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FolderFigures:
+    """The figures of a folder.
+
+    Attributes:
+        path: the folder.
+        images: how many images were read.
+        gamma: the images store intensity^(1 / gamma).
+        gamma_from: why this gamma was used: the folder states it, it was given, or neither ("assumed").
+        landmarks: where pupil and iris come from.
+        rows: name and figures of each measured image.
+        skipped: images that could not be measured.
+        tiles: every measured image about its eye, at equal scale.
+    """
+
+    path: str
+    images: int
+    gamma: float
+    gamma_from: str
+    landmarks: str
+    rows: tuple[tuple[str, dict[str, float | None]], ...]
+    skipped: tuple[Skipped, ...]
+    tiles: tuple[Bytes, ...]
+
+    def values(self, name: str) -> list[float]:
+        """Values of a figure in all images that have it."""
+        return [row[name] for _, row in self.rows if row[name] is not None]  # type: ignore[misc]
+
+    def median(self, name: str) -> float | None:
+        """Median of a figure over the images; None where no image has it."""
+        values = self.values(name)
+        return float(np.median(values)) if values else None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """What the JSON holds of the folder."""
+        return {
+            "path": self.path,
+            "images": self.images,
+            "measured": len(self.rows),
+            "skipped": len(self.skipped),
+            "skipped_first": [{"name": s.name, "reason": s.reason} for s in self.skipped[:_SKIPPED_SHOWN]],
+            "landmarks": self.landmarks,
+            "gamma": self.gamma,
+            "gamma_from": self.gamma_from,
+            "figures": {name: _summary(self.values(name)) for name in FIGURES},
+        }
+
+
+def _summary(values: Sequence[float]) -> dict[str, float | int | None]:
+    names, shares = ("q10", "q25", "median", "q75", "q90"), (0.1, 0.25, 0.5, 0.75, 0.9)
+    found = np.quantile(values, shares).tolist() if values else [None] * len(shares)
+    return {"n": len(values), **dict(zip(names, found, strict=True))}
 
 
 def open_source(path: str | Path, limit: int) -> Source:

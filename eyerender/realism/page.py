@@ -12,8 +12,8 @@ from ..arrays import Bytes
 from ..imagefile import png_bytes
 from ..report.page import Card, Figure, Page, Section, Table, write_page
 from ..report.style import ANALYTIC, IMAGE, figure, svg
-from .compare import FolderFigures
 from .figures import FIGURES
+from .folder import FolderFigures
 
 _COLUMNS, _TILES, _GAP = 4, 24, 6
 
