@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args, get_type_hints
 
 from ..errors import InputError
+from ..files import shown
 from ..geometry.ellipse import Ellipse
 
 
@@ -93,9 +94,9 @@ def number(value: Any, path: str, limit: float = 1e6) -> float:
         InputError: naming the path.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"must be a number, not {_shown(value)}", path=path)
+        raise InputError(f"must be a number, not {shown(value, 40)}", path=path)
     if abs(value) > limit or not math.isfinite(value):  # in this order, because an integer may be too large for a float
-        raise InputError(f"must be a finite number within {limit:g}, not {_shown(value)}", path=path)
+        raise InputError(f"must be a finite number within {limit:g}, not {shown(value, 40)}", path=path)
     return float(value)
 
 
@@ -106,10 +107,5 @@ def pair(value: Any, path: str) -> tuple[float, float]:
         InputError: naming the path.
     """
     if isinstance(value, str | Mapping) or not isinstance(value, Sequence) or len(value) != 2:
-        raise InputError(f"must be two numbers, not {_shown(value)}", path=path)
+        raise InputError(f"must be two numbers, not {shown(value, 40)}", path=path)
     return number(value[0], f"{path}.0"), number(value[1], f"{path}.1")
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else f"{text[:37]}..."

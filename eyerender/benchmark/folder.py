@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Floats
 from ..errors import InputError
@@ -104,24 +105,29 @@ def _load_own(folder: Path) -> list[LabelledImage]:
     out = []
     for name, path, pupil in own_labels(folder):
         image, depth, _ = read_any_image(path)
-        out.append(
-            LabelledImage(
-                name,
-                path,
-                depth,
-                (image.shape[1], image.shape[0]),
-                pupil,
-                np.zeros((0, 2)) if pupil is None else pupil.points(120),
-                None,
-                (),
-                {"polarity": "auto", "gamma": 1.0, "radius_px": None, "rig": None},
-                {},
-                _ellipse_factors(pupil, None),
-            )
-        )
+        out.append(_without_rig(name, path, depth, image, pupil))
     if not out:
         raise InputError("holds no labelled images", source=str(folder))
     return out
+
+
+def _without_rig(
+    name: str,
+    path: Path,
+    bit_depth: int,
+    image: NDArray[Any],
+    pupil: Ellipse | None,
+    *,
+    visible: float | None = None,
+    glints: tuple[TrueGlint, ...] = (),
+    polarity: str = "auto",
+    known: Mapping[str, float] | None = None,
+) -> LabelledImage:
+    """An image of which no camera or lights are known."""
+    size, outline = (image.shape[1], image.shape[0]), np.zeros((0, 2)) if pupil is None else pupil.points(120)
+    hints = {"polarity": polarity, "gamma": 1.0, "radius_px": None, "rig": None}
+    factors = _ellipse_factors(pupil, visible)
+    return LabelledImage(name, path, bit_depth, size, pupil, outline, visible, glints, hints, known or {}, factors)
 
 
 def _rendered(entry: ImageEntry, truth: Observations, row: int, rig: RigGeometry | None) -> LabelledImage:
@@ -272,16 +278,6 @@ def _ideal(path: Path, name: str, record: Mapping[str, Any], said: Mapping[str, 
     if visible == 0.0:
         pupil = None
     known = {"noise_dn": float(said["noise_dn"]), "blur_px": float(said["blur_px"]), "step_dn": float(said["step_dn"])}
-    return LabelledImage(
-        name,
-        path,
-        int(said["bit_depth"]),
-        (image.shape[1], image.shape[0]),
-        pupil,
-        np.zeros((0, 2)) if pupil is None else pupil.points(120),
-        visible,
-        tuple(TrueGlint(int(g["light"]), tuple(g["xy_px"])) for g in record["glints"] if g["status"] == "ok"),
-        {"polarity": said["polarity"], "gamma": 1.0, "radius_px": None, "rig": None},
-        known,
-        _ellipse_factors(pupil, visible),
-    )
+    glints = tuple(TrueGlint(int(g["light"]), tuple(g["xy_px"])) for g in record["glints"] if g["status"] == "ok")
+    more: dict[str, Any] = {"visible": visible, "glints": glints, "polarity": said["polarity"], "known": known}
+    return _without_rig(name, path, int(said["bit_depth"]), image, pupil, **more)

@@ -91,7 +91,7 @@ def bench_extractors(
     for name in titles:
         if titles.count(name) > 1:
             raise InputError(f"two extractors are called {name!r}; rename one with NAME=...", source="--extractor")
-    _refuse(output, overwrite)
+    refuse_non_empty(output, overwrite or _is_bench(Path(output)))
     images = load_labelled(folder)
     edges = [_edge(image) for image in images]
     sigmas = [e.centre_sigma_px(i.pupil) if e and i.pupil else None for e, i in zip(edges, images, strict=True)]
@@ -270,11 +270,6 @@ def _write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
             writer.writerows(rows)
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
-
-
-def _refuse(output: str | Path, overwrite: bool) -> None:
-    """Refuse a folder that is not empty, unless an earlier bench wrote it or --overwrite is given."""
-    refuse_non_empty(output, overwrite or _is_bench(Path(output)))
 
 
 def _is_bench(output: Path) -> bool:

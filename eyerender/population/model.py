@@ -137,13 +137,15 @@ class Model:
         found, places = self.distributions[name], self.places(name)
         assert isinstance(found, Regression)
         shape = (len(latent),) if len(places) == 1 else (len(latent), 2)
-        roots: dict[str, Floats] = {}
-        for root in found.slopes:
+        mean: Floats = np.asarray(found.mean)
+        for root, slope in found.slopes.items():
             value = self.value(root, latent) if known is None else known[root]
             if value.ndim > len(shape):
                 value = value.mean(axis=1)
-            roots[root] = value if value.ndim == len(shape) else value[:, None]
-        return np.broadcast_to(regressed(found, roots), shape)
+            elif value.ndim < len(shape):
+                value = value[:, None]
+            mean = mean + slope * (value - found.about[root])
+        return np.broadcast_to(mean, shape)
 
     def values(self, latent: Floats) -> dict[str, Floats]:
         """Values of every quantity, (n,) or (n, 2), of latent numbers (n, width)."""
@@ -175,14 +177,6 @@ class Model:
             return latent
         shared = latent * a.residual_sd * b.residual_sd + _explained(a, b, self.distributions)
         return shared / (self.expected(first)[1] * self.expected(second)[1])
-
-
-def regressed(found: Regression, roots: Mapping[str, Floats]) -> Floats:
-    """Mean of a regression at values of its predictors."""
-    mean: Floats = np.asarray(found.mean)
-    for root, slope in found.slopes.items():
-        mean = mean + slope * (roots[root] - found.about[root])
-    return np.asarray(mean)
 
 
 @cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import fields
 from functools import cached_property
 from typing import Annotated, Any, Self
 
@@ -23,13 +24,10 @@ from .eyes import amplitude_d, eye_file
 from .marginals import Fixed
 from .model import SIDES, Model, default_reference
 from .pupil import watson_yellott_mm
-from .refraction import Biometry, solve
+from .refraction import Biometry, Optics, solve
 from .table import ROOTS, Distribution, Regression, Table, default_table
 
-SOLVED = (
-    "steep_mm", "flat_mm", "flat_axis_deg", "posterior_steep_mm", "posterior_flat_mm", "posterior_flat_axis_deg",
-    "lens_c0",
-)  # fmt: skip
+SOLVED = tuple(field.name for field in fields(Optics))
 """Numbers of an eye that follow from its refraction."""
 
 

@@ -20,6 +20,7 @@ homogeneous.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,8 +91,8 @@ def lens_index(lens_c0: Floats, wavelength_nm: float) -> Floats:
 def solve(eyes: Biometry) -> Optics:
     """Find the cornea's astigmatism and the lens' index of eyes with drawn refractions."""
     cornea, aqueous, _ = _indices(eyes.wavelength_nm)
-    spectacles = tuple(np.asarray(p) / 1000.0 for p in eyes.refraction)
-    at_cornea = _mapped((spectacles[0], spectacles[1], spectacles[2]), lambda v: v / (1.0 - eyes.vertex_mm * v))
+    mean, j0, j45 = (np.asarray(p) / 1000.0 for p in eyes.refraction)
+    at_cornea = _mapped((mean, j0, j45), lambda v: v / (1.0 - eyes.vertex_mm * v))
     back = (
         (aqueous - cornea) / eyes.posterior_radius_mm,
         eyes.posterior_astigmatism_d[0] / 1000.0,
@@ -148,9 +149,8 @@ def _before(behind: Floats, back: Power, share: Floats) -> Power:
     return _mapped((behind - back[0], zero - back[1], zero - back[2]), lambda v: v / (1.0 + share * v))
 
 
-def _mapped(power: Power, f: object) -> Power:
+def _mapped(power: Power, f: Callable[[Floats], Floats]) -> Power:
     """Function of a power matrix: of its two eigenvalues."""
-    assert callable(f)
     m, a, b = power
     r = np.hypot(a, b)
     high, low = f(m + r), f(m - r)

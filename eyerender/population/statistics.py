@@ -154,8 +154,7 @@ def refusals(population: PopulationSpec, n: int, seed: int = 0, *, progress: Pro
     """
     values: dict[str, list[Floats]] = {}
     stays, reasons = np.ones(n, dtype=bool), Counter[str]()
-    for start in range(0, n, CHUNK):
-        piece = population.numbers(min(CHUNK, n - start), seed, first=start)
+    for piece in pieces(population, n, seed):
         for name, column in piece.items():
             values.setdefault(name, []).append(_right(column))
     for subject in range(n):
