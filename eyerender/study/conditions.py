@@ -8,7 +8,7 @@ C14). Angles are measured from the right eye (model-based) or the mid-point of b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..eye.spec import EyeSpec
 from ..gaze.estimate import angular_error_deg, binocular_average
 from ..gaze.guestrin import GuestrinEizenman
-from ..gaze.quality import quality
+from ..gaze.quality import Quality, quality
 from ..gaze.regression import Regression
 from ..observation import Observations
 from ..scene import Scene
@@ -34,6 +34,7 @@ DIAMETERS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 HEAD_MM = (-40.0, -20.0, 0.0, 20.0, 40.0)
 GRID = (13, 11)
 NOISE_PX, SAMPLES, SEED = 0.05, 100, 2014
+QUALITY = tuple(field.name for field in fields(Quality))
 
 
 def _with_lens(axis: int) -> str:
@@ -143,8 +144,7 @@ def conditions_part(eye: str) -> ConditionsPart:
             continue
         entry: dict[str, Any] = {"parameter": label, "step": abs(step), "unit": unit}
         for name in TRACKERS:
-            values: dict[str, Any] = {"base": base[name], "at_plus": None, "at_minus": None}
-            entry[name] = {**values, "per_step": None, "reason": None}
+            entry[name] = {"base": base[name], "at_plus": None, "at_minus": None, "per_step": None, "reason": None}
             try:
                 up, down = (_mean(_scene(name, eye).replaced(eye_spec=spec)) for spec in (more, less))
             except InputError as error:
@@ -211,11 +211,7 @@ def _precision(tracker: _Tracker, seen: Observations) -> dict[str, float]:
         frames, points = tracker.points(_noisy(seen, rng))
         samples.append(points)
     found = quality(np.stack(samples), frames.index.target_mm, tracker.from_mm(frames))
-    return {
-        "accuracy_deg": float(np.nanmean(found.accuracy_deg)),
-        "rms_s2s_deg": float(np.nanmean(found.rms_s2s_deg)),
-        "sd_deg": float(np.nanmean(found.sd_deg)),
-    }
+    return {name: float(np.nanmean(getattr(found, name))) for name in QUALITY}
 
 
 def _noisy(seen: Observations, rng: np.random.Generator) -> Observations:

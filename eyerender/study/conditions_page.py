@@ -19,8 +19,6 @@ _WHO = {
     "interpolation": f"{c.FUNCTION} calibrated on {c.CALIBRATION}",
 }
 
-_QUALITY = ("accuracy_deg", "rms_s2s_deg", "sd_deg")
-
 
 def findings(parts: Sequence[ConditionsPart]) -> list[Finding]:
     """Effects of the conditions as values; there is no published claim to compare them with."""
@@ -96,7 +94,7 @@ def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Report:
         "samples": c.SAMPLES,
         "seed": c.SEED,
         "precision": [
-            (t, p.eye_model, *(f"{p.precision[t][k]:.4f}" for k in _QUALITY)) for t in c.TRACKERS for p in parts
+            (t, p.eye_model, *(f"{p.precision[t][k]:.4f}" for k in c.QUALITY)) for t in c.TRACKERS for p in parts
         ],
         "values": [(f.id, f.rule, f"{f.value:.4f}", f.detail) for f in found],
         "rows": [
@@ -112,13 +110,15 @@ def _sensitivity_figure(parts: Sequence[ConditionsPart]) -> str:
     order = [name for name, *_ in c.PARAMETERS]
     entries = sorted((e for p in parts for e in p.sensitivity), key=lambda e: order.index(e["parameter"]))
     names = list(dict.fromkeys(_label(e) for e in entries))
-    steps = {(p.eye_model, _label(e)): e for p in parts for e in p.sensitivity}
-    changes = {
-        t: {
-            m: [_thousandths(steps[m, n][t]["per_step"]) if (m, n) in steps else np.nan for n in names]
-            for m in (p.eye_model for p in parts)
-        }
+    steps = {
+        (t, p.eye_model, _label(e)): 1000 * e[t]["per_step"]
         for t in c.TRACKERS
+        for p in parts
+        for e in p.sensitivity
+        if e[t]["per_step"] is not None
+    }
+    changes = {
+        t: {p.eye_model: [steps.get((t, p.eye_model, n), np.nan) for n in names] for p in parts} for t in c.TRACKERS
     }
     return sensitivity_figure(names, changes, "change of the mean error (thousandths of a degree)")
 
@@ -131,10 +131,6 @@ def _screen_axes(tracker: str, values: Floats) -> tuple[Floats, Floats]:
 
 def _label(entry: dict[str, Any]) -> str:
     return f"{entry['parameter']} ({entry['step']:g} {entry['unit']})".replace(" )", ")")
-
-
-def _thousandths(value: float | None) -> float:
-    return np.nan if value is None else 1000 * value
 
 
 def _failed(part: ConditionsPart) -> str:

@@ -38,16 +38,7 @@ def clouds_figure(clouds: Mapping[str, tuple[Floats, Floats]]) -> str:
             for model, points in clouds.items():
                 colour, marker = look(model, list(clouds))
                 p = points[part]
-                ax.scatter(
-                    p[:, 0],
-                    p[:, 1],
-                    s=11,
-                    marker=marker,
-                    facecolor="none",
-                    edgecolor=colour,
-                    linewidth=0.9,
-                    label=model,
-                )
+                ax.scatter(*p.T, s=11, marker=marker, facecolor="none", edgecolor=colour, linewidth=0.9, label=model)
             ax.set(aspect="equal", adjustable="datalim", title=title, xlabel="x (px)", ylabel="y (px, down)")
             ax.invert_yaxis()
         legend_above(fig, axes[0], len(clouds))

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Floats, frozen
 from ..gaze.estimate import GazePoints, angular_error_deg
-from ..gaze.parameters import Calibration, EyeParameters, ParameterBounds
+from ..gaze.parameters import NAMES, EyeParameters, ParameterBounds
 from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry
 from ..scene import Scene, load_scene
@@ -210,77 +210,43 @@ def rows_of(outcome: Outcome, **keys: Any) -> list[Row]:
     return out
 
 
-@dataclass(frozen=True, slots=True)
-class Restarts:
-    """Results of one eye's calibration from random starts; errors are the means at H1 (deg)."""
-
-    eye: str
-    chosen: Calibration
-    chosen_deg: float
-    costs: tuple[float, ...]
-    errors_deg: tuple[float, ...]
-    parameters: tuple[EyeParameters, ...]
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Convert to a mapping for JSON: the calibration that is reported, and the spread over the starts."""
-        errors, costs = np.array(self.errors_deg), np.array(self.costs)
-        best = costs <= min(costs.min(), self.chosen.cost) * (1 + 1e-4) + 1e-12
-        values = np.stack([p.vector() for p in self.parameters])
-        return {
-            "eye": self.eye,
-            "calibration": self.chosen.to_mapping(),
-            "h1_mean_deg": self.chosen_deg,
-            "restarts": {
-                "count": len(costs),
-                "seed": SEED,
-                "within_1e-4_of_the_lowest_cost": int(best.sum()),
-                "reported_cost_over_lowest": float(self.chosen.cost / costs.min()) if costs.min() > 0 else None,
-                "h1_mean_deg": {
-                    "min": float(errors.min()),
-                    "median": float(np.median(errors)),
-                    "max": float(errors.max()),
-                    "sd": float(errors.std(ddof=1)),
-                },
-                "parameter_sd_of_the_lowest": dict(
-                    zip(
-                        ("cornea_radius_mm", "pupil_distance_mm", "index", "alpha_deg", "beta_deg"),
-                        values[best].std(axis=0).tolist() if best.any() else [None] * 5,
-                        strict=True,
-                    )
-                ),
-            },
-        }
-
-
 def restarts(
-    outcome: Outcome, rig: RigGeometry, departures: Collection[str], *, starts: int = STARTS, eyes: Sequence[int] = (0,)
-) -> list[Restarts]:
-    """Calibrate those of `eyes` that were observed from random starts within the bounds."""
-    told = estimation_rig(rig, departures)
-    seen = outcome.observations
-    out = []
-    for eye in eyes:
-        rows = seen.take((seen.index.head == 0) & (seen.index.eye == eye))
-        if not len(rows):
-            continue
-        first = replace(outcome.estimator, calibrations={})
-        found = first.restarts(rows, told, first.bounds.draw(starts, SEED))[eye]
-        errors = []
-        for calibration in found:
-            gaze = replace(first, calibrations={eye: calibration}).predict(rows, told)
-            errors.append(float(np.nanmean(errors_deg(rows, gaze, departures))))
-        central = outcome.rows("H1") & (seen.index.eye == eye)
-        out.append(
-            Restarts(
-                EYES[eye],
-                outcome.estimator.calibrations[eye],
-                float(np.nanmean(outcome.error_deg[central])),
-                tuple(c.cost for c in found),
-                tuple(errors),
-                tuple(c.parameters for c in found),
-            )
-        )
-    return out
+    outcome: Outcome, rig: RigGeometry, departures: Collection[str], *, starts: int = STARTS
+) -> dict[str, Any]:
+    """Calibrate the right eye from random starts within the bounds.
+
+    Returns:
+        A mapping for JSON: the calibration that is reported, and the spread over the starts; errors are the means at
+        H1 (deg).
+    """
+    told, seen = estimation_rig(rig, departures), outcome.observations
+    central = outcome.rows("H1") & (seen.index.eye == 0)
+    rows, first = seen.take(central), replace(outcome.estimator, calibrations={})
+    found = first.restarts(rows, told, first.bounds.draw(starts, SEED))[0]
+    gazes = [replace(first, calibrations={0: calibration}).predict(rows, told) for calibration in found]
+    errors = np.array([np.nanmean(errors_deg(rows, gaze, departures)) for gaze in gazes])
+    chosen, costs = outcome.estimator.calibrations[0], np.array([c.cost for c in found])
+    best = costs <= min(costs.min(), chosen.cost) * (1 + 1e-4) + 1e-12
+    values = np.stack([c.parameters.vector() for c in found])
+    spread = values[best].std(axis=0).tolist() if best.any() else [None] * len(NAMES)
+    return {
+        "eye": EYES[0],
+        "calibration": chosen.to_mapping(),
+        "h1_mean_deg": float(np.nanmean(outcome.error_deg[central])),
+        "restarts": {
+            "count": len(costs),
+            "seed": SEED,
+            "within_1e-4_of_the_lowest_cost": int(best.sum()),
+            "reported_cost_over_lowest": float(chosen.cost / costs.min()) if costs.min() > 0 else None,
+            "h1_mean_deg": {
+                "min": float(errors.min()),
+                "median": float(np.median(errors)),
+                "max": float(errors.max()),
+                "sd": float(errors.std(ddof=1)),
+            },
+            "parameter_sd_of_the_lowest": dict(zip(NAMES, spread, strict=True)),
+        },
+    }
 
 
 def optimiser_settings(protocols: Sequence[str]) -> dict[str, Any]:

@@ -34,19 +34,6 @@ _PATIENCE_S = 60.0  # per image, after which a silent worker counts as dead
 
 
 @dataclass(frozen=True, slots=True)
-class ImageSettings:
-    """Settings of the images: the dataset's folder, the study's options, and receivers of progress and log.
-
-    With `auto_exposure` the images of each eye model have one exposure of their own (see `DatasetSpec`).
-    """
-
-    folder: Path
-    options: StudyOptions = StudyOptions()
-    progress: Progress | None = None
-    say: Say | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Shot:
     """A scene whose images form one sample, and the rows (n,) of the study's own scene that they show."""
 
@@ -118,10 +105,18 @@ def facing_scene(scene: Scene, head_mm: tuple[float, float, float], side: str) -
     return scene.replaced(spec)
 
 
-def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) -> StudyImages:
+def make_images(
+    study: str,
+    scenes: Sequence[Scene],
+    folder: Path,
+    options: StudyOptions,
+    progress: Progress | None = None,
+    say: Say | None = None,
+) -> StudyImages:
     """Get the images of all shots' scenes from the folder's dataset; missing ones are made.
 
-    The folder belongs to the study: a dataset of other settings or of another version of the package is replaced.
+    The folder belongs to the study: a dataset of other settings or of another version of the package is replaced. With
+    `options.auto_exposure` the images of each eye model have one exposure of their own (see `DatasetSpec`).
 
     Raises:
         BackendError: there is nothing to render with.
@@ -131,24 +126,23 @@ def make_images(study: str, scenes: Sequence[Scene], settings: ImageSettings) ->
     from ..dataset.run import generate
 
     scenes = list({_digest(scene): scene for scene in scenes}.values())
-    found = read_images(settings.folder)
-    options, level = settings.options, settings.options.auto_exposure
+    found, level = read_images(folder), options.auto_exposure
     if found is None or found.auto_exposure != level or not all(found.holds(scene) for scene in scenes):
-        plan = Plan.of(dataset_spec(study, scenes, level), source=str(settings.folder))
+        plan = Plan.of(dataset_spec(study, scenes, level), source=str(folder))
         generate(
             plan,
-            settings.folder,
+            folder,
             workers=options.workers,
             backend=options.backend,
             threads=options.threads,
             timeout_s=600.0 + _PATIENCE_S * len(scenes[0].index()),
-            overwrite=not _begun(settings.folder, plan),
-            progress=settings.progress,
-            say=settings.say,
+            overwrite=not _begun(folder, plan),
+            progress=progress,
+            say=say,
         )
-        found = read_images(settings.folder)
+        found = read_images(folder)
     if found is None or not all(found.holds(scene) for scene in scenes):
-        raise InputError("its dataset lacks images of this study", source=str(settings.folder))
+        raise InputError("its dataset lacks images of this study", source=str(folder))
     return replace(found, spp=options.spp)
 
 

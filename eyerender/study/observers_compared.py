@@ -7,6 +7,7 @@ paired difference = mean(error from images - error from rays) with its 95 % conf
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -80,7 +81,7 @@ def features(
         vectors, scales = (np.concatenate(part) for part in zip(*every, strict=True))
         compared.append((ALL_GLINTS, vectors, scales))
     return [
-        _difference(protocol, observer=observer, eye_model=eye_model, feature=feature, vectors=vectors, mm_per_px=scale)
+        FeatureDifference(protocol, observer, eye_model, feature, *_difference(vectors, scale))
         for feature, vectors, scale in compared
     ]
 
@@ -100,18 +101,16 @@ def gaze(
     )  # fmt: skip
 
 
-def _difference(
-    protocol: str, *, observer: str, eye_model: str, feature: str, vectors: Floats, mm_per_px: Floats
-) -> FeatureDifference:
+def _difference(vectors: Floats, mm_per_px: Floats) -> tuple[Any, ...]:
+    """Numbers of a `FeatureDifference`, from n on."""
     good = np.isfinite(vectors).all(axis=1)
     v = vectors[good]
-    n = len(v)
-    if n < 2:
-        nothing = (None,) * 7
-        return FeatureDifference(protocol, observer, eye_model, feature, n, int((~good).sum()), *nothing)
+    counts = len(v), int((~good).sum())
+    if len(v) < 2:
+        return (*counts, *(None,) * 7)
     at_eye = v * mm_per_px[good, None]
-    return FeatureDifference(
-        protocol, observer, eye_model, feature, n, int((~good).sum()), float(v[:, 0].mean()), float(v[:, 1].mean()),
-        float(v[:, 0].std(ddof=1)), float(v[:, 1].std(ddof=1)), float(np.median(np.linalg.norm(v, axis=1))),
-        float(np.linalg.norm(at_eye.mean(axis=0))), float(np.sqrt(at_eye.var(axis=0, ddof=1).sum())),
+    return (
+        *counts, float(v[:, 0].mean()), float(v[:, 1].mean()), float(v[:, 0].std(ddof=1)), float(v[:, 1].std(ddof=1)),
+        float(np.median(np.linalg.norm(v, axis=1))), float(np.linalg.norm(at_eye.mean(axis=0))),
+        float(np.sqrt(at_eye.var(axis=0, ddof=1).sum())),
     )  # fmt: skip

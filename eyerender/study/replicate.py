@@ -99,8 +99,8 @@ def guestrin_part(
                 out.h1_errors[protocol, observing.kind] = done.error_deg[done.rows("H1")]
             if analytic:
                 # The left eye is the right eye's mirror image, and so are its calibrations.
-                for spread in guestrin.restarts(done, scene.rig, departures, starts=starts):
-                    out.calibrations.append({**keys, **spread.to_mapping()})
+                spread = guestrin.restarts(done, scene.rig, departures, starts=starts)
+                out.calibrations.append({**keys, **spread})
     if analytic and len(protocols) == 2:
         out.waterfall = _waterfall(eye, guestrin, lambda d: scenes.run(d).means)
     if analytic and "corrected" in protocols:

@@ -19,10 +19,11 @@ from ..files import read_json, write_json, write_text
 from ..lock import writer_lock
 from ..outfolder import clear, refuse_non_empty
 from ..progress import Progress, Say
+from ..scene import Scene
 from . import blignaut, guestrin, head_mounted, together
 from .conditions import conditions_part
 from .head_mounted import head_mounted_part
-from .images import ImageSettings, StudyImages, make_images
+from .images import make_images
 from .literature import MODELS, VARIANTS
 from .observing import ObserverKind, Observing
 from .options import StudyOptions
@@ -95,8 +96,8 @@ def run_study(
         start = time.monotonic()
         images = None
         if any(kind != "analytic" for kind in kinds):
-            made = ImageSettings(folder / IMAGES, options, _noted(progress), say)
-            images = _images(name, eyes, protocols, kinds, made)
+            scenes = _image_scenes(name, eyes, protocols, kinds, options.spp)
+            images = make_images(name, scenes, folder / IMAGES, options, _noted(progress), say)
         observers = [Observing(kind, None if kind == "analytic" else images) for kind in kinds]
         # One job compares all observers, or has one of them.
         together_or_alone = [tuple(observers)] if name == "observers" else [(one,) for one in observers]
@@ -144,19 +145,17 @@ def _noted(progress: Progress | None) -> Progress | None:
     return lambda done, total, note: progress(done, total, note.replace("samples", "samples of images", 1))
 
 
-def _images(
-    name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[ObserverKind], settings: ImageSettings
-) -> StudyImages:
-    """Images of every scene of a study; missing ones are made."""
+def _image_scenes(
+    name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[ObserverKind], spp: int | None
+) -> list[Scene]:
+    """Scenes of every image that a study needs."""
     if name == "observers":
         scenes, turned = [head_mounted.scene(eye) for eye in eyes], False
     else:
         module = guestrin if name == "guestrin2006" else blignaut
         scenes, turned = scenes_of(module, eyes, protocols), facing(module)
-    shots = [
-        s for scene in scenes for k in kinds for s in Observing(k).shots(scene, facing=turned, spp=settings.options.spp)
-    ]
-    return make_images(name, [shot.scene for shot in shots], settings)
+    shots = [s for scene in scenes for k in kinds for s in Observing(k).shots(scene, facing=turned, spp=spp)]
+    return [shot.scene for shot in shots]
 
 
 def _models(

@@ -18,7 +18,6 @@ from eyerender.dataset.validate import validate
 from eyerender.imagefile import read_image
 from eyerender.study import blignaut, guestrin
 from eyerender.study.images import (
-    ImageSettings,
     dataset_spec,
     in_sequence,
     make_images,
@@ -95,12 +94,12 @@ def test_a_sequence_stands_where_values_differ_and_nowhere_else():
 @pytest.mark.render
 def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
     scenes = small_scenes()
-    made = make_images("small", scenes, ImageSettings(tmp_path / "images", StudyOptions(workers=1)))
+    made = make_images("small", scenes, tmp_path / "images", StudyOptions(workers=1))
     report = validate(tmp_path / "images")
     assert (report["ok"], report["images"]) == (True, len(scenes) // 2 * 3)
     stamps = {p: p.stat().st_mtime_ns for p in (tmp_path / "images").rglob("*")}
     for part in (scenes[:2], [s for s in scenes if not s.spec.sensor.noise]):
-        assert make_images("small", part, ImageSettings(tmp_path / "images", StudyOptions(workers=1))) == made
+        assert make_images("small", part, tmp_path / "images", StudyOptions(workers=1)) == made
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "images").rglob("*")} == stamps
     lines = tmp_path / "images" / "metadata.jsonl"
     lines.write_text("".join(reversed(lines.read_text().splitlines(keepends=True))))  # their order means nothing
@@ -115,14 +114,14 @@ def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
     assert 0.3 < np.std(noisy - quiet) < 10
     assert abs(np.mean(noisy - quiet)) < 0.5
     # Made on their own, the noiseless ones are the same images.
-    alone = make_images("small", scenes[2:4], ImageSettings(tmp_path / "alone", StudyOptions(workers=1)))
+    alone = make_images("small", scenes[2:4], tmp_path / "alone", StudyOptions(workers=1))
     for scene in scenes[2:4]:
         for own, beside in zip(alone.of(scene), made.of(scene), strict=True):
             assert own.path.read_bytes() == beside.path.read_bytes()
     # Exposed automatically, they are others, which are used again.
-    auto = ImageSettings(tmp_path / "alone", StudyOptions(workers=1, auto_exposure=0.3))
-    exposed = make_images("small", scenes[2:4], auto)
-    assert make_images("small", scenes[2:4], auto) == exposed != alone
+    auto = tmp_path / "alone", StudyOptions(workers=1, auto_exposure=0.3)
+    exposed = make_images("small", scenes[2:4], *auto)
+    assert make_images("small", scenes[2:4], *auto) == exposed != alone
     codes = read_image(exposed.of(scenes[2])[0].path)[0]
     assert np.quantile(codes, 0.98) / 65535 == pytest.approx(0.3, abs=0.03)
 
@@ -131,10 +130,10 @@ KILLED = """
 import sys
 from pathlib import Path
 sys.path.insert(0, {root!r})
-from eyerender.study.images import ImageSettings, make_images
+from eyerender.study.images import make_images
 from eyerender.study.options import StudyOptions
 from tests.support.study_scenes import small_scenes
-make_images("small", small_scenes(), ImageSettings(Path({folder!r}), StudyOptions(workers=1)))
+make_images("small", small_scenes(), Path({folder!r}), StudyOptions(workers=1))
 """
 
 
@@ -150,8 +149,8 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path):
     assert stamps
     assert read_images(folder) is None
     scenes = small_scenes()
-    after = make_images("small", scenes, ImageSettings(folder, StudyOptions(workers=1)))
-    undisturbed = make_images("small", scenes, ImageSettings(tmp_path / "whole", StudyOptions(workers=1)))
+    after = make_images("small", scenes, folder, StudyOptions(workers=1))
+    undisturbed = make_images("small", scenes, tmp_path / "whole", StudyOptions(workers=1))
     assert {p: p.stat().st_mtime_ns for p in stamps} == stamps  # what was finished was not made again
     for scene in scenes:
         assert list(after.observe(scene).records()) == list(undisturbed.observe(scene).records())
