@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, Floats, Indices, Statuses
+from ..arrays import ArrayValue, Bools, Floats, Statuses
 from ..errors import InputError
 from ..eye.batch import CHUNK_POINTS, chunks, groups, slices, take_eyes
 from ..eye.model import EyeModel
@@ -122,7 +122,8 @@ def features(
         for number in np.unique(cams[rows]):
             camera = cameras[number]
             for block, turned in chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // max(m, 4))):
-                view = _View.of(turned, _pose_rows(poses, block), position[block], camera)
+                pose = Poses(poses.azimuth_rad[block], poses.elevation_rad[block], poses.torsion_rad[block])
+                view = _View.of(turned, pose, position[block], camera)
                 for j, order in enumerate(purkinje if m else ()):
                     exits, residual, status = glint_exits(turned, order, view.into_eye(lights), view.camera_mm)
                     pixels, status = view.project(exits, status)
@@ -233,7 +234,3 @@ class _View:
         pixels[..., 0] = camera.K[0, 0] * u + camera.K[0, 2]
         pixels[..., 1] = camera.K[1, 1] * v + camera.K[1, 2]
         return pixels, status
-
-
-def _pose_rows(poses: Poses, rows: Indices) -> Poses:
-    return Poses(poses.azimuth_rad[rows], poses.elevation_rad[rows], poses.torsion_rad[rows])

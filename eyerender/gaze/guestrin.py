@@ -60,7 +60,7 @@ class GuestrinEizenman:
 
     def with_parameters(self, parameters: Mapping[int, EyeParameters]) -> Self:
         """Make an estimator with given parameters by eye (0 right, 1 left), without a calibration."""
-        known = {k: Calibration(p, p, 0.0, "given", 0, True, "given", ()) for k, p in parameters.items()}
+        known = {k: Calibration(p, p, "given", 0.0, 0, True, "given", ()) for k, p in parameters.items()}
         return replace(self, calibrations=known)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:

@@ -32,7 +32,9 @@ class OwnEstimator:
         Raises:
             InputError: there is no such class, it needs arguments, or it has no `fit` and `predict`.
         """
-        return cls(reference, _instance(_class(reference, source), reference))
+        kind = _class(reference, source)
+        with _calling(reference, "making one without arguments"):
+            return cls(reference, kind())
 
     def to_mapping(self) -> dict[str, Any]:
         """Name of the class, as in calibration files."""
@@ -111,12 +113,6 @@ def _class(reference: str, source: str) -> type[Any]:
         reason = f"{reference} has no method {' and no method '.join(missing)} (see er.gaze.GazeEstimator)"
         raise InputError(reason, source=source)
     return found
-
-
-def _instance(kind: type[Any], reference: str) -> GazeEstimator:
-    with _calling(reference, "making one without arguments"):
-        made: GazeEstimator = kind()
-    return made
 
 
 @contextmanager

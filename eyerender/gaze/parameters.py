@@ -86,8 +86,8 @@ class Calibration:
     Attributes:
         parameters: the result.
         start: where the search started.
-        cost: final value of the objective (mm^2, mm or degrees, depending on the objective).
         objective: what was minimised.
+        cost: final value of the objective (mm^2, mm or degrees, depending on the objective).
         evaluations: number of evaluations of the model.
         converged: whether the search converged.
         message: how it ended.
@@ -96,8 +96,8 @@ class Calibration:
 
     parameters: EyeParameters
     start: EyeParameters
-    cost: float
     objective: str
+    cost: float
     evaluations: int
     converged: bool
     message: str
@@ -105,13 +105,4 @@ class Calibration:
 
     def to_mapping(self) -> dict[str, Any]:
         """Convert to a mapping for JSON."""
-        return {
-            "parameters": self.parameters.to_mapping(),
-            "start": self.start.to_mapping(),
-            "objective": self.objective,
-            "cost": self.cost,
-            "evaluations": self.evaluations,
-            "converged": self.converged,
-            "message": self.message,
-            "at_bound": list(self.at_bound),
-        }
+        return {**asdict(self), "at_bound": list(self.at_bound)}

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..arrays import Floats
 from . import blignaut
 from . import literature as lit
 from .budget import Budget
@@ -79,11 +78,7 @@ def _clouds(parts: Sequence[BlignautPart]) -> list[tuple[str, str, str]]:
     keys = [k for k in observers if k[0] == "corrected"] or observers
     # The sensor's noise is invisible at this scale.
     keys = [k for k in keys if k[1] != "image-noiseless" or (k[0], "image") not in keys]
-    return [(*key, clouds_figure({p.eye_model: _points(p, key) for p in parts if key in p.clouds})) for key in keys]
-
-
-def _points(part: BlignautPart, key: tuple[str, str]) -> tuple[Floats, Floats]:
-    return part.clouds[key].pupil_px, part.clouds[key].glint_px
+    return [(*key, clouds_figure({p.eye_model: p.clouds[key] for p in parts if key in p.clouds})) for key in keys]
 
 
 def _best_deg(outcomes: Sequence[blignaut.Outcome], calibration: str) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..report.style import figure, legend_above, svg
+from .clouds import Cloud
 
 _LOOK = {
     "E1": ("#E69F00", "o"),
@@ -31,13 +32,13 @@ def look(model: str, others: Sequence[str] = ()) -> tuple[str, str]:
     return _OTHER[rest.index(model) % len(_OTHER)] if model in rest else _OTHER[0]
 
 
-def clouds_figure(clouds: Mapping[str, tuple[Floats, Floats]]) -> str:
-    """Figure 3: pupil centres and glints of every fixation (n, 2) px by eye model."""
+def clouds_figure(clouds: Mapping[str, Cloud]) -> str:
+    """Figure 3: pupil centres and glints of every fixation by eye model."""
     with figure(11.0, 4.9, 2) as (fig, axes):
-        for ax, part, title in ((axes[0], 0, "(a) pupil centre"), (axes[1], 1, "(b) glint")):
-            for model, points in clouds.items():
+        for ax, part, title in ((axes[0], "pupil_px", "(a) pupil centre"), (axes[1], "glint_px", "(b) glint")):
+            for model, cloud in clouds.items():
                 colour, marker = look(model, list(clouds))
-                p = points[part]
+                p = getattr(cloud, part)
                 ax.scatter(*p.T, s=11, marker=marker, facecolor="none", edgecolor=colour, linewidth=0.9, label=model)
             ax.set(aspect="equal", adjustable="datalim", title=title, xlabel="x (px)", ylabel="y (px, down)")
             ax.invert_yaxis()

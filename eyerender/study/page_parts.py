@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from .results import Departure, Erratum, Finding, WaterfallStep
 Apart = tuple[Sequence[FeatureDifference], Sequence[GazeDifference]]
 Values = dict[str, Any]
 """What a template shows: text, numbers as text, rows of a table, <svg> elements."""
+T = TypeVar("T")
+_Key = tuple[str, str, str, str]  # panel, protocol, observer, eye model
+_Panels = dict[str, dict[str, dict[str, T]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,57 +109,41 @@ def observers_values(apart: Apart, shown: Sequence[str] = ()) -> Values | None:
     features, gaze = apart
     if not features:
         return None
-    differences = _differences(features, gaze, shown)
-    return {
-        "distances": distances_figure(_distances(features)),
-        "differences": differences_figure(differences) if differences else None,
-        "features": [_feature_row(f) for f in features],
-        "gaze": [_gaze_row(g) for g in gaze],
-    }
-
-
-def _distances(features: Sequence[FeatureDifference]) -> dict[str, dict[str, dict[str, float]]]:
-    """Median distances (px): feature -> series -> eye model."""
     series = list(dict.fromkeys((f.protocol, f.observer) for f in features))
     # The glint of a single light is drawn itself; those of several lights are drawn together.
     drawn = list(dict.fromkeys(f.feature for f in features))
     if ALL_GLINTS in drawn:
         drawn = [name for name in drawn if not name.startswith("glint of light")]
+    distances = {
+        (f.feature, f.protocol, f.observer, f.eye_model): f.median_distance_px
+        for f in features
+        if f.median_distance_px is not None
+    }
+    differences = {
+        (g.estimator, g.protocol, g.observer, g.eye_model): (g.difference_deg, g.low_deg, g.high_deg) for g in gaze
+    }
+    estimators = [name for name in shown if any(g.estimator == name for g in gaze)]
     return {
-        name: {
-            _label(key, series): {
-                f.eye_model: f.median_distance_px
-                for f in features
-                if (f.feature, f.protocol, f.observer) == (name, *key) and f.median_distance_px is not None
-            }
-            for key in series
-        }
-        for name in drawn
+        "distances": distances_figure(_panels(drawn, series, distances)),
+        "differences": differences_figure(_panels(estimators, series, differences)) if estimators else None,
+        "features": [_feature_row(f) for f in features],
+        "gaze": [_gaze_row(g) for g in gaze],
     }
 
 
-def _differences(
-    features: Sequence[FeatureDifference], gaze: Sequence[GazeDifference], shown: Sequence[str]
-) -> dict[str, dict[str, dict[str, tuple[float, float, float]]]]:
-    """Paired differences (deg) with their interval: estimator -> series -> eye model."""
-    series = list(dict.fromkeys((f.protocol, f.observer) for f in features))
+def _panels(names: Sequence[str], series: Sequence[tuple[str, str]], values: Mapping[_Key, T]) -> _Panels[T]:
+    """Values of figures: panel -> series -> eye model."""
+    several = len({protocol for protocol, _ in series}) > 1
+    models = list(dict.fromkeys(model for *_, model in values))
     return {
         name: {
-            _label(key, series): {
-                g.eye_model: (g.difference_deg, g.low_deg, g.high_deg)
-                for g in gaze
-                if (g.estimator, g.protocol, g.observer) == (name, *key)
+            f"{protocol}, {observer}" if several else observer: {
+                m: values[name, protocol, observer, m] for m in models if (name, protocol, observer, m) in values
             }
-            for key in series
+            for protocol, observer in series
         }
-        for name in shown
-        if any(g.estimator == name for g in gaze)
+        for name in names
     }
-
-
-def _label(key: tuple[str, str], among: Sequence[tuple[str, str]]) -> str:
-    protocol, observer = key
-    return observer if len({p for p, _ in among}) == 1 else f"{protocol}, {observer}"
 
 
 def _feature_row(f: FeatureDifference) -> tuple[str, ...]:

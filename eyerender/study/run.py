@@ -107,7 +107,8 @@ def run_study(
             for eye, told in _models(name, eyes, protocols, observings)
         ]
         count = options.workers or len(os.sched_getaffinity(0))
-        parts = _collected(partial(_job, name), jobs, [_told(job) for job in jobs], count, progress)
+        notes = [f"{eye}, {' and '.join(o.kind for o in observings)}" for observings, eye, _ in jobs]
+        parts = _collected(partial(_job, name), jobs, notes, count, progress)
         rows, found, more, page = _TOGETHER[name](parts, protocols)
         more = {"settings": settings, "seconds": round(time.monotonic() - start, 2), **more}
         summary = write_results(folder, name, rows, found, more)
@@ -166,11 +167,6 @@ def _models(
     if name == "guestrin2006" and observings[0].kind == "analytic" and "E5" in eyes and "published" in protocols:
         out += [(v, ("published",)) for v in VARIANTS if v not in eyes]
     return out
-
-
-def _told(job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> str:
-    """Progress note of a job."""
-    return f"{job[1]}, {' and '.join(o.kind for o in job[0])}"
 
 
 def _job(name: str, job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> Any:
