@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -159,17 +158,6 @@ class Setup:
 def named(cameras: tuple[Camera, ...]) -> list[str]:
     """Names of cameras for people: number and name."""
     return [f"{k}: {camera.name}" for k, camera in enumerate(cameras)]
-
-
-def loaded(path: str | Path, eye: str | None = None) -> Setup:
-    """The first frame of a scene file, or of a shipped scene.
-
-    Raises:
-        InputError: the scene cannot be read.
-    """
-    from ..scene import load_scene
-
-    return Setup.of(load_scene(path, eye=eye))
 
 
 def directions(setup: Setup) -> EyeDirection:

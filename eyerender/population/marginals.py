@@ -15,31 +15,11 @@ from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 from ..arrays import Floats
 from ..spec import ByKind, Number, Positive, Spec
 
-# Gauss and Hermite's points for means over a standard normal number; smooth maps need few, kinked ones are off by 1e-4.
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(180)
-_WEIGHTS = _WEIGHTS / np.sqrt(2.0 * np.pi)
 FARTHEST = 8.0
 """Standard normal numbers are cut here; beyond it lies one of 1e15."""
 
 
-class _Marginal(Spec):
-    def at(self, z: Floats) -> Floats:
-        """Values of standard normal numbers."""
-        raise NotImplementedError
-
-    def latent(self, x: Floats) -> Floats:
-        """Standard normal numbers of values."""
-        raise NotImplementedError
-
-    @cached_property
-    def moments(self) -> tuple[float, float]:
-        """Mean and standard deviation."""
-        values = self.at(_NODES)
-        mean = float(_WEIGHTS @ values)
-        return mean, float(np.sqrt(_WEIGHTS @ (values - mean) ** 2))
-
-
-class Fixed(_Marginal):
+class Fixed(Spec):
     """One value for everybody."""
 
     kind: Literal["fixed"] = Field(description="the distribution")
@@ -53,8 +33,13 @@ class Fixed(_Marginal):
         """Standard normal numbers of values."""
         return np.zeros(np.shape(x))
 
+    @property
+    def moments(self) -> tuple[float, float]:
+        """Mean and standard deviation."""
+        return self.value, 0.0
 
-class Normal(_Marginal):
+
+class Normal(Spec):
     """Normal distribution; with `low` or `high` it is truncated there."""
 
     kind: Literal["normal"] = Field(description="the distribution")
@@ -103,7 +88,7 @@ class Normal(_Marginal):
         return self.mean + self.sd * shift, self.sd * float(np.sqrt(spread))
 
 
-class Lognormal(_Marginal):
+class Lognormal(Spec):
     """Lognormal distribution: median exp(sigma z)."""
 
     kind: Literal["lognormal"] = Field(description="the distribution")
@@ -126,7 +111,7 @@ class Lognormal(_Marginal):
         return mean, mean * float(np.sqrt(np.expm1(self.sigma**2)))
 
 
-class Uniform(_Marginal):
+class Uniform(Spec):
     """Uniform distribution."""
 
     kind: Literal["uniform"] = Field(description="the distribution")
@@ -154,7 +139,7 @@ class Uniform(_Marginal):
         return (self.low + self.high) / 2, (self.high - self.low) / float(np.sqrt(12.0))
 
 
-class Share(_Marginal):
+class Share(Spec):
     """1 for a share of the people, 0 for the others."""
 
     kind: Literal["share"] = Field(description="the distribution")
@@ -185,7 +170,7 @@ class Part(Spec):
     sd: Positive = Field(description="standard deviation")
 
 
-class Mixture(_Marginal):
+class Mixture(Spec):
     """Mixture of normal distributions."""
 
     kind: Literal["mixture"] = Field(description="the distribution")

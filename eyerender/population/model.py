@@ -161,7 +161,7 @@ class Model:
         return np.broadcast_to(found.latent(np.array(value)), shape)
 
     def expected(self, name: str) -> tuple[float, float]:
-        """Mean and standard deviation of a quantity, exactly (to 1e-4 of the standard deviation)."""
+        """Mean and standard deviation of a quantity, exactly."""
         found = self.distributions[name]
         if not isinstance(found, Regression):
             return found.moments

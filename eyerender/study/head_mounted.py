@@ -18,6 +18,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..gaze.estimate import angular_error_deg
+from ..gaze.recalibration import direction_of
 from ..observation import Observations
 from ..scene import Scene, load_scene
 from ..scene.spec import SceneSpec
@@ -98,14 +99,9 @@ def direction_errors_deg(feature_px: Floats, truth_deg: Floats, learnt: Bools) -
     coefficients, *_ = np.linalg.lstsq(design[rows], truth_deg[rows], rcond=None)
     test = usable & ~learnt
     found = design[test] @ coefficients
-    out[test] = angular_error_deg(_unit(found), _unit(truth_deg[test]), np.zeros(3))
+    way, true_way = (direction_of(np.radians(angles)) for angles in (found, truth_deg[test]))
+    out[test] = angular_error_deg(way, true_way, np.zeros(3))
     return out
-
-
-def _unit(angles_deg: Floats) -> Floats:
-    azimuth, elevation = np.radians(angles_deg).T
-    across = np.cos(elevation)
-    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
 def findings(features: Sequence[FeatureDifference], gaze: Sequence[GazeDifference]) -> list[Finding]:
