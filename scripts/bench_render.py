@@ -175,7 +175,7 @@ class Bench:
                 truth = np.mean(parts, axis=0) * abs(eye.stop.normal[0])
                 error = np.std(parts, axis=0, ddof=1) / np.sqrt(4) / np.mean(parts, axis=0)
                 mine = np.array(
-                    [self.renderer.iris_irradiance(job, ring_points(eye, p, q)).mean() for p, q in RINGS_MM]
+                    [rigs.iris_irradiance(self.renderer, job, ring_points(eye, p, q)).mean() for p, q in RINGS_MM]
                 )
                 worst = int(np.argmax(np.abs(mine / truth - 1) - 2 * error))
                 yield row(f"{model} iris {where}: tracer's standard error", 100 * error.max(), "%", 0.1)

@@ -69,7 +69,7 @@ class Blur:
         """Blur a picture, smaller by the reach on every side.
 
         Args:
-            pictures: (height, width) radiance; of a layered blur its parts (`film.mean_parts`).
+            pictures: (height, width) radiance; of a layered blur its parts (`film.begun`).
         """
         if not self.layered:
             return defocus.defocused(pictures, self.subject_px)

@@ -107,7 +107,7 @@ class Film:
     """A window whose samples are being taken: the device may still be at work until `means` reads the sums.
 
     Attributes:
-        sums: over the samples of each pixel: the radiance, or for each part what `mean_parts` returns.
+        sums: over the samples of each pixel: the radiance, or for each part what `begun` says.
         failed: number of failed light paths.
         shape: height and width of the window.
         spp: samples per pixel.
@@ -121,7 +121,7 @@ class Film:
     layered: bool
 
     def means(self) -> tuple[Singles, int]:
-        """What `mean_parts` or `mean_radiance` returns."""
+        """Read the means over the samples (see `begun`), and the number of failed light paths."""
         means = [total.numpy().reshape(self.shape) / np.float32(self.spp) for total in self.sums]
         failed = int(self.failed.numpy()[0])
         if self.layered:
@@ -135,17 +135,13 @@ def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[
     return begun(shown, window, spp, seed, layered=False).means()
 
 
-def mean_parts(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
-    """Parts of the scene from front to back: hairs and tears, skin, globe; or surround and globe; failed light paths.
-
-    The array (parts, 3, height, width) holds the radiance of each part (their sum is that of `mean_radiance`), the
-    share of the pixel's samples that show the part, and that share times their mean inverse depth (1/mm).
-    """
-    return begun(shown, window, spp, seed, layered=True).means()
-
-
 def begun(shown: Exposed, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
-    """Begin to take the samples of a window, for what `mean_radiance` returns, or if `layered`, `mean_parts`."""
+    """Begin to take the samples of a window.
+
+    Its `means` are those of `mean_radiance`. If `layered`, there are three numbers for each part of the scene from front
+    to back (hairs and tears, skin, globe; or surround and globe): the radiance of the part, which add up to that of
+    `mean_radiance`; the share of the pixel's samples that show it; that share times their mean inverse depth (1/mm).
+    """
     width, height = window[2:]
     shape = height, width
     grouped = shown.frame.structure.region

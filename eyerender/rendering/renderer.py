@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from ..arrays import Bools, Floats, Singles
@@ -16,7 +14,6 @@ from .blur import Blur
 from .film import Exposed, begun, mean_radiance
 from .frame import RenderJob
 from .labels import PartLabels, depths_mm, highlights, part_labels
-from .lighting import through_cornea
 from .prepared import Prepared
 from .recorded import uncollected
 from .region import RegionScene
@@ -144,18 +141,6 @@ class Renderer:
         """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""
         shown, _ = self.bind(job)
         return mean_radiance(shown, job.window, spp or self.spp, job.seed)[0].astype(float)
-
-    def iris_irradiance(self, job: RenderJob, points_mm: Floats) -> Floats:
-        """Irradiance (n,) mW/mm^2 of points (n, 3) of the iris' plane (eye frame, mm) from all lamps.
-
-        A lamp of finite size is represented by its centre.
-        """
-        shown, _ = self.bind(job, lit=False)
-        x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
-        corner = mi.Float(0)  # of the unit square, which is the disc's centre
-        inside = dr.full(mi.Bool, True, len(points_mm))
-        bent, _ = through_cornea(shown.frame, x, inside, corner, corner)
-        return np.asarray(bent.numpy(), dtype=float)
 
     def labels(self, job: RenderJob) -> PartLabels:
         """Compute the labels of a window alone."""

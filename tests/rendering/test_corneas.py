@@ -18,7 +18,7 @@ from eyerender.rig.light import Lamp
 from tests.support.corneas import conic_depth, eye_with, grid_of, keratoconus, measured_shapes, zernike_of
 from tests.support.light_tracing import trace_backward
 from tests.support.render_oracles import RINGS_MM, centroid, flux_on_rings, ring_points
-from tests.support.render_rigs import BLACK, PLAIN, RIGS, LampRig, eye_of, head_rig, job_of, remote_rig
+from tests.support.render_rigs import BLACK, PLAIN, RIGS, LampRig, eye_of, head_rig, iris_irradiance, job_of, remote_rig
 
 SHAPES = {name: shape for name, shape in measured_shapes().items() if "lens" not in name}
 
@@ -145,7 +145,7 @@ def test_light_on_the_iris_behind_measured_corneas_against_a_forward_light_trace
     rig = LampRig(remote_rig().camera, lights)
     job = job_of(eye, rig, (0, 0, 16, 16), look=PLAIN.model_copy(update={"limbus_width_mm": 0.0}))
     expected = flux_on_rings(eye, np.array(lamp), 100.0, 600)
-    measured = [renderer.iris_irradiance(job, ring_points(eye, p, q)).mean() for p, q in RINGS_MM]
+    measured = [iris_irradiance(renderer, job, ring_points(eye, p, q)).mean() for p, q in RINGS_MM]
     np.testing.assert_allclose(measured, expected, rtol=2e-3)
 
 

@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from eyerender.capture import render_job
 from eyerender.optics.solve import apparent_points
 from eyerender.rendering.blur import Blur
-from eyerender.rendering.film import mean_parts, mean_radiance
+from eyerender.rendering.film import begun, mean_radiance
 from eyerender.rendering.frame import RenderJob
 from eyerender.rig import defocus, psf
 from eyerender.rig.camera import PinholeCamera
@@ -51,6 +51,11 @@ def headset_job(focus_mm: float, window: tuple[int, int, int, int]) -> RenderJob
     job = render_job(load_scene("headset").frames(), 4)
     sensor = Sensor(f_number=2.0, noise=False)
     return replace(job, lens=Lens(focus_mm=focus_mm), sensor=sensor, window=window, labels=False)
+
+
+def mean_parts(shown, window, spp, seed):
+    """Parts of the scene (parts, 3, height, width), and the number of failed light paths."""
+    return begun(shown, window, spp, seed, layered=True).means()
 
 
 def blurred(renderer, job: RenderJob, spp: int) -> tuple[np.ndarray, np.ndarray]:

@@ -31,7 +31,7 @@ def test_the_grid_gives_the_light_of_exact_paths(renderer, model, name):
     lacked = left[left != ALL, None] >> np.arange(len(job.lights)) & 1
     assert np.mean(left == ALL) < 0.05  # before the back of the cornea
     assert np.mean(lacked) < 0.02  # where lamps set
-    truth = renderer.iris_irradiance(job, x)
+    truth = rigs.iris_irradiance(renderer, job, x)
     assert not np.any(found[truth == 0])
     known = (left == 0) & (truth > 0)
     error = np.abs(found[known] / truth[known] - 1)

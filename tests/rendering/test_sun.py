@@ -12,7 +12,7 @@ from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.region.anatomy import Region
 from eyerender.rig.imaging import Ambient, Sun
 from tests.support.render_oracles import RINGS_MM, centroid, cos4, flux_on_rings, mirror_pixel, ring_points
-from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, head_rig, job_of, remote_rig
+from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, head_rig, iris_irradiance, job_of, remote_rig
 
 pytestmark = pytest.mark.render
 
@@ -38,7 +38,7 @@ def test_iris_has_the_light_that_the_cornea_refracts(renderer):
     job = sunny(sun, M=M[0], t=t[0], look=BLACK)
     lamp = M[0].T @ (FAR_MM * way(sun) - t[0])
     truth = flux_on_rings(job.eye, lamp, sun.irradiance_w_m2 * 1e-3 * FAR_MM**2)
-    found = [renderer.iris_irradiance(job, ring_points(job.eye, *ring)).mean() for ring in RINGS_MM]
+    found = [iris_irradiance(renderer, job, ring_points(job.eye, *ring)).mean() for ring in RINGS_MM]
     np.testing.assert_allclose(found, truth, rtol=2e-3)
 
 

@@ -30,6 +30,7 @@ from eyerender.extraction.glints.prescreening import (
 )  # fmt: skip
 from eyerender.extraction.glints.windows import Windows
 from eyerender.extraction.preprocessing import DN, Image, as_image
+from eyerender.extraction.pupil import places
 from eyerender.extraction.pupil.candidates import ANGLES
 from eyerender.extraction.pupil.consensus import UNEVEN
 from eyerender.extraction.pupil.covariance import GROUPS, SHAPE, distance_slopes, reshaped
@@ -48,22 +49,10 @@ _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Place:
-    """Where points (n,) lie relative to an ellipse.
+class Place(places.Place):
+    """Where points (n,) lie relative to an ellipse, found with NumPy."""
 
-    It holds the signed distance, the nearest point's parameter (cos t, sin t), the outward normal there in the
-    ellipse's own axes (nx, ny), the curvature, and the parameter counted from the image's x axis (cos u, sin u).
-    """
-
-    distance: Floats
-    cos_t: Floats
-    sin_t: Floats
-    nx: Floats
-    ny: Floats
-    curvature: Floats
-    cos_u: Floats
-    sin_u: Floats
+    __slots__ = ()
 
     def taken(self, which: Bools | Indices) -> Place:
         """Places of the chosen points."""

@@ -20,7 +20,7 @@ from eyerender.rig.sensor import Sensor
 
 if TYPE_CHECKING:
     from eyerender.rendering.frame import RenderJob
-    from eyerender.rendering.renderer import RenderedWindow
+    from eyerender.rendering.renderer import RenderedWindow, Renderer
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
 NO_FUNDUS = Fundus(reflectance=0.0)
@@ -110,3 +110,17 @@ def digest(window: RenderedWindow) -> str:
 def noisy_job() -> RenderJob:
     rig = head_rig()
     return job_of(eye_of("E4"), rig, (200, 150, 160, 120), (5.0, 3.0), sensor=Sensor(), seed=77)
+
+
+def iris_irradiance(renderer: Renderer, job: RenderJob, points_mm: np.ndarray) -> np.ndarray:
+    """Irradiance (n,) mW/mm^2 of points (n, 3) of the iris' plane (eye frame, mm) from all lamps' middles, by paths."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from eyerender.rendering.lighting import through_cornea
+
+    shown, _ = renderer.bind(job, lit=False)
+    x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
+    corner = mi.Float(0)  # of the unit square, which is the disc's centre
+    bent, _ = through_cornea(shown.frame, x, dr.full(mi.Bool, True, len(points_mm)), corner, corner)
+    return np.asarray(bent.numpy(), dtype=float)
