@@ -361,12 +361,6 @@ def conic_from_parameters(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_r
     )
 
 
-def from_cv2(rotated_rect: tuple[tuple[float, float], tuple[float, float], float]) -> Ellipse:
-    """Convert OpenCV's rotated rectangle: centre, full axes (width, height), degrees of the width from +x toward +y."""
-    (cx, cy), (width, height), degrees = rotated_rect
-    return Ellipse(np.array([cx, cy]), np.array([0.5 * width, 0.5 * height]), math.radians(degrees))
-
-
 def signed_distance(ellipse: Ellipse, points: ArrayLike) -> Floats:
     """First-order (Sampson) signed distance F / |grad F| of points (..., 2) to the boundary, px; positive outside."""
     p = np.asarray(points, dtype=np.float64) - ellipse.centre_px

@@ -873,7 +873,6 @@ def _rays_of(frame: Frame, numbers: Received, tables: _Tables, lanes: int) -> tu
     target, weight, open_, distance, spot = _met(frame, numbers, o, d, index, active, tables)
     sky = mi.Float(0) * o.x
     if frame.structure.ambient:
-        assert frame.textures.ambience is not None
         sky = dr.pi * frame.textures.ambience.soft(d, outside | open_)
     bare = mi.Float(-1) if frame.textures.region is None else _bare(frame.lights, *spot)
     results = (target, weight, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky, bare)

@@ -138,9 +138,9 @@ def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[
 def begun(shown: Exposed, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
     """Begin to take the samples of a window.
 
-    Its `means` are those of `mean_radiance`. If `layered`, there are three numbers for each part of the scene from front
-    to back (hairs and tears, skin, globe; or surround and globe): the radiance of the part, which add up to that of
-    `mean_radiance`; the share of the pixel's samples that show it; that share times their mean inverse depth (1/mm).
+    Its `means` are those of `mean_radiance`. If `layered`, there are three numbers for each part of the scene, from
+    front to back (hairs and tears, skin, globe; or surround and globe): the radiance of the part, which adds up to
+    that of `mean_radiance`; the share of the samples that show it; that share times their mean inverse depth (1/mm).
     """
     width, height = window[2:]
     shape = height, width
@@ -341,7 +341,6 @@ def _hits_of(
 
     numbers: the first of the samples, and how many each pixel has.
     """
-    assert shown.frame.textures.region is not None
     if not len(chosen):
         nothing = dr.zeros(mi.Float, _TILE)
         return nothing, mi.UInt32(nothing), nothing, nothing
@@ -387,7 +386,6 @@ def _shaded(
     """
     # Embree traces sixteen neighbouring lanes together. They are one group of 4 x 4 pixels each, so that their camera
     # rays are close and their lamp rays go the same way.
-    assert frame.textures.region is not None
     skin = frame.textures.region
     index = dr.arange(mi.UInt32, packets * _TILE * _TILE)
     packet = index // (_TILE * _TILE)

@@ -45,7 +45,6 @@ def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, u: mi.F
     albedo = outer_albedo(frame, view)
     received = of_surroundings(frame, view, known)
     if frame.structure.region:
-        assert frame.textures.received is not None
         received = dr.select(view.other, view.received, frame.textures.received.globe(frame.point_to_scene(view.point)))
     seen = indirect(frame, view, d, albedo, inner, received) + direct(view, albedo, outer, shine)
     return Shaded(seen, view, albedo, failures)
@@ -62,7 +61,6 @@ def of_surroundings(frame: Frame, view: View, known: mi.Bool) -> mi.Vector4f:
     Obstacles receive nothing. The light from other surfaces on the globe is left out where it is `known`.
     """
     received, nothing = frame.textures.received, mi.Vector4f(0, 1, 0, 0)
-    assert received is not None
 
     def of_plane(x: mi.Vector3f) -> mi.Vector4f:
         return dr.select(dr.abs(x.x - frame.backdrop_x) < _FLAT_MM, received.surround(x), nothing)
@@ -114,7 +112,6 @@ def off_eye(frame: Frame, view: View, d: mi.Vector3f, albedo: mi.Float, received
     """The same of what is not the clear cornea; see `indirect`."""
     even, mirrored = received.x, mi.Float(0)
     if frame.structure.ambient:
-        assert frame.textures.ambience is not None
         facing = view.normal if view.level is None else view.level
         x, normal = frame.point_to_scene(view.point), frame.vector_to_scene(facing)
         even += received.y * frame.textures.ambience.irradiance(x, normal)
@@ -129,7 +126,6 @@ def _cover(view: View) -> mi.Float:
 
 def _leaving(frame: Frame, pupil: mi.Bool, x: mi.Vector3f, lit: mi.Float) -> mi.Float:
     """Radiosity of points in the plane of the iris that have the irradiance `lit` from the lamps."""
-    assert frame.textures.received is not None
     albedo = dr.if_stmt((x,), ~pupil, lambda x: iris_albedo(frame, x), lambda x: mi.Float(frame.pupil_albedo))
     return albedo * (lit + frame.textures.received.iris(x))
 
@@ -141,7 +137,6 @@ def _mirrored(frame: Frame, view: View, d: mi.Vector3f, clear: mi.Float) -> mi.F
     elsewhere mirrors the ambient light.
     """
     received = frame.textures.received
-    assert received is not None
     normal, share = view.normal, view.mirrored * clear
     seen, wet = mi.Float(0), view.cornea & (clear > 0)
     film = mi.Bool(False)
@@ -154,7 +149,6 @@ def _mirrored(frame: Frame, view: View, d: mi.Vector3f, clear: mi.Float) -> mi.F
     way = d - 2 * dr.dot(d, normal) * normal
     start = frame.point_to_scene(view.point) + EPSILON_MM * normal
     if frame.structure.ambient:
-        assert frame.textures.ambience is not None
         seen = frame.ambient_irradiance * dr.inv_pi + frame.textures.ambience.radiance(start, way, wet | film)
     else:
         wet &= received.on

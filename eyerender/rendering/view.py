@@ -208,7 +208,6 @@ def appearance(frame: Frame, view: View, hit: Hit, d: mi.Vector3f) -> View:
     if region is not None:
         there = look_at_skin(frame, region, region.face(hit), hit.prim_uv, d, view.other)
     else:
-        assert surround is not None
         matte = surround.surface(hit.prim_index, hit.prim_uv, view.other)
         there = replace(_matte(frame, matte.point, matte.normal, d, view.other), albedo=matte.albedo)
     return replace(

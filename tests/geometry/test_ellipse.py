@@ -12,6 +12,7 @@ import pytest
 from eyerender.arrays import FloatLike
 from eyerender.errors import InputError
 from eyerender.geometry import ellipse as el
+from tests.support.extraction_oracles import from_cv2
 from tests.support.paths import load
 
 
@@ -155,11 +156,11 @@ def test_opencv_fits_and_draws_the_same_ellipse():
     for centre, axes, angle in zip(*_random(rng, 30), strict=True):
         ellipse = el.Ellipse(centre, axes, angle)
         (x, y), (width, height), turn = cv2.fitEllipse(ellipse.points(60).astype(np.float32))
-        fitted = el.from_cv2(((x, y), (width, height), turn))
+        fitted = from_cv2(((x, y), (width, height), turn))
         np.testing.assert_allclose(fitted.centre_px, centre, atol=2e-3)  # float32
         np.testing.assert_allclose(fitted.semi_axes_px, axes, atol=5e-3)
         assert _angle_error(fitted.angle_rad, angle) * (1.0 - ellipse.aspect) < 1e-3
-        there = el.from_cv2(_to_cv2(ellipse))
+        there = from_cv2(_to_cv2(ellipse))
         np.testing.assert_allclose(there.semi_axes_px, axes, rtol=1e-12)
         assert _angle_error(there.angle_rad, ellipse.angle_rad) < 1e-12
         assert _to_cv2(ellipse)[1][0] <= _to_cv2(ellipse)[1][1]

@@ -41,12 +41,18 @@ from eyerender.extraction.pupil.occlusion import FARTHEST, LINEAR, OUTLIER
 from eyerender.extraction.pupil.outline import DARK, SHADED
 from eyerender.extraction.pupil.places import SECTORS
 from eyerender.extraction.statistics import median, quantile
-from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct, from_cv2, iou, points_on_ellipse, signed_distance
+from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct, iou, points_on_ellipse, signed_distance
 
 _COS, _SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.arange(12) * (np.pi / 6.0))
 _RING_STEPS = np.repeat((0.1, 0.5, 0.9), 24)
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
+
+
+def from_cv2(rotated_rect: tuple[tuple[float, float], tuple[float, float], float]) -> Ellipse:
+    """Convert OpenCV's rotated rectangle: centre, full axes (width, height), degrees of the width from +x toward +y."""
+    (cx, cy), (width, height), degrees = rotated_rect
+    return Ellipse(np.array([cx, cy]), np.array([0.5 * width, 0.5 * height]), math.radians(degrees))
 
 
 class Place(places.Place):
