@@ -5,6 +5,8 @@ The index of that code is a pickle, so it is kept only in a private folder (`cac
 Numba compiles a function again when its own file changed, but not when another file did from which it calls a
 function. So the machine code is kept in a folder of a name that depends on all files with compiled functions. When such
 a folder is made, those of other versions that nothing has used for thirty days are removed.
+
+Numba compiles one function at a time. So where the extractor's machine code is missing, several processes make it.
 """
 
 from __future__ import annotations
@@ -13,10 +15,12 @@ import hashlib
 import os
 import re
 import shutil
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -58,23 +62,28 @@ def used(folder: Path) -> Path:
 
 
 FOLDER = None if (_place := _folder()) is None else str(used(_place))
-FUNCTIONS: list[Any] = []  # what `compiled` made: numba's dispatchers
+FUNCTIONS: dict[Any, str] = {}  # what `compiled` made, numba's dispatchers, and the types of their arguments
 # Helpers are called by compiled functions only.
 HELPER: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-ABOUT_S = 40  # time that compilation takes, as people are told
+ABOUT_S = 20  # time that compilation takes on two cores, as people are told
+_MOST_WORKERS = 4
+_WORKER = "EYERENDER_COMPILE_WORKER"  # set in the processes that compile
 
 
 class _Announcement(numba_event.Listener):
-    """Says once, on stderr, that the extractor is being compiled."""
+    """At the first compilation, says so on stderr and has the whole extractor compiled."""
 
     def __init__(self) -> None:
-        self.said = FOLDER is not None and any(Path(FOLDER).glob("pupil_*"))
+        kept = FOLDER is not None and any(Path(FOLDER).glob("pupil_*"))
+        self.said = kept or _WORKER in os.environ
 
     def on_start(self, event: Any) -> None:
-        """Speak at the first compilation, where no earlier process kept anything."""
+        """Compile everything, where no earlier process kept anything."""
         if not self.said and event.data["dispatcher"].py_func.__module__.startswith("eyerender.extraction"):
             self.said = True
             print(f"compiling the extractor (once per machine), about {ABOUT_S} s ...", file=sys.stderr)
+            if FOLDER is not None:
+                _compile_in_processes()  # the compilation that starts here goes on, and finds the others' machine code
 
     def on_end(self, event: object) -> None:
         """Do nothing."""
@@ -83,11 +92,33 @@ class _Announcement(numba_event.Listener):
 event.register("numba:compile", _Announcement())
 
 
-def compiled(function: Function) -> Function:
-    """Compile at the first call; the machine code is kept on disk if a private folder there can be written."""
-    made = _dispatcher(function)
-    FUNCTIONS.append(made)
-    return cast(Function, made)
+def _compile_in_processes() -> None:
+    """Compile the extractor in as many processes as there are cores, at most four, and wait for them.
+
+    What they could not compile is compiled when it is called.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)), _WORKER: "1"}
+    null = subprocess.DEVNULL
+    with suppress(OSError), tempfile.TemporaryDirectory(prefix="eyerender-compile-") as claims, ExitStack() as workers:
+        command = [sys.executable, "-P", "-m", "eyerender.extraction.compile", claims]
+        for _ in range(min(cores, _MOST_WORKERS) if cores > 1 else 0):
+            workers.enter_context(subprocess.Popen(command, env=environment, stdin=null, stdout=null, stderr=null))
+
+
+def compiled(types: str = "") -> Callable[[Function], Function]:
+    """Compile at the first call; the machine code is kept on disk if a private folder there can be written.
+
+    Args:
+        types: those of the arguments that extraction passes, as numba writes them, for compilation beforehand.
+    """
+
+    def decorate(function: Function) -> Function:
+        made = _dispatcher(function)
+        FUNCTIONS[made] = types
+        return cast(Function, made)
+
+    return decorate
 
 
 def _dispatcher(function: Callable[..., Any]) -> Any:

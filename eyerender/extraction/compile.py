@@ -2,22 +2,44 @@
 
 from __future__ import annotations
 
+import sys
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba.core import sigutils
 
 from ..arrays import Bytes
 from ..jit import FUNCTIONS
 from .pipeline import extract
 
+normalize_signature: Any = sigutils.normalize_signature  # it has no types
+
 
 def compile_all() -> None:
-    """Run every compiled function on drawings of a pupil, which compiles those that no earlier process kept."""
+    """Run every compiled function on drawings of a pupil, which compiles them all unless an earlier process did."""
     for image in (drawn_eye(), drawn_eye(lid=True), drawn_eye(edge=True)):
         extract(image)
     missing = [one.__name__ for one in functions() if not one.signatures]
     if missing:
         raise RuntimeError(f"not compiled: {', '.join(missing)}")
+
+
+def compile_share(claims: Path) -> None:
+    """Compile the functions of modules, the longest first, except those that other processes claimed in a folder."""
+    made = functions()
+    sizes = {one.py_func.__module__: Path(one.py_func.__code__.co_filename).stat().st_size for one in made}
+    for module in sorted(sizes, key=lambda one: -sizes[one]):
+        with suppress(FileExistsError):
+            (claims / module).mkdir()
+            for one in (one for one in made if one.py_func.__module__ == module):
+                one.compile(argument_types(one))
+
+
+def argument_types(function: Any) -> tuple[Any, ...]:
+    """Return the types that are written beside a compiled function, as in numba's index of machine code."""
+    return tuple(normalize_signature(f"({FUNCTIONS[function]},)")[0])
 
 
 def functions() -> list[Any]:
@@ -46,4 +68,4 @@ def drawn_eye(*, lid: bool = False, edge: bool = False) -> Bytes:
 
 
 if __name__ == "__main__":
-    compile_all()
+    compile_share(Path(sys.argv[1])) if len(sys.argv) > 1 else compile_all()

@@ -180,7 +180,7 @@ def estimate_noise(linear: Image) -> float:
     return 0.7413 * median(difference if moving > 0.6 * difference.size else difference[difference > 0.0])
 
 
-@compiled
+@compiled("f4[:,::1], i8")
 def _differences(linear: Image, step: int) -> Image:
     """|I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1)| of every `step`-th pixel of every `step`-th row, in one row."""
     rows, columns = (linear.shape[0] - 2) // step + 1, (linear.shape[1] - 2) // step + 1

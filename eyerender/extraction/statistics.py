@@ -22,7 +22,7 @@ def quantile(values: NDArray[Any], share: float) -> float:
     return quantile_of(np.asarray(values, dtype=np.float64), share)
 
 
-@compiled
+@compiled("f8[::1], f8")
 def quantile_of(values: Floats, share: float) -> float:
     """Value below which `share` of (n,) values lie, by linear interpolation; NaN for none."""
     if values.size == 0:
@@ -33,7 +33,10 @@ def quantile_of(values: Floats, share: float) -> float:
     first = select(values, low)
     if low == at:
         return first
-    return first + (at - low) * (values[low + 1 :].min() - first)
+    above = math.inf
+    for i in range(low + 1, values.size):
+        above = min(above, values[i])
+    return first + (at - low) * (above - first)
 
 
 @inlined

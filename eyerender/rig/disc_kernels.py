@@ -11,7 +11,7 @@ from ..jit import compiled
 LANES = 8  # numbers that are added at once; rows of discs are padded with zeros to a multiple of it
 
 
-@compiled
+@compiled()
 def spread(pictures: Singles, index: Ints, discs: Singles, reaches: Ints, sums: Singles) -> None:
     """Spread every pixel of some pictures over the disc of its own diameter.
 
@@ -41,7 +41,7 @@ def spread(pictures: Singles, index: Ints, discs: Singles, reaches: Ints, sums: 
                         sums[p, top + i, left + j] += value * discs[disc, i, j]
 
 
-@compiled
+@compiled()
 def continue_nearest(values: Singles, steps: NDArray[np.int32]) -> None:
     """Give unknown pixels the value of the nearest known one, counted in steps along rows and columns, in place.
 

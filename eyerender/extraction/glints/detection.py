@@ -121,7 +121,7 @@ def _is_free(xy: Floats, disc: Floats, outer: float, k: int, x: float, y: float)
     return True
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], f8[::1]")
 def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
     """Height (n,) of each peak above the brightest tenth of a ring around it. Pixels of other spots are left out.
 
@@ -155,7 +155,7 @@ def optics_sigma(blur_px: float) -> float:
     return math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0))
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], f8[::1], f8[::1]")
 def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
     """Whether the level falls by at least a third of the height in 9 of 12 directions, 2.5 sigma from the peak.
 
@@ -172,7 +172,7 @@ def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
     return out
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], i8, f8")
 def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> Indices:
     """Indices of the maxima xy (n, 2) that are spots of their own, in the given order.
 
@@ -222,7 +222,7 @@ def _highest(image: Image, y: int, x: int) -> bool:
     return True
 
 
-@compiled
+@compiled("f4[:,::1], f4[:,::1], f4[:,::1], f8")
 def _maxima(smooth: Image, half: Image, opened: Image, threshold: float) -> tuple[Indices, Singles]:
     """Find local maxima that exceed the opened level by the threshold: flat indices (n,), and heights above it (n,)."""
     columns, size, n = half.shape[1], smooth.shape[1], 0
@@ -244,7 +244,7 @@ def _maxima(smooth: Image, half: Image, opened: Image, threshold: float) -> tupl
     return flat[:found].copy(), height[:found].copy()
 
 
-@compiled
+@compiled("f4[:,::1], f4[:,::1], f8[:,::1], f8[::1], i8")
 def _widths(smooth: Image, opened: Image, xy: Floats, height: Floats, size: int) -> Floats:
     """Estimate sigma = sqrt(area above half height / (2 pi ln 2)) in a window of the opening's size."""
     out = np.empty(height.size)

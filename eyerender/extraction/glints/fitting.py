@@ -16,9 +16,10 @@ import numpy as np
 from ...arrays import Bools, Floats
 from ...jit import compiled, inlined
 from ..preprocessing import Image
+from ..products import solve
 from .fits import SpotFit, no_spots
 from .gaussian_model import PARAMETERS, SAME_LIGHT, WITH_EDGE, Descent, Limits, descend, lost, prior, promising
-from .windows import SpotPixels, Windows, cut, light_of_others, shining_pairs, window_radius
+from .windows import WINDOWS, SpotPixels, Windows, cut, light_of_others, shining_pairs, window_radius
 
 # Rounds of several steps each. A spot that still moves by WANDERING_PX after PATIENCE rounds is abandoned. The second
 # numbers are for spots whose fit is promising or whose misfit still falls.
@@ -205,7 +206,7 @@ def _bright_moments(plane: Floats, begin: int, end: int, rest: Floats, level: fl
     out[0, 1] = out[1, 0] = xy / total - x * y
 
 
-@compiled
+@compiled(f"{WINDOWS}, f8[:,::1], f8[:,:,::1], f8[::1], f8[::1], f8, f8[:,::1], f8")
 def _reported(
     windows: Windows, theta: Floats, gram: Floats, used: Floats, rest: Floats,
     noise: float, penalty: Floats, blur_px: float,
@@ -226,7 +227,8 @@ def _reported(
         for j in range(2):
             unit = np.zeros(k)
             unit[j] = scale
-            covariance[s, j] = np.linalg.solve(matrix, unit)[:2]
+            solve(matrix.copy(), unit)
+            covariance[s, j, 0], covariance[s, j, 1] = unit[0], unit[1]
         x, y = own[0] - centre[s, 0], own[1] - centre[s, 1]
         level[s] = own[5] + own[6] * x + own[7] * y
         if k == WITH_EDGE:

@@ -15,8 +15,8 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices
 from ...jit import compiled, inlined
-from ..products import add_products
-from .windows import SpotPixels, Windows, light_of_others, profile
+from ..products import add_products, copy, solve
+from .windows import WINDOWS, SpotPixels, Windows, light_of_others, profile
 
 PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; with an edge also h, p, o
 LOST_PX = 12.0  # a spot that becomes wider or moves farther is not a glint
@@ -75,7 +75,7 @@ class Descent:
     falling: Bools
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,::1]")
 def lost(theta: Floats, start: Floats) -> Bools:
     """Whether spots (n,) have grown or moved more than a glint can."""
     out = np.empty(theta.shape[0], dtype=np.bool_)
@@ -85,7 +85,7 @@ def lost(theta: Floats, start: Floats) -> Bools:
     return out
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,:,::1], f8[::1], f8")
 def promising(theta: Floats, gram: Floats, used: Floats, noise: float) -> Bools:
     """Whether the fit roughly explains spots (n,) (see ROUGH and ROUGH_SHARE)."""
     out, k = np.empty(theta.shape[0], dtype=np.bool_), theta.shape[1]
@@ -107,7 +107,7 @@ def slopes(pixels: SpotPixels, theta: Floats, rest: Floats, blur_px: float | Non
     return _spot_rows(pixels.windows, theta, rest, 1.0 if blur_px is None else blur_px)
 
 
-@compiled
+@compiled(f"{WINDOWS}, f8[:,::1], f8[::1], f8")
 def _spot_rows(windows: Windows, theta: Floats, rest: Floats, blur_px: float) -> Floats:
     """Compute `slopes` from the parts of `SpotPixels`."""
     first, plane, centre, radius = windows
@@ -198,12 +198,13 @@ def _gram(
 def _step(gram: Floats, damping: float, theta: Floats, bounds: Floats, step: Floats, trial: Floats) -> float:
     """Write the damped step (K,) of a spot and where it leads (K,), both limited; return the gain that it promises."""
     k, gain = theta.size, 0.0
-    matrix, pull = gram[:k, :k].copy(), gram[:k, k].copy()
+    matrix = gram[:k, :k].copy()
     for j in range(k):
         matrix[j, j] = matrix[j, j] * (1.0 + damping) + 1e-9
-    step[:] = np.linalg.solve(matrix, pull)
+        step[j] = gram[j, k]
+    solve(matrix, step)
     for j in range(k):
-        gain += step[j] * pull[j]
+        gain += step[j] * gram[j, k]
         step[j] = min(max(step[j], -bounds[2, j]), bounds[2, j])
         trial[j] = min(max(theta[j] + step[j], bounds[0, j]), bounds[1, j])
     return gain
@@ -214,7 +215,7 @@ def _finish(step: Floats, trial: Floats, theta: Floats) -> None:
     """Take the last steps (n, K) of spots, unless they are large."""
     for s in range(theta.shape[0]):
         if np.abs(step[s]).max() < 1.0:
-            theta[s] = trial[s]
+            copy(trial[s], theta[s])
 
 
 @inlined
@@ -229,12 +230,17 @@ def _progress(theta: Floats, middle: Floats, gram: Floats, cost: Floats) -> tupl
 
 
 @inlined
-def _dim(first: Indices, rows: Floats, gram: Floats, light: Floats, noise: float) -> None:
-    """Subtract more light (P,) of other spots from the residual; changes the products in place."""
+def _dim(
+    first: Indices, rows: Floats, gram: Floats, light: Floats, held: Floats, rest: Floats, better: Bools, noise: float
+) -> None:
+    """Subtract the light (P,) of other spots, beyond that held, where a spot is better; changes the others in place."""
     n, k = gram.shape[0], gram.shape[1] - 1
     for s in range(n):
         square = taken = 0.0
         for i in range(first[s], first[s + 1]):
+            light[i] = (light[i] - held[i]) * better[s]
+            held[i] += light[i]
+            rest[i] -= light[i]
             square += (light[i] * rows[5, i]) ** 2  # 0 in pixels that do not count
         for j in range(k + 1):
             taken = 0.0
@@ -272,7 +278,7 @@ def descend(
     return Descent(*_descended(pixels.windows, np.ascontiguousarray(theta), rest, clip, pairs, *about))
 
 
-@compiled
+@compiled(f"{WINDOWS}, f8[:,::1], f8[::1], b1[::1], i8[:,::1], f8, f8[:,::1], f8, i8, f8[:,::1]")
 def _descended(
     windows: Windows, theta: Floats, rest: Floats, clip: Bools, pairs: Indices,
     noise: float, penalty: Floats, blur_px: float, steps: int, bounds: Floats,
@@ -322,16 +328,14 @@ def _descended(
             stalled[s] = better[s] and new[s, k, k] > STALLED * gram[s, k, k]
             damping[s] = max(0.1 * damping[s], 1e-7) if better[s] else 8.0 * damping[s]
             if better[s]:
-                theta[s], gram[s], used[s] = trial[s], new[s], new_used[s]
+                used[s] = new_used[s]
+                copy(trial[s], theta[s])
+                copy(new[s].ravel(), gram[s].ravel())
         if shared and turn % 2 == 1:
-            change = light_of_others(windows, theta, pairs, rest.size) - held
-            for s in range(n):
-                change[first[s] : first[s + 1]] *= better[s]
-            held += change
-            rest -= change
-            _dim(first, rows, gram, change, noise)
+            change = light_of_others(windows, theta, pairs, rest.size)
+            _dim(first, rows, gram, change, held, rest, better, noise)
         if turn + 1 == steps // 2:
-            middle[:] = theta[:, :2]
-            cost[:] = gram[:, k, k]
+            for s in range(n):
+                middle[s, 0], middle[s, 1], cost[s] = theta[s, 0], theta[s, 1], gram[s, k, k]
     moved, falling = _progress(theta, middle, gram, cost)
     return theta, gram, used, over, moved, falling

@@ -9,7 +9,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Indices
 from ...jit import compiled, inlined
 from ..preprocessing import DN, Image
-from ..products import add_products
+from ..products import add_products, solve
 
 # Largest misfit as a share of the height and of the scatter; smallest fitted peak as a share of the detected height.
 # Glints of the development images (rendered and ideal) reach 0.20 and 0.63, and 0.85.
@@ -119,7 +119,8 @@ def _is_bell(pixels: Floats, sigma: float, tall: float, noise_dn: float) -> bool
         for m in range(j + 1):
             matrix[j, m] = matrix[m, j] = gram[j, m]
         matrix[j, j] += 1e-6  # it keeps the matrix regular where half of the pixels belong to another spot
-    found = np.linalg.solve(matrix, gram[7, :7])
+    found = gram[7, :7].copy()
+    solve(matrix, found)
     cost = 0.0
     for i in range(n):
         left = -terms[7, i]
@@ -132,7 +133,7 @@ def _is_bell(pixels: Floats, sigma: float, tall: float, noise_dn: float) -> bool
     return good and _elongation(pixels, tall) <= LONGEST
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], f8[::1], f8[::1], f8, f8, i8[::1]")
 def _bells(
     linear: Image, xy: Floats, width: Floats, height: Floats, noise_dn: float, clip_dn: float, index: Indices
 ) -> Bools:

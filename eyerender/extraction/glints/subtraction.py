@@ -79,7 +79,7 @@ def subtract_spots(part: Part, noise_dn: float, fit: SpotFit, which: Bools, abou
     return Part(linear, part.corner), bright
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], f8[::1], f8")
 def _subtracted(linear: Image, spots: Floats, radius: Floats, limit: float) -> tuple[Image, Bools]:
     """Subtract the light of spots (n, 5: centre, two sigma, amplitude) within radius (n,).
 

@@ -16,6 +16,7 @@ from ...jit import compiled, inlined
 from ..preprocessing import Image
 
 Windows = tuple[Indices, Floats, Floats, Floats]  # first, plane, centre and radius of SpotPixels
+WINDOWS = "Tuple((i8[::1], f8[:,::1], f8[:,::1], f8[::1]))"  # for `compiled`
 _T = TypeVar("_T", bound=np.generic)
 
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
@@ -162,7 +163,7 @@ def cut(
     )
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], f8[:,::1], f8[::1]")
 def _windows(linear: Image, start: Floats, centre: Floats, radius: Floats) -> tuple[Indices, Indices, Floats, Floats]:
     """Find the pixels (P,) within `radius` (n,) of `start` (n, 2).
 
@@ -220,7 +221,7 @@ def profile(low: float, sigma: float) -> tuple[float, float, float]:
     return tail_first - tail_last, value, value + sigma * (first * tail_first - last * tail_last)
 
 
-@compiled
+@compiled(f"{WINDOWS}, f8[:,::1], i8[:,::1], i8")
 def light_of_others(windows: Windows, theta: Floats, pairs: Indices, count: int) -> Floats:
     """Light (count,) of other spots in every spot's pixels.
 

@@ -8,9 +8,10 @@ import numpy as np
 
 from ...arrays import Floats
 from ...jit import compiled, inlined
+from ..products import solve
 
 
-@compiled
+@compiled("f8[:,:,::1]")
 def direct_fits(points: Floats) -> Floats:
     """Direct ellipses (m, 5) through points (m, k, 2): centre, semi-axes and angle; NaN where there is none.
 
@@ -156,13 +157,13 @@ def _least_direction(scatter: Floats, gradient: Floats) -> Floats:
             pull[j] = 0.0
             for m in range(5):
                 pull[j] += gradient[j, m] * found[m]
-        new = np.linalg.solve(scatter, pull)
-        size = np.abs(new).max()
-        change = 0.0
+        solve(scatter.copy(), pull)
+        size = change = 0.0
         for j in range(5):
-            new[j] /= size
-            change = max(change, abs(new[j] - found[j]))
-        found = new
+            size = max(size, abs(pull[j]))
+        for j in range(5):
+            change = max(change, abs(pull[j] / size - found[j]))
+            found[j] = pull[j] / size
         if change < 1e-11:
             break
     return found

@@ -17,6 +17,7 @@ from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse
 from ...jit import compiled, inlined
 from ..preprocessing import Image, Prepared, as_image
+from ..products import copy
 from ..settings import Shape
 from ..statistics import quantile_of
 from .glare import Cleared, around
@@ -183,7 +184,7 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -
     ]
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,::1], f8")
 def _best_blobs(blobs: Floats, levels: Floats, noise: float) -> Floats:
     """Find different blobs of `_sweep` that stand out: at most MOST_BLOBS, best first.
 
@@ -215,7 +216,8 @@ def _best_blobs(blobs: Floats, levels: Floats, noise: float) -> Floats:
                 final[k] = min(final[k], 0.5 * final[m])
     out = np.empty((count, 8))
     for row, k in enumerate(_descending(final)):
-        out[row, :5], out[row, 5:7], out[row, 7] = blobs[kept[k], :5], levels[kept[k], :2], final[k]
+        copy(blobs[kept[k], :5], out[row])
+        out[row, 5], out[row, 6], out[row, 7] = levels[kept[k], 0], levels[kept[k], 1], final[k]
     return out
 
 
@@ -246,7 +248,7 @@ def _core(inner: Floats, outer: Floats, noise: float) -> bool:
     return darker and inner[2] > 0.55 and inner[1] > 0.12 * outer[1]
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], f8")
 def _ring_levels(small: Image, blobs: Floats, noise: float) -> Floats:
     """Levels (n, 5) of blobs (n, 6): inside, step to a ring outside, share of that ring, near the edge, scatter."""
     out = np.empty((blobs.shape[0], 5))
@@ -299,7 +301,7 @@ def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
     return Candidate(ellipse, inside, step) if step > prepared.noise_dn else None
 
 
-@compiled
+@compiled("f4[:,::1], UniTuple(f8, 5)")
 def _levels_about(linear: Image, ellipse: tuple[float, ...]) -> tuple[float, float]:
     """Level inside an ellipse (cx, cy, a, b, angle), and the step from its outer part to a ring outside.
 
@@ -353,7 +355,7 @@ def inspect_interior(cleared: Cleared, ellipse: Ellipse, blur_px: float, noise_d
     return Interior(darker, 1.2533 * noise_dn * math.sqrt(1.0 / core + 1.0 / ring), spread)
 
 
-@compiled
+@compiled("f4[:,::1], b1[:,::1], UniTuple(f8, 5), f8")
 def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float) -> tuple[float, int, int, float]:
     """Statistics of the pixels inside an ellipse (cx, cy, a, b, angle), up to the share `end` of its axes.
 

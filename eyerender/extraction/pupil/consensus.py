@@ -129,7 +129,7 @@ def _sane(a: Any, b: Any, candidate: Candidate, shape: Shape) -> Any:
     return alike & (a <= shape.most_px) & (b >= 0.8 * shape.least_px)
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8")
 def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) -> Floats:
     """Score (m,) of every ellipse (m, 5).
 
@@ -184,7 +184,7 @@ def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float)
     return BoundaryFit(ellipse, inliers, kept, support, gap, residual, sums, to_axes(covariance, ellipse))
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,::1], f8[::1], f8, f8")
 def _settled(
     points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float
 ) -> tuple[int, Floats, Bools, Floats, Floats]:
@@ -273,7 +273,7 @@ def _seen(numbers: Floats, points: Floats) -> Floats:
     return np.array([0.5 * full / SECTORS, min(longest, SECTORS) / SECTORS, math.sqrt(square)])
 
 
-@compiled
+@compiled("UniTuple(f8, 5), f8[:,::1], f8")
 def median_off(ellipse: tuple[float, ...], points: Floats, sigma_px: float) -> float:
     """Median distance of edge points (n, 2), moved outward by the curvature shift, from (cx, cy, a, b, angle)."""
     off = np.empty(points.shape[0])

@@ -86,7 +86,7 @@ def slopes_at(cos: float, sin: float, c: float, s: float, nx: float, ny: float, 
     row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
 
 
-@compiled
+@compiled("UniTuple(f8, 5), f8[:,::1]")
 def _edge_sums(ellipse: tuple[float, ...], points: Floats) -> tuple[Floats, Floats, Floats, Indices]:
     """The sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle)."""
     cos, sin = math.cos(ellipse[4]), math.sin(ellipse[4])
@@ -192,7 +192,7 @@ def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
     return _along_outline(ellipse.numbers(), covariance * (scale[:, None] * scale))
 
 
-@compiled
+@compiled("UniTuple(f8, 5), f8[:,::1]")
 def _along_outline(ellipse: tuple[float, ...], covariance: Floats) -> float:
     """Root mean square of the boundary's standard deviation, by the covariance (5, 5) of centre and shape matrix."""
     _, _, a, b, angle = ellipse

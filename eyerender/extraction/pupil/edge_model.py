@@ -147,7 +147,7 @@ def outer_levels(place: Floats, count: int, outer: Floats, basis: Floats, out: F
             out[i] += outer[j] * basis[i] + outer[j + 1] * basis[BLOCK + i]
 
 
-@compiled
+@compiled("f8[::1], f8[::1], f8[::1], f8[::1]")
 def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
     """Levels (n,) of the model of these numbers; `displaced` is empty for an exact ellipse."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])

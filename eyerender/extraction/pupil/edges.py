@@ -120,7 +120,7 @@ def find_edges(
     )
 
 
-@compiled
+@compiled("f4[:,::1], f4[:,::1], f4[:,::1], u1[:,::1], UniTuple(f8, 5), f8, f8")
 def _ridges(
     gx: Image, gy: Image, magnitude: Image, covered: Bytes, ellipse: tuple[float, ...], half_band: float, floor: float
 ) -> tuple[Floats, Floats, Floats, Indices, Indices]:
@@ -198,7 +198,7 @@ def nearest(image: Image, x: float, y: float) -> float:
     return image[min(max(int(np.rint(y)), 0), image.shape[0] - 1), column]
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], f8[:,::1], f8, UniTuple(f8, 6)")
 def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, limits: tuple[float, ...]) -> Bools:
     """Whether there is pupil behind points and iris ahead of them.
 

@@ -91,7 +91,7 @@ def _beside(
     return linear[row, column]
 
 
-@compiled
+@compiled("UniTuple(f8, 5), f8, f4[:,::1], UniTuple(i8, 2), f4[:,::1]")
 def levels_beside(
     ellipse: tuple[float, ...], away_px: float, linear: Image, corner: tuple[int, int], patch: Image
 ) -> Image:

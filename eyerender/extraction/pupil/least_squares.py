@@ -14,7 +14,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices
 from ...jit import compiled, inlined, summing
-from ..products import add_products
+from ..products import add_products, solve
 from .covariance import SHAPE
 from .edge_model import (
     BY_DISTANCE,
@@ -41,6 +41,7 @@ STILL_PX = 1.5e-2  # a fit ends with a step smaller than this
 
 
 _Sums = tuple[Floats, float, Floats, Floats, Floats, Floats]  # the parts of `Sums`
+_SUMS = "Tuple((f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[::1], f8[::1]))"  # for `compiled`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +68,7 @@ class Pixels:
         return Pixels(*_grouped(x, y, level, sector, use, seen))
 
 
-@compiled
+@compiled("f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], b1[::1]")
 def _grouped(
     x: Floats, y: Floats, level: Floats, bins: Indices, use: Bools, seen: Bools
 ) -> tuple[Floats, Floats, Floats, Indices, Indices]:
@@ -207,7 +208,7 @@ def _add_weighted(
         across[j, k] += second
 
 
-@compiled
+@compiled("f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], f8[::1]")
 def _pixel_sums(
     x: Floats, y: Floats, level: Floats, index: Indices, numbers: Floats, displaced: Floats
 ) -> tuple[Floats, float, Floats, Floats, Floats, Floats]:
@@ -270,7 +271,7 @@ class Normal:
         return Normal(matrix=matrix, vector=vector, cost=cost, across=sums.across, along=along, inverse=inverse)
 
 
-@compiled
+@compiled(f"{_SUMS}, f8[::1], f8")
 def _eliminated(sums: _Sums, displaced: Floats, displacement: float) -> tuple[Floats, Floats, float, Floats, Floats]:
     """Compute the parts of `Normal`, but `across`, from those of `Sums` and the prior's weight (see `Prior`)."""
     matrix, cost, pull, across, along, square = sums
@@ -313,7 +314,7 @@ def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, st
     return Solution(EdgeModel.of(numbers), displaced, Sums(*sums))
 
 
-@compiled
+@compiled("i8, f8[::1]")
 def _held(size: int, weights: Floats) -> Floats:
     """Weight (size,) of the square of every parameter, by those of the priors (4,)."""
     out = np.zeros(size)
@@ -334,7 +335,8 @@ def _step(matrix: Floats, vector: Floats, held: Floats, numbers: Floats, damping
         for m in range(size):
             scaled[j, m] /= scale[j] * scale[m]
         scaled[j, j] += damping
-    return np.linalg.solve(scaled, right) / scale
+    solve(scaled, right)
+    return right / scale
 
 
 @inlined
@@ -350,7 +352,7 @@ def _moved(numbers: Floats, step: Floats) -> Floats:
     return out
 
 
-@compiled
+@compiled("f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8, i8")
 def _gauss_newton(
     x: Floats, y: Floats, level: Floats, index: Indices, numbers: Floats, displaced: Floats,
     weights: Floats, displacement: float, steps: int,

@@ -144,7 +144,7 @@ def _uneven2(seen: Bools, whole: Floats, weight: Floats, by_noise: Floats) -> fl
     return max((1.4826 * quantile_of(size[:n], 0.5)) ** 2 - 1.3 * quantile_of(noise[:n], 0.5), 0.0)
 
 
-@compiled
+@compiled("f8[::1], f8[::1], f8[::1], b1[::1], b1[::1], b1[::1], f8[::1], f8[::1], f8")
 def _visible(
     x: Floats, y: Floats, level: Floats, use: Bools, seen: Bools, sectors: Bools, numbers: Floats, displaced: Floats,
     noise_dn: float,

@@ -65,7 +65,9 @@ def outline_of(found: Found, ellipse: Ellipse) -> Outline:
     )
 
 
-@compiled
+@compiled(
+    "UniTuple(f8, 5), f8[:,::1], f8[:,::1], f4[:,::1], UniTuple(i8, 2), f4[:,::1], UniTuple(f8, 2), UniTuple(f8, 2)"
+)
 def _along(
     ellipse: tuple[float, ...], points: Floats, others: Floats, linear: Image, corner: tuple[int, int], patch: Image,
     away: tuple[float, float], levels: tuple[float, float],

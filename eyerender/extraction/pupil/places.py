@@ -111,7 +111,7 @@ def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats) -> Indices:
     return out
 
 
-@compiled
+@compiled("UniTuple(f8, 5), f8[:,::1]")
 def holding(ellipse: tuple[float, ...], points: Floats) -> Bools:
     """Whether each sector (SECTORS,) of an ellipse (cx, cy, a, b, angle) holds one of the points (n, 2)."""
     flat, out = points.T.copy(), np.zeros(SECTORS, dtype=np.bool_)

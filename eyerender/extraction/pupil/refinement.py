@@ -205,7 +205,7 @@ def _near_boundary(
     return _band(part.linear, masked, part.corner, ellipse.numbers(), outer, inner)
 
 
-@compiled
+@compiled("f4[:,::1], b1[:,::1], UniTuple(i8, 2), UniTuple(f8, 5), UniTuple(f8, 2), UniTuple(f8, 2)")
 def _band(
     linear: Image, masked: Bools, corner: tuple[int, int], ellipse: tuple[float, ...],
     outer: tuple[float, float], inner: tuple[float, float],

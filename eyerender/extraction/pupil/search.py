@@ -119,7 +119,7 @@ def _chord(ellipse: tuple[float, ...], y: float) -> tuple[float, float]:
     return cx - (mixed + root) / square, cx - (mixed - root) / square
 
 
-@compiled
+@compiled("UniTuple(f8, 5), UniTuple(f8, 5)")
 def _overlap(first: tuple[float, ...], second: tuple[float, ...]) -> float:
     """Intersection over union of two ellipses (cx, cy, a, b, angle), to about 0.001."""
     nodes = 128
