@@ -519,7 +519,7 @@ class Bench:
                 _ = part_labels(shown, turned.window)(), shown.host.lid_margins_px
             with timed("glints"):
                 MirrorImages.of(turned, None).seen(place, shown.host.blur)
-            traced = self.renderer._traced(turned, 4, None)
+            traced = self.renderer._traced(turned, 4, (), None)
             with timed("lens and sensor"):
                 done = traced.developed()
             assert done.labels is not None

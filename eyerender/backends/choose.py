@@ -18,9 +18,10 @@ from typing import Literal
 
 from ..cachefolder import cache_folder, private_folder
 from ..errors import BackendError, InputError
+from ..versions import package_version
 from .libraries import load_runtime
 from .llvm import ensure_llvm
-from .probe import Verdict, cpu_name, package_version, probe
+from .probe import Verdict, cpu_name, probe
 from .remedies import CUDA_FIX
 
 BackendName = Literal["cuda", "llvm"]
@@ -88,7 +89,7 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
         raise InputError(f"must be auto, cuda or llvm, not {name!r}", path="backend")
     if threads is not None and threads < 1:
         raise InputError(f"must be >= 1, not {threads}", path="threads")
-    if package_version("mitsuba") == "none":
+    if package_version("mitsuba") == "unknown":
         raise BackendError("mitsuba is not installed; run: pip install mitsuba")
     _keep_kernels_private()
     if name != "llvm":

@@ -8,9 +8,10 @@ import sys
 from dataclasses import dataclass
 
 from ..cachefolder import cache_folder
+from ..versions import package_version
 from .choose import BackendName, BackendState, cuda_state
 from .llvm import examine
-from .probe import cpu_name, package_version
+from .probe import cpu_name
 from .remedies import llvm_fix
 
 

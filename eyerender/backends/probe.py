@@ -21,13 +21,13 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from ..cachefolder import cache_folder
 from ..errors import InputError
 from ..files import read_json
+from ..versions import package_version
 from .libraries import load_llvm, load_runtime
 
 TIMEOUT_S = 180.0
@@ -50,14 +50,6 @@ class Verdict:
     ok: bool
     detail: str
     lasting: bool = True
-
-
-def package_version(name: str) -> str:
-    """Installed version of a distribution, "none" where it is not installed."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "none"
 
 
 def cpu_name() -> str:

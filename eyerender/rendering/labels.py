@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Bytes, Singles, frozen, sealed
+from ..arrays import ArrayValue, Bools, Bytes, frozen, sealed
 from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..rig.camera import Window
 from .film import Exposed, Pixels
@@ -19,7 +19,7 @@ from .recorded import recorded
 from .region import glossy_normal
 from .sampling import camera_ray
 from .values import Frame
-from .view import View, hidden, look, meet, meet_globe, outer_albedo
+from .view import View, hidden, look, meet_globe, outer_albedo
 from .water import on_water
 
 _HIGHLIGHT = 0.5  # of the scattered light
@@ -107,14 +107,6 @@ def highlights(shown: Exposed, window: Window) -> Bools:
     marked = (np.asarray(mirrored) > _HIGHLIGHT * np.asarray(scattered)) & (np.asarray(beside) > 0.5)
     marked = np.broadcast_to(marked, window[2] * window[3])
     return frozen(marked.reshape(window[3], window[2]), np.bool_)
-
-
-def depths_mm(shown: Exposed, window: Window) -> Singles:
-    """Distances (height, width) of the first surfaces from the nodal point, infinite where there is none."""
-    o, d = _rays(shown, window, mi.Float(0), mi.Float(0))
-    view, _ = meet(shown.frame, o, d, True)
-    depth = dr.select(view.met, view.distance, dr.inf)
-    return frozen(depth.numpy().reshape(window[3], window[2]), np.float32)
 
 
 def _rays(shown: Exposed, window: Window, right: mi.Float, down: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:

@@ -13,7 +13,7 @@ from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from .blur import Blur
 from .film import Exposed, begun, mean_radiance
 from .frame import RenderJob
-from .labels import PartLabels, depths_mm, highlights, part_labels
+from .labels import PartLabels, highlights, part_labels
 from .prepared import Prepared
 from .recorded import uncollected
 from .region import RegionScene
@@ -39,13 +39,7 @@ class Renderer:
         obstacles: bodies in the scene's frame that hide and shade the eye.
     """
 
-    def __init__(
-        self,
-        backend: Backend,
-        *,
-        spp: int = 16,
-        obstacles: Sequence[Obstacle] = (),
-    ) -> None:
+    def __init__(self, backend: Backend, *, spp: int = 16, obstacles: Sequence[Obstacle] = ()) -> None:
         self.backend = backend
         self.spp = spp
         self._beside = ThreadPoolExecutor(1, "develop")
@@ -63,8 +57,7 @@ class Renderer:
         Raises:
             InputError: numbers so extreme that the image is not finite.
         """
-        traced = self._moving(job, spp, moments) if moments else self._traced(job, spp, None)
-        return traced.developed()
+        return self._traced(job, spp, moments, None).developed()
 
     def begin(
         self,
@@ -85,38 +78,26 @@ class Renderer:
             after: the very job that comes next, if it is known: what NumPy alone makes of it is made in the second
                 thread, too.
         """
-        traced = self._moving(job, spp, moments) if moments else self._traced(job, spp, after)
-        return self._beside.submit(traced.developed)
+        return self._beside.submit(self._traced(job, spp, moments, after).developed)
 
     @uncollected
-    def _traced(self, job: RenderJob, spp: int | None, after: RenderJob | None) -> Traced:
-        """Trace a job."""
-        shown, place = self._stage.set(job, after=after)
-        blur = shown.host.blur
-        film = begun(shown, blur.window, spp or self.spp, job.seed, layered=blur.layered)
-        # The device is at work until something is read, so the host's own work comes first.
-        marks = _marks(shown, job)
-        self._stage.prepare()
-        mirrored, shines = self._mirror_images(shown.host).seen(place, blur)
-        picture, failed = film.means()
-        labels, margins, bright = marks()
-        return Traced(job, picture, tuple(shines), blur, mirrored, labels, failed, margins, bright)
-
-    @uncollected
-    def _moving(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob]) -> Traced:
-        """Trace the moments of a job: the mean of their pictures, with labels and glints of the job itself."""
-        spp = max(1, (spp or self.spp) // len(moments))
+    def _traced(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob], after: RenderJob | None) -> Traced:
+        """Trace a job, or its moments: the mean of their pictures, with labels and glints of the job itself."""
+        shots = moments or (job,)
+        spp = max(1, (spp or self.spp) // len(shots))
         blur: Blur | None = None
         pictures: list[Singles] = []
         failed = 0
         glints: list[Shine] = []
         marks: tuple[Any, ...] | None = None
-        for shot in moments:
-            shown, place = self._stage.set(shot)
-            blur = blur or Blur.of(job, place.posed)
+        for shot in shots:
+            shown, place = self._stage.set(shot, after=None if moments else after)
+            blur = blur or (Blur.of(job, place.posed) if moments else shown.host.blur)
             film = begun(shown, blur.window, spp, shot.seed, layered=blur.layered)
+            # The device is at work until something is read, so the host's own work comes first.
             found = _marks(shown, job) if shot.M is job.M and shot.t is job.t else None
-            mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(moments))
+            self._stage.prepare()
+            mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(shots))
             glints += shines
             mean, missed = film.means()
             pictures.append(mean)
@@ -128,7 +109,8 @@ class Renderer:
             shown, place = self.bind(job, lit=False)
             marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(shown, job)()
         mirrored, labels, margins, bright = marks
-        return Traced(job, np.mean(pictures, axis=0), tuple(glints), blur, mirrored, labels, failed, margins, bright)
+        picture = np.mean(pictures, axis=0) if moments else pictures[0]
+        return Traced(job, picture, tuple(glints), blur, mirrored, labels, failed, margins, bright)
 
     def _mirror_images(self, host: Prepared) -> MirrorImages:
         """The lamps' mirror images, in the closed form of the cornea or in a mesh of it."""
@@ -145,10 +127,6 @@ class Renderer:
     def labels(self, job: RenderJob) -> PartLabels:
         """Compute the labels of a window alone."""
         return part_labels(self.bind(job, lit=False)[0], job.window)()
-
-    def depths_mm(self, job: RenderJob) -> Singles:
-        """Distances (height, width) from the nodal point of what a window shows, infinite where that is nothing."""
-        return depths_mm(self.bind(job, lit=False)[0], job.window)
 
     def bind(self, job: RenderJob, *, lit: bool = True) -> tuple[Exposed, Surround | RegionScene]:
         """Set up a job's frame on the device, with the surroundings of its eye.

@@ -126,7 +126,7 @@ def test_doctor_reports_both_backends_and_is_plain_data() -> None:
     assert report.ok == any(state.ok for state in report.backends)
     assert (report.chosen is None) != report.ok
     assert all(state.ok or state.fix for state in report.backends)
-    assert dict(report.packages)["mitsuba"] != "none"
+    assert dict(report.packages)["mitsuba"] != "unknown"
     plain = dataclasses.asdict(report)
     assert plain["backends"][1]["name"] == "llvm"
 

@@ -21,6 +21,7 @@ from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.labels import labels_of
 from tests.support.paths import SCRIPTS
+from tests.support.render_rigs import depths_mm
 
 pytestmark = pytest.mark.render
 
@@ -152,7 +153,7 @@ def test_the_opening_is_where_its_edge_projects(renderer, folder, side):
     pixels = np.column_stack([u[skin], v[skin]]) + image.window[:2]
     rays, node = camera.rays(pixels.astype(float)), camera.nodal_point_mm - apex
     distance = (X_MM - node[0]) / rays[:, 0]
-    np.testing.assert_allclose(renderer.depths_mm(render_job(scene.frames(), 0))[skin], distance, rtol=1e-5)
+    np.testing.assert_allclose(depths_mm(renderer, render_job(scene.frames(), 0))[skin], distance, rtol=1e-5)
     # The second lamp's glint lies high on the cornea, under the upper lid; the first stands free.
     labels = labels_of(image)
     assert [g["reason"] for g in labels["glints"]] == ["visible", "occluded by lid"]

@@ -12,7 +12,7 @@ import trimesh
 from eyerender.eye.meshes import eye_meshes
 from eyerender.rendering.export import bake_meshes, export_scene
 from tests.support.eye_meshes import crossing
-from tests.support.render_rigs import eye_of, job_of, remote_rig
+from tests.support.render_rigs import depths_mm, eye_of, job_of, remote_rig
 
 EYES = ["E1", "E2", "E3", "E4", "E5", "E5-published"]
 
@@ -83,7 +83,7 @@ def test_stock_mitsuba_loads_the_export_and_sees_the_same_depths(renderer, tmp_p
         inner &= np.roll(part, shift, (0, 1)) == part
     inner &= part >= 2
     assert inner.sum() > 200
-    error = (depth - renderer.depths_mm(job))[inner]
+    error = (depth - depths_mm(renderer, job))[inner]
     assert np.quantile(np.abs(error), 0.98) < 0.05
     assert abs(np.median(error)) < 5e-3
     assert {s.id() for s in scene.shapes()} >= {"cornea_front", "iris", "sclera", "backdrop", "lamp0"}

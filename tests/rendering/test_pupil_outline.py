@@ -8,7 +8,7 @@ from matplotlib.path import Path
 
 from eyerender.rendering.surround import Obstacle
 from tests.support.render_oracles import contour_error, outline
-from tests.support.render_rigs import PLAIN, RIGS, eye_of, head_rig, job_of, remote_rig
+from tests.support.render_rigs import PLAIN, RIGS, depths_mm, eye_of, head_rig, job_of, remote_rig
 
 
 @pytest.mark.parametrize("rig_name", RIGS)
@@ -38,7 +38,7 @@ def test_labels_show_the_pupil_through_the_cornea(renderer):
     assert expected.sum() > 300
     assert np.count_nonzero(expected != (labels.part == 3)) <= 1  # a centre within float32 of the edge
     assert labels.visible_fraction(3) == 1.0
-    nearest = renderer.depths_mm(job)[labels.part == 3]
+    nearest = depths_mm(renderer, job)[labels.part == 3]
     apex = np.linalg.norm(rig.camera.nodal_point_mm)
     assert np.all(np.abs(nearest - apex) < 4.0)
 
@@ -55,5 +55,5 @@ def test_amodal_labels_see_through_an_obstacle(renderer):
     np.testing.assert_array_equal(hidden.amodal, open_.amodal)
     assert 0.2 < hidden.visible_fraction(3) < 0.8
     covered = (open_.part != 0) & (hidden.part == 0)
-    assert np.all(other.depths_mm(job)[covered] < renderer.depths_mm(job)[covered])
+    assert np.all(depths_mm(other, job)[covered] < depths_mm(renderer, job)[covered])
     assert np.all(hidden.part[hidden.part != 0] == open_.part[hidden.part != 0])

@@ -124,3 +124,20 @@ def iris_irradiance(renderer: Renderer, job: RenderJob, points_mm: np.ndarray) -
     corner = mi.Float(0)  # of the unit square, which is the disc's centre
     bent, _ = through_cornea(shown.frame, x, dr.full(mi.Bool, True, len(points_mm)), corner, corner)
     return np.asarray(bent.numpy(), dtype=float)
+
+
+def depths_mm(renderer: Renderer, job: RenderJob) -> np.ndarray:
+    """Distances (height, width) from the nodal point of what pixels' centres show, infinite where that is nothing."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from eyerender.rendering.film import Pixels
+    from eyerender.rendering.sampling import camera_ray
+    from eyerender.rendering.view import meet
+
+    shown, _ = renderer.bind(job, lit=False)
+    _, _, width, height = job.window
+    u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, width * height))
+    o, d, _ = camera_ray(shown.frame, mi.Float(u), mi.Float(v))
+    view, _ = meet(shown.frame, o, d, True)
+    return dr.select(view.met, view.distance, dr.inf).numpy().reshape(height, width)
