@@ -285,16 +285,16 @@ def _taken(
     samples = _samples(u, v, pattern)
     spot, on_lamp = samples.in_pixel(k), samples.pair(k, 0)
     o, d, cosine = camera_ray(frame, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
-    seen = shade(frame, o, d, mi.Bool(True), on_lamp.x, on_lamp.y)
+    radiance, failures = shade(frame, o, d, on_lamp.x, on_lamp.y)
     cosine = cosine * cosine
-    lanes = [seen.radiance * cosine * cosine]
+    lanes = [radiance * cosine * cosine]
     if layered:
         view, _ = meet(frame, o, d, True)
         near = view.nearness(frame, d)
         parts = (view.other, view.cornea | view.sclera)
         lanes = [dr.select(part, x, 0) for part in parts for x in (lanes[0], mi.Float(1), near)]
-    dr.eval(lanes, seen.failures)  # together, because a separate reduction would trace everything again
-    failed = dr.sum(seen.failures)
+    dr.eval(lanes, failures)  # together, because a separate reduction would trace everything again
+    failed = dr.sum(failures)
     dr.eval(failed)
     return lanes, failed
 

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .manifold import connect
-from .region import glossy_normal, sheen
+from .region import sheen
 from .surfaces import Surface
 from .values import ALL, BITS, Frame, Lamp
 from .view import EPSILON_MM, View, meet_sphere, opacity
@@ -139,38 +139,22 @@ def onto_points(
     return total, free
 
 
-def light(
-    frame: Frame, view: View, back: mi.Vector3f, u: mi.Float, v: mi.Float, known: mi.Bool | None = None
-) -> tuple[mi.Float, mi.Float, mi.Float, mi.UInt32]:
-    """Light on the eye.
+def light(frame: Frame, view: View, u: mi.Float, v: mi.Float, known: mi.Bool) -> tuple[mi.Float, mi.Float, mi.UInt32]:
+    """Light of the lamps on a bare eye.
 
     The cornea is convex: where it faces a lamp it does not shadow itself.
 
     Args:
         frame: the frame.
         view: the points that are lit.
-        back: unit direction of the viewer (eye frame).
         u: place on each lamp's disc, [0, 1).
         v: the same, second coordinate.
         known: where the light at the first surface is not wanted.
 
     Returns:
-        Irradiance (mW/mm^2) at the first surface where it is matte, the radiance of its sheen towards `back`, the
-        irradiance in the plane of the iris, and failed paths.
+        Irradiance (mW/mm^2) at the first surface where it is matte, the irradiance in the plane of the iris, and failed
+        paths.
     """
-    if frame.structure.region:
-        # Skin fills the image and every lamp costs a ray through the region, so each sample uses one lamp, which stands
-        # for all.
-        count = mi.Float(frame.lights.count)
-        one = dr.minimum(mi.UInt32(u * count), frame.lights.count - 1)
-        lamp: Lamp = frame.lights[one]
-        source = lamp.point(u * count - mi.Float(one), *dr.sincos(v * (2 * dr.pi)))
-        direct, shine = straight(lamp, source, view, (glossy_normal(view.normal, view.gloss), back))
-        blocked = lamp_blocked(frame, view.point, source, view.other, ~view.cornea, direct > 0)
-        share = dr.select(blocked, 0, count)
-        bent, failures = through_cornea(frame, view.inner, view.lit_inside, u, v)
-        return direct * share, shine * share, bent, failures
-
     sine, cosine = dr.sincos(v * (2 * dr.pi))
 
     def onto_matte(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
@@ -180,13 +164,12 @@ def light(
         blocked = lamp_blocked(frame, view.point, source, view.other, ~view.cornea, direct > 0)
         return i + 1, total + dr.select(blocked, 0, direct)
 
-    matte = view.matte if known is None else view.matte & ~known
+    matte = view.matte & ~known
     state = (mi.UInt32(0), mi.Float(0))
     _, direct = dr.while_loop(
         state, lambda i, _: matte & (i < frame.lights.count), onto_matte, labels=("i", "direct"), label="lamps"
     )
-    bent, failures = through_cornea(frame, view.inner, view.lit_inside, u, v)
-    return direct, mi.Float(0), bent, failures
+    return direct, *through_cornea(frame, view.inner, view.lit_inside, u, v)
 
 
 def through_cornea(

@@ -8,8 +8,6 @@ lit directly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -21,33 +19,20 @@ from .view import EPSILON_MM, View, iris_albedo, look, outer_albedo, stop_coordi
 _FLAT_MM = 1e-2  # from the plane of a surround
 
 
-@dataclass(frozen=True, slots=True)
-class Shaded:
-    """Result of a ray: radiance (mW/mm^2/sr), what it met, the albedo there where it is matte, failed light paths."""
-
-    radiance: mi.Float
-    view: View
-    albedo: mi.Float
-    failures: mi.UInt32
-
-
-def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, u: mi.Float, v: mi.Float) -> Shaded:
-    """Radiance along rays of the scene's frame, from light that comes from the lamps by the shortest way.
+def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.UInt32]:
+    """Radiance (mW/mm^2/sr) along rays of the scene's frame before a bare eye, and failed light paths.
 
     u, v: place on each lamp's disc, [0, 1).
     """
-    view = on_relief(frame, look(frame, o, d, active))
+    view = on_relief(frame, look(frame, o, d, mi.Bool(True)))
     known, outer_known = mi.Bool(False), mi.Float(0)
     if frame.lights.on_matte is not None:
         outer_known, known = frame.lights.on_matte.at(frame, view)
-    outer, shine, inner, failures = light(frame, view, -frame.vector_to_eye(d), u, v, known)
-    outer += outer_known
+    outer, inner, failures = light(frame, view, u, v, known)
     albedo = outer_albedo(frame, view)
     received = of_surroundings(frame, view, known)
-    if frame.structure.region:
-        received = dr.select(view.other, view.received, frame.textures.received.globe(frame.point_to_scene(view.point)))
-    seen = indirect(frame, view, d, albedo, inner, received) + direct(view, albedo, outer, shine)
-    return Shaded(seen, view, albedo, failures)
+    seen = indirect(frame, view, d, albedo, inner, received) + direct(view, albedo, outer + outer_known, mi.Float(0))
+    return seen, failures
 
 
 def direct(view: View, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
