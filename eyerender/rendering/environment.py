@@ -134,7 +134,7 @@ def _size(kind: str, head: bytes) -> int | None:
     """
     if kind == ".npy":
         shape = re.search(rb"'shape': *\(([0-9, ]{1,99})\)", head)
-        return math.prod(int(n) for n in shape[1].split(b",") if n.strip()) if shape else None
+        return math.prod(int(n) for n in re.findall(rb"[0-9]+", shape[1])) if shape else None
     if kind == ".exr":
         window = re.search(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", head, re.DOTALL)
         x0, y0, x1, y1 = struct.unpack("<4i", window[1]) if window else (0, 0, -1, -1)

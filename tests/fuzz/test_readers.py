@@ -27,6 +27,13 @@ def test_the_unharmed_files_are_read(name, tmp_path):
     READERS[name].case(READERS[name].seeds()[0], tmp_path / "case")
 
 
+@pytest.mark.render
+def test_a_map_with_a_broken_shape_is_refused(tmp_path):
+    data = READERS["npy"].seeds()[0].replace(b"(4, 8)", b"(4 8 )")
+    with pytest.raises(InputError, match="is not a readable map"):
+        READERS["npy"].case(data, tmp_path / "case")
+
+
 def test_vertices_of_two_coordinates_are_refused(tmp_path):
     with pytest.raises(InputError, match="has vertices without three coordinates"):
         READERS["obj"].case(b"v 0 0\nv 100 0\nv 0 100\nf 1 2 3\n", tmp_path / "case")
