@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import queue
 import re
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -58,8 +60,8 @@ class Live:
         return int(head.split(" ")[1]), text
 
     @contextlib.contextmanager
-    def tab(self) -> Iterator[Any]:
-        """A page with its WebSocket, as a browser opens them."""
+    def tab(self) -> Iterator[queue.Queue[str]]:
+        """A page with its WebSocket, as a browser opens them; yields what it is sent."""
         from websockets.sync.client import connect
 
         client = re.search(r"[\"']client_id[\"']: *[\"']([0-9a-f-]{36})", self.page()[1])[1]
@@ -70,7 +72,17 @@ class Live:
             assert talk.recv(timeout=30).startswith("0")
             talk.send("40")
             assert talk.recv(timeout=30).startswith("40")
-            yield talk
+            sent: queue.Queue[str] = queue.Queue()
+
+            def listen() -> None:
+                with contextlib.suppress(Exception):  # until it is closed
+                    for message in talk:
+                        if message == "2":  # a ping
+                            talk.send("3")
+                        sent.put(str(message))
+
+            threading.Thread(target=listen, daemon=True).start()
+            yield sent
 
     def ends_s(self) -> float:
         """Time from Ctrl-C until the process has ended."""
@@ -104,23 +116,11 @@ def until(what: Callable[[], bool], timeout_s: float) -> None:
         time.sleep(0.5)
 
 
-def attend(talk: Any, seconds: float) -> None:
-    """Keep a tab open for a while, as a browser does: it answers the server's pings."""
-    end = time.monotonic() + seconds
-    while (left := end - time.monotonic()) > 0:
-        with contextlib.suppress(TimeoutError):
-            if talk.recv(timeout=left) == "2":
-                talk.send("3")
-
-
-def pictures(talk: Any) -> Iterator[str]:
-    """The addresses of the pictures that a tab is told to show."""
+def picture_of(sent: queue.Queue[str]) -> str:
+    """The address of the next picture that a tab is told to show."""
     while True:
-        message = talk.recv(timeout=120)
-        if message == "2":  # a ping
-            talk.send("3")
-        elif found := re.search(r"/picture/[\w-]+\?[\d.]+", message):
-            yield found[0]
+        if found := re.search(r"/picture/[\w-]+\?[\d.]+", sent.get(timeout=120)):
+            return found[0]
 
 
 def test_pages_without_a_websocket_are_few_and_soon_deleted():
@@ -144,10 +144,10 @@ def test_pages_without_a_websocket_are_few_and_soon_deleted():
 
 def test_a_tab_that_leaves_frees_its_pictures_at_once_and_its_page_later():
     with live("headset") as server:
-        with server.tab() as talk:
-            picture = next(pictures(talk))
+        with server.tab() as sent:
+            picture = picture_of(sent)
             assert server.page(picture)[0] == 200
-            attend(talk, 21)  # a page that has connected stays
+            time.sleep(21)  # a page that has connected stays
             assert server.counts()["clients"] == 1
         until(lambda: server.page(picture)[0] == 404, 5)
         assert server.counts()["clients"] == 1
@@ -184,8 +184,8 @@ def test_ctrl_c_ends_it_soon_with_half_open_connections():
 def test_ctrl_c_ends_it_soon_with_open_websockets():
     with live("headset") as server, contextlib.ExitStack() as stack:
         tabs = [stack.enter_context(server.tab()) for _ in range(3)]
-        for talk in tabs:
-            next(pictures(talk))
+        for sent in tabs:
+            picture_of(sent)
         assert server.ends_s() < ENDS_S
 
 
