@@ -7,6 +7,7 @@ import importlib.util
 import json
 import queue
 import re
+import select
 import signal
 import socket
 import subprocess
@@ -45,6 +46,10 @@ class Live:
     def counts(self) -> dict[str, Any]:
         self.process.stdin.write("\n")
         self.process.stdin.flush()
+        if not select.select([self.process.stdout], [], [], 60)[0]:
+            self.process.send_signal(signal.SIGUSR1)  # `live` shows the stacks
+            time.sleep(1)
+            pytest.fail("the server does not answer")
         return json.loads(self.process.stdout.readline())
 
     def asking(self, path: str = "/", end: str = "Connection: close\r\n\r\n") -> socket.socket:
@@ -149,7 +154,7 @@ def test_a_tab_that_leaves_frees_its_pictures_at_once_and_its_page_later():
             assert server.page(picture)[0] == 200
             time.sleep(21)  # a page that has connected stays
             assert server.counts()["clients"] == 1
-        until(lambda: server.page(picture)[0] == 404, 5)
+        until(lambda: server.page(picture)[0] == 404, 10)
         assert server.counts()["clients"] == 1
         until(lambda: server.counts()["clients"] == 0, 60)
         until(lambda: server.counts()["tabs"] == 0, 10)
