@@ -159,7 +159,7 @@ def test_a_planted_cache_is_not_used_by_any_of_its_users(tmp_path):
         "assert os.stat(kernels).st_mode & 0o777 == 0o700\n"
         "from eyerender import jit\n"
         "print([runtime_store(), pupil_labs_python(), mapcache.folder(), jit.FOLDER])\n"
-        "function = jit.compiled(lambda x: x + 1); assert function(1) == 2; print(function.stats.cache_path)\n"
+        "function = jit.compiled()(lambda x: x + 1); assert function(1) == 2; print(function.stats.cache_path)\n"
         "print(kernels)"
     )
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
