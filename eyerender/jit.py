@@ -28,7 +28,7 @@ import numba
 from numba.core import config as numba_config
 from numba.core import event as numba_event
 
-from .cachefolder import cache_folder
+from .storage.cachefolder import cache_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _DIGITS, _UNUSED_S = 16, 30 * 86400.0

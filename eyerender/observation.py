@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 
 from .arrays import ArrayValue, Bools, Columns, Floats, Ints, Objects, Statuses, column, frozen
 from .errors import InputError, Problems
-from .files import shown
 from .status import Status
+from .storage.files import shown
 
 RECORD = 2
 """The record's version that is written unless another one is asked for; `SCHEMAS` are those that are read."""

@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Any
 
 from .errors import InputError
-from .files import shown
+from .storage.files import shown
 
 _REFERENCE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 

@@ -29,7 +29,7 @@ from pydantic import (
 )
 
 from .errors import InputError, Problems
-from .files import opened, read_text, shown
+from .storage.files import opened, read_text, shown
 
 FORMAT = 1
 # Limits of a YAML file. Nodes are counted as expanded: an alias counts as much as the value it stands for. A scene with

@@ -37,7 +37,7 @@ from .dataset.realise import frames_of
 from .dataset.run import usable_cpus
 from .dataset.spec import DatasetSpec
 from .errors import InputError
-from .imagefolder import METADATA, ImageFolder
+from .folders.imagefolder import METADATA, ImageFolder
 
 if TYPE_CHECKING:
     from .dataset.maker import Maker

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 from eyerender import load_eye
-from eyerender.rendering.export import bake_meshes
+from eyerender.rendering.output.export import bake_meshes
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -122,7 +122,7 @@ def batches(runs: int) -> Iterator[Row]:
 
 def frames(backend: Any, runs: int) -> Iterator[Row]:
     """Rendered frames against those of conics, what a new subject costs, and its kernels."""
-    from eyerender.rendering.lattice import lattice
+    from eyerender.rendering.records.lattice import lattice
     from eyerender.rendering.renderer import Renderer
     from tests.rendering.test_renderer import kernels
     from tests.support.render_rigs import head_rig, job_of, remote_rig

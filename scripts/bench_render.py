@@ -79,9 +79,9 @@ class Bench:
         import mitsuba as mi
 
         from eyerender.arrays import frozen
-        from eyerender.rendering.film import Pixels
-        from eyerender.rendering.sampling import camera_ray
-        from eyerender.rendering.view import look
+        from eyerender.rendering.hits.interaction import look
+        from eyerender.rendering.integrator.film import Pixels
+        from eyerender.rendering.integrator.sampling import camera_ray
         from eyerender.rig.camera import Camera
         from eyerender.rig.light import Lamp
         from tests.support.render_oracles import RINGS_MM
@@ -146,7 +146,7 @@ class Bench:
         """The exported job as stock Mitsuba loads it."""
         import mitsuba as mi
 
-        from eyerender.rendering.export import export_scene
+        from eyerender.rendering.output.export import export_scene
 
         path = export_scene(job, folder, spp=16, max_depth=max_depth, rings=rings, sectors=sectors)
         return mi.load_file(str(path))
@@ -295,7 +295,7 @@ class Bench:
         """Job of a row of a shipped scene."""
         import yaml
 
-        from eyerender.capture import render_job
+        from eyerender.imaging.capture import render_job
         from eyerender.scene import Scene
         from eyerender.scene.spec import SceneSpec
 
@@ -362,7 +362,7 @@ class Bench:
 
     def cycles(self) -> Iterable[Row]:
         """CPU time and noise of Blender's Cycles and of this package on E2's meshes under one lamp, remote camera."""
-        from eyerender.rendering.export import bake_meshes
+        from eyerender.rendering.output.export import bake_meshes
 
         job, box = self._remote_eye()
         camera, samples = job.camera, 16 if self.small else 64
@@ -405,7 +405,7 @@ class Bench:
 
     def surfaces_cost(self) -> Iterable[Row]:
         """Meshed corneas and blur by depth, against exact surfaces and no blur."""
-        from eyerender.capture import render_job
+        from eyerender.imaging.capture import render_job
         from eyerender.rig.imaging import Lens
         from eyerender.scene.shipped import load_scene
 
@@ -427,7 +427,7 @@ class Bench:
 
     def region_cost(self) -> Iterable[Row]:
         """CPU time of eyes in their lids with a new pose in each frame."""
-        from eyerender.imagefile import png_bytes
+        from eyerender.folders.imagefile import png_bytes
 
         headset = self._scene_job("headset", 4)
         desktop = self._scene_job("desktop_tracker", 0)
@@ -492,10 +492,10 @@ class Bench:
         """CPU time of what a headset frame needs beside its light and its samples."""
         import drjit as dr
 
-        from eyerender.imagefile import png_bytes
-        from eyerender.rendering.labels import part_labels
-        from eyerender.rendering.region import RegionScene
-        from eyerender.rendering.splat import MirrorImages
+        from eyerender.folders.imagefile import png_bytes
+        from eyerender.rendering.glints.splatting import MirrorImages
+        from eyerender.rendering.output.labels import part_labels
+        from eyerender.rendering.scene.region import RegionScene
 
         job = self._scene_job("headset", 4)
         spent: dict[str, list[float]] = {}
@@ -535,8 +535,8 @@ class Bench:
         """Share of the clock in which no kernel runs while a run of headset frames is rendered and written."""
         import drjit as dr
 
-        from eyerender.capture import render_windows
-        from eyerender.imagefile import Writer
+        from eyerender.folders.imagefile import Writer
+        from eyerender.imaging.capture import render_windows
         from eyerender.scene.shipped import load_scene
 
         scene = load_scene("headset").with_(spp=4)

@@ -68,7 +68,7 @@ def add(table: Rows, count: int, first: int, processes: int) -> None:
 @cache
 def _renderer() -> Any:
     """This process' own, on one thread: the processes share the work."""
-    from eyerender.capture import make_renderer
+    from eyerender.imaging.capture import make_renderer
 
     return make_renderer(threads=1)
 

@@ -108,7 +108,7 @@ def _give_face(mapping: dict[str, Any], row: str, face: int) -> None:
 
 @cache
 def _renderer() -> Any:
-    from eyerender.capture import make_renderer
+    from eyerender.imaging.capture import make_renderer
 
     return make_renderer(threads=1)
 
@@ -116,8 +116,8 @@ def _renderer() -> Any:
 def render_one(task: tuple[str, int, Path]) -> Path:
     """Render one image to its file."""
     from eyerender.analytic.observer import trace
-    from eyerender.capture import render_windows
-    from eyerender.labels import image_labels
+    from eyerender.imaging.capture import render_windows
+    from eyerender.imaging.labels import image_labels
     from eyerender.scene import Scene
     from eyerender.scene.spec import SceneSpec
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from eyerender.capture import make_renderer, render_windows
+from eyerender.imaging.capture import make_renderer, render_windows
 from eyerender.region.anatomy import Region
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec

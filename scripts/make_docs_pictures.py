@@ -21,9 +21,9 @@ from matplotlib.patches import Ellipse
 from PIL import Image
 
 import eyerender as er
-from eyerender.capture import render_windows
 from eyerender.cli.main import run
-from eyerender.imagefile import preview
+from eyerender.folders.imagefile import preview
+from eyerender.imaging.capture import render_windows
 from eyerender.report.style import ANALYTIC_ON_DARK, IMAGE_ON_DARK
 
 ROOT = Path(__file__).resolve().parent.parent

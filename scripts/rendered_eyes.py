@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from eyerender.analytic.observer import trace
-from eyerender.capture import render_windows
+from eyerender.folders.imagefolder import PUPIL
 from eyerender.geometry.ellipse import Ellipse, signed_distance
-from eyerender.imagefolder import PUPIL
+from eyerender.imaging.capture import render_windows
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 from make_ideal_images import Drawing

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from eyerender import cachefolder
-from eyerender.cachefolder import cache_folder, private_folder
+from eyerender.storage import cachefolder
+from eyerender.storage.cachefolder import cache_folder, private_folder
 
 OTHER = 65534  # nobody
 as_root = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away")
@@ -57,7 +57,8 @@ def test_a_folder_that_others_can_write_is_refused_with_one_warning(tmp_path, ca
     assert said[0].startswith(f"warning: the cache folder {place} is not used, because other users can write to ")
     assert mode(place) != 0o700  # it is left as it was
     # Processes that this one starts know of the warning.
-    code = f"from pathlib import Path; from eyerender.cachefolder import private_folder as f; print(f(Path('{place}')))"
+    module = "eyerender.storage.cachefolder"
+    code = f"from pathlib import Path; from {module} import private_folder as f; print(f(Path('{place}')))"
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (child.stdout.strip(), child.stderr) == ("None", "")
 
@@ -125,7 +126,7 @@ def test_links_in_a_circle_are_refused(tmp_path):
 def test_a_folder_of_root_that_others_only_read_is_good_for_a_user(tmp_path):
     place = Path("/usr/share")  # readable for everybody, of root
     code = (
-        "import os; from pathlib import Path; from eyerender.cachefolder import private_folder\n"
+        "import os; from pathlib import Path; from eyerender.storage.cachefolder import private_folder\n"
         f"os.setuid({OTHER}); print(private_folder(Path({str(place)!r})))"
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -9,7 +9,7 @@ import socket
 import pytest
 
 from eyerender.errors import EyerenderError, InputError
-from eyerender.files import (
+from eyerender.storage.files import (
     inside,
     is_plain,
     make_folder,

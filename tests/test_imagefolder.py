@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from eyerender.errors import EyerenderError, InputError
-from eyerender.imagefile import Writer, png_bytes, preview, read_image, write_png
-from eyerender.imagefolder import FILE_KEYS, ImageFolder, same_run, write_dataset
-from eyerender.outfolder import staged
+from eyerender.folders.imagefile import Writer, png_bytes, preview, read_image, write_png
+from eyerender.folders.imagefolder import FILE_KEYS, ImageFolder, same_run, write_dataset
+from eyerender.folders.outfolder import staged
 
 
 def test_png_keeps_every_bit(tmp_path):

@@ -14,10 +14,10 @@ import pytest
 from eyerender.analytic.observer import trace
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec
+from eyerender.folders.imagefile import write_png
+from eyerender.folders.imagefolder import write_dataset
+from eyerender.folders.outfolder import staged
 from eyerender.geometry.ellipse import Ellipse, signed_distance
-from eyerender.imagefile import write_png
-from eyerender.imagefolder import write_dataset
-from eyerender.outfolder import staged
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 
@@ -163,7 +163,7 @@ def dataset_of(path, count, size):
     return path
 
 
-ITERATE = """from eyerender.imagefolder import ImageFolder
+ITERATE = """from eyerender.folders.imagefolder import ImageFolder
 
 folder = ImageFolder.load({path!r})
 assert sum(1 for entry in folder.entries if entry.window[2]) == {count}
@@ -175,7 +175,7 @@ report = validate({path!r}, quick=True)
 assert report["problem_count"] > {count}
 assert len(report["problems"]) == 50
 """
-COMPARE = """from eyerender.quickstart import compare_folder
+COMPARE = """from eyerender.applications.quickstart import compare_folder
 
 result = compare_folder({path!r})
 assert len(result.truth) == {count}

@@ -14,12 +14,12 @@ import pytest
 
 from eyerender.dataset import assemble, croissant, runfile, shard
 from eyerender.errors import EyerenderError, InputError
-from eyerender.imagefile import write_png
-from eyerender.imagefolder import write_dataset
-from eyerender.images import render_folder
-from eyerender.lock import LOCK, run_lock, writer_lock
-from eyerender.outfolder import MARKER, clear, refuse_non_empty, staged
+from eyerender.folders.imagefile import write_png
+from eyerender.folders.imagefolder import write_dataset
+from eyerender.folders.outfolder import MARKER, clear, refuse_non_empty, staged
+from eyerender.imaging.images import render_folder
 from eyerender.scene import load_scene
+from eyerender.storage.lock import LOCK, run_lock, writer_lock
 from eyerender.study import run as study
 
 LINE = {"file_name": "images/a.png", "window_px": {"x0": 3, "y0": 4, "width": 5, "height": 6}, "records": []}

@@ -14,7 +14,7 @@ from eyerender.cli.main import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import shipped_datasets
 from eyerender.errors import InputError
-from eyerender.images import render_folder
+from eyerender.imaging.images import render_folder
 from eyerender.plausibility import is_saturated
 from eyerender.rig.sensor import Sensor
 from eyerender.scene import Scene, load_scene, shipped_scenes

@@ -13,8 +13,8 @@ import pytest
 
 from eyerender.analytic.observer import trace
 from eyerender.cli.main import run
-from eyerender.imagefile import read_image
-from eyerender.imagefolder import ImageFolder
+from eyerender.folders.imagefile import read_image
+from eyerender.folders.imagefolder import ImageFolder
 from eyerender.scene import load_scene
 from tests.support.paths import ROOT
 

@@ -10,7 +10,7 @@ import pytest
 from tests.support import golden
 
 CHANGED = (
-    "what this package computes has changed. If that is intended, raise eyerender.imagefolder.RESULTS, say so in "
+    "what this package computes has changed. If that is intended, raise RESULTS in folders/imagefolder.py, say so in "
     "CHANGELOG.md, and run: python -m tests.support.golden"
 )
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ..cachefolder import cache_folder, private_folder
 from ..errors import BackendError, InputError
+from ..storage.cachefolder import cache_folder, private_folder
 from ..versions import package_version
 from .libraries import load_runtime
 from .llvm import ensure_llvm

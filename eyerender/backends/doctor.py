@@ -7,7 +7,7 @@ import platform
 import sys
 from dataclasses import dataclass
 
-from ..cachefolder import cache_folder
+from ..storage.cachefolder import cache_folder
 from ..versions import package_version
 from .choose import BackendName, BackendState, cuda_state
 from .llvm import examine

@@ -24,9 +24,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..cachefolder import cache_folder
 from ..errors import InputError
-from ..files import read_json
+from ..storage.cachefolder import cache_folder
+from ..storage.files import read_json
 from ..versions import package_version
 from .libraries import load_llvm, load_runtime
 

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args, get_type_hints
 
 from ..errors import InputError
-from ..files import shown
 from ..geometry.ellipse import Ellipse
+from ..storage.files import shown
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..files import inside, read_json
+from ..folders.imagefile import read_any_image, read_image
+from ..folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..geometry.ellipse import Ellipse
-from ..imagefile import read_any_image, read_image
-from ..imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
-from ..jsonlines import JsonLines
 from ..observation import Observations
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigGeometry
 from ..scene import Scene
 from ..scene.spec import SceneSpec
+from ..storage.files import inside, read_json
+from ..storage.jsonlines import JsonLines
 from .own import is_own, own_labels
 
 IDEAL_SCHEMA = "eyerender/ideal-images/1"

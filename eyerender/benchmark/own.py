@@ -19,10 +19,10 @@ import numpy as np
 
 from ..arrays import Bools
 from ..errors import InputError
-from ..files import inside, read_text
+from ..folders.imagefile import read_any_image
+from ..folders.imagefolder import DATASET
 from ..geometry.ellipse import Ellipse
-from ..imagefile import read_any_image
-from ..imagefolder import DATASET
+from ..storage.files import inside, read_text
 
 LABELS, MASKS, IMAGES = "labels.csv", "masks", "images"
 COLUMNS = ("centre_x_px", "centre_y_px", "semi_axis_a_px", "semi_axis_b_px", "angle_deg")

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, one_line
-from ..files import shown
 from ..geometry.ellipse import Ellipse
+from ..storage.files import shown
 from .conventions import Conventions, number, pair
 
 SCHEMA = "eyerender/extractor/1"

@@ -15,12 +15,12 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import EyerenderError, InputError
-from ..files import write_json
-from ..imagefile import read_any_image
-from ..imagefolder import versions
-from ..outfolder import refuse_non_empty, staged
+from ..folders.imagefile import read_any_image
+from ..folders.imagefolder import versions
+from ..folders.outfolder import refuse_non_empty, staged
 from ..progress import Progress
 from ..report.benchmark import Thumbnail, write_bench_report
+from ..storage.files import write_json
 from .bound import Edge, edge_of
 from .folder import LabelledImage, load_labelled
 from .process import ExtractorProcess, Failed

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cachefolder import cache_folder
 from ..extraction import FAST, REFINED, Extraction, ExtractionSettings, extract, identify
 from ..rig.camera import PinholeCamera
+from ..storage.cachefolder import cache_folder
 from .registry import Command
 
 PUPIL_LABS_PYTHON = "EYERENDER_PUPIL_DETECTORS"

@@ -15,7 +15,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from ..errors import InputError
-from ..imagefile import read_any_image
+from ..folders.imagefile import read_any_image
 from ..references import load_reference
 from .conventions import Conventions
 from .protocol import FEATURES, SCHEMA, Extractor

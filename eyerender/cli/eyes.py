@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from ..errors import InputError
-from ..files import written
+from ..storage.files import written
 from .app import app
 from .options import Result, Strict
 from .output import Heed, emit

@@ -41,8 +41,8 @@ def render(
         auto_exposure: Choose one exposure time for the whole run, so that 98 % of the pixels are at most at this share
             of full scale (0.7, for instance; more than 1 clips).
     """
-    from ..images import auto_exposed, render_folder
-    from ..outfolder import refuse_non_empty
+    from ..folders.outfolder import refuse_non_empty
+    from ..imaging.images import auto_exposed, render_folder
     from ..scene import load_scene
 
     heed = Heed(strict)
@@ -77,7 +77,7 @@ def quickstart(
     Args:
         output: The folder to write.
     """
-    from ..quickstart import run_quickstart
+    from ..applications.quickstart import run_quickstart
 
     heed = Heed(strict)
     with progress("quickstart") as steps:

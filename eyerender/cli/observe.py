@@ -94,10 +94,10 @@ def extract(
         record: Version of the records in the JSON, 1 or 2.
     """
     from ..extraction.video import is_video
-    from ..files import make_folder, refuse_special, written
-    from ..imageobserver import ImageObserver
+    from ..imaging.imageobserver import ImageObserver
+    from ..imaging.videoobserver import observe_video
     from ..scene import load_scene
-    from ..videoobserver import observe_video
+    from ..storage.files import make_folder, refuse_special, written
 
     if not images:
         raise InputError("give at least one image", source="extract")
@@ -157,8 +157,8 @@ def compare(
         estimator: The gaze estimator: a name as in `gaze fit`, or module:Class, a class of your own.
         function: regression: the function, R1 to R12.
     """
+    from ..applications.quickstart import compare_folder
     from ..gaze.store import choose_estimator
-    from ..quickstart import compare_folder
 
     chosen = choose_estimator(estimator, function=function)
     name = f"regression {function}" if estimator == "regression" else estimator

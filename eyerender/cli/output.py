@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 from ..errors import InputWarning
-from ..files import write_json
 from ..progress import Progress
+from ..storage.files import write_json
 
 
 def say(text: str) -> None:

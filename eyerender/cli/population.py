@@ -43,8 +43,8 @@ def population(
         spp: Samples per pixel of the faces.
         seed: The seed of the draw.
     """
+    from ..applications.survey import REPORT, Population, run_survey
     from ..spec import read_yaml
-    from ..survey import REPORT, Population, run_survey
 
     if not 1 <= spp <= 65536:
         raise InputError(f"must be 1 to 65536, not {spp}", source="--spp")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import parse_json, read_text, refuse_address, refuse_special
+from ..storage.files import parse_json, read_text, refuse_address, refuse_special
 
 # Names of the parameters that say where a command writes; all other paths of a command are inputs.
 OUTPUTS = ("output", "overlay", "json")
@@ -56,7 +56,7 @@ def _flattened(arguments: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _refuse_inputs(place: Path, state: os.stat_result, given: Sequence[Path], *, emptied: bool) -> None:
-    from ..outfolder import has_own_name
+    from ..folders.outfolder import has_own_name
 
     source, real = str(place), Path(os.path.realpath(place))
     for path, found in _with_named(given):

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EyerenderError, InputError
-from ..files import MAX_FILE_BYTES, read_json, remove_parts, write_json, write_text, written
-from ..imagefolder import CONVENTIONS, DATASET, DATASET_SCHEMA, METADATA
+from ..folders.imagefolder import CONVENTIONS, DATASET, DATASET_SCHEMA, METADATA
+from ..storage.files import MAX_FILE_BYTES, read_json, remove_parts, write_json, write_text, written
 from .card import data_card
 from .columns import type_first
 from .croissant import CROISSANT, croissant

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..imagefolder import CONVENTIONS
+from ..folders.imagefolder import CONVENTIONS
 from .plan import RANKED_SUBJECTS, Plan
 from .reading import IMAGEFOLDER, WHOLE
 from .shard import run_versions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..imagefolder import METADATA
+from ..folders.imagefolder import METADATA
 from .plan import Plan
 
 CROISSANT = "croissant.json"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import Warn
-from ..imagefile import png_bytes
+from ..folders.imagefile import png_bytes
 from .maker import Maker
 from .options import RunOptions
 from .plan import Plan

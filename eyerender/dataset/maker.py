@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
-from ..capture import BegunImage, EyeImage, begin_each, make_renderer, noiseless
-from ..images import settled_exposure_ms
-from ..labels import image_labels
+from ..imaging.capture import BegunImage, EyeImage, begin_each, make_renderer, noiseless
+from ..imaging.images import settled_exposure_ms
+from ..imaging.labels import image_labels
 from ..plausibility import is_saturated
 from ..progress import one_behind
 from .line import image_line

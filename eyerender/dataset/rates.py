@@ -15,10 +15,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ..cachefolder import cache_folder
 from ..errors import EyerenderError
-from ..files import read_json, write_json
 from ..spec import Positive, Spec
+from ..storage.cachefolder import cache_folder
+from ..storage.files import read_json, write_json
 from .plan import Plan
 from .shard import cpu_family
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from ..analytic.observer import trace
-from ..capture import check_windows
 from ..errors import EyerenderError, InputError, InputWarning
+from ..folders.outfolder import refuse_non_empty
+from ..imaging.capture import check_windows
 from ..observation import Observations
-from ..outfolder import refuse_non_empty
 from ..rig.camera import Window, in_window
 from ..scene import Frames, Scene
 from .plan import Plan, Sample

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import EyerenderError, InputError, Warn
-from ..files import make_folder, remove_file
-from ..imagefolder import DATASET
-from ..lock import LOCK, final_lock, run_lock
-from ..outfolder import clear, refuse_non_empty
+from ..folders.imagefolder import DATASET
+from ..folders.outfolder import clear, refuse_non_empty
 from ..plausibility import saturation_warnings
 from ..progress import Progress, Say
+from ..storage.files import make_folder, remove_file
+from ..storage.lock import LOCK, final_lock, run_lock
 from .assemble import assemble, damage
 from .options import RunOptions
 from .plan import Plan

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import MAX_FILE_BYTES, PART, read_json, remove_parts, write_json
-from ..imagefolder import DATASET, METADATA, RUN, STAGE
-from ..lock import LOCK
-from ..outfolder import MARKER, clear
+from ..folders.imagefolder import DATASET, METADATA, RUN, STAGE
+from ..folders.outfolder import MARKER, clear
 from ..progress import Say
+from ..storage.files import MAX_FILE_BYTES, PART, read_json, remove_parts, write_json
+from ..storage.lock import LOCK
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
 from .plan import Plan

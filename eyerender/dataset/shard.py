@@ -21,9 +21,18 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import MAX_FILE_BYTES, inside, make_folder, read_json, remove_file, sync_folder, sync_tree, write_json
-from ..imagefile import Writer
-from ..imagefolder import IMAGE_SCHEMA, STAGE, versions
+from ..folders.imagefile import Writer
+from ..folders.imagefolder import IMAGE_SCHEMA, STAGE, versions
+from ..storage.files import (
+    MAX_FILE_BYTES,
+    inside,
+    make_folder,
+    read_json,
+    remove_file,
+    sync_folder,
+    sync_tree,
+    write_json,
+)
 from ..versions import package_version
 from .maker import MadeImage, Maker
 

@@ -11,13 +11,13 @@ from PIL import Image, ImageDraw
 
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
-from ..capture import make_renderer, render_windows
 from ..errors import InputError, Warn
-from ..files import written
-from ..imagefile import preview as eight_bit
+from ..folders.imagefile import preview as eight_bit
+from ..imaging.capture import make_renderer, render_windows
 from ..plausibility import is_saturated, saturation_warnings
 from ..progress import Progress
 from ..scene import Scene, is_dataset, load_scene, refuse_folder, shipped_files
+from ..storage.files import written
 from .maker import Maker
 from .plan import Plan
 from .realise import frames_of

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..imagefolder import FILE_KEYS, METADATA, Entries, ImageEntry, ImageFolder
+from ..folders.imagefolder import FILE_KEYS, METADATA, Entries, ImageEntry, ImageFolder
 from ..progress import Progress
 from .validation.images import Tally, check_images
 from .validation.lines import Lines, check_records

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..arrays import Bytes
 from ..errors import EyerenderError, InputError
-from ..files import opened, written
+from ..storage.files import opened, written
 from .pair import extract_eyes
 from .pipeline import extract
 from .preprocessing import MAX_PIXELS

@@ -18,9 +18,9 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..files import shown
 from ..geometry.transforms import rotation_x, rotation_y, rotation_z, tilt_rotation
 from ..spec import LARGEST
+from ..storage.files import shown
 
 
 def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:

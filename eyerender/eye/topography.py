@@ -15,10 +15,10 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..files import read_bytes, read_text, shown
 from ..geometry.ply import plain_ply
 from ..geometry.topography import smooth_heights
 from ..spec import read_yaml
+from ..storage.files import read_bytes, read_text, shown
 from .parts import MAX_NODES, GridSpec, TopographySpec
 
 MAX_FILE_BYTES, MAX_POINTS, MIN_POINTS = 64 * 2**20, 200_000, 50

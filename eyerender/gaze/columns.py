@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ..errors import Problems
-from ..files import shown
 from ..observation import EYES
 from ..rig.light import MAX_LIGHTS
 from ..spec import FileSpec, Positive, Spec, Vec2, Vec3
+from ..storage.files import shown
 
 ColumnName = Annotated[str, Field(min_length=1, max_length=200)]
 ColumnPair = tuple[ColumnName, ColumnName]

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..arrays import Floats, frozen
 from ..errors import InputError, Problems
-from ..files import parse_json, read_text
 from ..observation import Observations
 from ..rig.camera import CameraCalibration, PinholeCamera
 from ..rig.light import MAX_LIGHTS, Lamp
@@ -19,6 +18,7 @@ from ..rig.rig import MAX_CAMERAS, Rig, RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
 from ..scene import Scene, load_scene
 from ..spec import LARGEST, FileSpec, read_yaml
+from ..storage.files import parse_json, read_text
 from .columns import CsvColumns
 from .table import observations_from_csv
 

@@ -12,13 +12,13 @@ from pydantic import Field
 
 from ..arrays import Floats, frozen
 from ..errors import InputError, Warn
-from ..files import read_json, shown, write_json
 from ..observation import EYES, Observations
 from ..plausibility import target_warnings
 from ..references import is_reference
 from ..rig.rig import RigGeometry, RigLike
 from ..spec import Positive, Spec
 from ..status import Status
+from ..storage.files import read_json, shown, write_json
 from .crossratio import CrossRatio
 from .estimate import GazeEstimator, angular_error_deg, binocular_average
 from .guestrin import GuestrinEizenman

@@ -18,7 +18,6 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError, Problems
-from ..files import read_bytes, shown
 from ..observation import (
     EYES,
     MAX_GLINTS,
@@ -33,6 +32,7 @@ from ..rig.light import MAX_LIGHTS
 from ..rig.rig import RigLike
 from ..rig.screen import ScreenPlane
 from ..status import Status
+from ..storage.files import read_bytes, shown
 from .columns import CsvColumns, EyeColumns, completed
 
 # A table is held in memory as text and as numbers, which takes some 20 times its size. A million rows are half an hour

@@ -6,7 +6,7 @@ import logging
 import re
 
 from ..errors import InputError
-from ..files import shown
+from ..storage.files import shown
 
 MAX_HEADER_BYTES = 65536
 _WORDS = (b"format", b"element", b"property")

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Floats
-from ..capture import eye_motion
 from ..eye.model import EyeModel
+from ..imaging.capture import eye_motion
 from ..observation import EYES, Observations
 from ..report.style import ANALYTIC, IMAGE, TARGET
 from ..rig.camera import PinholeCamera, Window

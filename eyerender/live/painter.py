@@ -26,10 +26,10 @@ from PIL import Image
 
 from ..arrays import Bytes, Floats, Reals
 from ..backends.choose import BackendChoice
-from ..capture import EyeImage, check_windows, make_renderer, moments, render_job, stored
 from ..errors import EyerenderError, one_line
-from ..imagefile import preview
-from ..imageobserver import detect
+from ..folders.imagefile import preview
+from ..imaging.capture import EyeImage, check_windows, make_renderer, moments, render_job, stored
+from ..imaging.imageobserver import detect
 from ..observation import Observations
 from ..plausibility import is_saturated
 from ..rig.camera import PinholeCamera, Window
@@ -39,7 +39,7 @@ from ..rig.stray import framed, scattered
 from ..scene import Frames
 
 if TYPE_CHECKING:
-    from ..rendering.frame import RenderJob
+    from ..rendering.records.job import RenderJob
     from ..rendering.renderer import RenderedWindow, Renderer
 
 PREVIEW_SPP = 4

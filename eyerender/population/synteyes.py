@@ -23,9 +23,9 @@ from ..arrays import ArrayValue, Floats
 from ..errors import InputError
 from ..eye.kappa import with_kappa
 from ..eye.spec import EyeSpec
-from ..files import read_bytes
 from ..geometry.transforms import read_only
 from ..spec import LARGEST, SMALLEST
+from ..storage.files import read_bytes
 
 CORNEA_INDEX, AQUEOUS_INDEX, VITREOUS_INDEX = 1.376, 1.336, 1.336
 RETINA_THICKNESS_MM = 0.2

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..arrays import Bytes
 from ..errors import InputError
-from ..files import read_json
 from ..progress import Progress, followed
+from ..storage.files import read_json
 from .figures import FIGURES, RADIUS_PX, Scaled, measure, ratio
 from .folder import FolderFigures, Skipped, Source, open_source, pictures
 

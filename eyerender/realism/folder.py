@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from ..arrays import Bytes, Singles
 from ..errors import InputError
 from ..extraction import FAST, extract
-from ..files import inside
+from ..folders.imagefile import read_image
+from ..folders.imagefolder import IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
 from ..geometry.ellipse import Ellipse
-from ..imagefile import read_image
-from ..imagefolder import IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
+from ..storage.files import inside
 from .figures import FIGURES, EyePicture
 from .limbus import iris_extent
 

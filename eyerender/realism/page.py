@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Bytes
-from ..imagefile import png_bytes
+from ..folders.imagefile import png_bytes
 from ..report.page import Card, Figure, Page, Section, Table, write_page
 from ..report.style import ANALYTIC, IMAGE, figure, svg
 from .figures import FIGURES

@@ -22,9 +22,9 @@ from PIL import Image
 
 from ..arrays import ArrayValue, Floats, Ints, Singles, frozen
 from ..errors import InputError
-from ..files import opened, read_bytes, shown
 from ..geometry.ply import plain_ply
 from ..spec import file_digest
+from ..storage.files import opened, read_bytes, shown
 from .anatomy import Region
 from .globe import Globe
 from .headspec import Head

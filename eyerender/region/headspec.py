@@ -14,8 +14,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from ..errors import InputError
-from ..files import opened, read_json
 from ..spec import NonNegative, Spec, Vec3
+from ..storage.files import opened, read_json
 
 SCHEMA = "eyerender/head/1"
 Name = Annotated[str, Field(min_length=1)]

@@ -22,9 +22,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..cachefolder import cache_folder
 from ..errors import EyerenderError, InputError
-from ..files import PART, parse_json, read_bytes, written
+from ..storage.cachefolder import cache_folder
+from ..storage.files import PART, parse_json, read_bytes, written
 from ..versions import __version__
 from .anatomy import Region
 from .iris import DrawnPattern

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..arrays import Bools, Floats, Singles
-from ..imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
-from .blur import Blur
-from .film import Exposed, begun, mean_radiance
-from .frame import RenderJob
-from .labels import PartLabels, highlights, part_labels
-from .prepared import Prepared
-from .recorded import uncollected
-from .region import RegionScene
-from .splat import MirrorImages, Shine
-from .stage import Stage
-from .surround import Obstacle, Surround
-from .window import RenderedWindow, Traced
+from ..folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
+from .glints.splatting import MirrorImages, Shine
+from .integrator.film import Exposed, begun, mean_radiance
+from .integrator.framebuilder import Stage
+from .integrator.hostdata import Prepared
+from .output.labels import PartLabels, highlights, part_labels
+from .output.window import RenderedWindow, Traced
+from .records.job import RenderJob
+from .records.recording import uncollected
+from .scene.background import Obstacle, Surround
+from .scene.blur import Blur
+from .scene.region import RegionScene
 
 if TYPE_CHECKING:
     from ..backends.choose import Backend

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..comparison import Comparison
-from ..imagefolder import ImageEntry, versions
+from ..folders.imagefolder import ImageEntry, versions
+from ..imaging.comparison import Comparison
 from ..observation import EYES
 from ..scene import Scene
 from .overlay import eye_picture

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..arrays import Bytes, Floats
-from ..imagefile import preview
+from ..folders.imagefile import preview
 from ..observation import Observations
 from .style import ANALYTIC_ON_DARK, IMAGE_ON_DARK
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-from ..files import write_text
+from ..storage.files import write_text
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,8 +28,7 @@ from scipy import fft, special
 
 from ..arrays import ArrayValue, Floats, Ints, Reals, Singles
 from ..errors import InputError
-from ..rig.camera import Window
-from .camera import PinholeCamera
+from .camera import PinholeCamera, Window
 from .imaging import Lens
 from .sensor import Sensor
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import fft, special
 
 from ..arrays import Floats, Reals, sealed
-from ..rig.camera import Window
+from .camera import Window
 
 _AT_ONCE = 16  # rows or columns of a blurred picture
 

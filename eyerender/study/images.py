@@ -20,13 +20,13 @@ import numpy as np
 
 from ..arrays import Ints, frozen
 from ..errors import InputError
-from ..files import read_json
-from ..imagefolder import DATASET, METADATA, RUN, ImageEntry
-from ..jsonlines import JsonLines
+from ..folders.imagefolder import DATASET, METADATA, RUN, ImageEntry
 from ..observation import EYES, Observations
 from ..progress import Progress, Say
 from ..scene import Scene
 from ..scene.spec import SceneSpec
+from ..storage.files import read_json
+from ..storage.jsonlines import JsonLines
 from .options import StudyOptions
 
 _SHARD_IMAGES = 27  # two or three seconds of work, the largest loss by a kill
@@ -64,7 +64,7 @@ class StudyImages:
         Raises:
             InputError: they do not exist.
         """
-        from ..imageobserver import ImageObserver
+        from ..imaging.imageobserver import ImageObserver
 
         if not self.holds(scene):
             raise InputError("the images of this scene are not in the study's dataset", source=scene.name)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..comparison import feature_errors
+from ..imaging.comparison import feature_errors
 from ..observation import Observations
 from ..rig.rig import RigGeometry
 from .budget import mean_interval

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..files import write_json, write_text
-from ..imagefolder import versions
+from ..folders.imagefolder import versions
 from ..observation import Observations
 from ..rig.rig import RigGeometry
+from ..storage.files import write_json, write_text
 
 SUMMARY_SCHEMA = "eyerender/study-summary/1"
 FINDINGS_SCHEMA = "eyerender/study-findings/1"

@@ -15,11 +15,11 @@ from typing import Any
 
 from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
-from ..files import read_json, write_json, write_text
-from ..lock import writer_lock
-from ..outfolder import clear, refuse_non_empty
+from ..folders.outfolder import clear, refuse_non_empty
 from ..progress import Progress, Say
 from ..scene import Scene
+from ..storage.files import read_json, write_json, write_text
+from ..storage.lock import writer_lock
 from . import blignaut, guestrin, head_mounted, together
 from .conditions import conditions_part
 from .head_mounted import head_mounted_part

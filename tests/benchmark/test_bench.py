@@ -22,8 +22,8 @@ from eyerender.benchmark.shipped import PUPIL_LABS_PYTHON, pupil_labs_python
 from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.extraction.baseline import contour_pupil
+from eyerender.folders.imagefile import write_png
 from eyerender.geometry.ellipse import signed_distance
-from eyerender.imagefile import write_png
 from tests.support.paths import SCRIPTS
 
 

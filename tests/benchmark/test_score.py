@@ -19,8 +19,8 @@ from eyerender.benchmark.protocol import Reply
 from eyerender.benchmark.score import GlintScore, Score, score, score_glints
 from eyerender.benchmark.summary import bins, breakdown, efficiency, failures, summarise
 from eyerender.errors import InputError
+from eyerender.folders.imagefile import read_image
 from eyerender.geometry.ellipse import Ellipse, signed_distance
-from eyerender.imagefile import read_image
 
 PUPIL = Ellipse(np.array([50.0, 40.0]), np.array([20.0, 16.0]), 0.4)
 IMAGE = LabelledImage(

@@ -20,7 +20,7 @@ from PIL import Image
 from eyerender.cli.main import run
 from eyerender.dataset.spec import shipped_datasets
 from eyerender.eye.catalogue import load_eye
-from eyerender.imagefile import write_png
+from eyerender.folders.imagefile import write_png
 from eyerender.scene import shipped_scenes
 from tests.support import stages
 

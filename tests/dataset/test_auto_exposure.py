@@ -9,8 +9,8 @@ import pytest
 
 from eyerender.dataset.maker import Maker
 from eyerender.dataset.validate import validate
-from eyerender.imagefile import read_image
-from eyerender.imagefolder import ImageFolder
+from eyerender.folders.imagefile import read_image
+from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import make, plan
 
 pytestmark = pytest.mark.render

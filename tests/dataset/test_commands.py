@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from eyerender.cli.main import run
-from eyerender.imagefolder import ImageFolder
-from eyerender.imageobserver import scene_of
+from eyerender.folders.imagefolder import ImageFolder
+from eyerender.imaging.imageobserver import scene_of
 from tests.support.dataset_specs import write
 
 pytestmark = pytest.mark.render

@@ -23,8 +23,8 @@ from eyerender.dataset.export import FORMATS, export, parquet
 from eyerender.dataset.export.coco import run_lengths
 from eyerender.dataset.export.video import LosslessVideo
 from eyerender.errors import InputError
-from eyerender.imagefile import read_image, write_png
-from eyerender.imagefolder import ImageFolder
+from eyerender.folders.imagefile import read_image, write_png
+from eyerender.folders.imagefolder import ImageFolder
 
 pytestmark = pytest.mark.render
 SPLITS = {"train": 12, "validation": 6, "test": 6}

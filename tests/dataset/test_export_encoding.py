@@ -14,8 +14,8 @@ from eyerender.cli.main import run
 from eyerender.dataset.export import FORMATS, Encoding, export
 from eyerender.dataset.export.encoding import measured_gain
 from eyerender.errors import InputError
-from eyerender.imagefile import read_image
-from eyerender.imagefolder import ImageFolder
+from eyerender.folders.imagefile import read_image
+from eyerender.folders.imagefolder import ImageFolder
 
 
 @pytest.mark.parametrize("bits", [8, 16])

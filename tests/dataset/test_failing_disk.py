@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 import yaml
 
-from eyerender.capture import render_windows
 from eyerender.cli.main import run
 from eyerender.dataset import run as dataset_run
 from eyerender.dataset.assemble import verify_dataset
@@ -25,6 +24,7 @@ from eyerender.dataset.pool import Events
 from eyerender.dataset.shard import finished, verify, write_shard
 from eyerender.dataset.worker import Job
 from eyerender.errors import EyerenderError
+from eyerender.imaging.capture import render_windows
 from eyerender.scene import load_scene
 from tests.support.dataset_specs import mapping, tree
 from tests.support.failing_disk import Disk, Name
@@ -123,7 +123,7 @@ def small(tmp_path_factory):
 def rendered(small, monkeypatch):
     """The scene; its pictures are not rendered again."""
     path, images = small
-    monkeypatch.setattr("eyerender.images.render_windows", lambda *_args, **_keys: iter(images))
+    monkeypatch.setattr("eyerender.imaging.images.render_windows", lambda *_args, **_keys: iter(images))
     return path
 
 

@@ -25,7 +25,7 @@ from eyerender.dataset.spec import DatasetSpec
 from eyerender.dataset.worker import Job
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
-from eyerender.imagefile import read_image
+from eyerender.folders.imagefile import read_image
 from tests.support import stages
 from tests.support.dataset_specs import command, make, mapping, tree, write
 

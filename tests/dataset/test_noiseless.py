@@ -11,8 +11,8 @@ from PIL import Image
 
 from eyerender.dataset.export import export
 from eyerender.dataset.validate import validate
-from eyerender.imagefile import read_image, write_png
-from eyerender.imagefolder import ImageFolder
+from eyerender.folders.imagefile import read_image, write_png
+from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import make, plan
 
 pytestmark = pytest.mark.render

@@ -10,7 +10,7 @@ import pytest
 
 from eyerender.dataset.assemble import verify_dataset
 from eyerender.dataset.shard import finished, verify
-from eyerender.files import read_json
+from eyerender.storage.files import read_json
 from tests.support.dataset_specs import make, plan, tree, write
 from tests.support.powercut import Disk, record
 

@@ -13,8 +13,8 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, find_dataset
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
-from eyerender.imagefile import read_image, write_png
-from eyerender.imagefolder import ImageFolder
+from eyerender.folders.imagefile import read_image, write_png
+from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import make
 
 pytestmark = pytest.mark.render

@@ -21,7 +21,7 @@ from eyerender.dataset.run import worker_count
 from eyerender.dataset.shard import finished
 from eyerender.dataset.worker import Job
 from eyerender.errors import EyerenderError, InputError
-from eyerender.lock import run_lock
+from eyerender.storage.lock import run_lock
 from tests.support import stages
 from tests.support.dataset_specs import command, make, plan, tree, write
 

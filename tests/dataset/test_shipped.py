@@ -8,7 +8,7 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
-from eyerender.images import render_folder
+from eyerender.imaging.images import render_folder
 from eyerender.scene import Scene, load_scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import make

@@ -14,8 +14,8 @@ from eyerender.dataset.export import export
 from eyerender.dataset.validate import validate
 from eyerender.dataset.validation.truth import SceneTruth
 from eyerender.errors import InputError
-from eyerender.imagefile import read_image, write_png
-from eyerender.labels import EyeInWindow
+from eyerender.folders.imagefile import read_image, write_png
+from eyerender.imaging.labels import EyeInWindow
 from eyerender.scene import load_scene
 from tests.support.dataset_specs import mapping
 

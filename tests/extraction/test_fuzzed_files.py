@@ -19,8 +19,8 @@ from PIL import Image
 import make_ideal_images as ideal
 from eyerender.cli.main import run
 from eyerender.errors import InputError
+from eyerender.folders.imagefile import read_image
 from eyerender.geometry.ellipse import Ellipse, iou
-from eyerender.imagefile import read_image
 
 Mutation = Callable[[bytes, np.random.Generator], bytes]
 

@@ -98,7 +98,7 @@ def _table(path: Path) -> Any:
 
 
 def _folder(path: Path) -> Any:
-    from eyerender.imagefolder import ImageFolder
+    from eyerender.folders.imagefolder import ImageFolder
 
     folder = ImageFolder.load(path.parent)
     for entry in folder:
@@ -117,7 +117,7 @@ def _folder_seeds() -> list[bytes]:
 
 
 def _beside_metadata(folder: Path) -> None:
-    from eyerender.imagefile import write_png
+    from eyerender.folders.imagefile import write_png
 
     (folder / "dataset.json").write_text(json.dumps({"schema": "eyerender/dataset/1"}), encoding="utf-8")
     for kind in ("images", "masks"):
@@ -132,20 +132,20 @@ def suppress_input() -> Any:
 
 
 def _image(path: Path) -> Any:
-    from eyerender.imagefile import read_any_image
+    from eyerender.folders.imagefile import read_any_image
 
     return read_any_image(path)
 
 
 def _png_seeds() -> list[bytes]:
-    from eyerender.imagefile import png_bytes
+    from eyerender.folders.imagefile import png_bytes
 
     grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
     return [png_bytes(grey), png_bytes(grey.astype(np.uint16) * 999), png_bytes(np.dstack([grey] * 3))]
 
 
 def _map(path: Path) -> Any:
-    from eyerender.rendering.environment import read_map
+    from eyerender.rendering.transport.environment import read_map
 
     return read_map(path)
 
@@ -173,7 +173,7 @@ def _exr_seeds() -> list[bytes]:
     from eyerender.backends.choose import choose_backend
 
     choose_backend("llvm")
-    from eyerender.rendering.exr import write_exr
+    from eyerender.rendering.scene.exr import write_exr
 
     with tempfile.TemporaryDirectory() as folder:
         write_exr(Path(folder) / "a.exr", np.ones((4, 8), np.float32))

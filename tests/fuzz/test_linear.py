@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from eyerender.errors import EyerenderError
-from eyerender.files import read_json
 from eyerender.gaze.records import load_observations
 from eyerender.region.head import _objects
 from eyerender.rig.opencv import read_opencv
+from eyerender.storage.files import read_json
 
 SIZE = 200_000
 # What is linear takes 1.6 s of processor time at most (a file of so many broken lines). A step that is quadratic as a

@@ -12,11 +12,11 @@ import yaml
 from hypothesis import given
 
 from eyerender.analytic.observer import trace
-from eyerender.capture import check_windows
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.eye.catalogue import FOLDER, catalogue_names, load_eye
 from eyerender.eye.spec import EyeSpec
+from eyerender.imaging.capture import check_windows
 from eyerender.scene import Scene, load_scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 from tests.support.corneas import eye_with, grid_of, keratoconus, measured_shapes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.capture import eye_motion
+from eyerender.imaging.capture import eye_motion
 from eyerender.live.drawing import colours_of, extent_mm, strokes
 from eyerender.live.readout import feature_table
 from eyerender.live.setup import Setup

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 import eyerender as er
-from eyerender.capture import render_job
-from eyerender.imagefile import preview
+from eyerender.folders.imagefile import preview
+from eyerender.imaging.capture import render_job
 from eyerender.live.painter import (
     BUDGET_S,
     PREVIEW_PX,

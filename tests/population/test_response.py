@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.capture import focus_dpt
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.entrance import entrance_pupil_mm
 from eyerender.eye.refraction import at_cornea_d, refraction_d
+from eyerender.imaging.capture import focus_dpt
 from eyerender.population.model import SIDES
 from eyerender.population.pupil import watson_yellott_mm
 from eyerender.population.response import responding

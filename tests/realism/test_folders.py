@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from eyerender.cli.main import run
-from eyerender.imagefile import write_png
+from eyerender.folders.imagefile import write_png
 from eyerender.realism import measure_folder, realism
 from eyerender.realism.figures import FIGURES
 from eyerender.realism.folder import Skipped, open_source, pictures

@@ -34,7 +34,7 @@ def _recordings(request):
     if "monkeypatch" not in request.fixturenames or "renderer" not in request.fixturenames:
         yield
         return
-    from eyerender.rendering.recorded import forget
+    from eyerender.rendering.records.recording import forget
 
     forget()
     yield

@@ -81,7 +81,7 @@ def test_an_even_sky_lights_sclera_surround_and_iris_as_in_the_stock_path_integr
     # globe and surround, the way through the cornea, and what surfaces send to each other. The oracle's noise is .4 %.
     import mitsuba as mi
 
-    from eyerender.rendering.export import export_scene
+    from eyerender.rendering.output.export import export_scene
 
     # It grows with a film of tears, whose mirror has an oracle of its own, so there is none here.
     bare = FLAT.model_copy(update={"tear_film": False})
@@ -100,7 +100,7 @@ def test_an_even_sky_lights_sclera_surround_and_iris_as_in_the_stock_path_integr
 
 def test_picture_does_not_depend_on_earlier_ones(renderer):
     """Bit for bit, although a renderer keeps much from frame to frame."""
-    from eyerender.capture import render_job
+    from eyerender.imaging.capture import render_job
     from eyerender.rendering.renderer import Renderer
     from eyerender.scene.shipped import load_scene
 

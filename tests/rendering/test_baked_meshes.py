@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from eyerender import load_eye
-from eyerender.rendering.export import bake_meshes
+from eyerender.rendering.output.export import bake_meshes
 from tests.support.paths import ROOT
 
 MESHES = ROOT / "meshes"

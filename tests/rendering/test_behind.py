@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import yaml
 
-from eyerender.capture import check_windows
 from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.eye.pose import Poses, rigid_motion
-from eyerender.imagefolder import ImageFolder
+from eyerender.folders.imagefolder import ImageFolder
+from eyerender.imaging.capture import check_windows
 from eyerender.region.globe import Globe
 from eyerender.region.mesh import region_mesh
-from eyerender.rendering.occlusion import lid_margins_px
+from eyerender.rendering.glints.occlusion import lid_margins_px
 from eyerender.scene import Scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 

@@ -13,7 +13,7 @@ from eyerender.arrays import frozen
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.spec import EyeSpec
 from eyerender.geometry.surfaces import components
-from eyerender.rendering.frame import parameters_of, tables
+from eyerender.rendering.records.job import parameters_of, tables
 from eyerender.rig.light import Lamp
 from tests.support.corneas import conic_depth, eye_with, grid_of, keratoconus, measured_shapes, zernike_of
 from tests.support.light_tracing import trace_backward
@@ -56,7 +56,7 @@ def test_a_conic_as_a_measured_cornea_gives_its_picture(renderer, kind):
 def test_the_device_meets_the_surface_of_the_host(renderer, name):
     import mitsuba as mi
 
-    from eyerender.rendering.values import Frame, Structure
+    from eyerender.rendering.records.frame import Frame, Structure
 
     eye = eye_with(SHAPES[name]).build()
     job = job_of(eye, remote_rig(), (0, 0, 8, 8))

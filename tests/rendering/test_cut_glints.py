@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from eyerender.rendering.cut import cut_nodes, quadrature, rim
-from eyerender.rendering.surround import Obstacle
+from eyerender.rendering.glints.cutdiscs import cut_nodes, quadrature, rim
+from eyerender.rendering.scene.background import Obstacle
 from tests.support.light_tracing import basis, mirror_yz, trace_light
 from tests.support.render_oracles import centroid
 from tests.support.render_rigs import BLACK, RIGS, eye_of, job_of
@@ -127,7 +127,7 @@ def test_a_card_before_a_lamp_leaves_a_segment_of_it(renderer, height):
 
 
 def test_a_glint_whose_centre_is_off_the_cornea_is_labelled_as_the_picture_shows_it(renderer):
-    from eyerender.images import render
+    from eyerender.imaging.images import render
     from eyerender.scene import Scene
     from eyerender.scene.spec import SceneSpec
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from eyerender.capture import render_job
+from eyerender.imaging.capture import render_job
 from eyerender.optics.solve import apparent_points
-from eyerender.rendering.blur import Blur
-from eyerender.rendering.film import begun, mean_radiance
-from eyerender.rendering.frame import RenderJob
+from eyerender.rendering.integrator.film import begun, mean_radiance
+from eyerender.rendering.records.job import RenderJob
+from eyerender.rendering.scene.blur import Blur
 from eyerender.rig import defocus, psf
 from eyerender.rig.camera import PinholeCamera
 from eyerender.rig.imaging import Lens
@@ -77,9 +77,9 @@ def matte(renderer, monkeypatch):
     """
     import mitsuba as mi
 
-    from eyerender.rendering import lighting
-    from eyerender.rendering.recorded import forget
+    from eyerender.rendering.records.recording import forget
     from eyerender.rendering.renderer import Renderer
+    from eyerender.rendering.transport import directlight as lighting
 
     monkeypatch.setattr(lighting, "sheen", lambda *_: mi.Float(0))
     forget()

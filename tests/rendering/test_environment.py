@@ -138,7 +138,7 @@ def test_irradiance_against_the_integral(renderer, tmp_path):
     """Matte surfaces against the sum over the map, with a window and a sun of two degrees in it."""
     import mitsuba as mi
 
-    from eyerender.rendering.environment import Ambience, Maps, map_rotation
+    from eyerender.rendering.transport.environment import Ambience, Maps, map_rotation
 
     rng = np.random.default_rng(5)
     spec = RadianceMap(file=str(tmp_path / "m.npy"), azimuth_deg=40.0, elevation_deg=-20.0, roll_deg=65.0)
@@ -166,8 +166,8 @@ def test_irradiance_against_the_integral(renderer, tmp_path):
 def test_a_panels_irradiance_against_the_integral(renderer, point, normal):
     import mitsuba as mi
 
-    from eyerender.rendering.environment import Ambience, Maps
-    from eyerender.rendering.frame import panel_table
+    from eyerender.rendering.records.job import panel_table
+    from eyerender.rendering.transport.environment import Ambience, Maps
 
     panel = Panel(centre_mm=(500.0, 60.0, 90.0), size_mm=(520.0, 290.0), radiance_w_m2_sr=2.0)
     table = panel_table(Ambient(panels=(panel,)), np.zeros(3))
@@ -213,8 +213,8 @@ def test_maps_strength_and_turn_compile_nothing_and_send_nothing_anew(renderer, 
 def test_formats_and_channels(renderer, tmp_path, ending):
     import mitsuba as mi
 
-    from eyerender.rendering.environment import read_map
-    from eyerender.rendering.exr import second_thread
+    from eyerender.rendering.scene.exr import second_thread
+    from eyerender.rendering.transport.environment import read_map
 
     colours = np.random.default_rng(3).uniform(0.1, 40.0, (8, 16, 3)).astype(np.float32)
     path = tmp_path / f"map.{ending}"
@@ -227,7 +227,7 @@ def test_formats_and_channels(renderer, tmp_path, ending):
 
 
 def test_a_large_map_is_averaged_not_sampled(renderer):
-    from eyerender.rendering.environment import surrounding
+    from eyerender.rendering.transport.environment import surrounding
 
     rng = np.random.default_rng(2)
     values = rng.exponential(size=(1200, 2400)) ** 4
@@ -237,7 +237,7 @@ def test_a_large_map_is_averaged_not_sampled(renderer):
 
 
 def test_files_that_are_no_maps_are_refused(renderer, tmp_path):
-    from eyerender.rendering.environment import Maps, read_map
+    from eyerender.rendering.transport.environment import Maps, read_map
 
     (tmp_path / "cut.hdr").write_bytes(b"#?RADIANCE\n")
     (tmp_path / "text.exr").write_text("hello")

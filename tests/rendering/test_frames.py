@@ -8,12 +8,12 @@ import threading
 import numpy as np
 import pytest
 
-from eyerender.capture import make_renderer, noiseless, render_job, render_windows
 from eyerender.cli.main import run
 from eyerender.errors import InputError
-from eyerender.imagefolder import FRAME, IMAGE_SCHEMAS, PUPIL, ImageFolder
-from eyerender.imageobserver import ImageObserver
-from eyerender.images import auto_exposed, render, render_folder
+from eyerender.folders.imagefolder import FRAME, IMAGE_SCHEMAS, PUPIL, ImageFolder
+from eyerender.imaging.capture import make_renderer, noiseless, render_job, render_windows
+from eyerender.imaging.imageobserver import ImageObserver
+from eyerender.imaging.images import auto_exposed, render, render_folder
 from eyerender.rig.surroundings import paint
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
@@ -67,7 +67,7 @@ def test_windows_that_overlap_are_those_rendered_one_by_one(renderer, monkeypatc
         threads.append(threading.current_thread())
         return region_mesh(*what)
 
-    monkeypatch.setattr("eyerender.rendering.stage.region_mesh", mesh_by)
+    monkeypatch.setattr("eyerender.rendering.integrator.framebuilder.region_mesh", mesh_by)
     together = list(render_windows(frames, renderer=renderer))
     assert len(threads) == 2  # those of the second and the third frame
     assert threading.main_thread() not in threads

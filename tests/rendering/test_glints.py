@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eyerender.rendering.glints import _roughly
-from eyerender.rendering.surround import Obstacle
+from eyerender.rendering.glints.tracing import _roughly
+from eyerender.rendering.scene.background import Obstacle
 from eyerender.rig.sensor import Sensor
 from tests.support.light_tracing import trace_backward
 from tests.support.render_oracles import centroid, mirror_pixel

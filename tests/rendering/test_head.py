@@ -14,9 +14,9 @@ import yaml
 from scipy import ndimage
 
 from eyerender.analytic.observer import trace
-from eyerender.capture import make_renderer, render_job, render_windows
 from eyerender.cli.main import run
 from eyerender.errors import InputError
+from eyerender.imaging.capture import make_renderer, render_job, render_windows
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.labels import labels_of
@@ -284,7 +284,7 @@ def test_kernels_do_not_depend_on_where_memory_lies(renderer, folder):
 
 @pytest.mark.parametrize("kind", [np.float32, np.uint32, np.float16])
 def test_aligned_copies_hold_the_same_and_lie_at_multiples_of_64_bytes(kind):
-    from eyerender.rendering.values import aligned
+    from eyerender.rendering.records.frame import aligned
 
     memory = np.arange(1000).astype(kind)
     for shift in range(40):

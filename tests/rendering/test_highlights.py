@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eyerender.capture import render_job
+from eyerender.imaging.capture import render_job
 from eyerender.scene.shipped import load_scene
 
 pytestmark = pytest.mark.render
@@ -16,9 +16,9 @@ pytestmark = pytest.mark.render
 def test_masks_mark_where_mirrored_light_exceeds_half_of_the_scattered(renderer, monkeypatch):
     import mitsuba as mi
 
-    from eyerender.rendering import lighting
-    from eyerender.rendering.recorded import forget
+    from eyerender.rendering.records.recording import forget
     from eyerender.rendering.renderer import Renderer
+    from eyerender.rendering.transport import directlight as lighting
 
     given = load_scene("desktop_tracker").with_({"image.window_px": [260, 180], "image.interreflection": False})
     job = replace(render_job(given.frames(), 8), highlights=True)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
-from eyerender.capture import make_renderer, render_windows
 from eyerender.errors import InputError
+from eyerender.imaging.capture import make_renderer, render_windows
 from eyerender.rig.defocus import confusion_px, defocused, disc, vignette
 from eyerender.rig.imaging import Lens
 from eyerender.rig.sensor import Sensor

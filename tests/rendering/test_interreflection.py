@@ -87,9 +87,9 @@ def plain(renderer, monkeypatch):
     """A renderer whose skin is as it is exported: of one albedo, without relief and sheen."""
     import mitsuba as mi
 
-    from eyerender.rendering import lighting
-    from eyerender.rendering.region import RegionScene
     from eyerender.rendering.renderer import Renderer
+    from eyerender.rendering.scene.region import RegionScene
+    from eyerender.rendering.transport import directlight as lighting
 
     def even(spec):
         look = skin_map(spec).copy()
@@ -160,7 +160,7 @@ def test_a_panel_against_path(plain, tmp_path):
 def test_a_map_against_path(plain, tmp_path, monkeypatch, place):
     # A disc of 40 degrees on black, and painted surroundings. The plane of the surround must end at the horizon: light
     # from below it, past the edges of a plane of a metre, is a half per cent of that on the sclera.
-    monkeypatch.setattr("eyerender.rendering.export._BACKDROP_HALF_MM", 5e4)
+    monkeypatch.setattr("eyerender.rendering.output.export._BACKDROP_HALF_MM", 5e4)
     which = {"file": disc(tmp_path)} if place == "disc" else {"place": place}
     spec = RadianceMap(**which, scale_w_m2_sr=1e3)
     job = job_in(remote(48), "E2", ambient=Ambient(map=spec))
@@ -188,8 +188,8 @@ def all_round(spec: RadianceMap, folder) -> str:
     """Write a map that is not turned for the stock integrator, in whose maps y is up and -z is in the middle."""
     import mitsuba as mi
 
-    from eyerender.rendering.environment import Maps
-    from eyerender.rendering.exr import second_thread
+    from eyerender.rendering.scene.exr import second_thread
+    from eyerender.rendering.transport.environment import Maps
 
     values = np.asarray(Maps().of(spec)[-1].values, dtype=float) * spec.scale_w_m2_sr * 1e-3
     h = len(values)
@@ -221,8 +221,8 @@ def oracle_of(job, folder, spp: int, depth: int = 24, extra: str = "</scene>") -
     """Stock picture of all light, and the standard error of each pixel."""
     import mitsuba as mi
 
-    from eyerender.rendering.export import export_scene
-    from eyerender.rendering.exr import second_thread
+    from eyerender.rendering.output.export import export_scene
+    from eyerender.rendering.scene.exr import second_thread
 
     path = export_scene(job, folder, max_depth=depth, rings=96, sectors=192)
     path.write_text(path.read_text(encoding="utf-8").replace("</scene>", extra), encoding="utf-8")

@@ -72,7 +72,7 @@ def exported(job, folder, depth: int, pattern: IrisPattern, cornea: bool):
     """The job's scene for stock Mitsuba with the relief as triangles."""
     import mitsuba as mi
 
-    from eyerender.rendering.export import export_scene
+    from eyerender.rendering.output.export import export_scene
 
     path = export_scene(job, folder, max_depth=depth)
     (folder / "meshes" / "iris.ply").write_bytes(relief_mesh(job.eye, pattern))

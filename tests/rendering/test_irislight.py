@@ -15,8 +15,8 @@ pytestmark = pytest.mark.render
 def test_the_grid_gives_the_light_of_exact_paths(renderer, model, name):
     import mitsuba as mi
 
-    from eyerender.rendering.lighting import behind
-    from eyerender.rendering.values import ALL
+    from eyerender.rendering.records.frame import ALL
+    from eyerender.rendering.transport.directlight import behind
 
     eye, rig = rigs.eye_of(model), rigs.RIGS[name](radius_mm=0.0)
     job = rigs.job_of(eye, rig, rig.window(32, 24), (12.0, -8.0))
@@ -45,7 +45,7 @@ def test_shadows_on_the_iris_keep_their_edges(renderer):
     found = renderer.radiance(job, spp=4)
     shown, _ = renderer.bind(job)
     shown.frame.lights.on_iris = None
-    from eyerender.rendering.film import mean_radiance
+    from eyerender.rendering.integrator.film import mean_radiance
 
     truth, _ = mean_radiance(shown, job.window, 4, job.seed)
     part = renderer.labels(job).part

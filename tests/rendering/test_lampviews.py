@@ -25,9 +25,9 @@ pytestmark = pytest.mark.render
 def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_mm, pose, blink):
     import mitsuba as mi
 
-    from eyerender.rendering import stage
-    from eyerender.rendering.lampviews import LampViews
-    from eyerender.rendering.recorded import forget
+    from eyerender.rendering.integrator import framebuilder as stage
+    from eyerender.rendering.records.recording import forget
+    from eyerender.rendering.transport.shadowmaps import LampViews
 
     monkeypatch.setattr(stage, "iris_light", lambda *_: None)  # which uses the views too
     forget()

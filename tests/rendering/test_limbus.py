@@ -9,9 +9,9 @@ import pytest
 from scipy import ndimage
 
 from eyerender.eye.meshes import chamber_rim
-from eyerender.imagefolder import IRIS
-from eyerender.rendering.chamber import IRIS as PLANE
-from eyerender.rendering.chamber import RAYS, ROOT_RINGS, TURNS, bundles, chamber_of, through_limbus
+from eyerender.folders.imagefolder import IRIS
+from eyerender.rendering.transport.chamber import IRIS as PLANE
+from eyerender.rendering.transport.chamber import RAYS, ROOT_RINGS, TURNS, bundles, chamber_of, through_limbus
 from tests.support.render_rigs import BLACK, PLAIN, eye_of, head_rig, job_of, remote_rig
 
 

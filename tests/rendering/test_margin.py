@@ -10,7 +10,7 @@ from matplotlib.path import Path
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.parts import ContourSpec
-from eyerender.rendering.frame import boundary_waves
+from eyerender.rendering.records.job import boundary_waves
 from tests.support.render_oracles import contour_error, outline
 from tests.support.render_rigs import PLAIN, RIGS, head_rig, job_of, remote_rig
 
@@ -29,7 +29,7 @@ def eye_with(contour, model="E2", side="right", pupil_mm=4.0):
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_the_waves_on_the_device_are_the_radius_of_the_stop(renderer, side):
-    from eyerender.rendering.values import PupilBoundary
+    from eyerender.rendering.records.frame import PupilBoundary
 
     eye = eye_with(CONTOUR, side=side)
     angle = np.linspace(0, 2 * np.pi, 50)
@@ -118,7 +118,7 @@ def drawn_scene(rig_name, side, seed, pupil_mm=4.0):
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_both_observers_have_the_margin_of_a_scene(renderer, side):
     from eyerender.analytic.observer import trace
-    from eyerender.capture import render_job
+    from eyerender.imaging.capture import render_job
 
     # The margin of the picture, as above, but with what a scene's key gives both observers.
     scene = drawn_scene("blignaut2014", side, 5, 5.0)
@@ -142,7 +142,7 @@ def test_the_ellipse_of_the_picture_is_that_of_the_analytic_observer(renderer, r
     from skimage.measure import find_contours
 
     from eyerender.analytic.observer import trace
-    from eyerender.capture import render_job
+    from eyerender.imaging.capture import render_job
 
     scene = drawn_scene(rig_name, "right", seed)
     truth = trace(scene)

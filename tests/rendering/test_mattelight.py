@@ -12,7 +12,7 @@ pytestmark = pytest.mark.render
 
 @pytest.mark.parametrize(("model", "name", "pose"), [("E2", "head", (20.0, -12.0)), ("E5", "remote", (-25.0, 10.0))])
 def test_the_grids_change_no_pixel(renderer, monkeypatch, model, name, pose):
-    from eyerender.rendering import stage
+    from eyerender.rendering.integrator import framebuilder as stage
 
     eye, rig = rigs.eye_of(model), rigs.RIGS[name](radius_mm=0.0)
     job = rigs.job_of(eye, rig, rig.window(240, 180), pose, labels=False)

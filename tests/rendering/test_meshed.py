@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eyerender.capture import render_job
 from eyerender.errors import InputError
 from eyerender.eye.meshes import cornea_patches, eye_meshes
+from eyerender.imaging.capture import render_job
 from eyerender.optics.solve import mirror_points
 from eyerender.scene.shipped import load_scene
 from eyerender.scene.spec import SceneSpec
@@ -43,7 +43,7 @@ def test_a_coarse_mesh_is_near_the_exact_cornea_and_a_finer_one_nearer(renderer)
 
 @pytest.mark.parametrize("rig_name", RIGS)
 def test_mirror_points_of_a_mesh(renderer, rig_name):
-    from eyerender.rendering.meshed import Meshes
+    from eyerender.rendering.hits.meshes import Meshes
 
     rig = RIGS[rig_name](radius_mm=0.0)
     job = job_of(eye_of("E5"), rig, (0, 0, 8, 8), (5.0, 3.0))

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from eyerender.eye.meshes import eye_meshes
-from eyerender.rendering.export import bake_meshes, export_scene
+from eyerender.rendering.output.export import bake_meshes, export_scene
 from tests.support.eye_meshes import crossing
 from tests.support.render_rigs import depths_mm, eye_of, job_of, remote_rig
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.capture import focus_dpt
 from eyerender.eye.fundus import Spread, fundus_light
+from eyerender.imaging.capture import focus_dpt
 from eyerender.region.look import Fundus
 from eyerender.rig.camera import Camera
 from eyerender.rig.light import Led

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.path import Path
 
-from eyerender.rendering.surround import Obstacle
+from eyerender.rendering.scene.background import Obstacle
 from tests.support.render_oracles import contour_error, outline
 from tests.support.render_rigs import PLAIN, RIGS, depths_mm, eye_of, head_rig, job_of, remote_rig
 

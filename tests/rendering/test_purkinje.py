@@ -11,7 +11,7 @@ from eyerender.errors import InputError
 from eyerender.geometry.surfaces import components
 from eyerender.optics.purkinje import purkinje_path, purkinje_points
 from eyerender.optics.shooting import ray_tube
-from eyerender.rendering.purkinje import stack
+from eyerender.rendering.glints.purkinje import stack
 from tests.support.render_oracles import centroid, corneal_share
 from tests.support.render_rigs import BLACK, RIGS, eye_of, head_rig, job_of, remote_rig
 

@@ -21,7 +21,7 @@ class Structure:
 def test_plain_values_choose_the_recording(renderer, structure):
     import mitsuba as mi
 
-    from eyerender.rendering.recorded import recorded
+    from eyerender.rendering.records.recording import recorded
 
     @recorded
     def doubled(structure, x: mi.Float, twice: bool, count: int) -> list[mi.Float]:
@@ -38,7 +38,7 @@ def test_plain_values_choose_the_recording(renderer, structure):
 def test_a_flag_inside_an_argument_chooses_the_recording(renderer):
     import mitsuba as mi
 
-    from eyerender.rendering.recorded import recorded
+    from eyerender.rendering.records.recording import recorded
 
     @recorded
     def scaled(structure: Structure, x: mi.Float) -> mi.Float:
@@ -53,7 +53,7 @@ def test_a_flag_inside_an_argument_chooses_the_recording(renderer):
 def test_the_second_call_is_recorded_and_new_subjects_forget_it(renderer):
     import mitsuba as mi
 
-    from eyerender.rendering.recorded import forget, recorded
+    from eyerender.rendering.records.recording import forget, recorded
 
     class Counter:
         runs = 0

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from eyerender.capture import make_renderer, render_job, render_windows
-from eyerender.labels import visible_arcs_deg
+from eyerender.imaging.capture import make_renderer, render_job, render_windows
+from eyerender.imaging.labels import visible_arcs_deg
 from eyerender.region.anatomy import Region
-from eyerender.rendering import film
-from eyerender.rendering.occlusion import glint_reason
+from eyerender.rendering.glints.occlusion import glint_reason
+from eyerender.rendering.integrator import film
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.labels import labels_of
@@ -130,7 +130,7 @@ def test_two_runs_are_the_same(renderer):
 
 def test_subjects_share_a_scene_and_its_recordings(renderer):
     """A subject with other numbers of hairs is shown as by a renderer that has seen none before it."""
-    from eyerender.rendering import recorded
+    from eyerender.rendering.records import recording as recorded
 
     few = {"seed": 2, "lashes": {"upper_count": 70, "lower_count": 20}, "brow": {"count": 150}}
 
@@ -161,10 +161,10 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.capture import render_job
-    from eyerender.rendering.film import Pixels
-    from eyerender.rendering.sampling import camera_ray
-    from eyerender.rendering.view import meet
+    from eyerender.imaging.capture import render_job
+    from eyerender.rendering.hits.interaction import meet
+    from eyerender.rendering.integrator.film import Pixels
+    from eyerender.rendering.integrator.sampling import camera_ray
 
     s = scene(poses=((9.0, -6.0),), region={"seed": 3})
     focal = 4000 if place[0] > 100 else 600
@@ -191,7 +191,9 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
         # A ray in a million or so slips between two triangles: Embree's test is not watertight.
         assert np.count_nonzero(~on_sheet.numpy().astype(bool)[plain]) <= 3
     quick = renderer.radiance(job)
-    monkeypatch.setattr("eyerender.rendering.prepared.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000))
+    monkeypatch.setattr(
+        "eyerender.rendering.integrator.hostdata.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000)
+    )
     slow = renderer.radiance(job)
     # And that pixel then lacks a sample, where each is asked.
     assert np.count_nonzero(quick != slow) < 1e-4 * plain.size
@@ -201,7 +203,7 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
 @pytest.mark.parametrize("lamps", [1, 2])
 def test_plain_tiles_leave_no_seam_where_fine_shadows_begin(renderer, monkeypatch, lamps):
     """With few lamps the samples of a group about the lids have rays of their own; one group may have both kinds."""
-    from eyerender.capture import render_job
+    from eyerender.imaging.capture import render_job
 
     data = scene(region={"seed": 100}).spec.to_mapping()
     lamp = data["rig"]["lights"][0]
@@ -209,7 +211,9 @@ def test_plain_tiles_leave_no_seam_where_fine_shadows_begin(renderer, monkeypatc
     s = Scene.of(SceneSpec.from_mapping(data))
     job = replace(render_job(s.frames(), 0), window=(0, 0, 640, 320))
     quick = renderer.radiance(job)
-    monkeypatch.setattr("eyerender.rendering.prepared.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000))
+    monkeypatch.setattr(
+        "eyerender.rendering.integrator.hostdata.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000)
+    )
     slow = renderer.radiance(job)
     # Some pixels lack a sample without plain tiles, as above.
     assert np.count_nonzero(np.abs(quick - slow) > 0.01 * np.median(slow)) < 1e-4 * slow.size
@@ -262,7 +266,7 @@ def test_hairs_are_sampled_more_finely(renderer, monkeypatch):
 def test_fine_pixels_are_those_that_hairs_touch(renderer):
     import mitsuba as mi
 
-    from eyerender.rendering.sampling import camera_ray
+    from eyerender.rendering.integrator.sampling import camera_ray
 
     job = render_job(scene(region={}).frames(), 0)
     x0, y0, width, height = job.window

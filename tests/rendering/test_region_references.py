@@ -18,7 +18,7 @@ def references():
 def test_the_picture_is_that_of_the_version(renderer, references, name):
     share = refused_share(rendered(renderer, name, TEST_SEEDS), references[name])
     assert share <= ALLOWED, (
-        f"{100 * share:.2g} % of the pixels have changed. If that is intended, raise eyerender.imagefolder.RESULTS and "
+        f"{100 * share:.2g} % of the pixels have changed. If that is intended, raise RESULTS in imagefolder.py and "
         "run: python -m tests.support.region_references"
     )
 

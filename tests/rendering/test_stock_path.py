@@ -120,7 +120,7 @@ def test_the_film_mirrors_all_light_that_grazes_it(backend):
     import mitsuba as mi
 
     from eyerender.optics.interface import fresnel
-    from eyerender.rendering.surfaces import fresnel as in_kernels
+    from eyerender.rendering.records.surfaces import fresnel as in_kernels
 
     index, film = 1.376, 1.3314
     c1 = np.array([-1e-3, -1e-5, -1e-7, 0.0, 1e-7, 1e-5, 0.01, 0.3, 1.0])

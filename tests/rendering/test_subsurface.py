@@ -35,9 +35,9 @@ def grids(renderer, bound):
     """Grids over skin and globe of a job's frame, and the middles (mm, scene's frame) of their cells."""
     import mitsuba as mi
 
-    from eyerender.rendering import subsurface as light
-    from eyerender.rendering.region import SHEET_COLUMNS
-    from eyerender.rendering.tissuecells import SIDE, GlobeCells, SheetCells
+    from eyerender.rendering.scene.diffusiongrids import SIDE, GlobeCells, SheetCells
+    from eyerender.rendering.scene.region import SHEET_COLUMNS
+    from eyerender.rendering.transport import diffusion as light
 
     shown, place = renderer.bind(bound)
     sheet = light.SheetGrid.of(SheetCells.of(place.posed, bound, 100.0, 0)).measured(place.skin)
@@ -56,7 +56,7 @@ def spread(grid, lit, length_mm, *radius):
     """What leaves a grid's cells of the light that falls on them, as NumPy arrays."""
     import mitsuba as mi
 
-    from eyerender.rendering.subsurface import Places
+    from eyerender.rendering.transport.diffusion import Places
 
     return grid.spread(mi.Float(lit.astype(np.float32).ravel()), *radius, Places.of(length_mm)).numpy()
 

@@ -44,8 +44,8 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.view import meet
-    from eyerender.rendering.water import through_water, wetted
+    from eyerender.rendering.hits.interaction import meet
+    from eyerender.rendering.hits.meniscus import through_water, wetted
 
     rig = head_rig()
     region = Region.from_mapping({"tears": {"unevenness": 0.0}})
@@ -95,7 +95,7 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
 def test_a_cylinder_of_water_mirrors_as_much_as_an_ideal_one(renderer, monkeypatch):
     import mitsuba as mi
 
-    from eyerender.rendering import region
+    from eyerender.rendering.scene import region
 
     # A cylinder of radius r mirrors E F r / 2 cos(i) of parallel light into a radian of its plane. Its roughness
     # spreads this along the axis: slopes of GGX have the density 1 / (2 a) at 0, and a tilt m turns the mirrored ray

@@ -15,7 +15,7 @@ import pytest
 from eyerender.analytic.observer import trace
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.validate import validate
-from eyerender.imagefile import read_image
+from eyerender.folders.imagefile import read_image
 from eyerender.study import blignaut, guestrin
 from eyerender.study.images import (
     dataset_spec,

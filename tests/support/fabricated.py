@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from eyerender.imagefile import read_image, write_png
+from eyerender.folders.imagefile import read_image, write_png
 
 SHARD = 100
 FRAMES = 50  # a subject

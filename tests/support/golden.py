@@ -1,6 +1,6 @@
 """Small results that stand for all: what `tests/test_results_version.py` compares with the stored ones.
 
-`python -m tests.support.golden` writes them for the version that `eyerender.imagefolder.RESULTS` says.
+`python -m tests.support.golden` writes them for the version that `eyerender.folders.imagefolder.RESULTS` says.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from eyerender.analytic.observer import trace
 from eyerender.dataset.maker import Maker
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
-from eyerender.imagefolder import RESULTS
+from eyerender.folders.imagefolder import RESULTS
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.paths import DATA

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from eyerender.analytic.observer import trace
-from eyerender.labels import seen_labels
+from eyerender.imaging.labels import seen_labels
 
 
 def labels_of(image):

@@ -13,7 +13,7 @@ from scipy.stats import qmc
 
 from eyerender.geometry.surfaces import components
 from eyerender.optics.solve import mirror_points
-from eyerender.rendering.frame import RenderJob
+from eyerender.rendering.records.job import RenderJob
 from eyerender.rig.light import Lamp
 
 from .render_oracles import corneal_share

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import binary_erosion
 
-from eyerender.imagefolder import IRIS
-from eyerender.rendering.frame import RenderJob
+from eyerender.folders.imagefolder import IRIS
+from eyerender.rendering.records.job import RenderJob
 from eyerender.rendering.renderer import Renderer
 from tests.support.render_oracles import contour_shift, outline
 from tests.support.render_rigs import PLAIN, RIGS, eye_of, job_of

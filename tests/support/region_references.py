@@ -1,6 +1,6 @@
 """Reference images of skin, lids and lashes, with the variance of each pixel.
 
-`python -m tests.support.region_references` renders them for the version that `eyerender.imagefolder.RESULTS` says.
+`python -m tests.support.region_references` renders them for the version `RESULTS` of `folders/imagefolder.py`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from eyerender.capture import make_renderer, render_job
-from eyerender.imagefolder import RESULTS
+from eyerender.folders.imagefolder import RESULTS
+from eyerender.imaging.capture import make_renderer, render_job
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.paths import DATA

@@ -15,7 +15,7 @@ from eyerender.optics.media import TEARS
 from eyerender.optics.solve import apparent_points
 
 if TYPE_CHECKING:
-    from eyerender.rendering.frame import RenderJob
+    from eyerender.rendering.records.job import RenderJob
 
 RINGS_MM = ((2.1, 3.1), (3.1, 4.1), (4.1, 5.1))
 HARMONICS = 12
@@ -187,7 +187,7 @@ def stock(job: RenderJob, folder: Path, max_depth: int, spp: int, seed: int = 3,
     """Radiance (h, w) of a job by Mitsuba's stock path integrator, on the exported meshes."""
     import mitsuba as mi
 
-    from eyerender.rendering.export import export_scene
+    from eyerender.rendering.output.export import export_scene
 
     scene = mi.load_file(str(export_scene(job, folder, max_depth=max_depth, **meshes)))
     return np.array(mi.render(scene, spp=spp, seed=seed))[..., 0].astype(float)
@@ -205,8 +205,8 @@ def rings(renderer: Any, job: RenderJob) -> dict[str, Any]:
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.sampling import camera_ray
-    from eyerender.rendering.view import meet
+    from eyerender.rendering.hits.interaction import meet
+    from eyerender.rendering.integrator.sampling import camera_ray
 
     shown, _ = renderer.bind(job, lit=False)
     x0, y0, w, h = job.window

@@ -19,7 +19,7 @@ from eyerender.rig.light import Lamp, Led, LedRing
 from eyerender.rig.sensor import Sensor
 
 if TYPE_CHECKING:
-    from eyerender.rendering.frame import RenderJob
+    from eyerender.rendering.records.job import RenderJob
     from eyerender.rendering.renderer import RenderedWindow, Renderer
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
@@ -95,7 +95,7 @@ def job_of(
     **changes: Any,
 ) -> RenderJob:
     """A job for an eye at the world's origin; the sensor is noise-free unless given."""
-    from eyerender.rendering.frame import RenderJob
+    from eyerender.rendering.records.job import RenderJob
 
     M, t = rigid_motion(Poses.from_degrees([pose_deg[0]], [pose_deg[1]]), eye)
     job = RenderJob(eye, M[0], t[0], rig.camera, window, rig.lights, Sensor(noise=False), apex_mm=np.zeros(3), seed=1)
@@ -117,7 +117,7 @@ def iris_irradiance(renderer: Renderer, job: RenderJob, points_mm: np.ndarray) -
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.lighting import through_cornea
+    from eyerender.rendering.transport.directlight import through_cornea
 
     shown, _ = renderer.bind(job, lit=False)
     x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
@@ -131,9 +131,9 @@ def depths_mm(renderer: Renderer, job: RenderJob) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.film import Pixels
-    from eyerender.rendering.sampling import camera_ray
-    from eyerender.rendering.view import meet
+    from eyerender.rendering.hits.interaction import meet
+    from eyerender.rendering.integrator.film import Pixels
+    from eyerender.rendering.integrator.sampling import camera_ray
 
     shown, _ = renderer.bind(job, lit=False)
     _, _, width, height = job.window

@@ -12,7 +12,7 @@ import pytest
 
 import eyerender as er
 from eyerender.errors import InputError
-from eyerender.imagefolder import ImageFolder
+from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import plan
 from tests.support.paths import ROOT
 

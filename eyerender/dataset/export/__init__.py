@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...files import write_json, write_text
-from ...imagefolder import DATASET, METADATA, ImageFolder
-from ...outfolder import staged
+from ...folders.imagefolder import DATASET, METADATA, ImageFolder
+from ...folders.outfolder import staged
 from ...progress import Progress
+from ...storage.files import write_json, write_text
 from ..assemble import verify_dataset
 from ..validation.problems import WRONG
 from . import coco, ellseg, openeds, parquet, table, teyed, webdataset

@@ -15,8 +15,8 @@ from typing import IO, Any
 import numpy as np
 
 from ...arrays import Bools
+from ...folders.imagefile import write_png
 from ...geometry.ellipse import Ellipse
-from ...imagefile import write_png
 from .item import Items
 
 # Except for the glints, a category's id is the part's value in the mask.

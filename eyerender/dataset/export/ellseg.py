@@ -16,7 +16,7 @@ from scipy.io import savemat
 
 from ...arrays import Floats
 from ...errors import InputError
-from ...files import write_bytes
+from ...storage.files import write_bytes
 from .item import Item, Items
 
 _MAT_TEXT = b"MATLAB 5.0 MAT-file".ljust(116)

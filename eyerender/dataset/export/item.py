@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from ...arrays import Bytes, Floats, Ints
 from ...errors import InputError
-from ...files import read_bytes
+from ...folders.imagefile import png_bytes, read_image
+from ...folders.imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
 from ...geometry.ellipse import Ellipse, signed_distance
-from ...imagefile import png_bytes, read_image
-from ...imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
+from ...storage.files import read_bytes
 from .encoding import RAW, Encoding
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...imagefile import write_png
+from ...folders.imagefile import write_png
 from .item import Items
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from ...errors import InputError
-from ...files import read_bytes
+from ...storage.files import read_bytes
 from .item import Item, Items
 from .table import row_of
 

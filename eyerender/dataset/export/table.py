@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from ...files import read_bytes, write_bytes
+from ...storage.files import read_bytes, write_bytes
 from .item import Item, Items
 
 _COLUMNS = (

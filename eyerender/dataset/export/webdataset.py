@@ -11,7 +11,7 @@ import json
 import tarfile
 from pathlib import Path
 
-from ...files import read_bytes
+from ...storage.files import read_bytes
 from .item import Items
 
 SAMPLES = 1000

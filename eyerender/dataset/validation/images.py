@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Bools, Floats
-from ...imagefile import read_image
-from ...imagefolder import FRAME, IRIS, PUPIL, ImageEntry
-from ...labels import moments_ellipse
+from ...folders.imagefile import read_image
+from ...folders.imagefolder import FRAME, IRIS, PUPIL, ImageEntry
+from ...imaging.labels import moments_ellipse
 from ...rig.camera import Window
 from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from ...arrays import Ints
 from ...errors import InputError
-from ...files import shown
-from ...imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
+from ...folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ...observation import Observations
 from ...status import Status
+from ...storage.files import shown
 from .problems import WRONG, Problems
 from .shards import hashed
 from .truth import DatasetTruth, SceneTruth

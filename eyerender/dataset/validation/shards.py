@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from ...arrays import Ints
 from ...errors import InputError
-from ...files import opened, parse_json, shown
-from ...imagefolder import METADATA
-from ...jsonlines import MAX_BYTES, MAX_LINE_BYTES
+from ...folders.imagefolder import METADATA
 from ...progress import Progress
+from ...storage.files import opened, parse_json, shown
+from ...storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
 from ..assemble import damage, shards_of
 from ..shard import LINES, SHARDS, finished, shard_name, verify
 from .problems import SHOWN, Problems, differences

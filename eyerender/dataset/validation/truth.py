@@ -18,16 +18,16 @@ import numpy as np
 from ...analytic.observer import trace
 from ...arrays import Bools, Floats
 from ...errors import InputError
-from ...files import parse_json, shown
-from ...imagefolder import DATASET, RESULTS, ImageFolder, versions
-from ...labels import EyeInWindow, known_labels, limbus_px
+from ...folders.imagefolder import DATASET, RESULTS, ImageFolder, versions
+from ...imaging.labels import EyeInWindow, known_labels, limbus_px
 from ...observation import EYES, Observations, version_of
 from ...region.mesh import lid_margins
-from ...rendering.frame import film_index, globe_of
-from ...rendering.glints import GlintScene, glint_table
-from ...rendering.occlusion import lid_margins_px
+from ...rendering.glints.occlusion import lid_margins_px
+from ...rendering.glints.tracing import GlintScene, glint_table
+from ...rendering.records.job import film_index, globe_of
 from ...scene import Frames, Scene
 from ...scene.spec import SceneSpec
+from ...storage.files import parse_json, shown
 from ..line import image_line, image_name
 from ..plan import Plan
 from ..realise import Realised, frames_of, realise

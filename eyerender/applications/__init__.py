@@ -1,0 +1,1 @@
+"""Applications that compose the package: the quickstart and surveys of populations."""

@@ -1,0 +1,120 @@
+"""The complete job: fixate, render, extract, calibrate on both kinds of features, compare, report."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from ..backends.choose import BackendChoice
+from ..errors import Warn
+from ..folders.imagefolder import ImageFolder, same_run
+from ..gaze.estimate import GazeEstimator
+from ..gaze.regression import Regression
+from ..imaging.comparison import Comparison, compare
+from ..imaging.imageobserver import ImageObserver, scene_of
+from ..imaging.images import render_folder
+from ..plausibility import saturation_warnings
+from ..progress import Progress
+from ..report.comparison import Timing, write_report
+from ..scene import Scene, load_scene
+
+REPORT = "report.html"
+
+
+def run_quickstart(
+    folder: str | Path,
+    *,
+    scene: str = "quickstart",
+    eye: str | None = None,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    warn: Warn | None = None,
+) -> Comparison:
+    """Do the complete job in a folder and write `report.html` there.
+
+    Existing images of the same scene, seed and versions in the folder are used again.
+
+    Args:
+        folder: the folder.
+        scene: a scene file, or the name of a shipped scene.
+        eye: replaces the scene's eye model.
+        backend: the render backend.
+        threads: total number of processor threads; None: all.
+        overwrite: replace what the folder holds.
+        progress: called with (done, total, note).
+        warn: called for probable mistakes, and may raise: for those of the scene before anything is done, and for
+            saturated images before they are put in place (or used again).
+
+    Raises:
+        InputError: the folder holds something else and `overwrite` is not given.
+        BackendError: there is nothing to render with.
+    """
+    folder = Path(folder)
+    loaded = load_scene(scene, eye=eye)
+    if warn is not None:
+        warn(loaded.warnings())
+    count = len(loaded.index())
+
+    def step(offset: int, what: str) -> Progress:
+        def show(done: int, _total: int, _note: str) -> None:
+            if progress is not None:
+                progress(offset + done, 2 * count + 1, what)
+
+        return show
+
+    start = time.monotonic()
+    timings = []
+    if overwrite or not same_run(folder, loaded.digest()):
+        render_folder(
+            loaded,
+            folder,
+            backend=backend,
+            threads=threads,
+            overwrite=overwrite,
+            progress=step(0, "rendering"),
+            warn=warn,
+        )
+        timings.append(Timing(f"observing and rendering {count} windows", time.monotonic() - start))
+    start = time.monotonic()
+    images = ImageFolder.load(folder)
+    if warn is not None:
+        saturated = images.dataset.get("statistics", {}).get("images_saturated", 0)
+        warn(saturation_warnings(saturated, len(images.entries), loaded.source))
+    result = _compared(images, loaded, Regression(), "", step(count, "extracting"))
+    timings.append(Timing("extracting and calibrating", time.monotonic() - start))
+    write_report(folder / REPORT, loaded, result, images.entries, timings)
+    if progress is not None:
+        progress(2 * count + 1, 2 * count + 1, "done")
+    return result
+
+
+def compare_folder(
+    path: str | Path,
+    *,
+    estimator: GazeEstimator | None = None,
+    name: str = "",
+    progress: Progress | None = None,
+) -> Comparison:
+    """Extract the features of a folder's images and compare them with its analytic ones, in pixels and in gaze.
+
+    Args:
+        path: a folder that `render`, `quickstart` or `generate` wrote.
+        estimator: gaze estimator for both; default: `er.gaze.Regression("R3")`.
+        name: name of the estimator in the result; default: as for `compare`.
+        progress: called with images done, images in all and "".
+
+    Raises:
+        InputError: it is not such a folder, or contains an image or a record that cannot be read.
+    """
+    images = ImageFolder.load(path)
+    return _compared(images, scene_of(images), estimator or Regression(), name, progress)
+
+
+def _compared(
+    images: ImageFolder, scene: Scene, estimator: GazeEstimator, name: str, progress: Progress | None
+) -> Comparison:
+    truth = images.truth()
+    found = ImageObserver().observe_entries(images.entries, truth.index, scene, progress=progress)
+    return compare(truth, found, scene.rig, estimator, name)

@@ -1,0 +1,1 @@
+"""Image files, folders of labelled images, and output folders of commands."""

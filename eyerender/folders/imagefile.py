@@ -1,0 +1,183 @@
+"""Reading and writing image files: 16- and 8-bit greyscale PNG; greyscale of the usual formats is read.
+
+Pixel values are linear sensor counts. Nothing here scales them, except `preview`, which is for people.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import warnings
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..arrays import Bytes
+from ..errors import InputError
+from ..storage.files import opened, written
+
+# Size of the largest window that can be rendered; it limits the memory that a hostile file can make us allocate.
+MAX_PIXELS = 8192 * 8192
+# More than such an image takes in any of the formats, in addition to the file's descriptive data.
+MAX_IMAGE_BYTES = 2**30
+# Pillow supports many more formats, some of which start other programs.
+FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
+
+COLOURED = ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr", "HSV", "LAB")
+
+
+_WAITING = 8  # images of a `Writer`
+
+
+def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> None:
+    """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour, completely or not at all.
+
+    Images are mostly written into a folder that is synced as a whole before it is published; `sync` makes a single one
+    durable.
+    """
+    with written(path, sync=sync) as file:
+        file.write(png_bytes(image))
+
+
+def png_bytes(image: NDArray[Any]) -> bytes:
+    """PNG file of (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour (ISO/IEC 15948).
+
+    Noise does not compress, and writing must not cost more than rendering. So every row has the same filter, and no
+    repetitions are searched for other than runs, which masks have.
+    """
+    import cv2
+
+    colour = image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8
+    if not colour and (image.ndim != 2 or image.dtype not in (np.uint8, np.uint16)):
+        raise ValueError(f"no PNG holds {image.shape} of {image.dtype}")
+    how = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+    _, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1] if colour else image), how)
+    return data.tobytes()
+
+
+class Writer:
+    """Writes PNG files in a second thread, while the next image is rendered; a context manager.
+
+    At most a few images wait. An error of a write is raised by the next call, or at the end of the block.
+    """
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, "png")
+        self._waiting: deque[Future[None]] = deque()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            while self._waiting and kind is None:
+                self._waiting.popleft().result()
+        finally:
+            self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def png(self, path: Path, image: NDArray[Any]) -> None:
+        """Write an image like `write_png`, later."""
+        while len(self._waiting) >= _WAITING:
+            self._waiting.popleft().result()
+        self._waiting.append(self._thread.submit(write_png, path, image))
+
+
+def compressed(image: Bytes, quality: int) -> Bytes:
+    """An 8-bit image (h, w) after compression as JPEG of a quality from 1 to 100."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="JPEG", quality=quality)
+    return np.asarray(Image.open(buffer, formats=("JPEG",)))
+
+
+def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
+    """Read a greyscale image and its bit depth (8 or 16).
+
+    Returns:
+        (h, w) uint8 or uint16, or float32 for a float TIFF; bit depth (32 for float).
+
+    Raises:
+        InputError: the file is missing, not regular, unreadable, empty or too large, or the image has real colour,
+            transparency or several frames.
+    """
+    image, depth, _ = _read(path, colour=False)
+    return image, depth
+
+
+def read_any_image(path: str | Path) -> tuple[NDArray[Any], int, bool]:
+    """Read an image like `read_image`, but take the luminance (ITU-R BT.601) where it has real colour.
+
+    Returns:
+        The image and its bit depth as of `read_image`, and whether it has colour.
+
+    Raises:
+        InputError: as `read_image`, except for colour.
+    """
+    return _read(path, colour=True)
+
+
+def _read(path: str | Path, *, colour: bool) -> tuple[NDArray[Any], int, bool]:
+    source = str(path)
+    try:
+        with opened(path, limit=MAX_IMAGE_BYTES) as data:
+            if os.fstat(data.fileno()).st_size == 0:
+                raise InputError("is empty", source=source)
+            # Where Pillow warns, it either reads the image nevertheless or fails with an error.
+            with warnings.catch_warnings(action="ignore"), Image.open(data, formats=FORMATS) as file:
+                return _decoded(file, source, colour)
+    except InputError:
+        raise
+    except MemoryError:
+        raise InputError("needs more memory than is available", source=source) from None
+    except Exception:
+        # For a damaged file Pillow's decoders may raise any exception.
+        raise InputError("is not a readable image", source=source) from None
+
+
+def _decoded(file: Image.Image, source: str, colour: bool) -> tuple[NDArray[Any], int, bool]:
+    if file.width * file.height > MAX_PIXELS:
+        raise InputError(f"is too large ({file.width} x {file.height} pixels)", source=source)
+    # Counting the frames would read the whole file.
+    if getattr(file, "is_animated", False):
+        raise InputError("holds several images; give a file with one", source=source)
+    if file.mode in COLOURED:
+        return _from_colour(file, source, colour)
+    file.load()
+    data = np.asarray(file)
+    if file.mode == "1":
+        return data.astype(np.uint8) * np.uint8(255), 8, False
+    if file.mode == "L":
+        return data, 8, False
+    if file.mode == "F":
+        return data.astype(np.float32), 32, False
+    if data.min(initial=0) < 0 or data.max(initial=0) > 65535:
+        raise InputError("has values outside 16 bits", source=source)
+    return data.astype(np.uint16), 16, False
+
+
+def _from_colour(file: Image.Image, source: str, colour: bool) -> tuple[Bytes, int, bool]:
+    """Grey levels of a file with colour channels; real colour only where it is allowed."""
+    if file.has_transparency_data and np.asarray(file.convert("RGBA"))[..., 3].min() < 255:
+        raise InputError("has transparent pixels", source=source)
+    grey = _same_channels(file)
+    if grey is not None:
+        return grey, 8, False
+    if not colour:
+        raise InputError(f"has colour channels ({file.mode}); give a greyscale near-infrared image", source=source)
+    return np.asarray(file.convert("RGB").convert("L")), 8, True
+
+
+def _same_channels(file: Image.Image) -> Bytes | None:
+    """Grey channel of a colour file whose channels are all equal; None for real colour."""
+    rgb = np.asarray(file.convert("RGB"))
+    equal = np.array_equal(rgb[..., 0], rgb[..., 1]) and np.array_equal(rgb[..., 0], rgb[..., 2])
+    return np.ascontiguousarray(rgb[..., 0]) if equal else None
+
+
+def preview(image: NDArray[Any], full_scale: float) -> Bytes:
+    """Make an 8-bit copy for viewing: the codes as they are, as pictures of near-infrared cameras are usually shown."""
+    return np.asarray(np.round(255 * np.clip(np.asarray(image, dtype=float) / full_scale, 0, 1)), dtype=np.uint8)

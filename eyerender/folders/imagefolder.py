@@ -1,0 +1,392 @@
+"""A folder of labelled images (docs/formats.md): metadata.jsonl, images/, masks/, dataset.json."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NoReturn, TypeGuard, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Bytes
+from ..errors import InputError, Refuse
+from ..observation import EYES, Observations, concatenate, count_heads
+from ..rig.camera import Window
+from ..storage.files import inside, is_plain, read_json, shown, write_json
+from ..storage.jsonlines import JsonLines
+from ..versions import package_version
+from .imagefile import read_image
+
+IMAGE_SCHEMA = "eyerender/image/3"
+# Version 2 has no masks of highlights, version 1 neither `gamma` nor the class 4 of masks; they are read wherever
+# version 3 is.
+IMAGE_SCHEMAS = (IMAGE_SCHEMA, "eyerender/image/2", "eyerender/image/1")
+DATASET_SCHEMA = "eyerender/dataset/1"
+METADATA, DATASET = "metadata.jsonl", "dataset.json"
+RUN = "run.json"  # in a folder that `generate` fills, from its start
+STAGE = ".partial-"
+_BATCH = 1024  # number of lines whose records are in memory at a time
+_MAX_PX = 2**31
+
+BACKGROUND, SCLERA, IRIS, PUPIL, FRAME = 0, 1, 2, 3, 4  # classes of a mask
+
+CONVENTIONS = {
+    "world_frame": "mm; origin midway between the corneal apexes of the unrotated eyes at the reference head position; "
+    "+x to the screen, +y to the subject's left, +z up",
+    "pixels": "pixel centres at integers, x right, y down, full-sensor coordinates also for a window",
+    "ellipse": "semi-axes a >= b in px, angle of a from +x toward +y in [0, pi) rad, direct least squares",
+    "values": "sensor counts, linear unless the line's gamma is not 1 (then count / full scale = linear^(1 / gamma)); "
+    "exposure belongs to the scene, never to the image",
+    "mask": "0 background or skin, 1 sclera, 2 iris, 3 pupil, as seen through the cornea at pixel centres; 4 what "
+    "frames the camera's view (openings of the lens, borders of the sensor)",
+}
+
+
+# Keys of a line that name files of the folder.
+FILE_KEYS = ("file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name", "highlight_mask_file_name")
+
+
+@dataclass(frozen=True, slots=True)
+class ImageEntry:
+    """One image of a folder: its files, its window (x0, y0, width, height) and its line of metadata.
+
+    `number` counts the lines of metadata from 1; it is 0 where it is unknown.
+    """
+
+    folder: Path
+    line: dict[str, Any]
+    number: int = 0
+
+    @property
+    def name(self) -> str:
+        """File of the image, relative to the folder, for messages."""
+        return str(self.line["file_name"])
+
+    @property
+    def path(self) -> Path:
+        """Path of the image file; raises `InputError` as `file` does."""
+        found = self.file("file_name")
+        if found is None:
+            raise InputError("missing", source=str(self.folder / METADATA), path=self._where("file_name"))
+        return found
+
+    @property
+    def mask_path(self) -> Path | None:
+        """Path of the mask file, if there is one; raises `InputError` as `file` does."""
+        return self.file("mask_file_name")
+
+    def file(self, key: str) -> Path | None:
+        """Path of the file that one of `FILE_KEYS` names, None where the line names none.
+
+        Raises:
+            InputError: it leads out of the folder, is missing, or is not a regular file (a link, a pipe, a folder).
+        """
+        name = self.line.get(key)
+        if name is None:
+            return None
+        return inside(self.folder, name, source=str(self.folder / METADATA), path=self._where(key))
+
+    @property
+    def gamma(self) -> float:
+        """The image stores linear intensity^(1 / gamma)."""
+        return float(self.line.get("gamma") or 1.0)
+
+    @property
+    def window(self) -> Window:
+        """Window x0, y0, width, height in full-sensor pixels."""
+        w = self.line["window_px"]
+        return w["x0"], w["y0"], w["width"], w["height"]
+
+    def image(self) -> NDArray[Any]:
+        """Read the sensor's counts in the window, (h, w) uint8 or uint16; float32 where the file holds floats.
+
+        Raises:
+            InputError: as for `file`; the file is not a greyscale image, or its size differs from the window's.
+        """
+        return self._picture(self.path)
+
+    def mask(self) -> Bytes | None:
+        """Read what each pixel shows, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 a frame.
+
+        Returns:
+            The mask, None where the line names none.
+
+        Raises:
+            InputError: as for `image`; the file does not have 8 bits.
+        """
+        return self._parts("mask_file_name")
+
+    def amodal_mask(self) -> Bytes | None:
+        """Read the mask of the eye without occluders; like `mask`."""
+        return self._parts("amodal_mask_file_name")
+
+    def highlight_mask(self) -> Bytes | None:
+        """Read where wet and oily surfaces mirror a lamp (1, else 0); like `mask`."""
+        return self._parts("highlight_mask_file_name")
+
+    def noiseless(self) -> NDArray[Any] | None:
+        """Read the counts without the sensor's noise, like `image`; None where the line names no such file."""
+        path = self.file("noiseless_file_name")
+        return None if path is None else self._picture(path)
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """Records of the analytic observer for each eye in the image, as in the JSON; see `truth` for arrays."""
+        found: list[dict[str, Any]] = self.line["records"]
+        return found
+
+    @property
+    def labels(self) -> dict[str, Any]:
+        """Labels of the image (docs/formats.md), empty where it has none.
+
+        Raises:
+            InputError: they are not a mapping.
+        """
+        found = self.line.get("labels")
+        if found is None:
+            return {}
+        if not isinstance(found, dict):
+            raise InputError("must be a mapping", source=str(self.folder / METADATA), path=self._where("labels"))
+        return found
+
+    def _picture(self, path: Path) -> NDArray[Any]:
+        image = read_image(path)[0]
+        width, height = self.window[2:]
+        if image.shape != (height, width):
+            reason = f"is {image.shape[1]} x {image.shape[0]} px, but its window is {width} x {height}"
+            raise InputError(reason, source=str(path))
+        return image
+
+    def _parts(self, key: str) -> Bytes | None:
+        path = self.file(key)
+        if path is None:
+            return None
+        mask = self._picture(path)
+        if mask.dtype != np.uint8:
+            raise InputError(f"holds {mask.dtype.name} values; a mask has 8 bits", source=str(path))
+        return mask
+
+    def truth(self) -> Observations:
+        """Records of the analytic observer for this image.
+
+        Raises:
+            InputError: naming line and key.
+        """
+        try:
+            return Observations.from_records(self.records, complete=True)
+        except InputError as error:
+            source, line = str(self.folder / METADATA), f"line {self.number}" if self.number else ""
+            raise error.placed(source=source, under=line) from None
+
+    def _where(self, key: str) -> str:
+        return f"line {self.number}.{key}" if self.number else key
+
+
+@dataclass(frozen=True, slots=True)
+class Entries(Sequence[ImageEntry]):
+    """The images of a folder. Each line of metadata is read and checked when its entry is requested, and not kept.
+
+    Iteration is faster than access by index. A slice is another such sequence.
+
+    Raises:
+        InputError: on access; the line is wrong (the message names line and key), or the file has changed.
+    """
+
+    folder: Path
+    lines: JsonLines
+    rows: range
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, at: int) -> ImageEntry: ...
+    @overload
+    def __getitem__(self, at: slice) -> Entries: ...
+    def __getitem__(self, at: int | slice) -> ImageEntry | Entries:
+        if isinstance(at, slice):
+            return Entries(self.folder, self.lines, self.rows[at])
+        row = self.rows[at]
+        return next(iter(Entries(self.folder, self.lines, range(row, row + 1))))
+
+    def __iter__(self) -> Iterator[ImageEntry]:
+        source = str(self.lines.path)
+        for row, line in zip(self.rows, self.lines.read(self.rows), strict=True):
+            _check_line(line, source, f"line {row + 1}")
+            yield ImageEntry(self.folder, line, row + 1)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFolder:
+    """A complete folder of images; iteration yields an `ImageEntry` for each.
+
+    The lines of metadata are read when their entries are requested, and never all kept.
+    """
+
+    path: Path
+    dataset: dict[str, Any]
+    entries: Entries
+
+    @classmethod
+    def load(cls, path: str | Path) -> ImageFolder:
+        """Open a folder: read dataset.json, find the lines of metadata.jsonl and check the first one.
+
+        Raises:
+            InputError: naming the file, and the line and key where there is one. A later wrong line is reported when it
+                is read.
+        """
+        folder = Path(path)
+        if not os.path.isdir(folder):
+            raise InputError("no such folder", source=str(path))
+        if (folder / RUN).is_file() and not (folder / DATASET).is_file():
+            raise InputError("holds an unfinished run; start generate again on the folder", source=str(path))
+        if not (folder / METADATA).exists():
+            raise InputError(
+                f"holds no {METADATA}, so it is not a folder of images written by this package", source=str(path)
+            )
+        dataset = read_json(folder / DATASET, follow=False)
+        if dataset.get("schema") != DATASET_SCHEMA:
+            raise InputError(
+                f"is {shown(dataset.get('schema'))}; this version reads {DATASET_SCHEMA!r}",
+                source=str(folder / DATASET),
+                path="schema",
+            )
+        lines = JsonLines.index(folder / METADATA)
+        if not len(lines):
+            raise InputError("holds no images", source=str(folder / METADATA))
+        entries = Entries(folder, lines, range(len(lines)))
+        _ = entries[0]
+        return cls(folder, dataset, entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __iter__(self) -> Iterator[ImageEntry]:
+        return iter(self.entries)
+
+    def truth(self) -> Observations:
+        """Records of the analytic observer for every image, in order.
+
+        Raises:
+            InputError: a record is wrong.
+        """
+        parts = []
+        for start in range(0, len(self.entries), _BATCH):
+            batch = list(self.entries[start : start + _BATCH])
+            try:
+                parts.append(Observations.from_records([r for entry in batch for r in entry.records], complete=True))
+            except InputError:
+                for entry in batch:
+                    entry.truth()  # this names the wrong line
+                raise
+        found = concatenate(parts)
+        # Head positions are counted over all images.
+        return replace(found, index=replace(found.index, head=count_heads(found.index.head_mm)))
+
+
+def _check_line(line: dict[str, Any], source: str, where: str) -> None:
+    """Check the files, names and window of a line; the rest of it is not checked.
+
+    Raises:
+        InputError: they cannot be used.
+    """
+
+    def refuse(key: str, reason: str) -> NoReturn:
+        raise InputError(reason, source=source, path=f"{where}.{key}")
+
+    if line.get("schema") not in IMAGE_SCHEMAS:
+        refuse("schema", f"is {shown(line.get('schema'))}, not an image record ({IMAGE_SCHEMA!r})")
+    for key in FILE_KEYS:
+        name = line.get(key)
+        if not is_plain(name) and (name is not None or key == "file_name"):
+            refuse(key, f"must be a path inside the folder, not {shown(name)}")
+    window = line.get("window_px")
+    for key in ("x0", "y0", "width", "height"):
+        value = window.get(key) if isinstance(window, dict) else None
+        if not _is_whole(value) or abs(value) > _MAX_PX or (value < 1 and key in ("width", "height")):
+            refuse(f"window_px.{key}", "must be a whole number of pixels")
+    depth = line.get("bit_depth")
+    if depth is not None and not (_is_whole(depth) and 1 <= depth <= 32):
+        refuse("bit_depth", "must be 1 to 32")
+    gamma = line.get("gamma")
+    if gamma is not None and (isinstance(gamma, bool) or not isinstance(gamma, int | float) or not 0.1 <= gamma <= 10):
+        refuse("gamma", "must be 0.1 to 10")
+    _check_names(line, refuse)
+    _check_records(line.get("records"), refuse)
+
+
+def _check_names(line: dict[str, Any], refuse: Refuse) -> None:
+    """Check what becomes a part of the names of exported files."""
+    for key in ("sample", "subject"):
+        if key in line and not _is_count(line[key], 2**63):
+            refuse(key, "must be a whole number >= 0")
+    if "split" in line and not (is_plain(line["split"]) and "/" not in line["split"] and len(line["split"]) <= 64):
+        refuse("split", f"must be a plain name, not {shown(line['split'])}")
+
+
+def _check_records(records: Any, refuse: Refuse) -> None:
+    if not isinstance(records, list):
+        refuse("records", "must be a list")
+    for k, record in enumerate(records):
+        if not isinstance(record, dict):
+            refuse(f"records.{k}", "must be a record")
+        if record.get("eye") not in (None, *EYES):
+            refuse(f"records.{k}.eye", "must be 'right' or 'left'")
+        camera = record.get("camera")
+        if camera is not None and not _is_count(camera, 2**31):
+            refuse(f"records.{k}.camera", "must be a whole number >= 0")
+
+
+def _is_count(value: object, end: int) -> bool:
+    return _is_whole(value) and 0 <= value < end
+
+
+def _is_whole(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def same_run(path: str | Path, digest: str) -> bool:
+    """Whether a folder already holds the complete result of the same spec made by the same versions."""
+    try:
+        found = read_json(Path(path) / DATASET)
+    except InputError:
+        return False
+    return bool(
+        found.get("schema") == DATASET_SCHEMA and found.get("digest") == digest and found.get("versions") == versions()
+    )
+
+
+def write_dataset(folder: Path, lines: list[dict[str, Any]], *, spec: dict[str, Any], digest: str, **more: Any) -> None:
+    """Write metadata.jsonl and then dataset.json, which marks the folder complete."""
+    with open(folder / METADATA, "w", encoding="utf-8") as file:
+        for line in lines:
+            file.write(json.dumps({"schema": IMAGE_SCHEMA, **line}, allow_nan=False) + "\n")
+    dataset = {
+        "schema": DATASET_SCHEMA,
+        "digest": digest,
+        "spec": spec,
+        "versions": versions(),
+        "conventions": CONVENTIONS,
+        **more,
+    }
+    write_json(folder / DATASET, dataset)
+
+
+RESULTS = 17
+"""Version of what this package computes: records, labels and pixels of the same spec.
+
+A change of the code that changes them raises it. A run that was begun with another version is not resumed.
+`tests/test_results_version.py` fails when results change and this number does not.
+"""
+
+
+def versions() -> dict[str, str]:
+    """Versions on which a result depends."""
+    packages = ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless")
+    found = {name: package_version(name) for name in packages}
+    return {"python": platform.python_version(), "results": str(RESULTS), **found}

@@ -1,0 +1,309 @@
+"""Rendering of frames in memory, with a window of the sensor for each eye."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Bytes, Floats, Singles
+from ..backends.choose import BackendChoice, choose_backend
+from ..errors import InputError
+from ..eye.model import EyeModel
+from ..eye.pose import Poses, rigid_motion
+from ..eye.refraction import at_cornea_d
+from ..folders.imagefile import MAX_PIXELS, compressed
+from ..observation import EYES
+from ..progress import Progress, followed_by, one_behind
+from ..rig.camera import Window
+from ..scene import Frames, Scene
+
+if TYPE_CHECKING:
+    from ..rendering.records.job import RenderJob
+    from ..rendering.renderer import RenderedWindow, Renderer
+
+# For one image, this is a day's work of a fast processor.
+MAX_SAMPLES = 10**12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EyeImage:
+    """A rendered image of one eye: a window of a camera's sensor.
+
+    Attributes:
+        frame: the one row of `Frames` that it shows.
+        row: index of that row among the rendered frames.
+        window: (x0, y0, width, height) of the window in full-sensor pixels.
+        counts: what the sensor stores, (height, width) uint8 or uint16 DN.
+        irradiance: on the sensor before noise and quantisation, (height, width) mW/mm^2.
+        parts: part of the picture at each pixel's centre, (height, width) uint8 (docs/formats.md).
+        eye: the eye's model, placed in the world by x_world = M x + t.
+        M: (3, 3) rotation of that motion.
+        t: (3,) translation of that motion, mm.
+        rendered: the renderer's complete result.
+    """
+
+    frame: Frames
+    row: int
+    window: Window
+    counts: NDArray[Any]
+    irradiance: Singles
+    parts: Bytes
+    eye: EyeModel
+    M: Floats
+    t: Floats
+    rendered: RenderedWindow
+
+    @property
+    def name(self) -> str:
+        """Name of the image's files: the number of the frame and the eye."""
+        index = self.frame.index
+        return f"{index.frame[0]:06d}_{EYES[index.eye[0]]}"
+
+    @property
+    def scene(self) -> Scene:
+        """Scene that was rendered."""
+        return self.frame.scene
+
+    @property
+    def camera(self) -> int:
+        """Index of the camera."""
+        return int(self.frame.index.camera[0])
+
+
+def render_windows(
+    frames: Frames,
+    *,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+    renderer: Renderer | None = None,
+    progress: Progress | None = None,
+) -> Iterator[EyeImage]:
+    """Render every row of `frames` in its own window, in order.
+
+    Args:
+        frames: n rows, one eye in one frame each.
+        backend: the backend, if no renderer is given.
+        threads: number of processor threads for rendering; None: all.
+        renderer: an existing renderer (see `make_renderer`).
+        progress: called with (done, n, "") after each image.
+
+    Raises:
+        InputError: the scene's windows cannot be rendered.
+        BackendError: no backend renders; the message says how to fix it.
+    """
+    scene = frames.scene
+    check_windows(scene)
+    if renderer is None:
+        renderer = make_renderer(backend, threads)
+    images = (begun.image() for begun in one_behind(begin_each([frames], renderer)))
+    yield from followed_by(images, len(frames), progress)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BegunImage:
+    """A row of `frames` that has been traced by `job`; a second thread makes its image."""
+
+    frames: Frames
+    row: int
+    job: RenderJob
+    made: Future[RenderedWindow]
+
+    def image(self) -> EyeImage:
+        """Wait for the image."""
+        done, job = self.made.result(), self.job
+        assert done.labels is not None
+        return EyeImage(
+            frame=self.frames.take([self.row]),
+            row=self.row,
+            window=done.window,
+            counts=stored(self.frames.scene, done.dn),
+            irradiance=done.irradiance,
+            parts=done.labels.part,
+            eye=job.eye,
+            M=job.M,
+            t=job.t,
+            rendered=done,
+        )
+
+
+def begin_each(many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False) -> Iterator[BegunImage]:
+    """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
+
+    The next frames are fetched before the last of these are traced, because what NumPy alone makes of them is made
+    beside that. Where fetching fails, these are traced first.
+
+    Args:
+        many: the frames, one scene after the other.
+        renderer: what traces them.
+        highlights: whether to find the highlights of wet and oily surfaces.
+
+    Raises:
+        InputError: a scene's windows cannot be rendered.
+    """
+    steps = _steps(many, highlights)
+    step = next(steps, None)
+    while step is not None:
+        failed: Exception | None = None
+        try:
+            after = next(steps, None)
+        except Exception as error:
+            after, failed = None, error
+        spp, expected = step.frames.scene.spec.image.spp, None if after is None or after.moments else after.job
+        made = renderer.begin(step.job, spp=spp, moments=step.moments, after=expected)
+        yield BegunImage(step.frames, step.row, step.job, made)
+        if failed is not None:
+            raise failed
+        step = after
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """The job of a row of `frames`, and its moments, if it moves."""
+
+    frames: Frames
+    row: int
+    job: RenderJob
+    moments: tuple[RenderJob, ...]
+
+
+def _steps(many: Iterable[Frames], highlights: bool) -> Iterator[_Step]:
+    """What to trace, one after the other."""
+    for frames in many:
+        check_windows(frames.scene)
+        for row in range(len(frames)):
+            job = replace(render_job(frames, row), highlights=highlights)
+            yield _Step(frames, row, job, moments(frames, row, job))
+
+
+def render_job(frames: Frames, row: int) -> RenderJob:
+    """Job of the renderer for one row: the eye in its pose, the rig, the window, the seed."""
+    from ..rendering.records.job import RenderJob
+
+    scene, index = frames.scene, frames.index
+    camera, head = int(index.camera[row]), int(index.head[row])
+    eye = scene.eye(EYES[index.eye[row]])
+    M, t = eye_motion(frames, row)
+    # Each image has its own seed, a pure function of the scene's seed, the frame and the eye.
+    seeds = np.random.SeedSequence([scene.spec.seed, int(index.frame[row]), int(index.eye[row])])
+    return RenderJob(
+        eye=eye,
+        M=M,
+        t=t,
+        camera=scene.rig.cameras[camera],
+        window=scene.window(camera, head, int(index.eye[row])),
+        lights=scene.rig.lights,
+        sensor=scene.spec.sensor,
+        look=scene.spec.look,
+        region=None if scene.region is None else scene.region.of_side(EYES[index.eye[row]]),
+        lens=scene.spec.lens,
+        ambient=scene.ambient,
+        mesh_edge_mm=scene.spec.image.mesh_edge_mm if scene.spec.image.surfaces == "mesh" else None,
+        interreflection=scene.spec.image.interreflection,
+        wavelength_nm=scene.spec.wavelength_nm,
+        seed=int(seeds.generate_state(1, np.uint64)[0]),
+        apex_mm=index.eye_position_mm[row] + index.head_mm[row],
+        focus_dpt=focus_dpt(frames, row),
+    )
+
+
+def focus_dpt(frames: Frames, row: int) -> float:
+    """Vergence at which the eye of one row is focused.
+
+    Where the scene tells how far the lens accommodates, as for drawn people, it is that much nearer than the far point.
+    Else the eye is focused on its target, or far away without one, unless it is too short-sighted.
+    """
+    scene, index = frames.scene, frames.index
+    far = -at_cornea_d(scene.refraction_d(EYES[index.eye[row]]))
+    if (accommodation := scene.accommodation_d) is not None:
+        return far + accommodation
+    gap = index.target_mm[row] - (index.eye_position_mm[row] + index.head_mm[row])
+    target = 1e3 / float(np.linalg.norm(gap)) if np.isfinite(gap).all() else 0.0
+    return max(target, far)
+
+
+def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:
+    """The same window at evenly spaced moments of the exposure, with moving eye and head; empty where nothing moves."""
+    scene, pose = frames.scene, frames.pose
+    motion = scene.spec.motion
+    if motion is None:
+        return ()
+    out = []
+    for k in range(motion.steps):
+        time_s = ((k + 0.5) / motion.steps - 0.5) * scene.spec.sensor.exposure_ms * 1e-3
+        azimuth = pose.azimuth_rad[row] + np.radians(motion.eye_deg_s[0]) * time_s
+        elevation = pose.elevation_rad[row] + np.radians(motion.eye_deg_s[1]) * time_s
+        M, t = rigid_motion(Poses.listing([azimuth], [elevation]), middle.eye)
+        apex = middle.anchor_mm + np.array(motion.head_mm_s) * time_s
+        seed = int(np.random.SeedSequence([middle.seed, k]).generate_state(1, np.uint64)[0])
+        # At the middle, the job itself: the renderer sees that it need not be set up again.
+        moved = {"M": M[0], "t": t[0] + apex, "apex_mm": apex} if time_s else {}
+        out.append(replace(middle, **moved, seed=seed, labels=False))
+    return tuple(out)
+
+
+def check_windows(scene: Scene) -> None:
+    """Check that the eyes of a scene can be rendered.
+
+    Raises:
+        InputError: they cannot.
+    """
+    spp = scene.spec.image.spp
+    for i in range(len(scene.rig.cameras)):
+        width, height = scene.window_size_px(i)
+        if width * height > MAX_PIXELS:
+            what = "image.window_px" if scene.spec.image.window_px else f"rig.cameras.{i}.resolution_px"
+            raise InputError(
+                f"{width} x {height} pixels are too many to render; at most {MAX_PIXELS} are allowed", path=what
+            )
+        if width * height * spp > MAX_SAMPLES:
+            raise InputError(
+                f"{width} x {height} pixels with {spp} samples each are more than {MAX_SAMPLES:.0e} samples",
+                path="image.spp",
+            )
+
+
+def make_renderer(backend: BackendChoice = "auto", threads: int | None = None) -> Renderer:
+    """Make a renderer on a backend that works.
+
+    Raises:
+        BackendError: there is none; the message says how to fix it.
+    """
+    chosen = choose_backend(backend, threads)
+    # Importing the renderer imports mitsuba, which requires a backend that is set up.
+    from ..rendering.renderer import Renderer
+
+    return Renderer(chosen)
+
+
+def noiseless(image: EyeImage) -> NDArray[Any]:
+    """Counts of an image without the sensor's noise, as with `sensor.noise: false`."""
+    from ..rig.exposure import recorded
+
+    spec = image.scene.spec
+    sensor = spec.sensor.model_copy(update={"noise": False})
+    camera = image.scene.rig.cameras[image.camera]
+    dn = recorded(sensor, camera, image.window, image.irradiance.astype(float), spec.wavelength_nm, 0)
+    return dn.astype(np.uint8) if sensor.bit_depth == 8 else dn
+
+
+def stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
+    """Convert counts to the type in which they are written, through the sensor's compression."""
+    sensor = scene.spec.sensor
+    if sensor.bit_depth != 8:
+        return dn
+    codes = dn.astype(np.uint8)
+    return codes if sensor.jpeg_quality is None else compressed(codes, sensor.jpeg_quality)
+
+
+def eye_motion(frames: Frames, row: int) -> tuple[Floats, Floats]:
+    """Rigid motion x_world = M x + t of the eye of one row: M (3, 3), t (3,) mm."""
+    index, pose = frames.index, frames.pose
+    one = slice(row, row + 1)
+    poses = Poses(pose.azimuth_rad[one], pose.elevation_rad[one], pose.torsion_rad[one])
+    M, t = rigid_motion(poses, frames.scene.eye(EYES[index.eye[row]]))
+    return M[0], t[0] + (index.eye_position_mm[row] + index.head_mm[row])

@@ -1,0 +1,381 @@
+"""The image observer, which reports features found in pixels in the same form as the analytic observer."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Floats, Ints
+from ..backends.choose import BackendChoice
+from ..errors import InputError, InputWarning, Warn
+from ..extraction import Extraction, ExtractionSettings, extract
+from ..extraction.glints.matching import assign_lights, predict_glints
+from ..extraction.overlay import overlay
+from ..extraction.pair import extract_eyes
+from ..extraction.preprocessing import single_threaded
+from ..eye.spec import EyeSpec
+from ..folders.imagefile import read_any_image, write_png
+from ..folders.imagefolder import DATASET, ImageEntry, ImageFolder
+from ..observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
+from ..progress import Progress, followed, followed_by
+from ..rig.camera import PinholeCamera
+from ..rig.rig import RigLike
+from ..scene import Frames, Scene
+from ..scene.spec import SceneSpec
+from ..storage.files import parse_json
+from .capture import EyeImage, render_windows
+
+# Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
+_PLACE_MM = 1.5
+_BATCH = 256
+# A process takes 1 to 1.5 s to start. Two that share images of 20 ms gain that after 100 to 150.
+LEAST_FOR_POOL = 128
+
+
+@dataclass(frozen=True, slots=True)
+class ImageObserver:
+    """The observer of pixels: the pupil ellipse and the glints that the extractor finds; it never uses the truth.
+
+    Args:
+        settings: settings of the extractor; where the rig is known, the range of pupil sizes is narrowed.
+        gamma: encoding gamma of the images; 1 is linear.
+        backend: backend that renders the frames.
+        threads: number of processor threads for rendering; None: all.
+        progress: called with (done, all, "") after each image.
+    """
+
+    settings: ExtractionSettings = field(default_factory=ExtractionSettings)
+    gamma: float = 1.0
+    backend: BackendChoice = "auto"
+    threads: int | None = None
+    progress: Progress | None = None
+
+    def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
+        """Render every (frame, eye) and extract its features; `rig` replaces that of the frames."""
+        images = render_windows(frames.seen_by(rig), backend=self.backend, threads=self.threads, progress=self.progress)
+        return self.observe_images(images)
+
+    def observe_images(self, images: Iterable[EyeImage]) -> Observations:
+        """Extract the features of rendered images, one row each."""
+        return concatenate(
+            [
+                self._observe_rows(
+                    image.counts,
+                    image.scene.spec.sensor.bit_depth,
+                    image.window[:2],
+                    image.frame.index,
+                    np.array([0]),
+                    image.scene,
+                    image.scene.spec.sensor.gamma,
+                )
+                for image in images
+            ]
+        )
+
+    def observe_folder(self, folder: ImageFolder, scene: Scene, *, progress: Progress | None = None) -> Observations:
+        """Extract the features of a folder's images, in the order of its records."""
+        return self.observe_entries(folder.entries, folder.truth().index, scene, progress=progress)
+
+    def observe_entries(
+        self, entries: Sequence[ImageEntry], index: Index, scene: Scene, *, progress: Progress | None = None
+    ) -> Observations:
+        """Extract the features of some images of a scene; `index` has a row for each of their records."""
+        parts: list[Observations] = []
+        few: list[Observations] = []  # observations of one row each take ten times the memory of joined ones
+        row = 0
+        for entry in followed(entries, progress):
+            if len(entry.records) == 0:
+                raise InputError("has no records", source=str(entry.path))
+            image = entry.image()
+            rows = np.arange(row, row + len(entry.records))
+            depth = int(entry.line.get("bit_depth") or 8 * image.itemsize)
+            few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene, entry.gamma))
+            if len(few) == _BATCH:
+                parts.append(concatenate(few))
+                few = []
+            row = int(rows[-1]) + 1
+        return concatenate([*parts, *few])
+
+    def observe_files(
+        self,
+        paths: Sequence[str | Path],
+        *,
+        scene: Scene | None = None,
+        progress: Progress | None = None,
+        eyes: int = 1,
+        processes: int = 1,
+        pictures: Path | None = None,
+        warn: Warn | None = None,
+    ) -> Observations:
+        """Extract the features of any images, or of one folder that this package wrote.
+
+        Each image is a frame; with a scene its glints are assigned to lights.
+
+        Args:
+            paths: images, or one folder.
+            scene: the scene whose rig took the images.
+            progress: called after each image.
+            eyes: 1, or 2 for images of both eyes. The eye on the image's left is then the right eye, as a camera in
+                front of the subject sees it.
+            processes: how many images are worked on at the same time.
+            pictures: folder for a picture of what was found in each image.
+            warn: receives a warning if images have colour.
+        """
+        if len(paths) == 1 and os.path.isdir(paths[0]):
+            folder = ImageFolder.load(paths[0])
+            return self.observe_folder(folder, scene or scene_of(folder), progress=progress)
+        if pictures is not None:
+            _refuse_inputs([_picture_of(path, pictures) for path in paths], paths)
+        parts, coloured = [], 0
+        job = _FileJob(self.settings, self.gamma, eyes, pictures)
+        with _mapper(processes if len(paths) >= LEAST_FOR_POOL else 1) as each:
+            for k, (found, shape, colour) in enumerate(followed_by(each(job, paths), len(paths), progress)):
+                coloured += colour
+                parts.append(self.observe_found(found, k, shape, scene=scene, source=str(paths[k])))
+        if coloured and warn is not None:
+            warn([colour_warning(coloured, "images" if coloured > 1 else "image")])
+        return concatenate(parts)
+
+    def observe_found(
+        self, found: Sequence[Extraction], frame: int, shape: tuple[int, int], *, scene: Scene | None, source: str
+    ) -> Observations:
+        """Report what was extracted from a whole sensor image (h, w): of one eye, or of the left and right half."""
+        parts = []
+        for side, one in enumerate(found):
+            lights: Sequence[int] = [-1] * len(one.glints)
+            reasons: Sequence[str | None] = [None] * len(one.glints)
+            if scene is not None:
+                # The part of the sensor that a single image shows is unknown, so only a whole sensor image can be
+                # placed.
+                camera = scene.rig.cameras[0]
+                if shape != (camera.resolution_px[1], camera.resolution_px[0]):
+                    raise InputError(f"is {shape[1]} x {shape[0]} px, but the scene's sensor is not", source=source)
+                lights, reasons = _lights(one, np.zeros(2), scene, camera, np.full(3, np.nan))
+            eye = np.array([side if len(found) > 1 else -1])
+            parts.append(_observation(one, lights, reasons, np.zeros(2), Index(frame=np.array([frame]), eye=eye)))
+        return concatenate(parts)
+
+    def _observe_rows(
+        self,
+        image: NDArray[Any],
+        depth: int,
+        origin: tuple[int, int],
+        index: Index,
+        rows: Ints,
+        scene: Scene,
+        gamma: float,
+    ) -> Observations:
+        """Extract the eyes of one image; if there are two, each is searched in its own part of the image."""
+        parts = []
+        for row in rows:
+            camera = scene.rig.cameras[int(index.camera[row])]
+            eye_mm = index.eye_position_mm[row] + index.head_mm[row]
+            px_per_mm = camera.scale_at(eye_mm)
+            cut, corner = image, np.array(origin)
+            if len(rows) > 1:
+                cut, corner = _around(image, corner, camera.project(eye_mm)[0], 16.0 * px_per_mm)
+            # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens them.
+            settings = self.settings.model_copy(
+                update={
+                    "radius_min_px": max(0.6 * px_per_mm, 3.0),
+                    "radius_max_px": max(5.0 * px_per_mm, 8.0),
+                }
+            )
+            found = extract(cut, bit_depth=depth, gamma=gamma if gamma != 1 else self.gamma, settings=settings)
+            lights, reasons = _lights(found, corner, scene, camera, eye_mm)
+            parts.append(_observation(found, lights, reasons, corner, index.take([row])))
+        return concatenate(parts)
+
+
+@dataclass(frozen=True, slots=True)
+class _FileJob:
+    """What is done with one image file; a process of its own may do it."""
+
+    settings: ExtractionSettings
+    gamma: float
+    eyes: int
+    pictures: Path | None
+
+    def __call__(self, path: str | Path) -> tuple[tuple[Extraction, ...], tuple[int, int], bool]:
+        """What was found in a file, its (h, w), and whether it has colour."""
+        image, depth, colour = read_any_image(path)
+        options: dict[str, Any] = {
+            "bit_depth": depth if depth <= 16 else None,
+            "gamma": self.gamma,
+            "settings": self.settings,
+        }
+        found = extract_eyes(image, **options) if self.eyes == 2 else (extract(image, **options),)
+        if self.pictures is not None:
+            full = float(2**depth - 1) if depth <= 16 else float(max(image.max(), 1e-9))
+            picture = overlay(image, found, full)
+            write_png(_picture_of(path, self.pictures), np.ascontiguousarray(picture[..., ::-1]))
+        return found, (image.shape[0], image.shape[1]), colour
+
+
+def _picture_of(path: str | Path, folder: Path) -> Path:
+    return folder / f"{Path(path).stem}.png"
+
+
+def _refuse_inputs(pictures: Sequence[Path], paths: Sequence[str | Path]) -> None:
+    """Check that no picture that will be written is one of the images that will be read."""
+    inputs = set()
+    for path in paths:
+        with suppress(OSError, ValueError):  # `read_any_image` says so
+            state = os.stat(path)
+            inputs.add((state.st_dev, state.st_ino))
+    for picture in pictures:
+        with suppress(OSError, ValueError):
+            state = picture.stat()
+            if (state.st_dev, state.st_ino) in inputs:
+                raise InputError("is one of the images, so it is not written to", source=str(picture))
+
+
+def colour_warning(count: int, what: str) -> InputWarning:
+    """Warning that images or frames have colour."""
+    return InputWarning(
+        code="colour", reason=f"{count} {what} in colour; the luminance is taken, but near-infrared images are grey"
+    )
+
+
+@contextmanager
+def _mapper(processes: int) -> Iterator[Callable[[_FileJob, Sequence[str | Path]], Iterable[Any]]]:
+    """A map of a job over paths, in this process or in several, in the order of the paths."""
+    if processes <= 1:
+        yield lambda job, paths: map(job, paths)
+        return
+    # New processes: those that are forked inherit the threads of OpenCV and of the renderer in a broken state.
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=single_threaded) as pool:
+        try:
+            yield lambda job, paths: pool.map(job, paths, chunksize=4)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def detect(
+    images: EyeImage | Iterable[EyeImage], rig: RigLike | None = None, *, settings: ExtractionSettings | None = None
+) -> Observations:
+    """Recover pupils and glints from rendered images, one row for each.
+
+    Args:
+        images: what `render` gave; the truth that they carry is not used.
+        rig: replaces the one that was rendered, to identify the glints by.
+        settings: of the extraction.
+    """
+    several = [images] if isinstance(images, EyeImage) else images
+    told = (replace(image, frame=image.frame.seen_by(rig)) for image in several)
+    return ImageObserver(settings or ExtractionSettings()).observe_images(told)
+
+
+def scene_of(folder: ImageFolder) -> Scene:
+    """Scene from which a folder of images was rendered."""
+    source = str(folder.path / DATASET)
+    spec = folder.dataset.get("spec")
+    if not isinstance(spec, dict):
+        raise InputError("missing", source=source, path="spec")
+    if folder.dataset.get("kind") == "dataset":
+        return _scene_of_samples(folder)
+    return Scene.of(SceneSpec.from_mapping(spec, source=source), source=source)
+
+
+def _scene_of_samples(folder: ImageFolder) -> Scene:
+    """Scene of a generated dataset's first sample, whose cameras and light positions all others must share."""
+    first: Scene | None = None
+    seen: set[str] = set()
+    for entry in folder:
+        source = str(folder.path / entry.name)
+        try:
+            text, eye = entry.line["parameters"]["scene_json"], entry.line["parameters"]["eye_json"]
+            if not isinstance(text, str):
+                raise TypeError
+            rig = parse_json(text)["rig"]
+            key = json.dumps([rig["cameras"], [{**light, "intensity_mw_sr": 0} for light in rig["lights"]]])
+        except (InputError, KeyError, TypeError, ValueError):
+            raise InputError("has no parameters", source=source) from None
+        if first is None:
+            spec = SceneSpec.from_mapping(parse_json(text), source=source)
+            first = Scene.compiled(spec, EyeSpec.from_mapping(_parsed(eye, source), source=source))
+        seen.add(key)
+        if len(seen) > 1:
+            raise InputError(
+                "the rig differs from image to image, so no calibration is possible", source=str(folder.path)
+            )
+    if first is None:
+        raise InputError("holds no images", source=str(folder.path))
+    return first
+
+
+def _parsed(text: Any, source: str) -> Any:
+    if not isinstance(text, str):
+        raise InputError("must be text", source=source, path="parameters.eye_json")
+    return parse_json(text, source=source, path="parameters.eye_json")
+
+
+def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float) -> tuple[NDArray[Any], Floats]:
+    """Part of an image within `half_px` of a full-sensor point, and its own first pixel on the sensor."""
+    h, w = image.shape
+    x0, y0 = np.clip(np.floor(centre_px - corner - half_px), 0, [w - 16, h - 16]).astype(int)
+    x1, y1 = np.clip(np.ceil(centre_px - corner + half_px), [x0 + 16, y0 + 16], [w, h]).astype(int)
+    return image[y0:y1, x0:x1], corner + np.array([x0, y0])
+
+
+def _lights(
+    found: Extraction, corner: Floats, scene: Scene, camera: PinholeCamera, eye_mm: Floats
+) -> tuple[list[int], Sequence[str | None]]:
+    """Light of each glint (-1: none) and the reason why it has none, from the rig and a rough position of the eye."""
+    if not found.glints or found.pupil.ellipse is None:
+        return [-1] * len(found.glints), ["no pupil to place the reflections by"] * len(found.glints)
+    spots = np.array([g.xy_px for g in found.glints]) + corner
+    pupil = np.asarray(found.pupil.ellipse.centre_px) + corner
+    places = np.array([light.position_mm for light in scene.rig.lights])
+    predicted, px_per_mm = predict_glints(
+        camera.ideal(pupil), K=camera.K, R=camera.R, t_mm=camera.t, lights_mm=places, eye_mm=eye_mm
+    )
+    assigned = assign_lights(camera.ideal(spots), predicted, shift_sd_px=_PLACE_MM * px_per_mm)
+    return [int(k) for k in assigned.light], assigned.reasons
+
+
+def _observation(
+    found: Extraction, lights: Sequence[int], reasons: Sequence[str | None], corner: Floats, index: Index
+) -> Observations:
+    """Convert the extraction of one image to a batch of one; `corner` shifts it to full-sensor pixels.
+
+    Glints are in the order of the rig's lights, and those of no light follow.
+    """
+    order = sorted(range(len(lights)), key=lambda i: (lights[i] < 0, lights[i]))
+    lights, reasons = [lights[i] for i in order], [reasons[i] for i in order]
+    pupil, glints = found.pupil, [found.glints[i] for i in order]
+    m = len(glints)
+    known: dict[str, Any] = {"status": [pupil.status], "reason": [pupil.reason]}
+    if pupil.ellipse is not None:
+        known["centre_px"] = [pupil.ellipse.centre_px + corner]
+        known["semi_axes_px"] = [pupil.ellipse.semi_axes_px]
+        known["angle_rad"] = [pupil.ellipse.angle_rad]
+    if pupil.covariance is not None:
+        known["covariance"] = [pupil.covariance]
+    spreads = [np.full((2, 2), np.nan) if g.covariance is None else g.covariance for g in glints]
+    why = [g.reason or reason for g, reason in zip(glints, reasons, strict=True)]
+    # What was measured in an image is in the image.
+    return Observations(
+        index=index,
+        pose=PoseTruth(azimuth_rad=np.array([np.nan])),
+        pupil=PupilFeatures(**known, in_image=np.array([pupil.ok])),
+        glints=GlintFeatures(
+            status=np.array([g.status for g in glints], np.int8).reshape(1, m),
+            light=np.array(lights, np.int64).reshape(1, m),
+            reason=np.array(why, object).reshape(1, m),
+            in_image=np.array([g.ok for g in glints], bool).reshape(1, m),
+            xy_px=np.array([g.xy_px + corner for g in glints]).reshape(1, m, 2),
+            covariance=np.array(spreads).reshape(1, m, 2, 2),
+        ),
+    )

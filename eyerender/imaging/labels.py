@@ -1,0 +1,322 @@
+"""Labels of an image: what ray optics predicts, and what the image shows.
+
+They contain ellipses, glints, points and lines in space, and matrices.
+
+`amodal` ellipses are those of the outline without occluders: that of the pupil seen through the cornea, and that of the
+iris at the circle of the limbus where the cornea is half clear. A `visible` ellipse has the second moments of the
+visible pixels (of pupil, or of iris and pupil together): semi-axes 2 sqrt(eigenvalues of covariance + 1/12).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from ..arrays import Bools, Bytes, Floats
+from ..eye.fixation import fixations
+from ..eye.model import EyeModel
+from ..folders.imagefolder import IRIS, PUPIL
+from ..geometry.ellipse import fit_ellipse_direct
+from ..observation import EYES, Observations
+from ..rig.camera import PinholeCamera, Window, in_window
+from ..scene import Frames, Scene
+from ..status import Status
+from .capture import EyeImage, eye_motion
+
+_OUTLINE_POINTS = 60
+_SAG_STEP_MM = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EyeInWindow:
+    """An eye in a window, without the image: row `row` of frames, its `camera` and `window`.
+
+    The window is (x0, y0, width, height) in full-sensor pixels. The eye's frame is placed in the world by x_world = M x
+    + t.
+    """
+
+    row: int
+    camera: int
+    window: Window
+    eye: EyeModel
+    M: Floats
+    t: Floats
+
+    @classmethod
+    def of(cls, frames: Frames, row: int) -> EyeInWindow:
+        """Make it for row `row` of frames."""
+        index, scene = frames.index, frames.scene
+        camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
+        M, t = eye_motion(frames, row)
+        return cls(row, camera, scene.window(camera, head, side), scene.eye(EYES[side]), M, t)
+
+
+def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
+    """What the image shows of pupil, iris, glints and lids: the labels of a rendered folder.
+
+    Args:
+        image: a rendered image, row `image.row` of `truth`.
+        truth: observations of the rendered frames by the analytic observer.
+    """
+    done, row = image.rendered, image.row
+    assert done.labels is not None
+    points = truth.pupil.points_px[row]
+    whole = bool(truth.pupil.ok[row]) and len(points) > 2
+    return {
+        "pupil_visible_fraction": _share(done.labels.visible_fraction(PUPIL)),
+        "iris_visible_fraction": _share(done.labels.visible_fraction(IRIS)),
+        "failed_paths": done.failed_paths,
+        "pupil_visible_arcs_deg": visible_arcs_deg(image.parts, PUPIL, points, image.window[:2]) if whole else None,
+        "glints": [
+            {"light": i, "reason": reason, "visible_share": float(share)}
+            for i, (reason, share) in enumerate(zip(done.glint_reasons, done.glints.share, strict=True))
+        ],
+        "lid_margins_px": done.lid_margins_px,
+    }
+
+
+def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
+    """All labels of an image, with the same keys for every image; the arguments are those of `seen_labels`."""
+    part, window, seen = image.parts, image.window, seen_labels(image, truth)
+    known = known_labels(image.scene, truth, image)
+    return {
+        "pupil": {
+            **known["pupil"],
+            "visible": moments_ellipse(part == PUPIL, window),
+            "visible_fraction": seen["pupil_visible_fraction"],
+            "visible_arcs_deg": seen["pupil_visible_arcs_deg"],
+        },
+        "iris": {
+            **known["iris"],
+            "visible": moments_ellipse((part == PUPIL) | (part == IRIS), window),
+            "visible_fraction": seen["iris_visible_fraction"],
+        },
+        "glints": [
+            glint | _seen_glint(image, k, seen["glints"][k]["reason"]) for k, glint in enumerate(known["glints"])
+        ],
+        "lid_margins_px": seen["lid_margins_px"],
+        **{key: known[key] for key in ("space", "globe_radius_mm", "pose", "camera", "lights_mm")},
+        "failed_paths": int(seen["failed_paths"]),
+    }
+
+
+def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> dict[str, Any]:
+    """Labels that follow from pose and parameters alone, without an image: a part of `image_labels`."""
+    camera = scene.rig.cameras[view.camera]
+    return {
+        "pupil": {"amodal": _ellipse_of_record(observations, view.row)},
+        "iris": {"amodal": iris_outline(scene, view)},
+        "glints": _glints(scene, observations, view),
+        "space": _space(scene, observations, view, camera),
+        "globe_radius_mm": float(view.eye.sclera.radius_mm),
+        "pose": {"rotation": view.M.tolist(), "translation_mm": view.t.tolist()},
+        "camera": {
+            "K": camera.K.tolist(),
+            "R": camera.R.tolist(),
+            "t_mm": camera.t.tolist(),
+            "distortion": camera.distortion.tolist(),
+            "resolution_px": list(camera.resolution_px),
+        },
+        "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
+    }
+
+
+def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
+    """Ellipse with the moments of a mask's pixels, in full-sensor pixels; null numbers where there are none.
+
+    `pixels` is their number, `cut` whether they touch the window's edge.
+    """
+    v, u = np.nonzero(inside)
+    out: dict[str, Any] = {"centre_px": None, "semi_axes_px": None, "angle_rad": None, "pixels": len(u), "cut": False}
+    if len(u) == 0:
+        return out
+    h, w = inside.shape
+    out["cut"] = bool(u.min() == 0 or v.min() == 0 or u.max() == w - 1 or v.max() == h - 1)
+    x, y = float(u.mean()), float(v.mean())
+    du, dv = u - x, v - y
+    a, b, c = float(np.mean(du * du)) + 1 / 12, float(np.mean(du * dv)), float(np.mean(dv * dv)) + 1 / 12
+    half, root = (a + c) / 2, float(np.hypot((a - c) / 2, b))
+    angle = 0.5 * float(np.arctan2(2 * b, a - c)) % np.pi
+    axes = [2 * float(np.sqrt(half + root)), 2 * float(np.sqrt(max(half - root, 0.0)))]
+    return out | {"centre_px": [x + window[0], y + window[1]], "semi_axes_px": axes, "angle_rad": angle}
+
+
+def visible_arcs_deg(
+    part: Bytes, pupil: int, points_px: Floats, origin_px: tuple[int, int], reach_px: float = 1.5
+) -> list[list[float]]:
+    """Visible arcs [from, to] of the pupil's outline, in degrees about its centre (image x towards y).
+
+    A point of the outline counts as visible where a pixel of the pupil lies within reach. Points outside the window do
+    not. A whole outline is [[0, 360]].
+
+    Args:
+        part: (h, w) part of the eye at each pixel of the window.
+        pupil: the value that means pupil.
+        points_px: (k, 2) points of the outline in full-sensor pixels.
+        origin_px: first pixel of the window on the full sensor.
+        reach_px: largest distance of a pixel of the pupil.
+    """
+    height, width = part.shape
+    x, y = points_px[:, 0] - origin_px[0], points_px[:, 1] - origin_px[1]
+    k = int(reach_px)
+    ball = np.hypot(*np.mgrid[-k : k + 1, -k : k + 1]) <= reach_px
+    near = ndimage.binary_dilation(part == pupil, structure=ball)
+    column, row = np.rint(x).astype(int), np.rint(y).astype(int)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    seen = np.zeros(len(x), dtype=bool)
+    seen[inside] = near[row[inside], column[inside]]
+    centre = points_px.mean(axis=0)
+    angle = np.degrees(np.arctan2(points_px[:, 1] - centre[1], points_px[:, 0] - centre[0])) % 360
+    order = np.argsort(angle)
+    angle, seen = angle[order], seen[order]
+    if np.all(seen):
+        return [[0.0, 360.0]]
+    if not np.any(seen):
+        return []
+    first = int(np.flatnonzero(~seen)[0])
+    angle, seen = np.roll(angle, -first), np.roll(seen, -first)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(int), [0]])))
+    return [[float(angle[a]), float(angle[b - 1])] for a, b in edges.reshape(-1, 2)]
+
+
+def iris_outline(scene: Scene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
+    """Ellipse of the apparent limbus (`limbus_px`), with a status and a reason where there is none."""
+    nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
+    pixels, reason = limbus_px(scene, view, _OUTLINE_POINTS)
+    if reason is not None:
+        return {"status": "missing", "reason": reason, **nothing}
+    fit = fit_ellipse_direct(pixels)
+    if not fit.ok:
+        return {"status": "missing", "reason": "no ellipse fits the outline", **nothing}
+    return {
+        "status": "ok",
+        "reason": None,
+        "centre_px": fit.centre_px.tolist(),
+        "semi_axes_px": fit.semi_axes_px.tolist(),
+        "angle_rad": float(fit.angle_rad),
+    }
+
+
+def limbus_px(scene: Scene, view: EyeInWindow | EyeImage, count: int) -> tuple[Floats, str | None]:
+    """Apparent limbus as points (count, 2) in full-sensor px.
+
+    The limbus is the circle of the front cornea whose radius is the limbus radius minus half the limbus' width.
+
+    Returns:
+        The projected circle, and the reason why it is not visible as a whole (None where it is).
+    """
+    surface, camera = view.eye.front[0], scene.rig.cameras[view.camera]
+    rho = float(view.eye.limbus_radius_mm) - 0.5 * scene.spec.look.limbus_width_mm
+    angle = 2 * np.pi * np.arange(count) / count
+    y, z = rho * np.cos(angle), rho * np.sin(angle)
+    local = np.stack([np.broadcast_to(surface.sag(y, z), y.shape), y, z], axis=-1)
+    points = surface.origin_mm + local @ np.asarray(surface.rotation).T
+    eyepoint = view.M.T @ (camera.nodal_point_mm - view.t)
+    facing = np.sum(surface.normal(points) * (eyepoint - points), axis=-1) > 0
+    pixels, front = camera.project(points @ view.M.T + view.t)
+    reason = None
+    if not front.all():
+        reason = "behind the camera"
+    elif not facing.all():
+        reason = "the cornea hides a part of its rim"
+    return np.asarray(pixels), reason
+
+
+def cornea_centre(eye: EyeModel) -> Floats:
+    """Centre of curvature of the front cornea at its apex, eye frame, (3,) mm: apex - R axis, R the mean radius."""
+    surface = eye.front[0]
+    apex = float(surface.sag(0.0, 0.0))
+    drop = 2 * apex - float(surface.sag(_SAG_STEP_MM, 0.0)) - float(surface.sag(0.0, _SAG_STEP_MM))
+    return np.asarray(surface.origin_mm + surface.rotation[:, 0] * (apex - _SAG_STEP_MM**2 / drop))
+
+
+def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
+    pupil = observations.pupil
+    ok = bool(pupil.ok[row])
+    return {
+        # The label needs the whole outline. A pupil of which only arcs are visible is missing here.
+        "status": "ok" if ok else "missing",
+        "reason": pupil.reason[row] or None,
+        "centre_px": pupil.centre_px[row].tolist() if ok else None,
+        "semi_axes_px": pupil.semi_axes_px[row].tolist() if ok else None,
+        "angle_rad": float(pupil.angle_rad[row]) if ok else None,
+    }
+
+
+def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> list[dict[str, Any]]:
+    """Place of each lamp's glint centre by ray optics."""
+    glints, row = observations.glints, view.row
+    out = []
+    for k in range(len(scene.rig.lights)):
+        xy, _ = glints.of_light(k)
+        found = bool(np.isfinite(xy[row]).all())
+        at = (glints.light[row] == k) & (glints.status[row] != Status.NONE)
+        slot = int(at.argmax())
+        out.append(
+            {
+                "light": k,
+                "status": Status(glints.status[row, slot]).label,
+                "reason": glints.reason[row, slot] or None,
+                "xy_px": xy[row].tolist() if found else None,
+                "in_window": found and bool(in_window(view.window, xy[row])),
+            }
+        )
+    return out
+
+
+def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any]:
+    """Visible part of a lamp's glint; it may be visible where the mirror point of the lamp's centre is not."""
+    table = image.rendered.glints
+    spot = table.xy_px[k]
+    lit = bool(np.isfinite(spot).all())
+    return {
+        "visible": lit and bool(table.visible[k]) and bool(in_window(image.window, spot)),
+        "hidden_by": hidden_by,
+        "visible_share": float(table.share[k]),
+        "spot_xy_px": spot.tolist() if lit else None,
+    }
+
+
+def _share(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _space(
+    scene: Scene, observations: Observations, view: EyeInWindow | EyeImage, camera: PinholeCamera
+) -> dict[str, Any]:
+    """Points (mm) and lines in the world and in the camera's frame."""
+    eye, M, t, row = view.eye, view.M, view.t, view.row
+    index = observations.index
+    point, way = _line_of_sight(scene, observations, view)
+    points = {
+        "rotation_centre_mm": eye.rotation.azimuth_centre_mm,
+        "globe_centre_mm": eye.sclera.centre_mm,
+        "cornea_centre_mm": cornea_centre(eye),
+        "cornea_apex_mm": np.zeros(3),
+        "pupil_centre_mm": eye.stop.centre_mm,
+        "line_of_sight_point_mm": point,
+    }
+    ways = {"optic_axis": np.array([1.0, 0, 0]), "line_of_sight": way}
+    world = {k: M @ np.asarray(p) + t for k, p in points.items()} | {k: M @ np.asarray(d) for k, d in ways.items()}
+    seen = {k: camera.R @ v + (camera.t if k in points else 0.0) for k, v in world.items()}
+    target = index.target_mm[row]
+    there = bool(np.isfinite(target).all())
+    return {
+        "world": {k: v.tolist() for k, v in world.items()} | {"target_mm": target.tolist() if there else None},
+        "camera": {k: v.tolist() for k, v in seen.items()}
+        | {"target_mm": (camera.R @ target + camera.t).tolist() if there else None},
+    }
+
+
+def _line_of_sight(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> tuple[Floats, Floats]:
+    """Line of sight of the unturned eye: the fixed chief ray, or that of the entrance window."""
+    index, row = observations.index, view.row
+    if scene.spec.eye.line_of_sight == "entrance_window" and np.isfinite(index.target_mm[row]).all():
+        place = index.eye_position_mm[[row]] + index.head_mm[[row]]
+        eyes = [scene.eye(side) for side in EYES]
+        found = fixations(eyes, index.eye[[row]], index.target_mm[[row]], place, "entrance_window")
+        return np.asarray(found.line_of_sight_mm[0]), np.asarray(found.line_of_sight_direction[0])
+    return np.asarray(view.eye.chief_ray.point_mm), np.asarray(view.eye.chief_ray.direction)

@@ -1,0 +1,98 @@
+"""A video's features, frame by frame, as records in a file."""
+
+from __future__ import annotations
+
+import json
+import math
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import Warn
+from ..extraction import Extraction
+from ..extraction.overlay import overlay as drawn
+from ..extraction.video import VideoReader, VideoWriter, follow
+from ..observation import RECORD
+from ..progress import Progress
+from ..scene import Scene
+from ..storage.files import written
+from .imageobserver import ImageObserver, colour_warning
+
+
+@dataclass(frozen=True, slots=True)
+class VideoSummary:
+    """How many frames a video has, how many pupils were looked for in them, and how many were found."""
+
+    source: str
+    frames: int
+    pupils: int
+    found: int
+    records: str | None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Convert to a mapping for JSON."""
+        return {
+            "schema": "eyerender/video/1", "video": self.source, "frames": self.frames, "pupils": self.pupils,
+            "found": self.found, "records": self.records,
+        }  # fmt: skip
+
+    def to_text(self) -> str:
+        """A line for people."""
+        where = f"; records in {self.records}" if self.records else ""
+        return f"{self.source}: {self.frames} frames, pupil found in {self.found} of {self.pupils}{where}"
+
+
+def observe_video(
+    path: Path,
+    observer: ImageObserver,
+    *,
+    scene: Scene | None = None,
+    eyes: int = 1,
+    output: Path | None = None,
+    overlay: Path | None = None,
+    record: int = RECORD,
+    progress: Progress | None = None,
+    warn: Warn | None = None,
+) -> VideoSummary:
+    """Extract the features of a video's frames.
+
+    Args:
+        path: the video.
+        observer: with its settings and gamma.
+        scene: the scene whose rig took the video.
+        eyes: 1, or 2 for frames with both eyes, as in `ImageObserver.observe_files`.
+        output: file for the records, one JSON object per line: the record, and the frame's `time_s` (null where the
+            video has no times) and the pupil's `confidence`.
+        overlay: video of what was found (.mp4, .avi or .mkv).
+        record: version of the records.
+        progress: called after each frame.
+        warn: receives a warning if frames have colour.
+    """
+    reader = VideoReader(path)
+    count = pupils = ok = coloured = 0
+    with ExitStack() as stack:
+        file = None if output is None else stack.enter_context(written(output, sync=False))
+        writer: VideoWriter | None = None
+        for frame, found in follow(reader, gamma=observer.gamma, settings=observer.settings, eyes=eyes):
+            if overlay is not None:
+                if writer is None:
+                    height, width = frame.image.shape
+                    writer = stack.enter_context(VideoWriter(overlay, width, height, reader.frames_per_s))
+                writer.add(drawn(frame.image, found, 255.0))
+            seen = observer.observe_found(found, frame.number, frame.image.shape, scene=scene, source=str(path))
+            if file is not None:
+                for line, one in zip(seen.records(record), found, strict=True):
+                    file.write(_line(line, frame.time_s, one))
+            count, pupils, coloured = count + 1, pupils + len(found), coloured + frame.colour
+            ok += sum(one.pupil.ok for one in found)
+            if progress is not None:
+                progress(count, max(reader.count, count), "")
+    if coloured and warn is not None:
+        warn([colour_warning(coloured, "frames")])
+    return VideoSummary(str(path), count, pupils, ok, None if output is None else str(output))
+
+
+def _line(record: dict[str, Any], time_s: float, found: Extraction) -> bytes:
+    timed = {**record, "time_s": time_s if math.isfinite(time_s) else None, "confidence": found.pupil.confidence}
+    return json.dumps(timed, allow_nan=False).encode() + b"\n"

@@ -1,0 +1,1 @@
+"""Corneal reflections and Purkinje images: traced, cut at edges, splatted, and occluded."""

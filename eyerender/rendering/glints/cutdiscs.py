@@ -1,0 +1,141 @@
+"""Quadrature over lamps: whole discs, and discs of which an edge of any shape hides a part.
+
+Points are those of the unit disc, which `disc_points` spreads over a lamp's disc or ring with equal areas. A disc is
+cut into circles. Where an edge crosses a circle, bisection finds the angles at which the visibility changes, and
+Gauss-Legendre nodes fill each visible arc. The lengths of the arcs vary like a square root where a circle just touches
+the edge. Bisection finds these radii too, and the panels between them are integrated over s with
+
+    u = r^2 = u0 + (u1 - u0) (3 s^2 - 2 s^3),
+
+under which a square root at an end of the panel becomes smooth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ...arrays import Bools, Floats
+
+Visible = Callable[[Floats], Bools]
+
+_CIRCLES, _ANGLES = 12, 48
+_RADIUS_STEPS, _ANGLE_STEPS = 10, 12  # bisections: to 1e-4 of the radius, 3e-5 rad
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """A quadrature over the unit disc: points (k, 2) and weights (k,); the weights of the whole disc sum to 1."""
+
+    point: Floats
+    weight: Floats
+
+    def and_(self, other: Nodes) -> Nodes:
+        """Points of both."""
+        return Nodes(np.concatenate([self.point, other.point]), np.concatenate([self.weight, other.weight]))
+
+
+POINT = Nodes(np.zeros((1, 2)), np.ones(1))
+
+
+@lru_cache(maxsize=64)
+def quadrature(radial: int, angular: int) -> Nodes:
+    """Gauss-Legendre nodes in r^2 and equal angles."""
+    x, weight = np.polynomial.legendre.leggauss(radial)
+    angle = 2 * np.pi * (np.arange(angular) + 0.5) / angular
+    r = np.sqrt(0.5 * (x + 1))
+    return Nodes(_polar(*np.broadcast_arrays(r[:, None], angle)), np.repeat(0.5 * weight, angular) / angular)
+
+
+@lru_cache(maxsize=4)
+def rim(count: int) -> Nodes:
+    """Points of the unit circle, which have no weight: they show whether an edge cuts the disc."""
+    return Nodes(_polar(np.ones(count), 2 * np.pi * np.arange(count) / count), np.zeros(count))
+
+
+def cut_nodes(visible: Visible, radial: int, angular: int) -> Nodes:
+    """Nodes of the visible part of a disc.
+
+    Args:
+        visible: whether points (n, 2) of the unit disc are visible.
+        radial: number of circles that the whole disc needs.
+        angular: number of points that a whole circle needs.
+    """
+    s, gauss = np.polynomial.legendre.leggauss(max(8, radial))
+    s, gauss = 0.5 * (s + 1), 0.5 * gauss
+    edges = _edges(visible) ** 2
+    start, size = edges[:-1, None], np.diff(edges)[:, None]
+    r = np.sqrt(start + size * (3 - 2 * s) * s * s).ravel()
+    weight = (size * 6 * s * (1 - s) * gauss).ravel()
+    which, begin, end = _arcs(visible, r)
+    length = end - begin
+    out = []
+    for k in range(len(which)):
+        x, share = np.polynomial.legendre.leggauss(max(4, math.ceil(angular * length[k] / (2 * np.pi))))
+        angle = begin[k] + 0.5 * length[k] * (x + 1)
+        point = _polar(np.full(len(x), r[which[k]]), angle)
+        out.append(Nodes(point, weight[which[k]] * length[k] / (2 * np.pi) * 0.5 * share))
+    if not out:
+        return Nodes(np.zeros((0, 2)), np.zeros(0))
+    return Nodes(np.concatenate([n.point for n in out]), np.concatenate([n.weight for n in out]))
+
+
+def _edges(visible: Visible) -> Floats:
+    """Radii from 0 to 1 between which all circles are alike: hidden, partly visible, or visible."""
+
+    def kind(r: Floats) -> Floats:
+        seen = _seen(visible, r, _ANGLES)
+        return np.asarray(seen.any(axis=1).astype(float) + seen.all(axis=1))
+
+    # The innermost circle is next to the centre, the outermost is the rim.
+    low = np.append((np.arange(_CIRCLES) + 1e-3) / _CIRCLES, 1.0)
+    kinds = kind(low)
+    changes = np.flatnonzero(np.diff(kinds))
+    low, high, inner = low[changes], low[changes + 1], kinds[changes]
+    for _ in range(_RADIUS_STEPS if len(changes) else 0):
+        middle = 0.5 * (low + high)
+        same = kind(middle) == inner
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return np.concatenate([[0.0], 0.5 * (low + high), [1.0]])
+
+
+def _arcs(visible: Visible, r: Floats) -> tuple[Floats, Floats, Floats]:
+    """Visible arcs of circles of radii r (n,): index of the circle, and the angles at which the arc begins and ends."""
+    seen = _seen(visible, r, _ANGLES)
+    step = 2 * np.pi / _ANGLES
+    whole = np.flatnonzero(seen.all(axis=1))
+    ends = []
+    for earlier in (False, True):
+        # An arc begins after a hidden point, and ends after a visible one.
+        circle, k = np.nonzero((seen == earlier) & (np.roll(seen, -1, axis=1) != earlier))
+        low, high = k * step, (k + 1) * step
+        for _ in range(_ANGLE_STEPS if len(k) else 0):
+            middle = 0.5 * (low + high)
+            same = visible(_polar(r[circle], middle)) == earlier
+            low, high = np.where(same, middle, low), np.where(same, high, middle)
+        ends.append((circle, 0.5 * (low + high)))
+    (which, begin), (_, end) = ends
+    # On each circle beginnings and ends alternate; an arc that contains angle 0 ends before it begins.
+    for c in np.unique(which):
+        here = which == c
+        if end[here][0] < begin[here][0]:
+            end[here] = np.append(end[here][1:], end[here][0] + 2 * np.pi)
+    return (
+        np.concatenate([whole, which]),
+        np.concatenate([np.zeros(len(whole)), begin]),
+        np.concatenate([np.full(len(whole), 2 * np.pi), end]),
+    )
+
+
+def _seen(visible: Visible, r: Floats, angles: int) -> Bools:
+    """Whether evenly spaced points of circles (n,) are visible, (n, angles)."""
+    angle = 2 * np.pi * np.arange(angles) / angles
+    return visible(_polar(*np.broadcast_arrays(r[:, None], angle))).reshape(len(r), angles)
+
+
+def _polar(r: Floats, angle: Floats) -> Floats:
+    return np.stack([(r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()], axis=1)

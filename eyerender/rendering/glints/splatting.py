@@ -1,0 +1,144 @@
+"""The lamps' mirror images in a picture: what is seen of them and why, and how they are splatted into it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Singles, frozen
+from ...rig import defocus, psf
+from ...rig.camera import Window
+from ...rig.light import Lamp
+from ..hits.meshes import SurfaceMesh
+from ..records.job import RenderJob, sun_lamps
+from ..scene.background import Surround
+from ..scene.blur import Blur
+from ..scene.region import RegionScene, blockers
+from .cutdiscs import POINT, quadrature
+from .occlusion import glint_reason
+from .purkinje import purkinje_images
+from .tracing import Glint, GlintScene, GlintTable, Image, Images, Spots, glint_table
+
+_FRAMED = "occluded by frame"
+
+
+@dataclass(frozen=True, slots=True)
+class Shine:
+    """What a mirror image adds to a picture: its spots, a share of the exposure, and its circle of confusion (px)."""
+
+    spots: Spots
+    share: float
+    blur_px: float
+
+
+def add_shines(shines: Sequence[Shine], picture: Singles, job: RenderJob) -> None:
+    """Add mirror images, blurred by lens and pixels, to the picture (height, width) of a job's window."""
+    lit = [shine for shine in shines if len(shine.spots.energy)]
+    if not lit:
+        return
+    camera, counts = job.camera, [len(shine.spots.energy) for shine in lit]
+    falloff = (camera.rays(np.concatenate([shine.spots.xy_px for shine in lit])) @ camera.axis) ** 4
+    for shine, part in zip(lit, np.split(falloff, np.cumsum(counts)[:-1]), strict=True):
+        energy, spread = shine.share * shine.spots.energy * part, defocus.disc(shine.blur_px)
+        patch, rows, columns = psf.splat(shine.spots.xy_px, energy, job.sensor.psf_sigma_px, job.window, spread)
+        picture[rows, columns] += patch
+
+
+@dataclass(frozen=True, slots=True)
+class Mirrored:
+    """The glints, (order, table) of the requested further images, and why each glint is visible or not."""
+
+    glints: GlintTable
+    others: tuple[tuple[int, GlintTable], ...]
+    reasons: tuple[str, ...]
+
+    def behind(self, covered: Bools, window: Window) -> Mirrored:
+        """The same where what frames the camera's view covers pixels (height, width) of a window."""
+        table, (x0, y0, width, height) = self.glints, window
+        xy = np.nan_to_num(table.xy_px, nan=-1e6)
+        column, row = (np.rint(xy - (x0, y0)).astype(int)).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        hidden = inside & table.visible & covered[np.where(inside, row, 0), np.where(inside, column, 0)]
+        glints = replace(
+            table,
+            share=frozen(np.where(hidden, 0.0, table.share)),
+            visible=frozen(table.visible & ~hidden, np.bool_),
+        )
+        reasons = tuple(_FRAMED if h else reason for h, reason in zip(hidden, self.reasons, strict=True))
+        return Mirrored(glints, self.others, reasons)
+
+
+@dataclass(frozen=True, slots=True)
+class MirrorImages:
+    """The mirror images of a job's lamps and of the sun, before it is known what hides them.
+
+    Attributes:
+        job: the job.
+        lamps: its lamps, and the sun if there is one.
+        scene: the mirrors.
+        first: the images in the front of the cornea.
+        further: the requested images of higher orders.
+        nearness: (n, 2) inverse depths (1/mm) of the first images; NaN where they do not matter.
+    """
+
+    job: RenderJob
+    lamps: tuple[Lamp, ...]
+    scene: GlintScene
+    first: Images
+    further: dict[int, list[Image]]
+    nearness: Floats
+
+    @classmethod
+    def of(cls, job: RenderJob, mesh: SurfaceMesh | None) -> MirrorImages:
+        """Find the images, with NumPy alone unless a mesh takes the place of the cornea's front."""
+        eye = job.eye
+        scene = GlintScene(
+            eye.front[0], float(eye.front_indices[0]), job.film_index, float(eye.limbus_radius_mm),
+            np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), job.M, job.t, job.camera, mesh,
+        )  # fmt: skip
+        lamps = (*job.lights, *sun_lamps(job.ambient, job.anchor_mm))
+        # Further images are small, because their mirrors are strongly curved, or concave with a short focus.
+        nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in lamps]
+        further = {order: purkinje_images(scene, eye, order, lamps, nodes) for order in sorted({*job.purkinje} - {1})}
+        near = 1 in job.purkinje and job.lens.focus_mm is not None
+        nearness = scene.nearness(lamps) if near else np.full((len(lamps), 2), np.nan)
+        return cls(job, lamps, scene, scene.images(lamps, job.sensor.psf_sigma_px), further, nearness)
+
+    def seen(self, place: Surround | RegionScene, blur: Blur, share: float = 1.0) -> tuple[Mirrored, list[Shine]]:
+        """What is seen of the images in posed surroundings, and what they add to the blurred picture.
+
+        The tables and reasons are those of the lamps alone. `share` is that of the exposure for which the job stands.
+        """
+        job, anchor, count = self.job, self.job.anchor_mm, len(self.job.lights)
+
+        def clear(a: Floats, b: Floats) -> Bools:
+            return place.clear(a - anchor, b - anchor)
+
+        glints = self.scene.glints(self.lamps, self.first, clear)
+        reasons = tuple(_reason(job, place, glint) for glint in glints[:count])
+        further = {order: self.scene.seen(images, clear) for order, images in self.further.items()}
+        shines = []
+        for order in sorted({*job.purkinje}):
+            # The further images are about as far as the iris.
+            sizes = [blur.of_image(near) for near in self.nearness] if order == 1 else [blur.subject_px] * len(glints)
+            shines += [
+                Shine(glint.spots, share, size) for glint, size in zip(further.get(order, glints), sizes, strict=True)
+            ]
+        others = tuple((order, glint_table(found[:count])) for order, found in further.items())
+        return Mirrored(glint_table(glints[:count]), others, reasons), shines
+
+
+def _reason(job: RenderJob, place: Surround | RegionScene, glint: Glint) -> str:
+    """State whether or why not a lamp's glint is visible."""
+    image = glint.image
+    open_ = glint.clear if place.obstructed else np.ones(len(glint.clear), dtype=bool)
+    names: list[str | None] = [None] * len(open_)
+    if isinstance(place, RegionScene) and not np.all(open_):
+        anchor = job.anchor_mm
+        node = np.broadcast_to(job.camera.nodal_point_mm, image.exit_mm.shape)
+        to_lamp = blockers(place, image.source_mm - anchor, image.entry_mm - anchor)
+        to_camera = blockers(place, node - anchor, image.exit_mm - anchor)
+        names = [c if c is not None else a for a, c in zip(to_lamp, to_camera, strict=True)]
+    return glint_reason(image.there, open_, names)

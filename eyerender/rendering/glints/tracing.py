@@ -1,0 +1,416 @@
+"""Glints: the mirror images of the LEDs in the front cornea (first Purkinje images), exact in position and energy.
+
+The mirror point of each point of an LED comes from `optics.solve`, the ray tube J = dA_perp / dOmega from
+`optics.shooting`. With the Fresnel reflectance F and the LED's radiant intensity I in the direction d of the ray:
+
+    E = I(d) F / J                                          irradiance at the nodal point, for each point of the LED
+    e = E f_x f_y D / cos^3(theta)                          energy of the spot, in radiance times pixels
+
+theta is the angle to the optical axis, D the determinant of the Jacobian of the lens distortion. An LED of finite size
+is integrated with Gauss-Legendre nodes in r^2 and equal angles, each with its own position and energy. The image of a
+near LED, which spans several pixels, is thus an energy-weighted disc. Where the limbus, the globe or something of the
+scene hides a part of an LED, the nodes are those of the visible part (`cut`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import ArrayValue, Bools, Floats, frozen, remembered
+from ...geometry.surfaces import Surface, Xyz, components, join
+from ...geometry.transforms import normalize
+from ...optics.interface import fresnel
+from ...optics.shooting import RESIDUAL_LIMIT_MM, ray_tube
+from ...optics.solve import Rays, mirrored_rays
+from ...optics.trace import Crossing
+from ...rig.camera import PinholeCamera
+from ...rig.light import Lamp
+from ...status import Status
+from ..hits.meshes import SurfaceMesh
+from ..records.job import ring_radius_mm
+from .cutdiscs import POINT, Nodes, cut_nodes, quadrature, rim
+
+_PARALLAX_MM = 0.05
+_MAP_ERROR = 1e-3  # of the extent of a lamp's image
+
+Visibility = Callable[[Floats, Floats], Bools]
+_ON_RIM = 16  # points: an edge that passes between them hides less than 0.2 % of a disc
+_LEAST = 2, 10  # circles, and points on each, of a wide lamp
+_ROUGH = quadrature(*_LEAST).and_(rim(_ON_RIM))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GlintTable(ArrayValue):
+    """Visible glints, one row per lamp.
+
+    Attributes:
+        xy_px: (n, 2) energy-weighted place in full-sensor pixels.
+        energy: (n,) radiance times pixels (mW/mm^2/sr px) that reaches the camera.
+        share: (n,) share of the lamp's image that is visible.
+        visible: (n,) whether any of it is.
+    """
+
+    xy_px: Floats
+    energy: Floats
+    share: Floats
+    visible: Bools
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spots(ArrayValue):
+    """Points of a lamp's image: places (k, 2) px and energies (k,)."""
+
+    xy_px: Floats
+    energy: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """A lamp's image, one row per point of the lamp.
+
+    Attributes:
+        source_mm: (k, 3) points of the lamp, world.
+        entry_mm: (k, 3) where their light enters the eye.
+        exit_mm: (k, 3) where it leaves the eye.
+        xy_px: (k, 2) pixels.
+        energy: (k,) energies, also where a larger cornea would mirror the point; 0 where no ray is found.
+        there: (k,) whether the eye mirrors the point to the camera.
+        found: (k,) whether it does, or a larger cornea would.
+    """
+
+    source_mm: Floats
+    entry_mm: Floats
+    exit_mm: Floats
+    xy_px: Floats
+    energy: Floats
+    there: Bools
+    found: Bools
+
+    @property
+    def spots(self) -> Spots:
+        """Points that the eye mirrors to the camera."""
+        return Spots(frozen(self.xy_px[self.there]), frozen(self.energy[self.there]))
+
+    def and_(self, other: Image) -> Image:
+        """Points of both images."""
+        return Image(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+
+    def last(self, count: int) -> Image:
+        """The last points."""
+        return Image(*(getattr(self, f.name)[-count:] for f in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class Glint:
+    """A lamp's mirror image, and what the camera sees of it.
+
+    Attributes:
+        image: through points of the whole lamp and of its rim, whose energies are 0.
+        clear: (k,) whether nothing of the scene hides these points.
+        spots: the points that make up the visible part.
+    """
+
+    image: Image
+    clear: Bools
+    spots: Spots
+
+
+@dataclass(frozen=True, slots=True)
+class Images:
+    """The lamps' images before it is known what hides them, and the circles and points that wide lamps need."""
+
+    parts: list[Image]
+    counts: dict[int, tuple[int, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class GlintScene:
+    """Input of the glints: front cornea with its film and rim, pose (x_world = M x + t), and camera.
+
+    What stands in the way is told by a function `clear`. It takes points (n, 3) and (n, 3) of the world, and returns
+    whether nothing of the scene stands between them.
+    """
+
+    surface: Surface
+    index: float
+    film_index: float
+    limbus_radius_mm: float
+    sclera_centre_mm: Floats
+    sclera_radius_mm: float
+    M: Floats
+    t: Floats
+    camera: PinholeCamera
+    mesh: SurfaceMesh | None = None
+
+    def images(self, lights: Sequence[Lamp], sigma_px: float) -> Images:
+        """Compute the image of each lamp as finely as its size and the point-spread function require."""
+        images = self._traced(_roughly(*lights))
+        wide = [k for k, lamp in enumerate(lights) if lamp.radius_mm > 0]
+        rims = ((images[k].xy_px[-_ON_RIM:], images[k].there[-_ON_RIM:]) for k in wide)
+        counts = {k: _node_counts(xy[there], sigma_px) for k, (xy, there) in zip(wide, rims, strict=True)}
+        if more := [k for k, count in counts.items() if count != _LEAST]:
+            finely = self._trace([lights[k] for k in more], [quadrature(*counts[k]) for k in more])
+            for k, image in zip(more, finely, strict=True):
+                images[k] = image.and_(images[k].last(_ON_RIM))
+        return Images(images, counts)
+
+    def glints(self, lights: Sequence[Lamp], images: Images, clear: Visibility) -> list[Glint]:
+        """Glints of lamps from their images, as finely as their edges require."""
+        glints = self.seen(images.parts, clear)
+        for k, count in images.counts.items():
+            visible = glints[k].clear & glints[k].image.there
+            if np.any(visible) and not np.all(visible):
+                glints[k] = replace(glints[k], spots=self._cut(lights[k], glints[k].image, count, clear))
+        return glints
+
+    def nearness(self, lights: Sequence[Lamp]) -> Floats:
+        """Inverse depths (1/mm) of the lamps' mirror images for lenses that are wide across and down, (n, 2).
+
+        When the nodal point moves by q, the image of a point at depth z moves by -f q / z. NaN where there is no image.
+        """
+        camera, out = self.camera, []
+        for axis in (0, 1):
+            xy = []
+            for step in (_PARALLAX_MM, -_PARALLAX_MM):
+                K, R = camera.K, camera.R
+                moved = PinholeCamera.of(K, R, camera.t - step * np.eye(3)[axis], camera.resolution_px)
+                images = replace(self, camera=moved)._trace(lights, [POINT] * len(lights))
+                xy.append([i.xy_px[0, axis] if i.found[0] else np.nan for i in images])
+            out.append((np.array(xy[1]) - xy[0]) / (2 * _PARALLAX_MM * camera.K[axis, axis]))
+        return np.stack(out, axis=1)
+
+    def seen(self, images: Sequence[Image], clear: Visibility) -> list[Glint]:
+        """Glints of images, made of their points that the camera sees."""
+        out = []
+        ways = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm"))
+        free = _parted(self._clear(clear, *ways), [len(i.energy) for i in images])
+        for image, open_ in zip(images, free, strict=True):
+            lit = open_ & image.there & (image.energy > 0)
+            out.append(Glint(image, open_, Spots(frozen(image.xy_px[lit]), frozen(image.energy[lit]))))
+        return out
+
+    def _cut(self, lamp: Lamp, image: Image, counts: tuple[int, int], clear: Visibility) -> Spots:
+        """Spots of the visible part of a lamp, whose whole `image` is known at some points."""
+        mirror = self._mirror_map(lamp, image)
+
+        def visible(points: Floats) -> Bools:
+            (seen,) = self._trace([lamp], [Nodes(points, np.ones(len(points)))])
+            return seen.there & self._clear(clear, seen.source_mm, seen.entry_mm, seen.exit_mm)
+
+        def nearly_visible(points: Floats) -> Bools:
+            assert mirror is not None
+            source, y = disc_points(lamp, points), mirror(points)
+            at = y @ self.M.T + self.t
+            there = self.surface.axis_distance(components(y)) <= self.limbus_radius_mm
+            there &= ~self._behind_globe(y, (source - self.t) @ self.M - y) & ~self._behind_globe(y, self._eyepoint - y)
+            return np.asarray(there & self._clear(clear, source, at, at))
+
+        nodes = cut_nodes(visible if mirror is None else nearly_visible, *counts)
+        (cut,) = self._trace([lamp], [nodes])
+        return cut.spots
+
+    def _mirror_map(self, lamp: Lamp, image: Image) -> Callable[[Floats], Floats] | None:
+        """Polynomial from points of the unit disc to mirror points (eye frame), or None where it is not accurate.
+
+        It only tells which points are visible; their places and energies are exact.
+        """
+        if float(ring_radius_mm(lamp)) > 0 or not np.all(image.found):
+            return None
+        e1, e2 = disc_basis(lamp)
+        offset = (image.source_mm - lamp.position_mm) / float(lamp.radius_mm)
+        terms = _terms(np.stack([offset @ e1, offset @ e2], axis=1))
+        y = (image.exit_mm - self.t) @ self.M
+        fit = np.linalg.lstsq(terms, y, rcond=None)[0]
+        if np.max(np.abs(terms @ fit - y)) > _MAP_ERROR * np.max(np.ptp(y, axis=0)):
+            return None
+        return lambda points: np.asarray(_terms(points) @ fit)
+
+    @property
+    def _eyepoint(self) -> Floats:
+        """The camera's nodal point in the eye frame."""
+        return np.asarray(self.M.T @ (self.camera.nodal_point_mm - self.t))
+
+    def _clear(self, clear: Visibility, sources: Floats, entries: Floats, exits: Floats) -> Bools:
+        """Whether nothing of the scene stands between points of lamps and of the eye, and the camera, (k,)."""
+        node = np.broadcast_to(self.camera.nodal_point_mm, exits.shape)
+        both = clear(np.concatenate([sources, node]), np.concatenate([entries, exits]))
+        return np.asarray(both[: len(sources)] & both[len(sources) :])
+
+    def _trace(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
+        """Images of lamps through the given points of their discs; all lamps in one batch."""
+        return self._traced(_Emitters.of(lights, nodes))
+
+    def _traced(self, emitters: _Emitters) -> list[Image]:
+        """Images of lamps through points of them."""
+        camera, which, counts, weights = self.camera, emitters.which, emitters.counts, emitters.weights
+        points, axes, strength, exponent = emitters.points, emitters.axes @ self.M, emitters.strength, emitters.exponent
+        eyepoint = self._eyepoint
+        sources = (points - self.t) @ self.M
+        lamp_xyz, node_xyz = components(sources), components(np.broadcast_to(eyepoint, sources.shape))
+        rays = mirrored_rays(self.surface, lamp_xyz, node_xyz, rim_mm=self.limbus_radius_mm)
+        # Where a larger cornea would mirror a point, the solver finds the ray too.
+        found = np.asarray((rays.status == Status.OK) | (rays.status == Status.OUTSIDE_LIMBUS))
+        found &= rays.residual_mm < RESIDUAL_LIMIT_MM
+        there = found & (rays.status == Status.OK)
+        y, d, w, N, J = self._mirrors(rays, lamp_xyz, node_xyz, found)
+        if self.mesh is not None:
+            seen = self.mesh.mirrored(y, sources, np.broadcast_to(eyepoint, sources.shape))
+            y, N, d, w, J = seen.point, seen.normal, seen.arrives, seen.leaves, seen.cross_section
+            found &= seen.found
+            there = found & (self.surface.axis_distance(components(y)) <= self.limbus_radius_mm)
+        F = fresnel(np.clip(-_dot(N, d), 0, 1), 1.0, self.index, self.film_index).unpolarized
+        leaving = np.maximum(_dot(d, axes[which]), 0)
+        power = exponent[which]
+        lobe = np.where(power == 0, 1.0, np.where(leaving > 0, leaving ** np.where(power == 0, 1.0, power), 0.0))
+        cam = -(w @ self.M.T) @ camera.R.T
+        found &= cam[:, 2] > 0
+        z = np.where(found, cam[:, 2], 1.0)
+        x, v = cam[:, 0] / z, cam[:, 1] / z
+        scale = camera.K[0, 0] * camera.K[1, 1] * distortion_determinant(camera, x, v) / z**3
+        there &= found & ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
+        energy = np.where(found, weights * strength[which] * lobe * F / np.where(found, J, 1.0) * scale, 0.0)
+        mirrors, xy = y @ self.M.T + self.t, camera.pixels_of(x, v)
+        columns = (_parted(a, counts) for a in (points, mirrors, mirrors, xy, energy, there, found))
+        return [Image(*c) for c in zip(*columns, strict=True)]
+
+    def _mirrors(self, rays: Rays, lamp: Xyz, node: Xyz, found: Bools) -> tuple[Floats, ...]:
+        """Mirror points of the closed form, directions of arriving and leaving light, normals, ray tubes."""
+        mirror = (Crossing(self.surface, 1.0, reflects=True),)
+        J = ray_tube(mirror, 1.0, node, rays.way, lamp).cross_section_mm2_sr
+        # The solver's ray runs from the camera to the lamp, the light in the other direction.
+        y, d, w = (
+            np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (join(rays.exit), -join(rays.end), -join(rays.way))
+        )
+        return y, d, w, self.surface.normal(y), J
+
+    def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
+        """Whether the sclera's sphere blocks the way from points of the cornea (eye frame)."""
+        d = normalize(towards)
+        o = y - self.sclera_centre_mm
+        b = _dot(o, d)
+        disc = b * b - (_dot(o, o) - self.sclera_radius_mm**2)
+        return np.asarray((disc > 0) & (-b - np.sqrt(np.maximum(disc, 0)) > 1e-6))
+
+
+@dataclass(frozen=True, slots=True)
+class _Emitters:
+    """Points of lamps.
+
+    Attributes:
+        points: (k, 3) in the world, those of each lamp side by side.
+        weights: (k,) shares of their lamps.
+        which: (k,) numbers of the lamps.
+        counts: number of points of each lamp.
+        axes: (n, 3) of the lamps.
+        strength: (n,) mW/sr along the axes.
+        exponent: (n,) of the lobes.
+    """
+
+    points: Floats
+    weights: Floats
+    which: NDArray[np.intp]
+    counts: list[int]
+    axes: Floats
+    strength: Floats
+    exponent: Floats
+
+    @classmethod
+    def of(cls, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> _Emitters:
+        """Take the given points of the discs of lamps."""
+        counts = [len(n.weight) for n in nodes]
+        return cls(
+            np.concatenate([disc_points(lamp, n.point) for lamp, n in zip(lights, nodes, strict=True)]),
+            np.concatenate([n.weight for n in nodes]),
+            np.repeat(np.arange(len(lights)), counts),
+            counts,
+            np.stack([lamp.axis for lamp in lights]),
+            np.array([float(lamp.intensity_mw_sr) for lamp in lights]),
+            np.array([float(lamp.lobe_exponent) for lamp in lights]),
+        )
+
+
+@remembered  # lamps are the same from frame to frame
+def _roughly(*lights: Lamp) -> _Emitters:
+    """Few points of lamps and points of their rims."""
+    return _Emitters.of(lights, [_ROUGH if lamp.radius_mm > 0 else POINT for lamp in lights])
+
+
+def glint_table(glints: Sequence[Glint]) -> GlintTable:
+    """Places, energies and visible shares of the glints of all lamps."""
+    place, share = [], []
+    for glint in glints:
+        xy, energy, whole = glint.spots.xy_px, glint.spots.energy, glint.image.energy.sum()
+        place.append(energy @ xy / energy.sum() if len(energy) else np.full(2, np.nan))
+        seen = energy.sum() / whole if whole > 0 else 0.0
+        share.append(seen if seen < 1 - 1e-9 else 1.0)
+    energies = np.array([g.spots.energy.sum() for g in glints])
+    return GlintTable(
+        frozen(np.reshape(place, (-1, 2))), frozen(energies), frozen(share), frozen(energies > 0, np.bool_)
+    )
+
+
+def _parted(array: NDArray[Any], counts: Sequence[int]) -> list[NDArray[Any]]:
+    """Parts of an array with so many rows each."""
+    ends = list(accumulate(counts))
+    return [array[end - count : end] for end, count in zip(ends, counts, strict=True)]
+
+
+def _node_counts(xy: Floats, sigma_px: float) -> tuple[int, int]:
+    """Numbers of circles and of points on each that a lamp needs whose rim is seen at pixels (k, 2)."""
+    # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
+    extent = float(np.max(np.hypot(*(xy - xy.mean(axis=0)).T))) / math.sqrt(2) if len(xy) else 1.0
+    radial = min(max(math.ceil(1.5 + 1.5 * extent / math.hypot(sigma_px, 0.29)), 2), 64)
+    return radial, 4 * radial + 2
+
+
+def disc_basis(light: Lamp) -> tuple[Floats, Floats]:
+    """Two unit vectors (3,) across a lamp's axis."""
+    return _across(*light.axis.tolist())
+
+
+@lru_cache(maxsize=256)  # lamps keep their axes from frame to frame
+def _across(x: float, y: float, z: float) -> tuple[Floats, Floats]:
+    axis = np.array([x, y, z])
+    e1 = normalize(np.cross(axis, (1.0, 0.0, 0.0) if abs(x) < 0.6 else (0.0, 1.0, 0.0)))
+    return frozen(e1), frozen(np.cross(axis, e1))
+
+
+def disc_points(light: Lamp, point: Floats) -> Floats:
+    """Points (k, 3) of a lamp's disc or ring in the world, from points (k, 2) of the unit disc."""
+    e1, e2 = disc_basis(light)
+    outer, inner = float(light.radius_mm), ring_radius_mm(light)
+    r2 = _dot(point, point)
+    # Equal areas on the disc stay equal on the ring: r^2 runs from inner^2 to outer^2.
+    stretch = np.sqrt(inner**2 + r2 * (outer**2 - inner**2)) / np.sqrt(np.maximum(r2, 1e-300))
+    offset = (stretch[:, None] if outer > 0 else 0.0) * point
+    return np.asarray(light.position_mm + offset[:, :1] * e1 + offset[:, 1:] * e2)
+
+
+def _terms(point: Floats) -> Floats:
+    """Monomials (k, 15) up to order 4 of points (k, 2)."""
+    a, b = point.T
+    return np.stack([a**i * b ** (n - i) for n in range(5) for i in range(n + 1)], axis=1)
+
+
+def distortion_determinant(camera: PinholeCamera, x: Floats, y: Floats) -> Floats:
+    """Determinant of d(distorted) / d(undistorted) normalised coordinates."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
+    a = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    b = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    c = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return np.asarray(a * c - b * b)
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.asarray(np.einsum("...i,...i->...", a, b))

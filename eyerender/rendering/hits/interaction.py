@@ -1,0 +1,475 @@
+"""Intersection of camera rays with the exact surfaces of the eye or with the scene, and the albedo there.
+
+A ray is intersected with the eye in closed form (the exact surfaces, not a mesh) and with everything else by Embree or
+OptiX; the nearer hit is used. Through the clear cornea the ray continues to the plane of the iris.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...region.iris import WIDTH_MM, DrawnPattern, iris_maps
+from ...region.look import Look
+from ...region.mapcache import kept
+from ...region.texture import sclera_texture
+from ..records.frame import Frame
+from ..records.surfaces import Bundle
+from ..scene.background import HALF_MM
+from ..scene.region import SkinGeometry
+
+EPSILON_MM = 2e-3  # points closer than this are the same in single precision
+_NEAR_MM = 20.0
+_DEEPEST = 0.75  # least inverse depth of the image of an iris, relative to the cornea's: grazing rays come from afar
+GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of maps of the globe
+_FAR = float(np.finfo(np.float32).max)
+_WET = 0.93  # gloss of the sclera
+_WIDE_MM = 2.5  # width of an iris whose relief has its full height
+STEEPEST = 1.5  # slope of the opacity of the cornea's rim where it is steepest, times the width of the rim
+_RING = (0.62, 0.95)  # share of the way from the pupil to the root over which a limbal ring grows dark
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What a camera ray meets, with points and normals in the eye frame."""
+
+    cornea: mi.Bool  # it enters through the clear part of the cornea
+    sclera: mi.Bool
+    other: mi.Bool  # anything of the scene that is not the eye
+    distance: mi.Float
+    point: mi.Vector3f  # on the first surface
+    normal: mi.Vector3f
+    opacity: mi.Float  # of the tissue at the first surface: 0 clear cornea, 1 sclera
+    mirrored: mi.Float  # reflectance of the front cornea
+    passed: mi.Float  # transmittance of the refracted branch, 0 where it does not reach the plane of the iris
+    inner: mi.Vector3f  # point in the plane of the iris
+    slant: mi.Vector3f  # lateral motion of the ray per mm of height above that plane
+    pupil: mi.Bool  # the inner point lies in the pupil
+    albedo: mi.Float  # of the region's mesh, where there is one
+    gloss: mi.Float  # likewise, and of the wet sclera
+    received: mi.Vector4f  # of the region's mesh: what it receives from other surfaces (see `exchange`)
+    level: mi.Vector3f | None = None  # normal without the relief of skin in which light spreads
+
+    @property
+    def matte(self) -> mi.Bool:
+        """Whether the first surface is matte, at least in part."""
+        return (self.cornea & (self.opacity > 0)) | self.sclera | self.other
+
+    @property
+    def lit_inside(self) -> mi.Bool:
+        """Whether light from behind the cornea is visible."""
+        return self.cornea & (self.opacity < 1) & (self.passed > 0)
+
+    @property
+    def met(self) -> mi.Bool:
+        """Whether the ray meets anything."""
+        return self.cornea | self.sclera | self.other
+
+    def nearness(self, frame: Frame, d: mi.Vector3f) -> mi.Float:
+        """Inverse depth (1/mm) of what camera rays along d (scene's frame) show.
+
+        Behind the cornea it is the change of direction that keeps a ray on its place in the plane of the iris while the
+        pinhole moves across the optical axis: by the mean of moves in two directions, because the image is astigmatic.
+        """
+        forward = frame.camera.forward
+        near = dr.rcp(dr.maximum(self.distance * dr.dot(d, forward), 1e-3))
+        deep = self.lit_inside & (self.opacity < 0.5)
+        return dr.if_stmt(
+            (mi.Vector3f(d), near),
+            deep,
+            lambda d, near: dr.clip(self._nearness_inside(frame, d), _DEEPEST * near, near),
+            lambda _, near: near,
+        )
+
+    def _nearness_inside(self, frame: Frame, d: mi.Vector3f) -> mi.Float:
+        """The same of lanes that show the plane of the iris."""
+        camera, front = frame.camera, frame.surfaces[0]
+        cosine = dr.dot(d, camera.forward)
+        turned = [frame.vector_to_eye(cosine * (e - d * dr.dot(e, d))) for e in (camera.right, camera.down)]
+        moved = [frame.vector_to_eye(e) for e in (camera.right, camera.down)]
+        y, form = front.on_surface(self.point)
+        w, none = frame.vector_to_eye(d), mi.Vector3f(0)
+        at = []
+        for points, ways in (([self.distance * e for e in turned], turned), (moved, [none, none])):
+            bundle = front.bend(Bundle(y, w, *points, *ways), form)[0]
+            for surface in frame.surfaces[1:]:
+                bundle = surface.refract_bundle(bundle)[0]
+            s = dr.dot(frame.stop.centre - bundle.y, frame.stop.normal) / dr.dot(bundle.w, frame.stop.normal)
+            at.append((bundle.w, bundle.da + s * bundle.wa, bundle.db + s * bundle.wb))
+        (w, a, b), (_, p, q) = at
+        both = dr.dot(w, dr.cross(p, b)) + dr.dot(w, dr.cross(a, q))
+        return 0.5 * both / dr.dot(w, dr.cross(a, b))
+
+
+@dataclass(kw_only=True)
+class Textures:
+    """Maps of the eye, and the light and the surroundings of a frame.
+
+    Attributes:
+        iris: relative albedo (mean 1) of the iris over (angle, pupil to root).
+        heights: height (mm) of the iris over the same.
+        raised: whether the iris has any heights.
+        sclera: relative albedo of the sclera.
+        surround: `surround.SurroundGeometry` of frames without a region.
+        region: `region.SkinGeometry`.
+        ambience: `environment.Ambience`.
+        lamp_views: `lampviews.LampViews`.
+        pupil: `pupillight.PupilLight`.
+        received: `exchange.Received`.
+        tissues: `subsurface.TissueLight`.
+    """
+
+    iris: mi.Texture2f
+    heights: mi.Texture2f
+    raised: bool
+    sclera: mi.Texture2f
+    surround: Any = None
+    region: Any = None
+    ambience: Any = None
+    lamp_views: Any = None
+    pupil: Any = None
+    received: Any = None
+    tissues: Any = None
+
+    @classmethod
+    def of(cls, look: Look) -> Textures:
+        """Make the textures of one eye."""
+        maps = kept(iris_maps, DrawnPattern.of(look.iris_seed, look.iris))
+        # The texture repeats so that the angle wraps. Additional rows separate the ends along the radius.
+        maps = np.concatenate([maps[:, :1], maps, maps[:, -1:]], axis=1)
+        texture: Any = mi.Texture2f
+        iris, heights = (
+            texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat) for rows in maps
+        )
+        sclera = texture(mi.TensorXf(kept(sclera_texture, look.iris_seed)[..., None]), use_accel=False)
+        raised = look.iris.relief > 0 or look.iris.convexity_mm > 0
+        return cls(iris=iris, heights=heights, raised=raised, sclera=sclera)
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneHit:
+    """Hit on the plane of the surround in closed form, as on its first triangle, extended."""
+
+    t: mi.Float
+    prim_index: mi.UInt32
+    prim_uv: mi.Point2f
+
+    @classmethod
+    def of(cls, plane_x: mi.Float, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> PlaneHit:
+        """Hits of rays with the plane at `plane_x` that are nearer than `nearest`."""
+        t = (plane_x - o.x) / d.x
+        y, z = o.y + t * d.y, o.z + t * d.z
+        met = (t > 0) & (t < nearest) & (dr.maximum(dr.abs(y), dr.abs(z)) < HALF_MM)
+        uv = mi.Point2f((y - z) / (2 * HALF_MM), (z + HALF_MM) / (2 * HALF_MM))
+        return cls(dr.select(met, t, dr.inf), mi.UInt32(0), uv)
+
+    def is_valid(self) -> mi.Bool:
+        """Whether the plane is hit."""
+        return self.t < dr.inf
+
+
+@dataclass
+class RegionHit:
+    """Hit of a ray on a triangle (`face`) of an eye region, infinitely far where there is none."""
+
+    t: mi.Float = None
+    face: mi.UInt32 = None
+    prim_uv: mi.Point2f = None
+
+    def is_valid(self) -> mi.Bool:
+        """Whether anything is hit."""
+        return self.t < dr.inf
+
+
+Hit: TypeAlias = "mi.PreliminaryIntersection3f | PlaneHit"
+
+
+def opacity(frame: Frame, rho: mi.Float) -> mi.Float:
+    """Share by which the cornea's rim has turned to sclera at radius `rho` (mm): a smooth step up to the limbus."""
+    s = dr.clip((rho - frame.limbus.radius) * frame.limbus.gain + 1, 0, 1)
+    return s * s * (3 - 2 * s)
+
+
+def look(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> View:
+    """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris."""
+    view, hit = meet(frame, o, d, active)
+    return appearance(frame, view, hit, d)
+
+
+def appearance(frame: Frame, view: View, hit: Hit, d: mi.Vector3f) -> View:
+    """View of rays along which `meet` found `view` and `hit`, with the surface of what is not the eye."""
+    region, surround = frame.textures.region, frame.textures.surround
+    if region is not None:
+        there = look_at_skin(frame, region, region.face(hit), hit.prim_uv, d, view.other)
+    else:
+        matte = surround.surface(hit.prim_index, hit.prim_uv, view.other)
+        there = replace(_matte(frame, matte.point, matte.normal, d, view.other), albedo=matte.albedo)
+    return replace(
+        view,
+        point=dr.select(view.other, there.point, view.point),
+        normal=dr.select(view.other, there.normal, view.normal),
+        albedo=there.albedo,
+        gloss=dr.select(view.other, there.gloss, view.gloss),
+        received=there.received,
+    )
+
+
+def meet(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True) -> tuple[View, Hit]:
+    """View of the globe along rays, and the hit of Embree or OptiX, whose surface is not evaluated yet.
+
+    coherent: whether neighbouring rays are alike, as those of a camera.
+    """
+    alone = meet_globe(frame, o, d)
+    hit: Hit
+    if frame.structure.obstacles:
+        ray = _ray(alone, o, d)  # whatever is behind the eye does not matter
+        hit = frame.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+    else:
+        hit = PlaneHit.of(frame.backdrop_x, o, d, alone.distance)
+    return behind(alone, hit, active), hit
+
+
+def behind(alone: View, hit: Hit | RegionHit, active: mi.Bool) -> View:
+    """View of rays that meet the globe like `alone` where nothing is hit in front of it."""
+    clear = ~hit.is_valid() & active
+    on_cornea, on_sclera = alone.cornea & clear, alone.sclera & clear
+    other = hit.is_valid() & active
+    return replace(
+        alone, cornea=on_cornea, sclera=on_sclera, other=other, distance=dr.select(other, hit.t, alone.distance)
+    )
+
+
+def region_hit(skin: SkinGeometry, scene: mi.Scene, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> RegionHit:
+    """Hits of camera rays on an eye region in front of the globe."""
+    hit = scene.ray_intersect_preliminary(_ray(alone, o, d), coherent=True, active=True)
+    return RegionHit(dr.select(hit.is_valid(), hit.t, dr.inf), skin.face(hit), hit.prim_uv)
+
+
+def hidden(frame: Frame, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
+    """Whether anything of the scene is in front of the globe, where the rays of `meet_globe` meet it."""
+    met = alone.cornea | alone.sclera
+    if not frame.structure.obstacles:
+        return met & PlaneHit.of(frame.backdrop_x, o, d, alone.distance).is_valid()
+    return dr.if_stmt(
+        (), met, lambda: frame.scene.ray_test(_ray(alone, o, d), coherent=True, active=True), lambda: mi.Bool(False)
+    )
+
+
+def _ray(alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Ray3f:
+    """Rays as far as the globe."""
+    ray = mi.Ray3f(mi.Point3f(o), d)
+    ray.maxt = alone.distance
+    return ray
+
+
+def meet_globe(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> View:
+    """View of the globe along rays, as if it stood alone; the distance of rays that miss it has no bound."""
+    # In single precision the ray must start next to the eye.
+    t0 = -dr.dot(o, d) - _NEAR_MM
+    oe, de = frame.point_to_eye(o + t0 * d), frame.vector_to_eye(d)
+    front = frame.surfaces[0]
+    ol, dl = front.point_in(oe), front.vector_in(de)
+    tc, on_cornea, facing = front.meet(ol, dl)
+    yl = ol + tc * dl
+    rho = dr.sqrt(yl.y * yl.y + yl.z * yl.z)
+    on_cornea &= (rho < frame.limbus.radius) & (yl.x > frame.limbus.floor)
+    ts, on_sclera = meet_sphere(oe - frame.sclera.centre, de, frame.sclera.radius)
+    # The sphere's front is behind the cornea, so a ray that meets the sphere first has met no clear cornea. This avoids
+    # cracks, even where the rim of a tilted or toric cornea is no circle of the sphere.
+    on_cornea &= ~on_sclera | (tc < ts)
+    on_sclera &= ~on_cornea
+    t_eye = t0 + dr.select(on_cornea, tc, ts)
+    on_cornea &= t_eye > EPSILON_MM
+    on_sclera &= t_eye > EPSILON_MM
+    normal, mirrored, passed, inner, slant, pupil = dr.if_stmt(
+        (facing, oe + tc * de, dl),
+        on_cornea,
+        lambda facing, y, dl: _refracted(frame, facing, y, dl),
+        lambda *_: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Vector3f(0), mi.Bool(False)),
+    )
+    xs = oe + ts * de
+    return View(
+        cornea=on_cornea,
+        sclera=on_sclera,
+        other=mi.Bool(False),
+        distance=dr.select(on_cornea | on_sclera, t_eye, _FAR),
+        point=dr.select(on_cornea, oe + tc * de, xs),
+        normal=dr.normalize(dr.select(on_cornea, normal, xs - frame.sclera.centre)),
+        opacity=dr.select(on_cornea, opacity(frame, rho), 1),
+        mirrored=mirrored,
+        passed=passed,
+        inner=inner,
+        slant=slant,
+        pupil=pupil,
+        albedo=mi.Float(0),
+        gloss=mi.Float(_WET),
+        received=mi.Vector4f(0),
+    )
+
+
+def look_at_skin(
+    frame: Frame, region: SkinGeometry, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, other: mi.Bool
+) -> View:
+    """View of rays that meet places on triangles of an eye region, where `other`."""
+    skin = region.surface(face, uv, other)
+    view = _matte(frame, skin.point, skin.normal, d, other)
+    level = _facing(frame, skin.smooth, d) if frame.structure.scattering else None
+    return replace(view, albedo=skin.albedo, gloss=skin.gloss, received=skin.received, level=level)
+
+
+def _matte(frame: Frame, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector3f, other: mi.Bool) -> View:
+    """View of matte points of the scene; normals are turned to the viewer."""
+    no, nothing = mi.Bool(False), mi.Float(0)
+    return View(
+        cornea=no,
+        sclera=no,
+        other=other,
+        distance=nothing,
+        point=frame.point_to_eye(point),
+        normal=_facing(frame, facing, d),
+        opacity=mi.Float(1),
+        mirrored=nothing,
+        passed=nothing,
+        inner=mi.Vector3f(0),
+        slant=mi.Vector3f(0),
+        pupil=no,
+        albedo=nothing,
+        gloss=mi.Float(_WET),
+        received=mi.Vector4f(0),
+    )
+
+
+def _facing(frame: Frame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
+    """Normals (eye frame) turned to the viewer; normals and rays are given in the scene's frame."""
+    normal = frame.vector_to_eye(normal)
+    return dr.normalize(dr.select(dr.dot(normal, frame.vector_to_eye(d)) > 0, -normal, normal))
+
+
+def _refracted(
+    frame: Frame, N: mi.Vector3f, y: mi.Vector3f, dl: mi.Vector3f
+) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Vector3f, mi.Vector3f, mi.Bool]:
+    """From the front cornea to the plane of the iris.
+
+    Normal, reflectance, transmittance, point, lateral motion per mm above the plane, whether in the pupil.
+
+    N, dl: normal and direction in the front surface's frame; y: the point in the eye frame.
+    """
+    front = frame.surfaces[0]
+    c = -dr.dot(N, dl)
+    c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
+    mirrored = front.mirrored(c, c2)
+    passed = 1 - mirrored
+    w = front.vector_out(front.eta * dl + (front.eta * c - c2) * N)
+    inside = mi.Vector3f(y)
+    reached = mi.Bool(True)
+    for surface in frame.surfaces[1:]:
+        inside, w, share, ok = surface.refract(inside, w)
+        passed *= share
+        reached &= ok
+    n = frame.stop.normal
+    down = dr.dot(w, n)
+    s = dr.dot(frame.stop.centre - inside, n) / down
+    inner = dr.select(s > 0, inside + s * w, _beyond_root(frame, inside))
+    pu, pv = stop_coordinates(frame, inner)
+    margin = frame.boundary.radius(pu, pv)
+    pupil = reached & (pu * pu + pv * pv < margin * margin)
+    # A ray that finds no way may have no place at all, and nothing may be computed from that.
+    inner = dr.select(reached, inner, frame.stop.centre)
+    slant = dr.select(reached & (down < -0.05), w / down - n, 0)
+    return front.vector_out(N), mirrored, dr.select(reached, passed, 0), inner, slant, pupil
+
+
+def _beyond_root(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
+    """Places in the plane of the iris, just beyond its root, that stand for points behind the plane.
+
+    Where a shallow chamber's cornea ends behind the plane, a real iris bends back to its root. It is lit there about as
+    at the end of the flat one.
+    """
+    n, centre = frame.stop.normal, frame.stop.centre
+    scale = (frame.iris.root_radius + EPSILON_MM) * dr.rsqrt(dr.maximum(x.y * x.y + x.z * x.z, 1e-12))
+    y, z = x.y * scale, x.z * scale
+    return mi.Vector3f(centre.x - (n.y * (y - centre.y) + n.z * (z - centre.z)) / n.x, y, z)
+
+
+def stop_coordinates(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """Coordinates of points of the stop's plane along its semi-axes, in units of these."""
+    q = x - frame.stop.centre
+    a, b = frame.stop.axes
+    return dr.dot(q, frame.stop.u) / a, dr.dot(q, frame.stop.v) / b
+
+
+def meet_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Bool]:
+    """Distance to the near side of a sphere about the origin, and whether it is met from outside."""
+    b, c = dr.dot(o, d), dr.squared_norm(o) - radius * radius
+    disc = b * b - c
+    q = dr.sqrt(dr.maximum(disc, 0)) - b
+    return c / q, (disc > 0) & (q > 0) & (c > 0)
+
+
+def _iris_place(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+    """Place of points of the iris' plane: share of the way from margin to root, turn, distance to the root, width."""
+    pu, pv = stop_coordinates(frame, x)
+    a, b = frame.stop.axes
+    beyond = (dr.sqrt(pu * pu + pv * pv) - frame.boundary.radius(pu, pv)) * dr.sqrt(a * b)
+    left = frame.iris.root_radius - dr.sqrt(x.y * x.y + x.z * x.z)
+    width = dr.maximum(beyond + dr.maximum(left, 0), 1e-4)
+    return dr.clip(beyond / width, 0, 1), dr.atan2(pv, pu) / (2 * dr.pi), left, width
+
+
+def _on_iris(texture: mi.Texture2f, s: mi.Float, turn: mi.Float) -> mi.Float:
+    rows = texture.shape[0]
+    return texture.eval(mi.Point2f(turn, (1 + s * (rows - 2)) / rows))[0]
+
+
+def iris_height(frame: Frame, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float:
+    """Height (mm) of the iris above points of its plane, 0 in the pupil and beyond the root, by the map of its heights.
+
+    The pattern stretches with the iris. A narrow iris is as steep as a wide one, so its heights are less.
+    """
+    s, turn, left, width = _iris_place(frame, x)
+    bulge = frame.iris.convexity * dr.minimum(width / WIDTH_MM, 1) * 4 * s * (1 - s)
+    pattern = frame.iris.relief * dr.minimum(width / _WIDE_MM, 1) * _on_iris(heights, s, turn)
+    return dr.select((s > 0) & (left > 0), bulge + pattern, 0)
+
+
+def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
+    """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
+    s, turn, left, _ = _iris_place(frame, x)
+    texture = _on_iris(frame.textures.iris, s, turn)
+    albedo = frame.iris.albedo * dr.maximum(1 + frame.iris.contrast * (texture - 1), 0.02)
+    edge = dr.clip((s - _RING[0]) / (_RING[1] - _RING[0]), 0, 1)
+    albedo *= 1 - frame.iris.ring * edge * edge * (3 - 2 * edge)
+    return dr.select(left > 0, albedo, frame.limbus.albedo)
+
+
+def outer_albedo(frame: Frame, view: View) -> mi.Float:
+    """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
+    return dr.if_stmt(
+        (view.point, view.albedo),
+        view.other,
+        lambda point, other: other,
+        lambda point, other: _sclera_albedo(frame, point),
+    )
+
+
+def globe_map(frame: Frame, point: mi.Vector3f) -> mi.Point2f:
+    """Place in [0, 1]^2 of points of the globe (eye frame) in the azimuthal equidistant map of its front."""
+    r = point - frame.sclera.centre
+    polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / GLOBE_EDGE
+    inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
+    return mi.Point2f(0.5 + 0.5 * polar * r.y * inv, 0.5 + 0.5 * polar * r.z * inv)
+
+
+def _sclera_albedo(frame: Frame, point: mi.Vector3f) -> mi.Float:
+    texture = frame.textures.sclera.eval(globe_map(frame, point))[0]
+    sclera = frame.sclera.albedo * dr.maximum(1 + frame.sclera.contrast * (texture - 1), 0.02)
+    # The grey ring of the limbus fades into the white over its width, on the side of the sclera.
+    local = frame.surfaces[0].point_in(point)
+    away = dr.sqrt(local.y * local.y + local.z * local.z) - frame.limbus.radius
+    s = dr.clip(0.5 + 0.5 * away * frame.limbus.gain, 0, 1)
+    s = s * s * (3 - 2 * s)
+    return frame.limbus.albedo + s * (sclera - frame.limbus.albedo)

@@ -1,0 +1,312 @@
+"""Refracting surfaces as triangle meshes: hits of Embree or OptiX, with interpolated normals.
+
+A mesh is a patch of one of the eye's dielectric bodies (`eye.meshes`). It lies in a Mitsuba scene of its own, so a ray
+that has been refracted by one surface cannot meet that surface again. Its points are on the triangles, its normals
+n / |n| are interpolated from those of the vertices, n = sum_i b_i N_i with barycentric coordinates b_i. Paths and
+glints are found by Newton's method on the mesh itself. Their derivatives need dn for a step of the point:
+
+    dn = sum_i N_i db_i,    db_i linear in the step over the surface's plane (y, z)
+
+Both are continuous over edges, so Newton's steps cross them. Beyond the rim of the mesh, where no path ends, the search
+goes on over the closed form.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+from ...eye.meshes import Patch, cornea_patches
+from ...eye.model import EyeModel
+from ...geometry.surfaces import Surface as ExactSurface
+from ..records.frame import aligned, sent
+from ..records.surfaces import Bundle, NormalForm, Surface
+
+_ABOVE_MM = 40.0  # beyond every cornea along its axis
+_STEPS = 12
+_SETTLED = 1e-12
+_PARALLEL = 1e-9
+
+
+class Mirror(NamedTuple):
+    """Mirror points of a mesh (n, 3), in the eye frame.
+
+    Attributes:
+        point: on the mesh.
+        normal: unit normal there.
+        arrives: unit direction of the light before it is reflected.
+        leaves: unit direction after.
+        cross_section: cross section of the ray tube at the source per solid angle at the viewpoint, (n,) mm^2/sr.
+        found: (n,).
+    """
+
+    point: Floats
+    normal: Floats
+    arrives: Floats
+    leaves: Floats
+    cross_section: Floats
+    found: Bools
+
+
+@dataclass(kw_only=True)
+class MeshGeometry:
+    """One surface as a mesh for the kernels, in the surface's own frame (+x outward, mm).
+
+    Attributes:
+        scene: the mesh.
+        faces: four entries for each triangle, of which the first three are its vertices.
+        vertices: eight numbers for each vertex: place, 0, normal, 0.
+    """
+
+    scene: mi.Scene
+    faces: mi.UInt32
+    vertices: mi.Float
+
+    @classmethod
+    def of(cls, name: str, vertices: Floats, normals: Floats, faces: Ints) -> MeshGeometry:
+        """Make a mesh of vertices (n, 3) with normals (n, 3), and triangles (m, 3)."""
+        mesh = mi.Mesh(name, len(vertices), len(faces))
+        params = mi.traverse(mesh)
+        params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+        params["vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
+        params.update()
+        scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
+        corners = np.zeros((len(faces), 4), np.uint32)
+        corners[:, :3] = faces
+        records = np.zeros((len(vertices), 8), np.float32)
+        records[:, 0:3], records[:, 4:7] = vertices, normals
+        return cls(scene=scene, faces=mi.UInt32(aligned(corners.ravel())), vertices=sent(records))
+
+    def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> mi.PreliminaryIntersection3f:
+        """First hit of rays of the surface's frame."""
+        return self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=True)
+
+    def above(self, y: mi.Float, z: mi.Float) -> mi.PreliminaryIntersection3f:
+        """Hit at given (y, z), by rays along the axis from outside."""
+        return self.hit(mi.Vector3f(_ABOVE_MM, y, z), mi.Vector3f(-1, 0, 0))
+
+    def corners(self, hit: mi.PreliminaryIntersection3f) -> tuple[list[mi.Vector3f], list[mi.Vector3f]]:
+        """Places and normals of the corners of the triangles that were hit."""
+        met = hit.is_valid()
+        i = dr.gather(mi.Vector4u, self.faces, hit.prim_index, met)
+        rows = [[dr.gather(mi.Vector4f, self.vertices, 2 * k + part, met) for k in (i.x, i.y, i.z)] for part in (0, 1)]
+        places, normals = ([mi.Vector3f(r.x, r.y, r.z) for r in row] for row in rows)
+        return places, normals
+
+    def normal(self, hit: mi.PreliminaryIntersection3f) -> mi.Vector3f:
+        """Interpolated unit normal."""
+        _, normals = self.corners(hit)
+        return dr.normalize(_mixed(normals, hit.prim_uv))
+
+    def form(self, hit: mi.PreliminaryIntersection3f) -> tuple[mi.Float, NormalForm]:
+        """Height x on the axis' direction, and the normal form, whose Hessian is the slope of the normals."""
+        places, normals = self.corners(hit)
+        n = _mixed(normals, hit.prim_uv)
+        inv = dr.rsqrt(dr.squared_norm(n))
+        a, b = places[1] - places[0], places[2] - places[0]
+        area = dr.rcp(a.y * b.z - a.z * b.y)
+        first, second = normals[1] - normals[0], normals[2] - normals[0]
+
+        def slope(v: mi.Vector3f) -> mi.Vector3f:
+            return ((v.y * b.z - v.z * b.y) * area) * first + ((a.y * v.z - a.z * v.y) * area) * second
+
+        return _mixed(places, hit.prim_uv).x, NormalForm(n * inv, inv, slope)
+
+
+class SurfaceMesh:
+    """One surface as a mesh, in its own frame (+x outward, mm), on the host in float64.
+
+    Attributes:
+        geometry: the same for the kernels.
+    """
+
+    def __init__(self, patch: Patch, surface: ExactSurface) -> None:
+        self.rotation, self.origin = np.asarray(surface.rotation), np.asarray(surface.origin_mm)
+        self.vertices = (patch.vertices - self.origin) @ self.rotation
+        self.normals = patch.normals @ self.rotation
+        self.faces = np.asarray(patch.faces)
+        self.geometry = MeshGeometry.of(patch.name, self.vertices, self.normals, self.faces)
+
+    def mirrored(self, start: Floats, source: Floats, viewpoint: Floats) -> Mirror:
+        """Mirror points of sources (n, 3) for viewpoints (n, 3), searched from points (n, 3) near them; eye frame."""
+        y, lamp, node = ((p - self.origin) @ self.rotation for p in (start, source, viewpoint))
+        q = y[:, 1:].copy()
+        found = np.ones(len(q), dtype=bool)
+        for _ in range(_STEPS):
+            x, n, slope, normal_slope, there = self._at(q)
+            found &= there
+            miss, jacobian = _unevenness(x, n, slope, normal_slope, lamp, node)
+            determinant = np.linalg.det(jacobian)
+            found &= np.abs(determinant) > _SETTLED
+            jacobian[~found] = np.eye(2)
+            step = np.linalg.solve(jacobian, miss[..., None])[..., 0]
+            q = np.where(found[:, None], q - step, q)
+            if not found.any() or np.max(np.abs(step[found])) < _SETTLED:
+                break
+        x, n, _, normal_slope, there = self._at(q)
+        miss, _ = _unevenness(x, n, _, normal_slope, lamp, node)
+        found &= there & (np.max(np.abs(miss), axis=1) < _PARALLEL)
+        out, arrive = _unit(x - node), _unit(x - lamp)
+        N = _unit(n)
+        tube = _tube(out, x, N, n, normal_slope, lamp, node)
+        point, normal, arrives, leaves = (p @ self.rotation.T for p in (x, N, arrive, -out))
+        return Mirror(point + self.origin, normal, arrives, leaves, tube, found)
+
+    def _at(self, q: Floats) -> tuple[Floats, Floats, Floats, Floats, Bools]:
+        """Points of the mesh at (y, z) (n, 2).
+
+        Returns:
+            Points (n, 3) and normals (n, 3) (not unit), their derivatives by y and z (n, 3, 2), and whether the mesh
+            reaches there.
+        """
+        hit = self.geometry.above(*(mi.Float(aligned(c.astype(np.float32))) for c in q.T))
+        valid, face = hit.is_valid(), hit.prim_index
+        dr.eval(valid, face)
+        there = np.asarray(valid.numpy(), dtype=bool)
+        corners = self.faces[np.where(there, face.numpy(), 0)]
+        p, n = self.vertices[corners], self.normals[corners]
+        edges = np.swapaxes(p[:, 1:] - p[:, :1], 1, 2)  # (n, 3, 2)
+        inverse = np.linalg.inv(edges[:, 1:])  # steps in (y, z) to barycentric coordinates
+        uv = np.einsum("nij,nj->ni", inverse, q - p[:, 0, 1:])
+        turns = np.swapaxes(n[:, 1:] - n[:, :1], 1, 2)
+        point = p[:, 0] + np.einsum("nij,nj->ni", edges, uv)
+        normal = n[:, 0] + np.einsum("nij,nj->ni", turns, uv)
+        return point, normal, edges @ inverse, turns @ inverse, there
+
+
+def _either(which: mi.Bool, one: NormalForm, other: NormalForm) -> NormalForm:
+    """One normal form or the other."""
+    return NormalForm(
+        dr.select(which, one.normal, other.normal),
+        dr.select(which, one.inverse, other.inverse),
+        lambda v: dr.select(which, one.hessian(v), other.hessian(v)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class MeshedSurface(Surface):
+    """A refracting surface whose hits, normals and their slopes are those of a mesh."""
+
+    mesh: MeshGeometry | None = None
+
+    def _mesh(self) -> MeshGeometry:
+        assert self.mesh is not None
+        return self.mesh
+
+    def meet(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool, mi.Vector3f]:
+        """Distance to the mesh, success, and the interpolated unit normal."""
+        hit = self._mesh().hit(o, d)
+        N = self._mesh().normal(hit)
+        met = hit.is_valid() & (dr.dot(d, N) < 0)
+        return dr.select(met, hit.t, 0), met, N
+
+    def on_surface(self, x: mi.Vector3f) -> tuple[mi.Vector3f, NormalForm]:
+        """Point of the mesh at the same local (y, z), and its form; beyond the mesh those of the closed form."""
+        l = self.point_in(x)
+        hit = self._mesh().above(l.y, l.z)
+        met = hit.is_valid()
+        height, form = self._mesh().form(hit)
+        outside, other = Surface.on_surface(self, x)
+        point = dr.select(met, x + self.vector_out(mi.Vector3f(height - l.x, 0, 0)), outside)
+        return point, _either(met, form, other)
+
+    def refract_bundle(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
+        """Enter the eye through the mesh with ray differentials; beyond the mesh through the closed form."""
+        hit = self._mesh().hit(self.point_in(b.y), self.vector_in(b.w))
+        met = hit.is_valid()
+        t, form = hit.t, self._mesh().form(hit)[1]
+        far, ok, _ = Surface.meet(self, self.point_in(b.y), self.vector_in(b.w))
+        t = dr.select(met, t, far)
+        there = Bundle(b.y + t * b.w, b.w, b.da + t * b.wa, b.db + t * b.wb, b.wa, b.wb)
+        out, share, c = self.bend(there, _either(met, form, self._normal_form(self.point_in(there.y))))
+        return out, share, (met | ok) & (c > 1e-4)
+
+
+class Meshes:
+    """The corneas of the last eyes as meshes."""
+
+    def __init__(self, kept: int = 4) -> None:
+        self._kept = kept
+        self._made: dict[Any, tuple[SurfaceMesh, ...]] = {}
+
+    def of(self, eye: EyeModel, edge_mm: float) -> tuple[SurfaceMesh, ...]:
+        """Meshes of an eye's refracting surfaces in front of the iris, whose edges are at most about `edge_mm` long."""
+        stop = np.concatenate([eye.stop.centre_mm, eye.stop.normal])
+        key = (eye.front, float(eye.limbus_radius_mm), stop.tobytes(), edge_mm)
+        if key not in self._made:
+            if len(self._made) >= self._kept:
+                self._made.pop(next(iter(self._made)))
+            patches = cornea_patches(eye, *resolution(float(eye.limbus_radius_mm), edge_mm))
+            self._made[key] = tuple(SurfaceMesh(p, s) for p, s in zip(patches, eye.front, strict=True))
+        return self._made[key]
+
+
+def resolution(radius_mm: float, edge_mm: float) -> tuple[int, int]:
+    """Rings and sectors of a cap of a radius whose rings and whose rim have edges of at most a length."""
+    return math.ceil(radius_mm / edge_mm), max(8, math.ceil(2 * math.pi * radius_mm / edge_mm))
+
+
+def meshed(surfaces: Sequence[Surface], meshes: Sequence[SurfaceMesh]) -> tuple[Surface, ...]:
+    """Put meshes in the place of surfaces."""
+    return tuple(
+        MeshedSurface(s.origin, s.axes, s.shape, s.eta, s.kind, s.table, s.film, mesh.geometry)
+        for s, mesh in zip(surfaces, meshes, strict=True)
+    )
+
+
+def _mixed(corners: Sequence[mi.Vector3f], uv: mi.Point2f) -> mi.Vector3f:
+    a, b, c = corners
+    return (1 - uv.x - uv.y) * a + uv.x * b + uv.y * c
+
+
+def _unevenness(
+    x: Floats, n: Floats, slope: Floats, normal_slope: Floats, lamp: Floats, node: Floats
+) -> tuple[Floats, Floats]:
+    """By how much the bisector h of the ways to lamp and viewpoint is not parallel to n: (n, 2), with its Jacobian.
+
+    In the surface's frame, with the index i of y and z: h_i n_x - n_i h_x.
+    """
+    h, dh = np.zeros_like(x), np.zeros_like(slope)
+    for end in (lamp, node):
+        way = end - x
+        length = np.linalg.norm(way, axis=1)[:, None]
+        u = way / length
+        h += u
+        dh -= (slope - u[:, :, None] * np.einsum("ni,nij->nj", u, slope)[:, None, :]) / length[:, :, None]
+    miss = h[:, 1:] * n[:, :1] - n[:, 1:] * h[:, :1]
+    jacobian = (
+        dh[:, 1:] * n[:, :1, None]
+        + h[:, 1:, None] * normal_slope[:, :1]
+        - normal_slope[:, 1:] * h[:, :1, None]
+        - n[:, 1:, None] * dh[:, :1]
+    )
+    return miss, jacobian
+
+
+def _tube(out: Floats, x: Floats, N: Floats, n: Floats, normal_slope: Floats, lamp: Floats, node: Floats) -> Floats:
+    """Cross section at the lamp of a tube of rays from the viewpoint, per solid angle there, (n,)."""
+    s, rest = np.linalg.norm(x - node, axis=1), np.linalg.norm(lamp - x, axis=1)
+    c = -np.sum(N * out, axis=1)
+    w = out + 2 * c[:, None] * N
+    helper = np.where(np.abs(out[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    e1 = _unit(np.cross(out, helper))
+    ends = []
+    for e in (e1, np.cross(out, e1)):
+        v = s[:, None] * e
+        dy = v + out * (np.sum(N * v, axis=1) / c)[:, None]
+        dn = np.einsum("nij,nj->ni", normal_slope, dy[:, 1:])
+        dN = (dn - N * np.sum(N * dn, axis=1)[:, None]) / np.linalg.norm(n, axis=1)[:, None]
+        dc = -(np.sum(e * N, axis=1) + np.sum(out * dN, axis=1))
+        ends.append(dy + rest[:, None] * (e + 2 * (dc[:, None] * N + c[:, None] * dN)))
+    return np.asarray(np.abs(np.sum(w * np.cross(*ends), axis=1)))
+
+
+def _unit(v: Floats) -> Floats:
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))

@@ -1,0 +1,1 @@
+"""The integrator: set-up of a frame, samples of its pixels, and their shading."""

@@ -1,0 +1,246 @@
+"""What is kept from frame to frame (scenes, textures, maps), and the set-up of a job's frame from it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...errors import InputError
+from ...region.mesh import RegionMesh, region_mesh
+from ...rig.imaging import Ambient
+from ..hits.interaction import Textures
+from ..hits.meshes import Meshes, meshed
+from ..records.eyecache import KeptForEye
+from ..records.frame import Frame, Lights, Structure, sent
+from ..records.job import LampTable, RenderJob, boundary_waves, kinds, panel_lamps, panel_table, tables
+from ..records.recording import forget, recorded
+from ..scene.background import Obstacle, Surround
+from ..scene.head import place_scene
+from ..scene.region import RegionScene
+from ..transport.diffusion import tissue_light
+from ..transport.environment import Ambience, Maps, bright_lamps
+from ..transport.fundusirradiance import PupilLight, pupil_light
+from ..transport.globeirradiance import matte_light
+from ..transport.irisirradiance import IrisLight, iris_light
+from ..transport.radiosity import Exchange
+from ..transport.reliefmapping import IrisRelief, ReliefShape, ReliefSize, flat_relief, lit_relief, relief_shape
+from ..transport.shadowmaps import LampViews
+from .film import Exposed
+from .hostdata import Prepared
+
+_REGIONS, _TEXTURES = 4, 8  # kept
+_REMEMBERED = 32  # subjects; then recordings are made anew, because those of sizes that never come back take 3 MB each
+_FARTHEST_MM = 60.0  # of places in the plane of a surround that have a grid
+
+
+@dataclass(slots=True)
+class _Next:
+    """The job of the frame that comes next, and what a second thread makes of it: the mesh, then all the rest."""
+
+    job: RenderJob
+    posed: Future[RegionMesh] | None = None
+    host: Future[Prepared] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _GridSizes:
+    """Whether there is a grid over the iris; lamps that use it; nodes of the relief; points of lamps that light it."""
+
+    gridded: bool
+    lamps: int
+    nodes: int
+    points: int
+
+
+@recorded
+def _grids_behind_cornea(
+    frame: Frame, shape: ReliefShape | None, side: mi.UInt32, points: mi.UInt32, factors: mi.Float | None,
+    sizes: _GridSizes,
+) -> tuple[IrisLight | None, IrisRelief, PupilLight]:  # fmt: skip
+    """Fill the grids of the lamps' light on the iris, on its relief, and on the fundus."""
+    pupil = pupil_light(frame, factors)
+    on_iris = iris_light(frame, sizes.lamps, points) if sizes.gridded else None
+    if shape is None:
+        return on_iris, flat_relief(side), pupil
+    return on_iris, lit_relief(frame, shape, side, points, (sizes.nodes, sizes.points)), pupil
+
+
+class Stage:
+    """Scenes, textures and maps.
+
+    Args:
+        beside: what makes what NumPy alone can make, in one other thread.
+        obstacles: in the scene's frame about eyes without a region.
+    """
+
+    def __init__(self, beside: Executor, obstacles: Sequence[Obstacle] = ()) -> None:
+        self._beside = beside
+        self._surround = Surround(obstacles)
+        self._textures: dict[Any, Textures] = {}
+        self._regions: dict[Any, RegionScene] = {}  # the one that was used last is last
+        self._filled = 0
+        self._replaced: deque[Any] = deque(maxlen=_REGIONS)  # subjects whose scenes others took
+        self._maps = Maps()
+        self.meshes = Meshes()
+        self._exchange = Exchange()
+        self._shapes: KeptForEye[ReliefShape] = KeptForEye()
+        self._next: _Next | None = None
+
+    def _expect(self, job: RenderJob) -> None:
+        """Have the mesh of the next job made by the second thread, but for a head mesh."""
+        self._next = _Next(job)
+        region = job.region
+        if region is not None and region.head is None:
+            self._next.posed = self._beside.submit(region_mesh, region, job.globe)
+
+    def prepare(self) -> None:
+        """Have what can be made of the next job without the device made by the second thread, once all is launched."""
+        after = self._next
+        if after is None or (after.job.region is not None and after.posed is None):
+            return
+        if after.posed is not None and after.posed.exception():
+            return  # its own frame shall raise the error
+        posed = None if after.posed is None else after.posed.result()
+        after.host = self._beside.submit(Prepared.made, after.job, posed)
+
+    def set(
+        self, job: RenderJob, *, lit: bool = True, after: RenderJob | None = None
+    ) -> tuple[Exposed, Surround | RegionScene]:
+        """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call.
+
+        Args:
+            job: the job.
+            lit: whether radiance is wanted, not only what is seen where.
+            after: the job of the next frame, if it is known.
+        """
+        host, place = self._prepared(job)
+        region = place if isinstance(place, RegionScene) else None
+        textures = self._textures_of(job)
+        # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
+        if isinstance(place, RegionScene):
+            textures = replace(textures, region=place.skin, lamp_views=LampViews.of(host.views, place))
+        else:
+            textures = replace(textures, surround=place.geometry)
+        structure = Structure(
+            kinds(job.eye),
+            bool(np.any(job.camera.distortion)),
+            place.obstructed,
+            region is not None,
+            job.ambient.model_copy(update={"sun": None}) != Ambient(),
+            region is not None and region.skin.is_sheet and job.look.scattering is not None,
+        )
+        frame = Frame.upload(
+            structure, host.parameters, boundary_waves(job.eye), tables(job.eye),
+            lights=Lights.upload(host.lamps), textures=textures, scene=place.scene,
+        )  # fmt: skip
+        if job.mesh_edge_mm is not None:
+            frame.surfaces = meshed(frame.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
+        if lit and structure.scattering and region is not None:
+            textures.tissues = tissue_light(job, frame, host.lamps, region, host.tissue_cells)
+        if structure.ambient:
+            even = job.ambient.irradiance_w_m2 * 1e-3
+            panels = panel_table(job.ambient, job.anchor_mm)
+            textures.ambience = Ambience.upload(even, panels, job.ambient.map, self._maps)
+        if lit:
+            self._light(host, frame, place, after)
+        return Exposed(frame, host), place
+
+    def _light(self, host: Prepared, frame: Frame, place: Surround | RegionScene, after: RenderJob | None) -> None:
+        """Add the light between surfaces, and the grids of the lamps' light that the frame can use."""
+        job = host.job
+        parts = panel_lamps(job.ambient, job.anchor_mm) + bright_lamps(job.ambient.map, self._maps, job.anchor_mm)
+        read = self._exchange.begun(job, host.lamps, host.places, frame, LampTable.of(parts, job.M, job.t), place)
+        if after is not None:
+            self._expect(after)
+        solved = read()
+        self._fill_grids(host, frame, place)
+        frame.textures.received = solved()
+        if not place.obstructed:
+            reach = dr.opaque(mi.Float, min(host.reach_mm, _FARTHEST_MM))
+            points = dr.opaque(mi.UInt32, host.lamps.points)
+            frame.lights.on_matte = matte_light(frame, reach, points, host.lamps.gridded)
+
+    def _fill_grids(self, host: Prepared, frame: Frame, place: Surround | RegionScene) -> None:
+        """Add the light of the lamps behind the cornea."""
+        job, lamps, heights = host.job, host.lamps, frame.textures.heights
+        size = ReliefSize.of(job)
+        side, shape = dr.opaque(mi.UInt32, size.side), None
+        if frame.textures.raised:
+            shape = self._shapes.get(
+                job.eye,
+                (size.side, job.look.iris_seed, job.look.iris),
+                lambda: relief_shape(frame.bare(), heights, side, dr.opaque(mi.UInt32, size.about), size),
+            )
+        gridded = not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet)
+        points = lamps.points * max(len(lamps), 1)
+        sizes = _GridSizes(gridded, len(lamps) if lamps.gridded else 0, size.side**2, points)
+        factors = host.returned.factors
+        sent_factors = sent(factors) if len(lamps) and factors.any() else None
+        lights, textures = frame.lights, frame.textures
+        lights.on_iris, lights.relief, textures.pupil = _grids_behind_cornea(
+            frame, shape, side, dr.opaque(mi.UInt32, lamps.points), sent_factors, sizes
+        )
+
+    def _prepared(self, job: RenderJob) -> tuple[Prepared, Surround | RegionScene]:
+        """What NumPy makes of a job, and its posed surroundings."""
+        expected, self._next = self._next, None
+        host = None
+        if expected is not None and expected.job is job and expected.host is not None:
+            host = expected.host.result()
+        place = self._place(job, None if host is None else host.posed)
+        return host or Prepared(job, place.posed), place
+
+    def _place(self, job: RenderJob, known: RegionMesh | None) -> Surround | RegionScene:
+        """Posed surroundings; the mesh of a region may be known."""
+        if job.region is None:
+            self._surround.show(job.look)
+            return self._surround
+        if self._surround.obstructed:
+            raise InputError("obstacles cannot be combined with an eye region")
+        place = self._region(job, known)
+        place.show(job.region, job.globe, known)
+        return place
+
+    def _region(self, job: RenderJob, known: RegionMesh | None) -> RegionScene:
+        """The scene of a subject.
+
+        A subject never seen before takes over that of another one, so recordings last. One that comes back after that
+        gets a scene of its own, because subjects that take turns would else fill one again and again.
+        """
+        assert job.region is not None
+        spec, globe = job.region, job.globe
+        key = RegionScene.key(spec, globe)
+        place = self._regions.pop(key, None)
+        if place is None:
+            full, back = len(self._regions) >= _REGIONS, key in self._replaced
+            oldest = next((k for k, kept in self._regions.items() if kept.takes(spec)), None)
+            if oldest is None or (back and not full):
+                if full:
+                    self._regions.pop(next(iter(self._regions)))
+                forget()
+                place = place_scene(spec, globe, known)
+            else:
+                place = self._regions.pop(oldest)
+                self._replaced.append(oldest)
+                self._filled += 1
+                if self._filled % _REMEMBERED == 0:
+                    forget()
+                    dr.flush_malloc_cache()
+                place.fill(spec, globe, known)
+        self._regions[key] = place
+        return place
+
+    def _textures_of(self, job: RenderJob) -> Textures:
+        key = (job.look.iris_seed, job.look.iris)
+        if key not in self._textures:
+            if len(self._textures) >= _TEXTURES:
+                self._textures.pop(next(iter(self._textures)))
+            self._textures[key] = Textures.of(job.look)
+        return self._textures[key]

@@ -1,0 +1,117 @@
+"""Camera rays and sample points of a window of the sensor, on Dr.Jit arrays.
+
+Places in the pixel form a rank-1 lattice, x = (k + 1/2) / N, y = frac((k a + 1/2) / N), with the a whose smallest
+distance is largest, tiled over the sensor. The edges of a frame are thus sampled by one regular lattice, which places a
+contour far better than the same number of independent samples (Sloan and Joe 1994, chapter 4). Its mean is the pixel's
+centre in every image: a random shift of the whole lattice would move the image, but not the computed glints, by up to 1
+/ (2 N) px.
+
+Places on the lamps: sample k is at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018). The
+shift is a hash of the pixel's place on the whole sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft
+shadows show noise and no bands. Nothing depends on threads, on the window, or on what was rendered before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..records.frame import Frame
+
+_PHI = 1.324717957244746
+_ALPHA = tuple(round(_PHI ** -(k + 1) * 2**32) for k in range(2))
+_UNDISTORT_STEPS = 8
+_CALLS = 3  # pairs of further numbers of a sample
+
+
+@lru_cache(maxsize=64)
+def lattice_generator(count: int) -> int:
+    """The a, prime to `count`, whose lattice {(k, k a mod N)} / N has the largest smallest distance on the torus."""
+    if count <= 2:
+        return 1
+    # For long lattices every a near the golden section is good, so the best of a few is found quickly.
+    golden = round(count * 0.6180339887498949)
+    choice = range(1, count) if count <= 1024 else range(max(1, golden - 64), min(count, golden + 64))
+    k = np.arange(1, count)
+    best, found = -1, 1
+    for a in choice:
+        if np.gcd(a, count) != 1:
+            continue
+        y = k * a % count
+        x, y = np.minimum(k, count - k), np.minimum(y, count - y)
+        distance = int(np.min(x * x + y * y))
+        if distance > best:
+            best, found = distance, a
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """The samples of all pixels of a frame: numbers and steps of two lattices, and keys of the further numbers.
+
+    A step is the lattice's generator over its number, in units of 2^-32, so that wrapping takes the place of a
+    remainder: processors divide whole numbers one by one.
+    """
+
+    lattices: tuple[tuple[mi.UInt32, mi.UInt32], tuple[mi.UInt32, mi.UInt32]]
+    keys: tuple[mi.UInt32, ...]
+
+    @classmethod
+    def of(cls, count: int, seed: int, *, times: int = 1) -> Pattern:
+        """Make the pattern of `count` samples, `times` as many in fine pixels, for a seed."""
+        few, many = (
+            (dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, -(-(lattice_generator(n) << 32) // n) & 0xFFFFFFFF))
+            for n in (count, count * times)
+        )
+        keys = (np.random.SeedSequence([seed, call]).generate_state(1)[0] for call in range(_CALLS))
+        return cls((few, many), tuple(dr.opaque(mi.UInt32, int(key)) for key in keys))
+
+
+class Samples:
+    """The `count` samples of the pixels of a frame, for lanes with a place on the sensor (`pixel`)."""
+
+    def __init__(self, pixel: mi.UInt32, pattern: Pattern, fine: mi.Bool | bool = False) -> None:
+        self.pixel, self._keys = pixel, pattern.keys
+        # Where `fine`, a pixel has more samples.
+        (few, one), (many, other) = pattern.lattices
+        self.count, self._step = dr.select(fine, many, few), dr.select(fine, other, one)
+
+    def in_pixel(self, k: mi.UInt32) -> mi.Point2f:
+        """Place of sample `k` in the pixel, [0, 1)^2."""
+        scale = dr.rcp(mi.Float(self.count))
+        return mi.Point2f((mi.Float(k) + 0.5) * scale, mi.Float((k * self._step) >> 8) * 2.0**-24 + 0.5 * scale)
+
+    def pair(self, k: mi.UInt32, call: int) -> mi.Point2f:
+        """Two further numbers of sample `k`, [0, 1)^2: each call of a pixel has its own shift."""
+        tea: Any = mi.sample_tea_32
+        return mi.Point2f(
+            *(
+                mi.Float((shift + k * mi.UInt32(alpha)) >> 8) * (2.0**-24)
+                for shift, alpha in zip(tea(self.pixel, self._keys[call]), _ALPHA, strict=True)
+            )
+        )
+
+
+def camera_ray(frame: Frame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+    """Ray of the scene's frame through pixel (u, v), centres at integers: origin, unit direction, cos to the axis."""
+    fx, fy = frame.camera.focal
+    cx, cy = frame.camera.principal
+    xd, yd = (u - cx) / fx, (v - cy) / fy
+    x, y = mi.Float(xd), mi.Float(yd)
+    if frame.structure.distorted:
+        k1, k2, p1, p2, k3 = frame.camera.distortion
+        for _ in range(_UNDISTORT_STEPS):
+            r2 = x * x + y * y
+            radial = dr.rcp(1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+            x, y = (
+                (xd - (2 * p1 * x * y + p2 * (r2 + 2 * x * x))) * radial,
+                (yd - (p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)) * radial,
+            )
+    d = frame.camera.right * x + frame.camera.down * y + frame.camera.forward
+    inv = dr.rsqrt(dr.squared_norm(d))
+    return frame.camera.centre, d * inv, inv

@@ -1,0 +1,119 @@
+"""What a frame gives: its traced picture, and the window of the sensor that is developed from it without the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import ArrayValue, Bools, Singles, frozen, sealed
+from ...errors import InputError
+from ...rig import defocus, exposure, psf, stray
+from ...rig.camera import Window
+from ..glints.splatting import Mirrored, Shine, add_shines
+from ..glints.tracing import GlintTable
+from ..records.job import RenderJob
+from ..scene.blur import Blur
+from .labels import PartLabels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedWindow(ArrayValue):
+    """A rendered window.
+
+    Attributes:
+        window: (x0, y0, width, height) in full-sensor pixels.
+        irradiance: (height, width) W/m^2 of the sensor.
+        dn: (height, width) digital numbers of the sensor.
+        bit_depth: bits of `dn`.
+        labels: raster labels, if they were requested.
+        glints: the first images.
+        purkinje: (order, table) of the further mirror images that were requested.
+        failed_paths: number of light paths that did not converge; they are missing from the irradiance.
+        glint_reasons: for each glint, whether it is visible or what hides it.
+        lid_margins_px: landmarks along the lids, where there are any.
+        highlights: (height, width) pixels with highlights of wet and oily surfaces, if they were requested.
+    """
+
+    window: Window
+    irradiance: Singles
+    dn: NDArray[np.uint16]
+    bit_depth: int
+    labels: PartLabels | None
+    glints: GlintTable
+    purkinje: tuple[tuple[int, GlintTable], ...]
+    failed_paths: int
+    glint_reasons: tuple[str, ...] = ()
+    lid_margins_px: dict[str, list[list[float]]] | None = None
+    highlights: Bools | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Traced(ArrayValue):
+    """A frame before the lens and the sensor.
+
+    Attributes:
+        job: the frame's job.
+        picture: mean radiance of the pixels with the border that the lens needs, or its parts.
+        glints: what the lamps' mirror images add.
+        blur: the lens.
+        mirrored: the glints' places and energies.
+        labels: raster labels, if they were requested.
+        failed: number of light paths that did not converge.
+        lid_margins_px: landmarks along the lids, where there are any.
+        highlights: (height, width) highlights of wet and oily surfaces, if they were requested.
+    """
+
+    job: RenderJob
+    picture: Singles
+    glints: tuple[Shine, ...]
+    blur: Blur
+    mirrored: Mirrored
+    labels: PartLabels | None
+    failed: int
+    lid_margins_px: dict[str, list[list[float]]] | None
+    highlights: Bools | None
+
+    def developed(self) -> RenderedWindow:
+        """The window through lens and sensor. It needs NumPy alone, so another thread may do it.
+
+        Raises:
+            InputError: numbers so extreme that the image is not finite.
+        """
+        job, labels, mirrored, highlights = self.job, self.labels, self.mirrored, self.highlights
+        irradiance = sealed(self._through_the_lens())
+        if not np.all(np.isfinite(irradiance)):
+            raise InputError("the numbers of the scene are too extreme: its image is not finite")
+        # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
+        dn = exposure.recorded(job.sensor, job.camera, job.window, irradiance, job.wavelength_nm, job.seed)
+        covered = stray.covered(job.lens, job.sensor, job.camera, job.window)
+        if covered is not None:
+            labels = labels.behind(covered) if labels is not None else None
+            mirrored = mirrored.behind(covered, job.window)
+            highlights = None if highlights is None else frozen(highlights & ~covered, np.bool_)
+        return RenderedWindow(
+            job.window,
+            irradiance,
+            sealed(dn),
+            job.sensor.bit_depth,
+            labels,
+            mirrored.glints,
+            mirrored.others,
+            self.failed,
+            mirrored.reasons,
+            self.lid_margins_px,
+            highlights,
+        )
+
+    def _through_the_lens(self) -> Singles:
+        """Irradiance (height, width) of the window, W/m^2."""
+        job = self.job
+        seen = (job.lens, job.camera, job.window)
+        # Single precision is finer than the samples' noise, and takes half the time.
+        picture = psf.blur(self.blur.of_pictures(self.picture).astype(np.float32), job.sensor.psf_sigma_px)
+        add_shines(self.glints, picture, job)
+        if job.lens.vignetting > 0:
+            picture *= defocus.vignette(*seen)
+        picture = stray.scattered(stray.framed(picture, *seen), *seen)
+        return np.asarray(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)))

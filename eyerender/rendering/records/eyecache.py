@@ -1,0 +1,27 @@
+"""What depends on an eye and a few plain values alone, and is kept while frames show the same eye in other poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from ...eye.model import EyeModel
+
+_T = TypeVar("_T")
+_EYES = 4  # kept: two of a person, and those of the next
+
+
+class KeptForEye(Generic[_T]):
+    """Results of a few eyes. Eyes are compared by identity, for comparing their numbers takes longer than is gained."""
+
+    def __init__(self) -> None:
+        self._known: list[tuple[EyeModel, Any, _T]] = []
+
+    def get(self, eye: EyeModel, values: Any, make: Callable[[], _T]) -> _T:
+        """The result for an eye and other values, which `make` computes if they are new."""
+        for known, others, result in self._known:
+            if known is eye and others == values:
+                return result
+        result = make()
+        self._known = [*self._known[1 - _EYES :], (eye, values, result)]
+        return result

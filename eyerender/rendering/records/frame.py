@@ -1,0 +1,297 @@
+"""A frame on the device; its parameters are opaque Dr.Jit arrays of size one.
+
+A literal that changes between frames would be compiled into the kernel, so everything that can change is stored here.
+What determines the kernel (the kinds of surfaces, whether the lens distorts) is the `Structure`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import Floats, Reals, Singles
+from .job import LampTable
+from .parameters import (
+    CameraParameters,
+    ImageParameters,
+    IrisParameters,
+    Kind,
+    LimbusParameters,
+    Parameters,
+    PoseParameters,
+    ScleraParameters,
+    StopParameters,
+    packed,
+    rebuilt,
+)
+from .recording import recorded
+from .surfaces import Surface
+
+_ALIGNMENT = 64  # bytes; the widest vector of a processor
+SMALL = 0.02  # radius over distance of lamps whose shadows of hairs are finer than a pixel
+ALL, BITS = 0xFFFFFFFF, 32  # marks of lamps
+_LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
+
+
+def aligned(values: NDArray[Any]) -> NDArray[Any]:
+    """Copy an array so that it starts at a multiple of 64 bytes.
+
+    Dr.Jit shares NumPy's memory. It gathers several numbers at once only from aligned memory, so without this the place
+    of an allocation would decide which kernel is compiled for a frame.
+    """
+    memory = np.empty(values.nbytes + _ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    copy = memory[start : start + values.nbytes].view(values.dtype).reshape(values.shape)
+    copy[...] = values
+    return copy
+
+
+def sent(numbers: Reals) -> mi.Float:
+    """Send numbers to the device, row by row."""
+    return mi.Float(aligned(np.asarray(numbers, dtype=np.float32).ravel()))
+
+
+def one_by_one(numbers: NDArray[np.float32]) -> list[mi.Float]:
+    """Send numbers to the device as arrays of size one, in one transfer and one kernel."""
+    return _apart(mi.Float(aligned(numbers)), dr.opaque(mi.UInt32, 0), numbers.size)
+
+
+@recorded
+def _apart(buffer: mi.Float, first: mi.UInt32, count: int) -> list[mi.Float]:
+    # Places that are known when a kernel is compiled would be copied one by one.
+    numbers = [dr.gather(mi.Float, buffer, first + k) for k in range(count)]
+    dr.eval(numbers)
+    return numbers
+
+
+def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
+    """Whole part of a / b for numbers below a million: processors divide whole numbers one by one."""
+    return mi.UInt32((mi.Float(a) + 0.5) / mi.Float(b))
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """What a kernel is compiled for.
+
+    It holds (kind, tilted) of each surface, whether the camera's lens distorts, whether anything can stand in the
+    way of light (the surround's plane cannot: it hides no lamp before it), whether the scene is an eye region instead
+    of a surround, whether there is other light than that of the lamps, and whether light spreads inside the tissues.
+    """
+
+    surfaces: tuple[tuple[Kind, bool], ...]
+    distorted: bool = False
+    obstacles: bool = True
+    region: bool = False
+    ambient: bool = False
+    scattering: bool = False
+
+
+@dataclass(kw_only=True)
+class Frame:
+    """A frame on the device: its parameters (see `parameters.Parameters`), and all that kernels read.
+
+    Attributes:
+        structure: what kernels are compiled for.
+        boundary: the shape of the pupil's boundary.
+        lights: the lamps, with the grids of their light.
+        textures: the maps of the eye, the surroundings, and the light of other surfaces (`view.Textures`).
+        scene: what may stand in the way.
+    """
+
+    structure: Structure
+    boundary: PupilBoundary
+    surfaces: tuple[Surface, ...]
+    inner_index: mi.Float
+    stop: StopParameters
+    iris: IrisParameters
+    limbus: LimbusParameters
+    sclera: ScleraParameters
+    image: ImageParameters
+    pose: PoseParameters
+    camera: CameraParameters
+    pupil_albedo: mi.Float
+    globe_reach: mi.Float
+    backdrop_x: mi.Float
+    ambient_irradiance: mi.Float
+    lights: Lights
+    textures: Any
+    scene: mi.Scene
+
+    @classmethod
+    def upload(
+        cls,
+        structure: Structure,
+        parameters: Parameters,
+        waves: Floats,
+        tables: Sequence[Singles | None],
+        *,
+        lights: Lights | None = None,
+        textures: Any = None,
+        scene: mi.Scene | None = None,
+    ) -> Frame:
+        """Send the numbers to the device.
+
+        Args:
+            structure: what kernels are compiled for.
+            parameters: the numbers.
+            waves: the pupil's boundary.
+            tables: the cells of measured surfaces.
+            lights: the lamps.
+            textures: as the attribute.
+            scene: as the attribute.
+        """
+        left = iter(one_by_one(packed(parameters)))
+
+        def leaf(size: int) -> mi.Float | mi.Vector3f | tuple[mi.Float, ...]:
+            part = [next(left) for _ in range(size)]
+            return part[0] if size == 1 else mi.Vector3f(*part) if size == 3 else tuple(part)
+
+        sent_parameters = rebuilt(parameters, leaf)
+        others = {f.name: getattr(sent_parameters, f.name) for f in fields(Parameters)}
+        surfaces = tuple(
+            Surface(s.origin, s.axes, s.shape, s.eta, kind, None if table is None else mi.Float(aligned(table)), s.film)
+            for s, (kind, _), table in zip(others.pop("surfaces"), structure.surfaces, tables, strict=True)
+        )
+        boundary = PupilBoundary.upload(waves)
+        seen: dict[str, Any] = {"lights": lights, "textures": textures, "scene": scene}
+        return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, **seen)
+
+    def bare(self) -> Frame:
+        """The frame without lamps and textures, for recordings that should last when these change."""
+        without: dict[str, Any] = {"lights": None, "textures": None}
+        return replace(self, **without)
+
+    def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
+        """Transform a point from the scene's frame to the eye frame: M^T (x - t)."""
+        return self.vector_to_eye(x - self.pose.shift)
+
+    def vector_to_eye(self, v: mi.Vector3f) -> mi.Vector3f:
+        """Transform a direction from the scene's frame to the eye frame: M^T v."""
+        return mi.Vector3f(*(dr.dot(column, v) for column in self.pose.columns))
+
+    def vector_to_scene(self, v: mi.Vector3f) -> mi.Vector3f:
+        """Transform a direction from the eye frame to the scene's frame: M v."""
+        a, b, c = self.pose.columns
+        return a * v.x + b * v.y + c * v.z
+
+    def point_to_scene(self, x: mi.Vector3f) -> mi.Vector3f:
+        """Transform a point from the eye frame to the scene's frame: M x + t."""
+        return self.vector_to_scene(x) + self.pose.shift
+
+
+HARMONICS = 32  # largest number for the pupil's boundary
+
+
+@dataclass(kw_only=True)
+class PupilBoundary:
+    """The pupil's boundary: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), f the angle in the stop's plane.
+
+    Attributes:
+        count: number of the z_k; an ellipse has none and costs nothing.
+        waves: the real and imaginary parts of the z_k, k from 1.
+    """
+
+    count: mi.UInt32
+    waves: mi.Float
+
+    @classmethod
+    def upload(cls, waves: Floats) -> PupilBoundary:
+        """Send z_k = c_k - i s_k, (n, 2), to the device."""
+        table = np.zeros((HARMONICS, 2), np.float32)
+        table[: len(waves)] = waves
+        return cls(count=dr.opaque(mi.UInt32, len(waves)), waves=mi.Float(aligned(table.ravel())))
+
+    def radius(self, x: mi.Float, y: mi.Float) -> mi.Float:
+        """Radius r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
+        inv = dr.rsqrt(dr.maximum(x * x + y * y, 1e-12))
+        c, s = x * inv, y * inv
+
+        def more(k: mi.UInt32, *_: object) -> mi.Bool:
+            return k > 0
+
+        def body(k: mi.UInt32, re: mi.Float, im: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+            k = k - 1
+            re = re + dr.gather(mi.Float, self.waves, 2 * k)
+            im = im + dr.gather(mi.Float, self.waves, 2 * k + 1)
+            return k, re * c - im * s, re * s + im * c
+
+        state = (mi.UInt32(self.count), mi.Float(0), mi.Float(0))
+        return 1 + dr.while_loop(state, more, body, labels=("k", "re", "im"), label="margin")[1]
+
+
+@dataclass(kw_only=True)
+class Lights:
+    """The lamps in the eye frame, in one buffer, so kernels do not depend on their number.
+
+    Attributes:
+        count: number of lamps.
+        suns: 1 if the last lamp is a sun with sharp shadows, else 0.
+        rows: the numbers of the lamps, as in `LampTable`.
+        on_iris: their light in the plane of the iris, where a grid of it is used (`irislight.IrisLight`).
+        on_matte: their light on matte surfaces, where grids of it are used (`mattelight.MatteLight`).
+        relief: the relief of the iris in their light (`irisrelief.IrisRelief`).
+    """
+
+    count: mi.UInt32
+    suns: mi.UInt32
+    rows: mi.Float
+    on_iris: Any = None
+    on_matte: Any = None
+    relief: Any = None
+
+    @classmethod
+    def upload(cls, table: LampTable) -> Lights:
+        """Send lamps to the device."""
+        rows = np.zeros((max(len(table), 1), _LIGHT_ROW), np.float32)
+        rows[: len(table), : table.rows.shape[1]] = table.rows
+        sharp = table.suns and table.widths[-1] < SMALL
+        count, suns = (dr.opaque(mi.UInt32, n) for n in (len(table), table.suns if sharp else 0))
+        return cls(count=count, suns=suns, rows=sent(rows))
+
+    def __getitem__(self, i: mi.UInt32) -> Lamp:
+        # Four numbers are gathered at once.
+        a, b, c = (dr.gather(mi.Vector4f, self.rows, i * (_LIGHT_ROW // 4) + k) for k in range(3))
+        return Lamp(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(a.w, b.x, b.y), b.z, b.w, c.x, c.y, i)
+
+
+@dataclass(frozen=True, slots=True)
+class Lamp:
+    """One LED on the device: I(w) = intensity * max(0, cos)^exponent, from an annulus of points across its axis."""
+
+    position: mi.Vector3f
+    axis: mi.Vector3f
+    radius: mi.Float
+    intensity: mi.Float
+    exponent: mi.Float
+    inner_radius: mi.Float
+    number: mi.UInt32
+
+    def point(self, u: mi.Float, sine: mi.Float, cosine: mi.Float) -> mi.Vector3f:
+        """Point of the emitting disc or ring, uniform by area: u in [0, 1) and a direction in its plane."""
+        e1, e2 = mi.coordinate_system(self.axis)
+        inner = self.inner_radius * self.inner_radius
+        r = dr.sqrt(inner + u * (self.radius * self.radius - inner))
+        return self.position + (r * cosine) * e1 + (r * sine) * e2
+
+    def node(self, k: mi.UInt32, count: mi.UInt32) -> mi.Vector3f:
+        """Point k of the `count` that stand for the lamp at the nodes of a grid: its middle, or four about it."""
+        turn = (mi.Float(k) + 0.5) * (0.5 * dr.pi)
+        return self.point(dr.select(count > 1, 0.5, 0), *dr.sincos(turn))
+
+    def radiant_intensity(self, direction: mi.Vector3f) -> mi.Float:
+        """Radiant intensity (mW/sr) into a unit direction that leaves the lamp."""
+        c = dr.dot(direction, self.axis)
+        # A Lambertian lamp, the usual one, needs no power function.
+        lobe = dr.if_stmt(
+            (c, self.exponent),
+            self.exponent != 1,
+            lambda c, m: dr.select(m == 0, 1, dr.select(c > 0, dr.power(dr.maximum(c, 1e-6), m), 0)),
+            lambda c, m: dr.maximum(c, 0),
+        )
+        return self.intensity * lobe

@@ -1,0 +1,165 @@
+"""Irradiance on a square grid that is filled once per frame, interpolated by cubics where these are good enough.
+
+Light of lamps changes slowly from place to place, except at the edges of shadows and where a lamp sets. So a few
+thousand exact values give it everywhere else. A cell holds the sum over those lamps for which third differences between
+the sixteen nodes about it say that cubic interpolation is good to a thousandth, and whose light is known at all
+sixteen. It marks the other lamps: there, every sample follows light paths of its own to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .frame import ALL, BITS
+
+BENT = 0.004  # largest third difference about a cell over its irradiance
+
+
+@dataclass(kw_only=True)
+class IrradianceGrid:
+    """Irradiance (mW/mm^2) in the cells between `side` by `side` nodes.
+
+    Attributes:
+        side: number of nodes along a side.
+        cells: irradiance at the sixteen nodes about each cell, row by row, summed over the lamps that the cell holds.
+        left: bit l of a cell stands for lamp l, which the cell lacks. Of more than 32 lamps it lacks all or none.
+    """
+
+    side: int
+    cells: mi.Float
+    left: mi.UInt32
+
+    @classmethod
+    def unknown(cls, side: int) -> IrradianceGrid:
+        """Make a grid whose cells lack all lamps."""
+        grid = cls(side=side, cells=dr.zeros(mi.Float, 16 * side**2), left=dr.full(mi.UInt32, ALL, side**2))
+        dr.make_opaque(grid.cells, grid.left)
+        return grid
+
+    @classmethod
+    def build(
+        cls,
+        side: int,
+        nodes: mi.Float,
+        lamps: mi.UInt32,
+        *,
+        more: mi.Float | None = None,
+        held: Callable[[mi.UInt32, mi.UInt32, mi.Float], mi.Bool] | None = None,
+    ) -> tuple[IrradianceGrid, mi.UInt32]:
+        """Build a grid from the irradiance of its nodes.
+
+        Args:
+            side: number of nodes along a side.
+            nodes: irradiance of the nodes, lamp by lamp and row by row, negative where it is not known; evaluated.
+            lamps: number of lamps, on the device.
+            more: further light at the nodes, which changes slowly, so it does not decide what a cell holds; evaluated.
+            held: called with a lamp, the cell, and the third difference that is allowed there, where cubic
+                interpolation is not good enough; tells whether the caller holds this lamp's light in another way.
+
+        Returns:
+            The grid, and the lamps of each cell that the caller holds, as bits.
+        """
+        cell = dr.arange(mi.UInt32, side * side)
+        row = cell // side
+        column = cell - row * side
+        within = (column > 0) & (row > 0) & (column < side - 2) & (row < side - 2)
+        around = nodes_about(cell, side)
+        many = lamps > BITS
+
+        def add_lamp(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            return k + 1, total + dr.maximum(dr.gather(mi.Float, nodes, k * side**2 + cell), 0)
+
+        state = (mi.UInt32(0), mi.Float(0) * mi.Float(cell))
+        _, total = dr.while_loop(state, lambda k, _: k < lamps, add_lamp, labels=("k", "total"), label="all lamps")
+        usual = total / mi.Float(lamps)
+
+        def examine(
+            k: mi.UInt32, left: mi.UInt32, elsewhere: mi.UInt32, *sums: mi.Float
+        ) -> tuple[mi.UInt32 | mi.Float, ...]:
+            values = [dr.gather(mi.Float, nodes, k * side**2 + node) for node in around]
+            bent, least, most = unevenness(values)
+            allowed = BENT * dr.maximum(most, usual)
+            good = (least >= 0) & (bent <= allowed)
+            kept, bit = mi.Bool(False), mi.UInt32(1) << k
+            if held is not None:
+                kept = dr.if_stmt(
+                    (k, cell, allowed), within & ~good & ~many, held, lambda *_: mi.Bool(False)
+                )  # fmt: skip
+            left |= dr.select(good | kept, 0, dr.select(many, ALL, bit))
+            elsewhere |= dr.select(kept, bit, 0)
+            return k + 1, left, elsewhere, *(s + dr.select(good, v, 0) for s, v in zip(sums, values, strict=True))
+
+        # An array of its own for each: Dr.Jit writes the results of the loop into them.
+        none, dark = mi.UInt32(0) * cell, mi.Float(0) * mi.Float(cell)
+        state = (mi.UInt32(0), mi.UInt32(none), mi.UInt32(none), *(mi.Float(dark) for _ in around))
+        labels = ("k", "left", "elsewhere", *(f"sum{n}" for n in range(16)))
+        _, left, elsewhere, *sums = dr.while_loop(state, lambda k, *_: k < lamps, examine, labels=labels, label="cells")
+        left = dr.select(within, left, ALL)
+        if more is not None:
+            sums = [s + dr.gather(mi.Float, more, node) for s, node in zip(sums, around, strict=True)]
+        sums = [dr.select(within & ~(many & (left != 0)), s, 0) for s in sums]
+        dr.eval(sums, left, elsewhere)
+        cells = dr.zeros(mi.Float, 16 * side**2)
+        for k in range(4):
+            dr.scatter(cells, mi.Vector4f(*sums[4 * k : 4 * k + 4]), 4 * cell + k)
+        dr.eval(cells)
+        return cls(side=side, cells=cells, left=left), elsewhere
+
+    def place(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> Place:
+        """Find the cells of places in units of the distance between nodes."""
+        inside = active & (u >= 0) & (v >= 0) & (u < self.side - 1) & (v < self.side - 1)
+        i, j = mi.UInt32(u), mi.UInt32(v)
+        across, down = (cubic_weights(p - mi.Float(n)) for p, n in ((u, i), (v, j)))
+        return Place(cell=j * self.side + i, across=mi.Vector4f(*across), down=mi.Vector4f(*down), inside=inside)
+
+    def at(self, place: Place) -> tuple[mi.Float, mi.UInt32]:
+        """Irradiance (mW/mm^2) at places, and the lamps that it lacks: all of them outside the grid."""
+        total = mi.Float(0)
+        for k in range(4):
+            row = dr.gather(mi.Vector4f, self.cells, 4 * place.cell + k, place.inside)
+            total += place.down[k] * dr.dot(place.across, row)
+        left = dr.gather(mi.UInt32, self.left, place.cell, place.inside)
+        return dr.select(place.inside, dr.maximum(total, 0), 0), dr.select(place.inside, left, ALL)
+
+
+@dataclass(kw_only=True)
+class Place:
+    """Places in a grid: the cell, the weights of its four columns and rows of nodes, and whether the grid is there."""
+
+    cell: mi.UInt32
+    across: mi.Vector4f
+    down: mi.Vector4f
+    inside: mi.Bool
+
+
+def grid_nodes(side: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """Column and row of all nodes of a grid, in row order."""
+    index = dr.arange(mi.UInt32, side * side)
+    row = index // side
+    return index - row * side, row
+
+
+def nodes_about(cell: mi.UInt32, side: int) -> list[mi.UInt32]:
+    """The sixteen nodes about cells of a grid, row by row."""
+    nodes = (mi.Int32(cell) + dv * side + du for dv in range(-1, 3) for du in range(-1, 3))
+    return [mi.UInt32(dr.clip(node, 0, side**2 - 1)) for node in nodes]
+
+
+def unevenness(values: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Largest third difference, least and greatest of the values at the `nodes_about` cells."""
+    bent, least, most = mi.Float(0), values[0], values[0]
+    for e in [values[n : n + 4] for n in range(0, 16, 4)] + [values[n::4] for n in range(4)]:
+        bent = dr.maximum(bent, dr.abs(e[0] - 3 * e[1] + 3 * e[2] - e[3]))
+    for value in values[1:]:
+        least, most = dr.minimum(least, value), dr.maximum(most, value)
+    return bent, least, most
+
+
+def cubic_weights(s: mi.Float) -> tuple[mi.Float, ...]:
+    """Weights of four neighbours at the place s, 0 to 1 between the second and the third (Keys 1981, a = -1/2)."""
+    r = 1 - s
+    return -0.5 * s * r * r, 1 + s * s * (1.5 * s - 2.5), 1 + r * r * (1.5 * r - 2.5), -0.5 * r * s * s

@@ -1,0 +1,393 @@
+"""The parameters of a frame, from eye, pose, camera, lamps and look: on the host, in float64, without Mitsuba."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import ArrayValue, Floats, frozen, remembered
+from ...errors import InputError
+from ...eye.entrance import entrance_pupil
+from ...eye.fundus import FundusLight, Spread, fundus_light
+from ...eye.model import EyeModel
+from ...geometry.surfaces import Surface
+from ...geometry.surfaces_biconic import Biconic
+from ...geometry.surfaces_measured import Measured
+from ...geometry.surfaces_quadric import Quadric
+from ...optics.media import TEARS
+from ...region.anatomy import Region
+from ...region.globe import Globe
+from ...region.look import Look
+from ...rig.camera import PinholeCamera, Window
+from ...rig.imaging import Ambient, Lens
+from ...rig.light import Lamp
+from ...rig.sensor import Sensor
+from .lattice import lattice
+from .parameters import (
+    CameraParameters,
+    ImageParameters,
+    IrisParameters,
+    Kind,
+    LimbusParameters,
+    Parameters,
+    PoseParameters,
+    ScleraParameters,
+    StopParameters,
+    SurfaceParameters,
+)
+
+_SENSOR, _LOOK, _LENS, _AMBIENT = Sensor(), Look(), Lens(), Ambient()
+_SUN_MM = 1e6
+_POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
+_PANEL_PARTS = 4  # along each side
+_GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderJob(ArrayValue):
+    """One window of one exposure to render.
+
+    Attributes:
+        eye: the eye.
+        M: (3, 3) rotation of its rigid motion x_world = M x + t.
+        t: (3,) translation of that motion, mm.
+        camera: the camera.
+        window: (x0, y0, width, height) in full-sensor pixels.
+        sensor: the sensor.
+        look: albedos and textures.
+        wavelength_nm: wavelength in vacuum.
+        seed: seed of samples and noise.
+        labels: whether to compute raster labels.
+        highlights: whether to find the highlights of wet and oily surfaces.
+        purkinje: mirror images of the lamps to show, from 1 (the glint) to 4.
+        apex_mm: (3,) apex of the unrotated eye in the world, to which the surround is fixed. By default it follows from
+            a turn about a point 13.5 mm behind the apex.
+        region: the eye region; None for the bare eye.
+        lens: focus and vignetting.
+        ambient: light other than that of the lamps.
+        focus_dpt: vergence at which the eye is focused, 1 / distance in metres.
+        mesh_edge_mm: length of the edges of meshes that take the place of the cornea's surfaces; None: closed forms.
+        interreflection: whether surfaces send light to each other.
+    """
+
+    eye: EyeModel
+    M: Floats
+    t: Floats
+    camera: PinholeCamera
+    window: Window
+    lights: tuple[Lamp, ...]
+    sensor: Sensor = _SENSOR
+    look: Look = _LOOK
+    wavelength_nm: float = 850.0
+    seed: int = 0
+    labels: bool = True
+    purkinje: tuple[int, ...] = (1,)
+    apex_mm: Floats | None = None
+    region: Region | None = None
+    lens: Lens = _LENS
+    ambient: Ambient = _AMBIENT
+    focus_dpt: float = 0.0
+    mesh_edge_mm: float | None = None
+    interreflection: bool = True
+    highlights: bool = False
+
+    @property
+    def anchor_mm(self) -> Floats:
+        """Origin of the scene's frame in the world: the apex of the unrotated eye, (3,) mm."""
+        if self.apex_mm is not None:
+            return np.asarray(self.apex_mm, dtype=float)
+        return np.asarray(self.M @ _GLOBE_CENTRE_MM + self.t - _GLOBE_CENTRE_MM)
+
+    @property
+    def globe(self) -> Globe:
+        """Posed globe in the scene's frame."""
+        return globe_of(self.eye, self.M, self.t - self.anchor_mm)
+
+    @property
+    def film_index(self) -> float:
+        """Index of what lies on the front cornea."""
+        return film_index(self.eye, self.look)
+
+
+def film_index(eye: EyeModel, look: Look) -> float:
+    """Index of what lies on the front cornea: tears, or the cornea itself where there is no film."""
+    return TEARS.index(eye.wavelength_nm) if look.tear_film else float(eye.front_indices[0])
+
+
+def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
+    """Posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
+    sclera = eye.sclera
+    return Globe(
+        eye.front[0],
+        float(eye.limbus_radius_mm),
+        np.asarray(sclera.centre_mm),
+        float(sclera.radius_mm),
+        M,
+        t,
+        eye.side == "left",
+    )
+
+
+def kinds(eye: EyeModel) -> tuple[tuple[Kind, bool], ...]:
+    """Kind of each refracting surface in front of the iris, and whether it is tilted."""
+    return tuple((_kind(s), not np.array_equal(s.rotation, np.eye(3))) for s in eye.front)
+
+
+def _kind(surface: Surface) -> Kind:
+    return "biconic" if isinstance(surface, Biconic) else "measured" if isinstance(surface, Measured) else "quadric"
+
+
+def tables(eye: EyeModel) -> tuple[NDArray[np.float32] | None, ...]:
+    """Spline coefficients of the measured surfaces in front of the iris; None for the others."""
+    return tuple(lattice(s, float(eye.limbus_radius_mm)).table if isinstance(s, Measured) else None for s in eye.front)
+
+
+def parameters_of(job: RenderJob) -> Parameters:
+    """Compute the parameters of a frame on the host."""
+    eye, look, anchor, camera = job.eye, job.look, job.anchor_mm, job.camera
+    still = _still(eye)
+    surfaces = (replace(still.surfaces[0], film=1 / job.film_index), *still.surfaces[1:])
+    stop, sclera = eye.stop, eye.sclera
+    return Parameters(
+        surfaces=surfaces,
+        inner_index=float(eye.front_indices[-1]),
+        stop=StopParameters(
+            centre=stop.centre_mm,
+            normal=stop.rotation[:, 0],
+            u=stop.rotation[:, 1],
+            v=stop.rotation[:, 2],
+            axes=tuple(stop.semi_axes_mm),
+        ),
+        iris=IrisParameters(
+            eye.iris_root_radius_mm,
+            look.iris_albedo,
+            look.iris_contrast,
+            look.limbal_ring,
+            look.iris.relief,
+            look.iris.convexity_mm,
+        ),
+        limbus=LimbusParameters(
+            radius=eye.limbus_radius_mm,
+            floor=still.floor,
+            gain=1 / max(look.limbus_width_mm, 1e-6),
+            albedo=look.limbus_albedo,
+            bulge=still.bulge,
+            bulge_radius=still.bulge_radius,
+        ),
+        sclera=ScleraParameters(sclera.centre_mm, sclera.radius_mm, look.sclera_albedo, look.sclera_contrast),
+        image=still.image,
+        pose=PoseParameters((job.M[:, 0], job.M[:, 1], job.M[:, 2]), job.t - anchor),
+        camera=CameraParameters(
+            centre=camera.nodal_point_mm - anchor,
+            right=camera.R[0],
+            down=camera.R[1],
+            forward=camera.R[2],
+            focal=(camera.K[0, 0], camera.K[1, 1]),
+            principal=(camera.K[0, 2], camera.K[1, 2]),
+            distortion=tuple(camera.distortion),
+        ),
+        pupil_albedo=look.pupil_albedo,
+        globe_reach=still.globe_reach,
+        backdrop_x=-look.backdrop_distance_mm,
+        ambient_irradiance=job.ambient.irradiance_w_m2 * 1e-3,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Still:
+    """Parameters that depend on the eye alone; the surfaces have no film."""
+
+    surfaces: tuple[SurfaceParameters, ...]
+    image: ImageParameters
+    floor: float
+    bulge: Floats
+    bulge_radius: float
+    globe_reach: float
+
+
+@remembered
+def _still(eye: EyeModel) -> _Still:
+    indices = np.asarray(eye.front_indices, dtype=float)
+    surfaces = tuple(
+        _surface_parameters(surface, before / index, float(eye.limbus_radius_mm))
+        for surface, index, before in zip(eye.front, indices, [1.0, *indices[:-1]], strict=True)
+    )
+    front, sclera = eye.front[0], eye.sclera
+    entrance_mm, magnification = entrance_pupil(eye)
+    angle = np.linspace(0, 2 * np.pi, 64)
+    edge = front.sag(eye.limbus_radius_mm * np.cos(angle), eye.limbus_radius_mm * np.sin(angle))
+    ring = eye.limbus_radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rim = front.origin_mm + np.column_stack([edge, ring]) @ np.asarray(front.rotation).T
+    bulge = 0.5 * (rim.mean(axis=0) + apex_of(front))
+    cornea_reach = float(np.linalg.norm(apex_of(front) - sclera.centre_mm))
+    return _Still(
+        surfaces=surfaces,
+        image=ImageParameters(magnification, float(entrance_mm[0] - eye.stop.centre_mm[0])),
+        floor=float(np.min(edge)) - 2.0,
+        bulge=bulge,
+        bulge_radius=float(np.max(np.linalg.norm(rim - bulge, axis=1))) + 0.05,
+        globe_reach=max(float(sclera.radius_mm), cornea_reach) + 0.5,
+    )
+
+
+def _surface_parameters(surface: Surface, eta: float, limbus_mm: float) -> SurfaceParameters:
+    rotation = np.asarray(surface.rotation)
+    axes = None if np.array_equal(rotation, np.eye(3)) else (rotation[:, 0], rotation[:, 1], rotation[:, 2])
+    return SurfaceParameters(surface.origin_mm, tuple(_shape(surface, limbus_mm)), eta, axes)
+
+
+def boundary_waves(eye: EyeModel) -> Floats:
+    """Fourier coefficients (k, 2) of the pupil's relative radius over the angle in the stop's plane, as c_k and -s_k.
+
+    The stop's own angle runs in the other direction for a left eye: f' = pi - f, cos(k f') = (-1)^k cos(k f),
+    sin(k f') = -(-1)^k sin(k f).
+    """
+    cosines, sines = np.asarray(eye.stop.contour, dtype=float)
+    if float(eye.stop.handed) < 0:
+        turned = (-1.0) ** np.arange(1, len(cosines) + 1)
+        cosines, sines = turned * cosines, -turned * sines
+    return np.stack([cosines, -sines], axis=1)
+
+
+def panel_table(ambient: Ambient, anchor: Floats) -> Floats:
+    """Panels in the scene's frame, (n, 13): centre, normal to the origin, right, up (over half sizes), radiance.
+
+    A panel faces the origin; its width is level.
+    """
+    rows = []
+    for panel in ambient.panels:
+        centre = np.asarray(panel.centre_mm, dtype=float) - anchor
+        normal = -centre / np.linalg.norm(centre)
+        right = np.cross([0.0, 0.0, 1.0], normal)
+        size = np.linalg.norm(right)
+        right = right / size if size > 1e-9 else np.array([0.0, 1.0, 0.0])
+        up = np.cross(normal, right)
+        w, h = panel.size_mm
+        rows.append([*centre, *normal, *(2 / w * right), *(2 / h * up), panel.radiance_w_m2_sr * 1e-3])
+    return np.reshape(rows, (-1, 13))
+
+
+def panel_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
+    """Parts of panels as lamps, which light the iris through the cornea: each part is Lambertian, at its centre."""
+    out = []
+    for panel, row in zip(ambient.panels, panel_table(ambient, anchor), strict=True):
+        centre, normal = row[0:3] + anchor, row[3:6]
+        right, up = (v / (v @ v) for v in (row[6:9], row[9:12]))
+        share = (2 * np.arange(_PANEL_PARTS) + 1) / _PANEL_PARTS - 1
+        intensity = panel.radiance_w_m2_sr * 1e-3 * np.prod(panel.size_mm) / _PANEL_PARTS**2
+        out += [
+            Lamp(
+                position_mm=frozen(centre + a * right + b * up),
+                axis=frozen(normal),
+                radius_mm=0.0,
+                intensity_mw_sr=float(intensity),
+                lobe_exponent=1.0,
+            )
+            for a in share
+            for b in share
+        ]
+    return tuple(out)
+
+
+def sun_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
+    """Return the sun, if there is one, as a lamp: a disc of even radiance a kilometre from the eye."""
+    if ambient.sun is None or ambient.sun.irradiance_w_m2 == 0:
+        return ()
+    sun = ambient.sun
+    az, el, half = np.radians([sun.azimuth_deg, sun.elevation_deg, sun.diameter_deg / 2])
+    way = np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
+    return (
+        Lamp(
+            position_mm=frozen(anchor + _SUN_MM * way),
+            axis=frozen(-way),
+            radius_mm=float(_SUN_MM * np.tan(half)),
+            intensity_mw_sr=float(sun.irradiance_w_m2 * 1e-3 * (_SUN_MM / np.cos(half)) ** 2),
+            lobe_exponent=1.0,
+        ),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LampTable(ArrayValue):
+    """Lamps in the eye frame, on the host.
+
+    Attributes:
+        rows: (n, 10) position, axis, radius, intensity, lobe exponent, inner radius.
+        suns: 1 if the last lamp is the sun, else 0.
+    """
+
+    rows: Floats
+    suns: int = 0
+
+    @classmethod
+    def of(cls, lights: Sequence[Lamp], M: Floats, t: Floats, suns: int = 0) -> LampTable:
+        """Make the table of lamps of the world for an eye at x_world = M x + t."""
+        rows = [
+            [*(M.T @ (lamp.position_mm - t)), *(M.T @ lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
+             lamp.lobe_exponent, ring_radius_mm(lamp)]
+            for lamp in lights
+        ]  # fmt: skip
+        return cls(np.reshape(rows, (-1, 10)), suns)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def widths(self) -> Floats:
+        """Radii of the lamps over their distances from the apex of the eye, (n,)."""
+        return np.asarray(self.rows[:, 6] / np.maximum(np.linalg.norm(self.rows[:, :3], axis=1), 1e-3))
+
+    @property
+    def widest(self) -> float:
+        """Largest of these."""
+        return float(np.max(self.widths, initial=0.0))
+
+    @property
+    def points(self) -> int:
+        """Number of points that stand for each lamp at the nodes of a grid: its middle, or four about it."""
+        return 1 if self.widest < _POINT_LIKE and not np.any(self.rows[:, 9] > 0) else 4
+
+    @property
+    def gridded(self) -> bool:
+        """Whether the lamps are so small that their light may be interpolated on grids."""
+        return self.widest < _LARGE
+
+
+def returned_light(job: RenderJob) -> FundusLight:
+    """Return factors of the fundus for the lamps of a job."""
+    fundus = job.look.fundus
+    spread = Spread(
+        reflectance=fundus.reflectance,
+        halo_share=fundus.halo_share,
+        halo_rad=float(np.radians(fundus.halo_deg)),
+        blur_rad=float(np.radians(fundus.blur_deg)),
+        disc_gain=fundus.disc_gain,
+    )
+    lamps = LampTable.of(job.lights, job.M, job.t).rows[:, :3]
+    return fundus_light(job.eye, lamps, job.M.T @ (job.camera.nodal_point_mm - job.t), job.focus_dpt, spread)
+
+
+def ring_radius_mm(lamp: Lamp) -> float:
+    """Radius of the dark middle of a ring-shaped lamp; 0 for points and discs."""
+    return lamp.inner_radius_mm
+
+
+def _shape(surface: Surface, limbus_mm: float) -> Floats:
+    if isinstance(surface, Measured):
+        return np.array(lattice(surface, limbus_mm).shape)
+    if isinstance(surface, Biconic):
+        return np.array([*surface.radii_mm, *(1 + np.asarray(surface.conic_constants)), 0.0])
+    if not isinstance(surface, Quadric):
+        raise InputError(f"a surface of kind {surface.kind} cannot be rendered")
+    A, b = np.asarray(surface.matrix), np.asarray(surface.vector)
+    if np.any(np.diag(np.diag(A)) != A) or b[1] != 0 or b[2] != 0:
+        raise InputError("a quadric whose axes differ from those of its frame cannot be rendered")
+    return np.array([*np.diag(A), b[0], float(surface.constant)])
+
+
+def apex_of(surface: Surface) -> Floats:
+    """Apex of a surface in the eye frame, (3,) mm."""
+    return np.asarray(surface.origin_mm + surface.rotation[:, 0] * float(surface.sag(0.0, 0.0)))

@@ -1,0 +1,66 @@
+"""Measured surfaces for the device: bicubic B-splines on a paraboloid, on the host, without Mitsuba.
+
+One kind of table serves Zernike expansions and grids, with the transition to the outer biconic in it. Its spacing makes
+it agree with the exact surface to some 1e-7 mm, as far as the device's single precision goes. Glints are computed on
+the exact surface.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import Floats
+from ...geometry.surfaces_measured import Measured
+from ...geometry.topography import spline_coefficients
+
+SPACING_MM = 0.15
+_MARGIN_MM = 1.2
+_STEEPEST = 0.93
+_POWERS = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6.0
+"""Rows: what the powers 0 to 3 of the share of a cell get from its four B-spline coefficients."""
+
+
+class Lattice(NamedTuple):
+    """The device's numbers of a measured surface.
+
+    Attributes:
+        shape: (R, 1 + Q, cells per mm, cells in a row, 0).
+        table: (n * n * 16,) the depth on the paraboloid of R in each cell, sum_pq a_pq s^p t^q with the shares s and t
+            of the cell along y and z; cells row by row along z, and in each a_00, a_01, ...
+    """
+
+    shape: tuple[float, ...]
+    table: NDArray[np.float32]
+
+
+@lru_cache(maxsize=64)
+def lattice(surface: Measured, limbus_mm: float) -> Lattice:
+    """Sample a surface on a square that reaches beyond the limbus.
+
+    Beyond the margin, or where the sheet becomes steep because it ends, the surface is continued along its tangents:
+    the search for paths may pass there.
+
+    Raises:
+        ValueError: the surface opens to +x.
+    """
+    curvature, shape = (float(value) for value in surface.likeness())
+    if curvature <= 0.0:
+        raise ValueError("a front surface must open to -x")
+    half = int(np.ceil((limbus_mm + _MARGIN_MM) / SPACING_MM))
+    place = SPACING_MM * np.arange(-half, half + 1)
+    y, z = np.meshgrid(place, place, indexing="ij")
+    rho = np.maximum(np.hypot(y, z), 1e-12)
+    ends = (1.0 + surface.outer[2:4]) / surface.outer[:2] ** 2
+    reach = min(half * SPACING_MM, _STEEPEST / np.sqrt(max(float(ends.max()), 1e-9)))
+    inside = np.minimum(rho, reach) / rho
+    sag = surface.slopes(inside * y, inside * z)
+    beyond: Floats = (1.0 - inside) * (sag.y * y + sag.z * z)
+    depth = -(sag.x + beyond) - 0.5 * curvature * (y * y + z * z)
+    near = np.lib.stride_tricks.sliding_window_view(spline_coefficients(depth), (4, 4))
+    table = np.einsum("pa,ijab,qb->ijpq", _POWERS, near, _POWERS, optimize=True)
+    numbers = (1.0 / curvature, shape, 1.0 / SPACING_MM, float(len(table)), 0.0)
+    return Lattice(numbers, table.astype(np.float32).ravel())

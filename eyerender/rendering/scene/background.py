@@ -1,0 +1,196 @@
+"""Everything in the scene that is not the eye: the matte surround and other obstacles.
+
+It is fixed in the scene's frame (the world's axes, origin at the apex of the unrotated eye), so neither a pose nor a
+camera rebuilds it. The surround is a plane of matte skin behind the apex, through which the globe protrudes. It does
+not imitate lids and brow, because these are not modelled here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...arrays import ArrayValue, Bools, Floats, Ints, Singles
+from ...geometry.vectors import lengths
+from ...region.look import Look
+from ...region.mapcache import kept
+from ...region.texture import skin_texture
+from ..records.frame import aligned
+from ..records.recording import recorded
+
+HALF_MM = 500.0
+_TILE_MM = 60.0
+_FEWEST = 64  # rays
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Obstacle(ArrayValue):
+    """A matte body in the scene's frame: vertices (n, 3) mm, faces (m, 3), albedo."""
+
+    vertices_mm: Floats
+    faces: Any
+    albedo: float = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Matte:
+    """Points of the surround: place, geometric normal (scene's frame), albedo."""
+
+    point: mi.Vector3f
+    normal: mi.Vector3f
+    albedo: mi.Float
+
+
+@dataclass(kw_only=True)
+class SurroundGeometry:
+    """The triangles of the surround for the kernels, and the map of its plane.
+
+    Kernels read them from buffers and do not call methods of Mitsuba's shapes and materials: the code of such a call
+    depends on how many objects the process has made.
+
+    Attributes:
+        corners: four entries for each triangle, of which the first three are its vertices.
+        vertices: four numbers for each vertex: place (mm), and albedo, negative for that of the map.
+        map: albedo of the plane.
+    """
+
+    corners: mi.UInt32
+    vertices: mi.Float
+    map: Any
+
+    @classmethod
+    def of(cls, faces: Ints) -> SurroundGeometry:
+        """Send the triangles (m, 3) to the device."""
+        corners = np.zeros((len(faces), 4), np.uint32)  # four entries, which are gathered together
+        corners[:, :3] = faces
+        blank, texture = mi.TensorXf(np.zeros((2, 2, 1), np.float32)), cast(Any, mi.Texture2f)
+        plane = texture(blank, use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+        return cls(corners=mi.UInt32(aligned(corners.ravel())), vertices=mi.Float(0), map=plane)
+
+    def place(self, vertices: Floats, albedo: Floats) -> None:
+        """Set the vertices (n, 3) mm and their albedos (n,); negative ones stand for the map of the plane."""
+        self.vertices = mi.Float(aligned(np.column_stack([vertices, albedo]).astype(np.float32).ravel()))
+
+    def paint(self, tile: Floats) -> None:
+        """Set the map of the plane's albedo, which repeats."""
+        self.map.set_tensor(mi.TensorXf(tile.astype(np.float32)[..., None]))
+
+    def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Matte:
+        """Surface at barycentric coordinates `uv` of triangles."""
+        corner = dr.gather(mi.Vector4u, self.corners, face, active)
+        a, b, c = (dr.gather(mi.Vector4f, self.vertices, i, active) for i in (corner.x, corner.y, corner.z))
+        at = a + uv.x * (b - a) + uv.y * (c - a)
+        p, q, r = (mi.Vector3f(v.x, v.y, v.z) for v in (a, b, c))
+        around = mi.Point2f(at.y + HALF_MM, at.z + HALF_MM) / _TILE_MM
+        mapped = self.map.eval(around, active)[0]
+        normal = dr.normalize(dr.cross(q - p, r - p))
+        return Matte(mi.Vector3f(at.x, at.y, at.z), normal, dr.select(a.w < 0, mapped, a.w))
+
+
+class Surround:
+    """The Mitsuba scene of the surround; `show` changes its look in place."""
+
+    posed = None  # no region
+
+    def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
+        places, faces, albedos = [_corners(10.0)], [np.array([[0, 1, 2], [0, 2, 3]])], [np.full(4, -1.0)]
+        for body in obstacles:
+            faces.append(np.asarray(body.faces) + sum(len(p) for p in places))
+            places.append(np.asarray(body.vertices_mm, dtype=np.float64))
+            albedos.append(np.full(len(places[-1]), body.albedo))
+        self._vertices, self._albedos, triangles = (
+            np.concatenate(places),
+            np.concatenate(albedos),
+            np.concatenate(faces),
+        )
+        mesh = mi.Mesh("surround", len(self._vertices), len(triangles))
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
+        params["faces"] = mi.UInt32(triangles.astype(np.uint32).ravel())
+        params.update()
+        # Without robust intersections rays slip between neighbouring triangles on some processors.
+        self.scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surround": mesh})
+        self._params: Any = mi.traverse(self.scene)
+        self.geometry = SurroundGeometry.of(triangles)
+        self.obstructed = len(obstacles) > 0
+        self._shown: tuple[float, float, float] | None = None
+
+    def show(self, look: Look) -> None:
+        """Update the surround to a look: its plane, albedo and unevenness."""
+        wanted = (look.backdrop_distance_mm, look.backdrop_albedo, look.backdrop_contrast)
+        if wanted == self._shown:
+            return
+        if self._shown is None or self._shown[0] != wanted[0]:
+            self._vertices[:4] = _corners(wanted[0])
+            self._params["surround.vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
+            self._params.update()
+            self.geometry.place(self._vertices, self._albedos)
+        tile = wanted[1] * (1 + wanted[2] * (kept(skin_texture, 1) - 1))
+        self.geometry.paint(np.clip(tile, 0.0, 0.98))
+        self._shown = wanted
+
+    def clear(self, a: Floats, b: Floats) -> Bools:
+        """Whether nothing of the surround stands between points (n, 3) of the scene's frame; ends not included."""
+        return clear_between(self.scene, a, b) if self.obstructed else _beside_plane(self._vertices[0, 0], a, b)
+
+
+def _beside_plane(x: float, a: Floats, b: Floats) -> Bools:
+    """The same for the plane of the surround alone."""
+    table = _between(a, b).astype(float)
+    o, d, length = table[:, :3], table[:, 3:6], table[:, 6]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (x - o[:, 0]) / d[:, 0]
+        y, z = o[:, 1] + t * d[:, 1], o[:, 2] + t * d[:, 2]
+        met = (t > 0) & (t < length) & (np.maximum(np.abs(y), np.abs(z)) < HALF_MM)
+    return np.asarray(~met)
+
+
+def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
+    """Whether nothing of a Mitsuba scene stands between points (n, 3) of its frame; ends not included."""
+    if not len(a):
+        return np.zeros(0, dtype=bool)
+    # Some rays more than there are make few numbers of rays, so that recordings are played back.
+    step = max(1 << len(a).bit_length() >> 3, _FEWEST)
+    count = -(-len(a) // step) * step
+    table = _between(a, b)[np.minimum(np.arange(count), len(a) - 1)]
+    return ~np.asarray(_met(scene, mi.Float(aligned(table.ravel())), count).numpy()[: len(a)], dtype=bool)
+
+
+@recorded
+def _met(scene: mi.Scene, table: mi.Float, count: int) -> mi.Bool:
+    """Whether rays meet anything; the table holds origin, direction and length of each."""
+    met = scene.ray_test(_rays(table, count))
+    dr.eval(met)
+    return met
+
+
+def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> mi.Ray3f:
+    """Rays from points (n, 3) towards points b, without the last `margin_mm` at both ends."""
+    table = _between(a, b, margin_mm)
+    return _rays(mi.Float(table.ravel()), len(table))
+
+
+def _between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> Singles:
+    """Origin, direction and length (n, 7) of such rays."""
+    length = lengths(b - a)
+    d = (b - a) / length[:, None]
+    return np.column_stack([a + margin_mm * d, d, length - 2 * margin_mm]).astype(np.float32)
+
+
+def _rays(table: mi.Float, count: int) -> mi.Ray3f:
+    # The values are gathered from one buffer, else the kernel would depend on the alignment of every NumPy array.
+    row = dr.arange(mi.UInt32, count) * 7
+    o = [dr.gather(mi.Float, table, row + k) for k in range(7)]
+    ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))
+    ray.maxt = o[6]
+    return ray
+
+
+def _corners(distance_mm: float) -> Floats:
+    h = HALF_MM
+    return np.array([[-distance_mm, y, z] for y, z in ((-h, -h), (h, -h), (h, h), (-h, h))])

@@ -1,0 +1,104 @@
+"""Blur of a job by the lens: one kernel where all things are as much out of focus, else one for each depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...arrays import Floats, Reals
+from ...region.mesh import RegionMesh
+from ...rig import defocus, psf
+from ...rig.camera import Window
+from ..records.job import RenderJob
+
+_GLOBE_MM = 13.5  # the globe and the cornea about the sclera's centre
+_BESIDE = 0.25  # of a window's size: the border about it whose things may blur into it
+
+
+@dataclass(frozen=True, slots=True)
+class Blur:
+    """How a job's picture is blurred by defocus.
+
+    Attributes:
+        job: the job.
+        subject_px: diameter of the circle of confusion of the eye.
+        layered: whether other things have visibly other ones.
+        reach: pixels beyond the window's border that are needed.
+    """
+
+    job: RenderJob
+    subject_px: float
+    layered: bool
+    reach: int
+
+    @classmethod
+    def of(cls, job: RenderJob, posed: RegionMesh | None) -> Blur:
+        """Find the blur of a job, with its posed region, before it is rendered.
+
+        Raises:
+            InputError: the eye would be blurred over more than 400 px.
+        """
+        if job.lens.focus_mm is None:
+            return cls(job, 0.0, False, 0)
+        camera, sensor = job.camera, job.sensor
+        eye = job.eye.stop.centre_mm @ job.M.T + job.t
+        subject = defocus.checked(
+            float(defocus.confusion_px(job.lens, camera, sensor, camera.R[2] @ eye + camera.t[2]))
+        )  # fmt: skip
+        depths = _depths(job, posed)
+        sizes = defocus.confusion_px(job.lens, camera, sensor, depths)
+        if np.min(depths) < job.lens.focus_mm < np.max(depths):
+            sizes = np.append(sizes, 0.0)
+        layered = not defocus.one_blur(sizes, subject, sensor.psf_sigma_px)
+        reach = defocus.reach_px(float(np.max(sizes)) if layered else subject)
+        return cls(job, subject, layered, reach)
+
+    @property
+    def border_px(self) -> int:
+        """Width of the border about the job's window that lens and point-spread function need."""
+        return self.reach + psf.margin(self.job.sensor.psf_sigma_px)
+
+    @property
+    def window(self) -> Window:
+        """The job's window with this border."""
+        (x0, y0, width, height), pad = self.job.window, self.border_px
+        return x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad
+
+    def of_pictures(self, pictures: Reals) -> Reals:
+        """Blur a picture, smaller by the reach on every side.
+
+        Args:
+            pictures: (height, width) radiance; of a layered blur its parts (`film.begun`).
+        """
+        if not self.layered:
+            return defocus.defocused(pictures, self.subject_px)
+        job, layers = self.job, []
+        for radiance, coverage, near in pictures:
+            nearness = np.divide(near, coverage, out=np.zeros_like(near), where=coverage > 0)
+            size = defocus.confusion_of(job.lens, job.camera, job.sensor, nearness)
+            layers.append(defocus.Layer(radiance, coverage, size))
+        return defocus.blurred(layers, self.reach)
+
+    def of_image(self, nearness: Floats) -> float:
+        """Diameter of the circle of confusion of a mirror image: mean square over its inverse depths (1/mm)."""
+        job = self.job
+        if not np.all(np.isfinite(nearness)):
+            return self.subject_px
+        return float(np.sqrt(np.mean(defocus.confusion_of(job.lens, job.camera, job.sensor, nearness) ** 2)))
+
+
+def _depths(job: RenderJob, posed: RegionMesh | None) -> Floats:
+    """Depths (mm) of things in the window: nearest and farthest."""
+    camera = job.camera
+    middle = float(camera.R[2] @ (np.asarray(job.eye.sclera.centre_mm) @ job.M.T + job.t) + camera.t[2])
+    depths = [middle - _GLOBE_MM, middle]
+    if posed is not None:
+        points = posed.vertices + job.anchor_mm
+        xy, front = camera.project(points)
+        x0, y0, width, height = job.window
+        with np.errstate(invalid="ignore"):
+            seen = front & (np.abs((xy - (x0 - 0.5, y0 - 0.5)) / (width, height) - 0.5) < 0.5 + _BESIDE).all(axis=1)
+        z = points[seen] @ camera.R[2] + camera.t[2]
+        depths += [float(z.min()), float(z.max())] if len(z) else []
+    return np.array([min(depths), max(depths)])

@@ -1,0 +1,135 @@
+"""Which cells of the grids of light in the tissues matter in a pose (see `subsurface`), found with NumPy alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints, Singles, frozen
+from ...optics.diffusion import half_space_length_mm, slab_length_mm
+from ...region.globe import Globe
+from ...region.mesh import RegionMesh, sheet_neighbours
+from ...region.skin import SHEET_ROWS, sheet_place
+from ..records.job import RenderJob
+
+GRID_ROWS, GRID_COLUMNS = 160, 768  # of the finer grid over the sheet of skin
+SIDE = 192  # of the grid over the front of the globe
+WIDTH = 2.5  # of this grid in units of the globe's radius, in Lambert's equal-area projection
+_REDUCTIONS = 2  # of the grid over the skin, by 2 each, whose cells have marks of their own
+_FINE_PX_PER_MM = 11.0  # in pictures of fewer pixels per mm every second row and column of the skin's grid will do
+_SPARE, _SPARE_MM = 24.0, 10.0  # beyond the window, from where light still arrives: in units of d, and at least
+_EDGE_MM = 0.4  # about the lids' margins, where the globe may be seen
+
+
+@dataclass(frozen=True, slots=True)
+class TissueCells:
+    """The cells of a pose, and how far light spreads in skin and sclera (d, mm)."""
+
+    sheet: SheetCells
+    globe: GlobeCells
+    thick_mm: float
+    thin_mm: float
+
+    @classmethod
+    def of(cls, job: RenderJob, posed: RegionMesh, spare_px: int) -> TissueCells:
+        """Find the cells of a job with scattering and a posed region; `spare_px` beyond the window are rendered."""
+        scattering = job.look.scattering
+        assert scattering is not None
+        assert job.region is not None
+        thick = half_space_length_mm(job.region.skin.albedo, scattering.skin_per_mm)
+        thin = slab_length_mm(job.look.sclera_albedo, scattering.sclera_per_mm)
+        sheet = SheetCells.of(posed, job, max(_SPARE * thick, _SPARE_MM), spare_px)
+        globe = GlobeCells.of(posed, job.globe, _SPARE * thin)
+        return cls(sheet, globe, thick, thin)
+
+
+@dataclass(frozen=True, slots=True)
+class SheetCells:
+    """Cells of the grid over a posed sheet of skin.
+
+    Attributes:
+        rows: number of the grid's rows.
+        columns: number of its columns, which close.
+        numbers: of the cells that matter, and of the cells about them on the grid reduced by 2 and by 4.
+        edges: row of the sheet's vertices at the edges of the grid's rows.
+        middles: the same in their middles.
+    """
+
+    rows: int
+    columns: int
+    numbers: tuple[Ints, ...]
+    edges: Singles
+    middles: Singles
+
+    @classmethod
+    def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> SheetCells:
+        """Find the cells that are shown in the window, or so close that their light gets there."""
+        each = 1 if float(job.camera.scale_at(job.t)) > _FINE_PX_PER_MM else 2
+        rows, columns = GRID_ROWS // each, GRID_COLUMNS // each
+        texels = SHEET_ROWS // rows
+        edges = sheet_place(np.arange(rows + 1.0) * texels - 0.5)
+        sheet = posed.vertices[: posed.layout.vertex_ends[0]]
+        shown = _in_window(sheet + job.anchor_mm, job, spare_mm, spare_px)
+        near = _grown(np.any(shown[sheet_neighbours()], axis=0))
+        middle = sheet_place((np.arange(rows, dtype=float) + 0.5) * texels - 0.5)
+        marks = [near[np.rint(middle).astype(int)][:, np.arange(columns) * near.shape[1] // columns]]
+        for _ in range(_REDUCTIONS):
+            rows_of = marks[-1][::2] | marks[-1][1::2]
+            marks.append(_grown(rows_of[:, ::2] | rows_of[:, 1::2]))
+        numbers = tuple(np.flatnonzero(m) for m in marks)
+        return cls(rows, columns, numbers, edges.astype(np.float32), middle.astype(np.float32))
+
+
+@dataclass(frozen=True, slots=True)
+class GlobeCells:
+    """Numbers of cells of the grid over the globe, as in `subsurface.GlobeGrid`."""
+
+    between: Ints
+    under: Ints
+    coarse: Ints
+    over: Ints
+
+    @classmethod
+    def of(cls, posed: RegionMesh, globe: Globe, reach_mm: float) -> GlobeCells:
+        """Find the cells of a pose; light gets as far as `reach_mm` from under a lid."""
+        centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+        y, z = (v + c for v, c in zip(_globe_cells(globe.radius_mm), centre[1:], strict=True))
+        upper, lower = (m[np.argsort(m[:, 1])] for m in (posed.upper_margin, posed.lower_margin))
+        over = np.maximum(z - np.interp(y, upper[:, 1], upper[:, 2]), np.interp(y, lower[:, 1], lower[:, 2]) - z)
+        beside = np.maximum(upper[0, 1] - y, y - upper[-1, 1])
+        away = np.maximum(over, beside)
+        between, under = np.flatnonzero(away < _EDGE_MM), np.flatnonzero((away > 0) & (away < reach_mm))
+        over = under // SIDE // 2 * (SIDE // 2) + under % SIDE // 2
+        coarse = np.flatnonzero(np.bincount(over, minlength=SIDE * SIDE // 4))
+        return cls(between, under, coarse, over)
+
+
+@lru_cache(maxsize=4)
+def _globe_cells(radius_mm: float) -> tuple[Floats, Floats]:
+    """Places (y, z) of the cells of the grid over the globe about its middle, mm."""
+    row, column = np.divmod(np.arange(SIDE * SIDE), SIDE)
+    a, b = ((k - 0.5 * (SIDE - 1)) * (WIDTH / SIDE) for k in (column, row))
+    scale = radius_mm * np.sqrt(np.maximum(1 - 0.25 * (a * a + b * b), 0))
+    return frozen(a * scale), frozen(b * scale)
+
+
+def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -> Bools:
+    """Which points (n, 3) are in a window, or beside it by no more than what is spare."""
+    camera, (x0, y0, width, height) = job.camera, job.window
+    xy, front = camera.project(points)
+    depth = np.maximum((points - camera.nodal_point_mm) @ camera.R[2], 1.0)
+    spare = spare_px + spare_mm * float(max(camera.K[0, 0], camera.K[1, 1])) / depth
+    with np.errstate(invalid="ignore"):
+        inside = np.abs(xy - (x0 + 0.5 * width, y0 + 0.5 * height)) < 0.5 * np.array([width, height]) + spare[..., None]
+    return np.asarray(front & inside[..., 0] & inside[..., 1])
+
+
+def _grown(marked: Bools) -> Bools:
+    """Marks of a grid, whose columns close, and of all neighbours."""
+    out = marked | np.roll(marked, 1, axis=1) | np.roll(marked, -1, axis=1)
+    grown = out.copy()
+    grown[1:] |= out[:-1]
+    grown[:-1] |= out[1:]
+    return grown

@@ -1,0 +1,190 @@
+"""Plain tiles: the parts of a window that show nothing but skin, without hairs, margins or the globe.
+
+The skin is a sheet with a hole, the fissure, that ends at a border. A ray whose pixel lies within the border's outline
+and not within the hole's outline crosses the sheet, because the number of crossings is the difference of the two
+winding numbers. Hairs and the line of tears are in front of the sheet. The tears, hairs that are thick in the picture
+and both outlines are marked, with some pixels to spare, and thin hairs pixel by pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...arrays import Bools, Floats
+from ...region.mesh import HAIRS, RegionMesh
+from ...rig.camera import PinholeCamera, Window
+
+_TILE_PX = 8
+_STEP_PX = 4.0  # between marked points of a curve
+_SPARE_PX = 1.0
+_HAIR_MM = 0.1  # no hair and no part of a margin is thicker
+_THICK_PX, _FINE_STEP_PX, _SLACK_PX = 2.0, 0.5, 0.02
+_NEAREST_MM = 3.0  # if hairs are closer to the camera, nothing is plain
+
+
+def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, int]:
+    """Tiles (rows, columns) of a window that show nothing but skin and thin hairs, and the size of a tile in pixels.
+
+    `fine_pixels` tells where the thin hairs are. No tile is like that where the region's border is unknown or hairs
+    come too close to the camera.
+    """
+    nothing = np.zeros((1, 1), dtype=bool), max(window[2:])
+    if len(region.border) == 0:
+        return nothing
+    hole = np.concatenate([region.upper_margin, region.lower_margin[-2:0:-1]])
+    closed = [np.concatenate([c, c[:1]])[None] for c in (hole, region.border)]
+    curves = [c for c in (*closed, *region.strands) if c.size]
+    hairs = sum(c.size > 0 for c in region.strands[:HAIRS])
+    depth = [float(np.min((c + anchor_mm - camera.nodal_point_mm) @ camera.R[2])) for c in curves]
+    if min(depth) < _NEAREST_MM:
+        return nothing
+    thick = _HAIR_MM * float(max(camera.K[0, 0], camera.K[1, 1])) / min(depth[2:], default=np.inf)
+    reach = _STEP_PX / 2 + _SPARE_PX + thick
+    tile = max(_TILE_PX, int(np.ceil(2 * reach)))
+    x0, y0, width, height = window
+    shape = (-(-height // tile), -(-width // tile))
+    corner = np.array([x0, y0]) - 0.5
+    marked = np.zeros(shape, dtype=bool)
+    outlines = []
+    for k, curve in enumerate(curves):
+        if 2 <= k < 2 + hairs and _thin(depth[k], camera):
+            continue
+        xy = (camera.project(curve + anchor_mm)[0] - corner) / tile
+        if k < 2:
+            outlines.append(_winding(xy[0], shape))
+        _mark(marked, _pieces(xy, shape)[:2], _STEP_PX / tile, reach / tile)
+    return (outlines[1] != 0) & (outlines[0] == 0) & ~marked, tile
+
+
+def fine_pixels(
+    region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window
+) -> tuple[Bools, Bools]:
+    """Pixels (height, width) of a window at menisci and those that hairs at most two pixels thick touch.
+
+    The second result marks those that may show menisci, which are all pixels if a meniscus is too close. Marks do not
+    depend on the window.
+    """
+    if region is None:
+        return np.zeros((window[3], window[2]), dtype=bool), np.zeros((window[3], window[2]), dtype=bool)
+    fine = np.zeros((window[3], window[2]), dtype=bool)
+    for curve, radii in zip(region.strands[:HAIRS], region.radii, strict=True):
+        _mark_hairs(fine, curve + anchor_mm, radii, camera, window)
+    # Menisci are grids, of which the strands are the rows.
+    grids = region.strands[HAIRS:]
+    wet, every = _drawn([*grids, *(grid.transpose(1, 0, 2) for grid in grids)], camera, anchor_mm, window)
+    wet = _with_beside(wet)
+    return fine | wet, wet | (not every)
+
+
+def _thin(depth_mm: float, camera: PinholeCamera) -> bool:
+    """Whether hairs that come so close are thin in the picture."""
+    focal = float(max(camera.K[0, 0], camera.K[1, 1]))
+    return depth_mm >= _NEAREST_MM and _HAIR_MM * focal <= _THICK_PX * depth_mm
+
+
+def _mark_hairs(marked: Bools, curves: Floats, radii: Floats, camera: PinholeCamera, window: Window) -> None:
+    """Mark the pixels of a window that hairs touch, unless these are thick or too close."""
+    depth = (curves - camera.nodal_point_mm) @ camera.R[2]
+    focal = float(max(camera.K[0, 0], camera.K[1, 1]))
+    if not curves.size or not _thin(float(depth.min()), camera):
+        return
+    # Away from the axis the picture is stretched.
+    thick = radii * focal * np.linalg.norm(curves - camera.nodal_point_mm, axis=-1) / depth**2 + _SLACK_PX
+    start, way, ends = _pieces(camera.project(curves)[0] - window[:2], marked.shape, thick)
+    half = np.maximum(*ends.T)
+    # Along x or y, whichever a piece follows more closely, each pixel has a few pixels across it.
+    steep = np.abs(way[:, 1]) > np.abs(way[:, 0])
+    a, b = (np.where(steep, v[:, ::-1].T, v.T) for v in (start, way))
+    slope = b[1] / np.where(b[0] == 0, 1, b[0])
+    first = np.rint(np.minimum(a[0], a[0] + b[0]) - half).astype(int)
+    count = np.rint(np.maximum(a[0], a[0] + b[0]) + half).astype(int) - first + 1
+    which = np.repeat(np.arange(len(count)), count)
+    along = first[which] + np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+    share = np.clip((along - a[0][which]) / np.where(b[0] == 0, 1, b[0])[which], 0, 1)
+    middle = a[1][which] + share * b[1][which]
+    reach = (half * np.sqrt(1 + slope * slope) + 0.5 * np.abs(slope))[which]
+    low, high = (np.rint(middle + side * reach).astype(int) for side in (-1, 1))
+    steep = steep[which]
+    for k in range(int(np.max(high - low, initial=-1)) + 1):
+        across = low + k
+        row, column = np.where(steep, along, across), np.where(steep, across, along)
+        there = (across <= high) & (row >= 0) & (column >= 0) & (row < marked.shape[0]) & (column < marked.shape[1])
+        marked[row[there], column[there]] = True
+
+
+def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, bool]:
+    """Pixels on curves in a window and a border of one pixel about it; whether no curve is too close to be drawn."""
+    x0, y0, width, height = window
+    marked, every = np.zeros((height + 2, width + 2), dtype=bool), True
+    for curve in (c for c in curves if c.size):
+        z = (curve + anchor_mm - camera.nodal_point_mm) @ camera.R[2]
+        if not _thin(float(z.min()), camera):
+            every = False
+            continue
+        xy = camera.project(curve + anchor_mm)[0] - (x0 - 1, y0 - 1)
+        # Pieces beside the window need no points.
+        start, way, _ = _pieces(xy, (height + 2, width + 2))
+        count = np.ceil(np.hypot(way[:, 0], way[:, 1]) / _FINE_STEP_PX).astype(int) + 1
+        step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        column, row = (
+            np.rint(np.repeat(start[:, k], count) + step * np.repeat(way[:, k] / count, count)).astype(int)
+            for k in (0, 1)
+        )
+        inside = (column >= 0) & (column < width + 2) & (row >= 0) & (row < height + 2)
+        marked[row[inside], column[inside]] = True
+    return marked, every
+
+
+def _with_beside(marked: Bools) -> Bools:
+    """Marks of a grid without its border, and of what is beside them."""
+    out = marked[1:-1, 1:-1].copy()
+    for beside in (marked[:-2, 1:-1], marked[2:, 1:-1], marked[1:-1, :-2], marked[1:-1, 2:]):
+        out |= beside
+    return out
+
+
+def _pieces(xy: Floats, shape: tuple[int, int], values: Floats | None = None) -> tuple[Floats, Floats, Floats]:
+    """Straight pieces of polylines (n, k, 2) that come near a grid of so many cells: start and way (m, 2).
+
+    The third result (m, 2) are `values` (n, k) at the ends of the pieces.
+    """
+    a, b = xy[:, :-1].reshape(-1, 2), xy[:, 1:].reshape(-1, 2)
+    near = (np.maximum(a, b) > -1) & (np.minimum(a, b) < (shape[1] + 1, shape[0] + 1))
+    near = near[:, 0] & near[:, 1]
+    start = a[near]
+    ends = np.zeros((len(start), 2))
+    if values is not None:
+        ends = np.stack([values[:, :-1].ravel()[near], values[:, 1:].ravel()[near]], axis=1)
+    return start, b[near] - start, ends
+
+
+def _mark(marked: Bools, pieces: tuple[Floats, Floats], step: float, reach: float) -> None:
+    """Mark the tiles within `reach`, at most half a tile, of points of the pieces that are `step` tiles apart."""
+    rows, columns = marked.shape
+    start, way = pieces
+    count = np.ceil(np.sqrt(way[:, 0] ** 2 + way[:, 1] ** 2) / step).astype(int) + 1
+    which = np.repeat(np.arange(len(count)), count)
+    share = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)) / np.maximum(count - 1, 1)[which]
+    xy = start[which] + share[:, None] * way[which]
+    for dx in (-reach, reach):
+        column = np.floor(xy[:, 0] + dx).astype(int)
+        for dy in (-reach, reach):
+            row = np.floor(xy[:, 1] + dy).astype(int)
+            there = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+            marked[row[there], column[there]] = True
+
+
+def _winding(xy: Floats, shape: tuple[int, int]) -> Floats:
+    """Winding number of a closed polyline (k + 1, 2) about the middle of each tile (rows, columns)."""
+    rows, columns = shape
+    y = np.arange(rows) + 0.5
+    (ax, ay), (bx, by) = xy[:-1].T[..., None], xy[1:].T[..., None]
+    turn = ((ay <= y) & (by > y)).astype(int) - ((ay > y) & (by <= y))
+    edge, row = np.nonzero(turn)
+    share = (y[row] - ay[edge, 0]) / (by[edge, 0] - ay[edge, 0])
+    x = ax[edge, 0] + share * (bx[edge, 0] - ax[edge, 0])
+    # A crossing counts for all middles beyond it.
+    column = np.clip(np.ceil(x - 0.5).astype(int), 0, columns)
+    steps = np.zeros((rows, columns + 1), dtype=int)
+    np.add.at(steps, (row, column), turn[edge, row])
+    return np.cumsum(steps[:, :-1], axis=1)

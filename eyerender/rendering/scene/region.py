@@ -1,0 +1,410 @@
+"""The eye region in Mitsuba: triangles with one map, moved in place, of one subject after another.
+
+The triangles are in the scene's frame (the world's axes, origin at the apex of the unrotated eye) as one instance,
+because Mitsuba lets Embree build an instance's tree without the spatial splits of a scene's own meshes, which takes a
+third of the time. The menisci are a scene of their own. The appearance of a hit is read from buffers of our own
+(`SkinGeometry`), so kernels do not change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import Bools, Floats, Singles
+from ...region.anatomy import Region
+from ...region.contour import COLUMNS
+from ...region.globe import Globe
+from ...region.head import file_states
+from ...region.lids import FINE, ROWS
+from ...region.mapcache import kept
+from ...region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_ends
+from ...region.skin import SHEET_ROWS, skin_texels
+from ..records.frame import aligned
+from .background import clear_between, rays_between
+from .diffusiongrids import GRID_COLUMNS, GRID_ROWS
+
+SHEET_COLUMNS = COLUMNS + 1  # of the sheet's grid, because the first column is repeated
+_F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
+_ROUGH_OIL, _THINNER = 0.05, 0.15  # roughness of a film of oil at a gloss of 0.5, and how much it grows per gloss below
+_ROUGH_WET = 0.02
+_WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
+_RIPPLES = ((0.13, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
+
+
+class RegionScene:
+    """The Mitsuba scene of an eye region; `show` moves it, and `fill` gives it to another subject.
+
+    Attributes:
+        scene: the solid parts.
+        skin: the region for the kernels.
+        relief: mean slopes of the map over the cells of the grids on which light spreads, by their numbers of rows.
+        sheet_faces: number of triangles of the sheet of skin.
+        posed: the mesh in its pose.
+        subject: what the scene was made for.
+    """
+
+    obstructed = True
+    parts: tuple[str, ...] = PARTS
+    fixed = False  # whether the mesh keeps still, and has no menisci that light passes through
+
+    def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> None:
+        posed = known or self._posed(spec, globe)
+        meshes = {name: _mesh(posed, *cut) for name, cut in self._cuts(posed.layout).items()}
+        parts = {name: {"solid": mesh} if self.fixed else _instance(mesh) for name, mesh in meshes.items()}
+        scenes = {name: self._loaded(name, part) for name, part in parts.items()}
+        self.scene: mi.Scene = scenes["solid"]
+        self._water: mi.Scene | None = scenes.get("film")
+        self._params = {name: mi.traverse(scene) for name, scene in scenes.items()}
+        self._dress(spec, globe, posed)
+
+    @staticmethod
+    def _loaded(name: str, parts: dict[str, Any]) -> mi.Scene:
+        """Make a scene and its tree."""
+        scene: dict[str, Any] = {"type": "scene", **parts}
+        if name == "solid":
+            # Without robust intersections rays slip between the triangles of a large face on some processors. An
+            # instance cannot have them, but its triangles are small.
+            scene["embree_use_robust_intersections"] = True
+        return mi.load_dict(scene)
+
+    def _cuts(self, layout: RegionLayout) -> dict[str, tuple[slice, slice]]:
+        """The vertices and faces of each mesh."""
+        if self.fixed:
+            return {"solid": (slice(0, None), slice(0, None))}
+        v, f = (int(ends[-2]) for ends in (layout.vertex_ends, layout.face_ends))
+        return {"solid": (slice(0, v), slice(0, f)), "film": (slice(v, None), slice(f, None))}
+
+    def _dress(self, spec: Region, globe: Globe, posed: RegionMesh) -> None:
+        """Take the appearance of a subject."""
+        texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
+        pixels = aligned(self._look(spec))
+        look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+        mirror = -1.0 if globe.mirrored else 1.0
+        inner = self._inner()
+        self.skin = SkinGeometry.of(look, posed.layout, mirror, inner, self._water)
+        self.relief = {} if inner is None else _mean_slopes(pixels)
+        self.sheet_faces = int(posed.layout.face_ends[0])
+        self._records = np.zeros((len(posed.layout.uv), 8), np.float32)
+        self._records[:, 3], self._records[:, 7] = posed.layout.uv.T
+        self._pose_skin(posed)
+        self._shown: tuple[Region, Globe] | None = (spec, globe)
+        self.posed = posed
+        self.subject = self.key(spec, globe)
+
+    def takes(self, spec: Region) -> bool:
+        """Whether the scene has the meshes that a subject needs."""
+        return not self.fixed and spec.head is None
+
+    def fill(self, spec: Region, globe: Globe, known: RegionMesh | None) -> None:
+        """Show another subject with the same shapes, so that recordings can still be played back."""
+        posed = known or self._posed(spec, globe)
+        for name, cut in self._cuts(posed.layout).items():
+            self._set(name, "faces", _faces(posed.layout, *cut))
+        self._send(posed)
+        self._dress(spec, globe, posed)
+
+    @staticmethod
+    def key(spec: Region, globe: Globe) -> tuple[Any, ...]:
+        """What a scene is made for: a subject, a side, and the state of a head mesh's files."""
+        files = () if spec.head is None else file_states(spec.head)
+        return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
+
+    def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
+        """Move lids and lashes to a pose and a blink, whose mesh may be known."""
+        if self._shown != (spec, globe):
+            posed = known or self._posed(spec, globe)
+            if posed is not self.posed:
+                self.posed = posed
+                self._send(posed)
+                self._pose_skin(posed)
+            self._shown = (spec, globe)
+        return self.posed
+
+    def at_rest(self, globe: Globe) -> RegionMesh:
+        """Mesh of the subject with open lids about a globe; the scene keeps its pose."""
+        assert self._shown is not None
+        return self._posed(self._shown[0].model_copy(update={"blink": 0.0}), globe)
+
+    def _set(self, name: str, array: str, values: mi.Float | mi.UInt32) -> None:
+        """Set an array of a mesh."""
+        params = self._params[name]
+        params[next(key for key in params.keys() if key.endswith(array))] = values  # noqa: SIM118  # no dictionary
+
+    def _send(self, posed: RegionMesh) -> None:
+        """Set the vertices, and build the trees of what was set."""
+        for name, (cut, _) in self._cuts(posed.layout).items():
+            self._set(name, "vertex_positions", _floats(posed.vertices[cut]))
+            self._params[name].update()
+
+    def _pose_skin(self, posed: RegionMesh) -> None:
+        """Send places and normals of the vertices to the kernels."""
+        self._records[:, 0:3], self._records[:, 4:7] = posed.vertices, posed.normals
+        self.skin.vertices = mi.Float(aligned(self._records.ravel()))
+
+    def _posed(self, spec: Region, globe: Globe) -> RegionMesh:
+        return region_mesh(spec, globe)
+
+    @staticmethod
+    def _look(spec: Region) -> NDArray[np.float16]:
+        return kept(skin_texels, spec.model_copy(update={"blink": 0.0}))
+
+    def _inner(self) -> Bools | None:
+        """Which triangles of the sheet of skin are not at its ends; None if it is not known to be one surface."""
+        return ~sheet_ends()
+
+    def clear(self, a: Floats, b: Floats) -> Bools:
+        """Whether nothing of the region stands between points (n, 3) of the scene's frame; ends not included."""
+        return clear_between(self.scene, a, b)
+
+
+def _mean_slopes(pixels: NDArray[np.float16]) -> dict[int, mi.Float]:
+    """Means of the slopes of a map over the cells of the two grids on which light spreads, by their rows."""
+    slopes = pixels[:SHEET_ROWS, :, 1:3]
+    down, across = len(slopes) // GRID_ROWS, slopes.shape[1] // GRID_COLUMNS
+    parts = [slopes[i::down, j::across].astype(np.float32) for i in range(down) for j in range(across)]
+    fine: Singles = np.asarray(sum(parts) / len(parts), dtype=np.float32)
+    coarse = 0.25 * (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2])
+    return {len(means): mi.Float(aligned(means.ravel())) for means in (fine, coarse)}
+
+
+def _floats(values: Floats) -> mi.Float:
+    return mi.Float(aligned(values.astype(np.float32).ravel()))
+
+
+def _faces(layout: RegionLayout, vertices: slice, faces: slice) -> mi.UInt32:
+    """Some of the triangles, with numbers of some of the vertices."""
+    triangles = layout.faces[faces] - vertices.start
+    return mi.UInt32(aligned(triangles.astype(np.uint32).ravel()))
+
+
+def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
+    """Make a mesh of some of the triangles."""
+    corners, triangles = posed.vertices[vertices], _faces(posed.layout, vertices, faces)
+    mesh = mi.Mesh("region", len(corners), len(triangles) // 3)
+    params = mi.traverse(mesh)
+    params["faces"] = triangles
+    params["vertex_positions"] = _floats(corners)
+    params.update()
+    return mesh
+
+
+def _instance(mesh: mi.Mesh) -> dict[str, Any]:
+    """Make a group of one mesh, and the group's only instance."""
+    group = mi.load_dict({"type": "shapegroup", "mesh": mesh})
+    return {"group": group, "shown": mi.load_dict({"type": "instance", "of": group})}
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Points of the region: place, normals with and without relief, albedo, gloss, received light (see `exchange`)."""
+
+    point: mi.Vector3f
+    normal: mi.Vector3f
+    smooth: mi.Vector3f
+    albedo: mi.Float
+    gloss: mi.Float
+    received: mi.Vector4f
+
+
+@dataclass(kw_only=True)
+class SkinGeometry:
+    """A posed region for the kernels: the corners of its triangles, and the map.
+
+    Attributes:
+        map: relative albedo, slopes and gloss over the coordinates of the map.
+        water: the menisci, which are not in the scene because light passes through them; None if they are opaque.
+        is_sheet: whether the skin is known to be one surface.
+        faces: four entries for each triangle: its vertices, and 1 unless it is a part inside the sheet of skin.
+        vertices: eight numbers for each vertex: place (scene's frame, mm), first coordinate of the map, normal, second
+            coordinate of the map.
+        received: four numbers for each vertex: the light of other surfaces, as in `exchange.Received`.
+        sheet: number of the triangles of the sheet, which come first.
+        film: number of the first triangle of the menisci.
+        mirror: -1 for a left eye, else 1.
+    """
+
+    map: Any
+    water: mi.Scene | None
+    is_sheet: bool
+    faces: mi.UInt32
+    vertices: mi.Float
+    received: mi.Float
+    sheet: mi.UInt32
+    film: mi.UInt32
+    mirror: mi.Float
+
+    @classmethod
+    def of(
+        cls, look: mi.Texture2f, layout: RegionLayout, mirror: float, inner: Bools | None, water: mi.Scene | None
+    ) -> SkinGeometry:
+        """Send the triangles of a region to the device.
+
+        Args:
+            look: the map.
+            layout: the triangles.
+            mirror: -1 for a left eye, else 1.
+            inner: which triangles of the sheet are not at its ends; None if it is not known to be one surface.
+            water: the menisci.
+        """
+        faces = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
+        faces[:, :3] = layout.faces
+        faces[: layout.face_ends[0], 3] = False if inner is None else ~inner
+        sheet, film = (dr.opaque(mi.UInt32, int(layout.face_ends[k])) for k in (0, -2))
+        return cls(
+            map=look, water=water, is_sheet=inner is not None, faces=mi.UInt32(aligned(faces.ravel())),
+            vertices=mi.Float(0), received=mi.Float(0), sheet=sheet, film=film, mirror=dr.opaque(mi.Float, mirror),
+        )  # fmt: skip
+
+    def corners(self, face: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f, mi.Bool]:
+        """Corners of triangles (scene's frame), and whether these are more than a part inside the sheet of skin."""
+        corner = dr.gather(mi.Vector4u, self.faces, face)
+        a, b, c = (dr.gather(mi.Vector4f, self.vertices, 2 * i) for i in (corner.x, corner.y, corner.z))
+        return *(mi.Vector3f(p.x, p.y, p.z) for p in (a, b, c)), corner.w > 0
+
+    def sheet_point(self, row: mi.Float, column: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """Points of the sheet's triangles at fractional rows and columns of its grid, and the smooth normals."""
+        i, j = mi.UInt32(dr.clip(row, 0, ROWS - 1.001)), mi.UInt32(dr.clip(column, 0, SHEET_COLUMNS - 1.001))
+        wide = dr.select(i < FINE, mi.UInt32(1), 2)
+        j -= j & (wide - 1)
+        s, t = (column - mi.Float(j)) / mi.Float(wide), row - mi.Float(i)
+        # Each cell has two triangles, whose common edge runs from its first corner to the opposite one.
+        weights = (1 - dr.maximum(s, t), dr.abs(s - t), dr.minimum(s, t))
+        corners = ((i, j), (dr.select(s > t, i, i + 1), dr.select(s > t, j + wide, j)), (i + 1, j + wide))
+        place, turned = mi.Vector4f(0), mi.Vector4f(0)
+        for weight, corner in zip(weights, corners, strict=True):
+            vertex = _sheet_vertex(*corner)
+            place += weight * dr.gather(mi.Vector4f, self.vertices, 2 * vertex)
+            turned += weight * dr.gather(mi.Vector4f, self.vertices, 2 * vertex + 1)
+        return mi.Vector3f(place.x, place.y, place.z), dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
+
+    def map_place(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Coordinates of the map at barycentric coordinates `uv` of triangles."""
+        corner = dr.gather(mi.Vector4u, self.faces, face, active)
+        u, v = mi.Float(0), mi.Float(0)
+        for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), (corner.x, corner.y, corner.z), strict=True):
+            # As in `surface`, so that Dr.Jit gathers them only once.
+            u += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i, active).w
+            v += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active).w
+        return u, v
+
+    def tilted(self, normal: mi.Vector3f, slope_y: mi.Float, slope_z: mi.Float) -> mi.Vector3f:
+        """Normals of a relief: n - (g - n (n . g)) for the slope g over the tangent plane of the normal n."""
+        g = mi.Vector3f(0, self.mirror * slope_y, slope_z)
+        return dr.normalize(normal - (g - normal * dr.dot(normal, g)))
+
+    def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
+        """Index of the layout's triangle that was hit."""
+        return mi.UInt32(hit.prim_index)
+
+    def on_water(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
+        """Index of the layout's triangle of the menisci that was hit."""
+        return hit.prim_index + self.film
+
+    def on_sheet(self, face: mi.UInt32) -> mi.Bool:
+        """Whether a triangle belongs to the sheet of skin, not to what is in front of it."""
+        return face < self.sheet
+
+    def corner(self, face: mi.UInt32, uv: mi.Point2f, u: mi.Float, active: mi.Bool) -> mi.UInt32:
+        """Vertices of triangles, each as often as its barycentric weight for even u in [0, 1)."""
+        corner = dr.gather(mi.Vector4u, self.faces, face, active)
+        return dr.select(u < uv.x, corner.y, dr.select(u < uv.x + uv.y, corner.z, corner.x))
+
+    def from_behind(self, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+        """Whether rays along d (scene's frame) meet triangles on their inner side, such as a lid's from within it."""
+        corner = dr.gather(mi.Vector4u, self.faces, face, active)
+        corners = (corner.x, corner.y, corner.z)
+        a, b, c = (
+            mi.Vector3f(p.x, p.y, p.z) for p in (dr.gather(mi.Vector4f, self.vertices, 2 * i, active) for i in corners)
+        )
+        turned = mi.Vector4f(0)
+        for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), corners, strict=True):
+            turned += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active)
+        n = dr.cross(b - a, c - a)
+        behind = dr.dot(n, d) * dr.dot(n, mi.Vector3f(turned.x, turned.y, turned.z)) > 0
+        return behind & self.on_sheet(face) if self.is_sheet else behind  # hairs are thin, and some are open tubes
+
+    def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Surface:
+        """Surface at barycentric coordinates `uv` of triangles."""
+        corner = dr.gather(mi.Vector4u, self.faces, face, active)
+        weights = (1 - uv.x - uv.y, uv.x, uv.y)
+        place, turned, received = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
+        for weight, i in zip(weights, (corner.x, corner.y, corner.z), strict=True):
+            place += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i, active)
+            turned += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active)
+            received += weight * dr.gather(mi.Vector4f, self.received, i, active)
+        albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in self.map.eval(mi.Point2f(place.w, turned.w), active))
+        smooth = dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
+        normal = self.tilted(smooth, slope_y, slope_z)
+        return Surface(mi.Vector3f(place.x, place.y, place.z), normal, smooth, albedo, gloss, received)
+
+
+def _sheet_vertex(row: mi.UInt32, column: mi.UInt32) -> mi.UInt32:
+    """Numbers of vertices of the sheet, like those of `mesh.sheet_vertices`."""
+    half = COLUMNS // 2
+    return dr.select(row > FINE, half * (FINE + 1) + (half + 1) * row + (column >> 1), SHEET_COLUMNS * row + column)
+
+
+def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:
+    """First part of the region between points (n, 3) a and b of the scene's frame, None where there is none."""
+    hit = place.scene.ray_intersect_preliminary(rays_between(a, b), coherent=False, active=True)
+    valid, face = hit.is_valid(), place.skin.face(hit)
+    dr.eval(valid, face)
+    which = np.searchsorted(place.posed.layout.face_ends, face.numpy(), side="right")
+    return [place.parts[int(w)] if v else None for v, w in zip(valid.numpy(), which, strict=True)]
+
+
+def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, gloss: mi.Float) -> mi.Float:
+    """Mirror-like reflectance f (1/sr) of skin (gloss below 0.5) and of wet tissue (above), about a `glossy_normal`.
+
+        f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
+
+    with h half way between lamp and camera (GGX: Walter et al. 2007; the visibility term: Kelemen, Szirmay-Kalos 2001;
+    F: Schlick 1994). The roughness a of skin stands for what is finer than its map, so no oil on it mirrors like
+    water; it is rougher the thinner the film. Oil on tears, which makes their gloss higher than `_WATER`, mirrors more.
+    """
+    wet = gloss > 0.5
+    half = dr.normalize(to_lamp + to_camera)
+    lh = dr.maximum(dr.dot(to_lamp, half), 0.05)
+    nh = dr.maximum(dr.dot(normal, half), 0)
+    water = (2 * gloss - 1) * (1 + 10 * dr.maximum(gloss - _WATER, 0))
+    weight = dr.select(wet, water, gloss * (1 / 0.45))
+    D = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL + _THINNER * (0.5 - gloss)))
+    return weight * D * _schlick(lh, dr.select(wet, _F0_TEARS, _F0_OIL)) * 0.25 / (lh * lh)
+
+
+def _ggx(nh: mi.Float, a: mi.Float) -> mi.Float:
+    """Distribution D (1/sr) of the normals of a surface of roughness a."""
+    a2 = a * a
+    base = nh * nh * (a2 - 1) + 1
+    return a2 * dr.inv_pi / (base * base)
+
+
+def glossy_normal(normal: mi.Vector3f, gloss: mi.Float) -> mi.Vector3f:
+    """Normal (eye frame) of what mirrors: of skin itself, or of the tear film on wet tissue."""
+    return dr.select(gloss > 0.5, film_normal(normal), normal)
+
+
+def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
+    """Normal of the tear film (eye frame); the uneven conjunctiva below it breaks up its highlights."""
+    tilted = normal
+    for slope, wave in _RIPPLES:
+        p, q = wave * (71 * normal.y + 23 * normal.z), wave * (67 * normal.z - 29 * normal.y)
+        tilted = tilted + slope * mi.Vector3f(0, dr.sin(p + 1.7 * dr.sin(q)), dr.sin(q + 1.7 * dr.sin(p)))
+    return dr.normalize(tilted)
+
+
+def film_reflectance(cosine: mi.Float, gloss: mi.Float) -> mi.Float:
+    """Share of the light from wide surroundings that the film of wet tissue mirrors."""
+    return (2 * gloss - 1) * _schlick(dr.clip(cosine, 0, 1), mi.Float(_F0_TEARS))
+
+
+def _schlick(cosine: mi.Float, f0: mi.Float) -> mi.Float:
+    s = 1 - cosine
+    s2 = s * s
+    return f0 + (1 - f0) * s2 * s2 * s

@@ -1,0 +1,507 @@
+"""Light inside the anterior chamber: what iris and chamber wall send to each other by way of the cornea.
+
+Light that the iris scatters is mirrored by the cornea (by Fresnel, totally beyond the critical angle) and returns to
+it. The irradiance that this adds varies slowly, so it is computed at a few places: points on rings in the plane of the
+iris, and points on the wall between this plane and the cornea's rim. From each, rays of a cosine-distributed pattern
+are traced through the exact surfaces:
+
+    E_i = E0_i + (1 / K) sum_k [ F_k rho_j E_j + n^2 (1 - F_k) pi L_k ]
+
+with F_k the share that the cornea mirrors, j the place where the mirrored ray arrives, and L_k the radiance that comes
+from outside along the ray that leaves the eye. Both sums depend on the eye alone, and they are linear in its lights.
+For a new pose, one ray is followed outside for each bundle of like rays, from whatever places.
+
+Limbal tissue is translucent. Of the light that falls on it, a share T goes through and leaves its inner side scattered.
+This side is that of the cornea's rim, as far as the rim has turned to sclera (opacity o), and the chamber's wall:
+
+    E_i += T sum_s (f_is + w_is) E_s,   f_is = integral over the rim's sector s of o cos_i cos / (pi r^2) dA
+
+with E_s the irradiance of the limbus in sector s from outside, and w_is the share of the wall in the view of place i.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from ...arrays import ArrayValue, Bools, Floats, Ints, Singles, frozen, remembered
+from ...eye.meshes import chamber_rim
+from ...eye.model import EyeModel
+from ...geometry.surfaces import Surface, components
+from ...optics.interface import fresnel
+
+IRIS_RINGS, TURNS = 16, 16  # points in the plane of the iris, over radius and angle
+ROOT_RINGS = 14  # of these on iris and pupil, the others beyond the root
+IRIS = IRIS_RINGS * TURNS
+LEVELS = 2  # of points on the wall
+PLACES = IRIS + TURNS * LEVELS
+RAYS = 256  # from each point
+_FAR_MM = 8.0  # distance of what rays that leave the eye meet: so far apart are two rays at an angle of 1
+_WEAK, _FEW = 0.25, 4  # of the rays of which the cornea mirrors less, one of four stands for all
+_ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
+_STEPS = 20  # crossings and mirrorings of a ray
+_NEAR_MM = 1e-6
+_SAME_MM = 0.005  # chambers of depths and radii that differ by less are one
+_AHEAD_MM = 1e-4  # hits are looked for from here on: a root cannot be computed from a point of the surface itself
+_BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
+_WALL_MM = 1.0  # thickness of the sclera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chamber(ArrayValue):
+    """The chamber of one eye, in the eye frame; arrays with PLACES rows list the rings from the middle, then the wall.
+
+    Attributes:
+        root_mm: radius of the iris' root, between two rings.
+        reach_mm: radius of the edge of the last ring.
+        points: (PLACES, 3) places, mm.
+        normals: (PLACES, 3) unit normals into the chamber.
+        valid: (PLACES,) whether a place is in the chamber.
+        exchange: (PLACES, PLACES) share of the radiosity of each place in the irradiance of each other.
+        leaving: (PLACES, RAYS, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none.
+    """
+
+    root_mm: float
+    reach_mm: float
+    points: Floats
+    normals: Floats
+    valid: Bools
+    exchange: Floats
+    leaving: Floats
+
+
+def chamber_of(eye: EyeModel, film: float) -> Chamber:
+    """Compute the chamber of an eye with a film of this index on its cornea; pupil and albedos do not matter.
+
+    As the pupil of a person changes, the centre of the stop moves within the plane of the iris, and by a micrometre
+    across it. A plane that is square to the axis stays the same plane, so depth and root are rounded to `_SAME_MM`, and
+    all images of a person share one chamber, whichever comes first. A tilted plane has a chamber of its own.
+    """
+    root_mm = float(eye.iris_root_radius_mm)
+    if np.array_equal(eye.stop.normal, [1.0, 0.0, 0.0]):
+        depth, root_mm = (_SAME_MM * round(v / _SAME_MM) for v in (float(eye.stop.centre_mm[0]), root_mm))
+        eye = replace(eye, stop=replace(eye.stop, centre_mm=frozen([depth, 0.0, 0.0])))
+    plane = (*np.asarray(eye.stop.centre_mm).tolist(), *np.asarray(eye.stop.normal).tolist())
+    sclera = (*np.asarray(eye.sclera.centre_mm).tolist(), float(eye.sclera.radius_mm))
+    indices = tuple(float(n) for n in eye.front_indices)
+    foot = None
+    if len(eye.front) > 1:
+        foot = float(np.mean(chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(TURNS) / TURNS)))
+    radii = root_mm, float(eye.limbus_radius_mm)
+    return _chamber(tuple(eye.front), indices, film, plane, radii, sclera, foot)
+
+
+def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
+    """Share (PLACES, TURNS) by which light that comes through each sector of the limbal tissue lights each place.
+
+    Args:
+        eye: the eye.
+        chamber: its chamber.
+        width_mm: width of the cornea's rim that turns to sclera.
+    """
+    return _through_limbus(chamber, eye.front[0], float(eye.limbus_radius_mm), float(width_mm))
+
+
+@remembered
+def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
+    """Bundle the rays that leave an eye: those of like origin and direction, from whatever places, are one bundle.
+
+    From the outer iris few rays leave. So none is left out, and one ray of each bundle is followed for all.
+
+    Args:
+        chamber: the chamber of the eye.
+        halvings: how often the rays are halved into bundles.
+
+    Returns:
+        Origin and direction (bundles, 6) of a ray from the middle of each bundle, and the gain (PLACES, bundles),
+        sparse, by which pi times the radiance along it becomes irradiance of each place.
+    """
+    place, ray = np.nonzero(chamber.leaving[..., 6])
+    rays, count = chamber.leaving[place, ray], 2**halvings
+    # Some rays are there twice at first, so that all bundles have the same number.
+    full = -(-len(rays) // count) * count
+    order = np.arange(full) * len(rays) // full
+    at = (rays[:, :6] * np.repeat([1.0, _FAR_MM], 3)).astype(np.float32).T.take(order, axis=1)
+
+    def off_middle(parts: int) -> Singles:
+        """Deviations (6, parts, rays) from the mean of each part."""
+        of_part = at.reshape(6, parts, -1)
+        return np.asarray(of_part - of_part.mean(axis=2, keepdims=True))
+
+    for k in range(halvings):
+        off = off_middle(2**k)
+        widest = np.argmax(np.einsum("ijk,ijk->ij", off, off), axis=0)
+        half = np.argpartition(off[widest, np.arange(2**k)], off.shape[2] // 2, axis=1)
+        half += off.shape[2] * np.arange(2**k)[:, None]
+        order, at = order.take(half.ravel()), at.take(half.ravel(), axis=1)
+    off, order = off_middle(count), order.reshape(count, -1)
+    middle = order[np.arange(count), np.argmin(np.einsum("ijk,ijk->jk", off, off), axis=1)]
+    bundle = np.empty(len(rays), dtype=int)
+    bundle[order] = np.arange(count)[:, None]
+    gain = csr_array((rays[:, 6] / RAYS, (place, bundle)), shape=(PLACES, count))
+    return rays[middle, :6], gain
+
+
+@lru_cache(maxsize=64)
+def _through_limbus(chamber: Chamber, front: Surface, limbus: float, width: float) -> Floats:
+    wall = chamber.exchange[:, IRIS:].reshape(PLACES, TURNS, LEVELS).sum(axis=2)
+    if width == 0:
+        return frozen(wall)
+    rows, fine = 8, 4
+    step, turn = width / rows, 2 * np.pi / (TURNS * fine)
+    share = (np.arange(rows) + 0.5) / rows
+    rho, angle = np.meshgrid(limbus - width * (1 - share), (np.arange(TURNS * fine) + 0.5) * turn, indexing="ij")
+    y, z = rho * np.cos(angle), rho * np.sin(angle)
+    rotation = np.asarray(front.rotation)
+    at = np.asarray(front.origin_mm) + np.stack([front.sag(y, z), y, z], axis=-1) @ rotation.T
+    normal = front.normal(at.reshape(-1, 3)).reshape(at.shape)
+    opacity = (share * share * (3 - 2 * share))[:, None]
+    area = opacity * rho * step * turn / np.abs(normal @ rotation[:, 0])
+    way = at - chamber.points[:, None, None]
+    r2 = np.sum(way * way, axis=-1)
+    here = np.einsum("ijkl,il->ijk", way, chamber.normals)
+    there = np.einsum("ijkl,jkl->ijk", way, normal)
+    seen = np.maximum(here, 0) * np.maximum(there, 0) / (np.pi * r2 * r2) * area
+    sectors = seen.reshape(PLACES, rows, TURNS, fine).sum(axis=(1, 3))
+    return frozen(wall + np.where(chamber.valid[:, None], sectors, 0))
+
+
+def limbus_points(eye: EyeModel) -> tuple[Floats, Floats]:
+    """Points of the limbus, one in the middle of each sector, and the unit normals there (TURNS, 3)."""
+    angle, r = 2 * np.pi * (np.arange(TURNS) + 0.5) / TURNS, float(eye.limbus_radius_mm)
+    front, y, z = eye.front[0], r * np.cos(angle), r * np.sin(angle)
+    at = np.asarray(front.origin_mm) + np.stack([front.sag(y, z), y, z], axis=-1) @ np.asarray(front.rotation).T
+    return at, np.asarray(front.normal(at))
+
+
+def _in_plane(centre: Floats, normal: Floats, y: Floats, z: Floats) -> Floats:
+    """Points (..., 3) of the plane of the iris at (y, z)."""
+    x = centre[0] - (normal[1] * (y - centre[1]) + normal[2] * (z - centre[2])) / normal[0]
+    return np.stack([x, y, z], axis=-1)
+
+
+def shares(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: float) -> Floats:
+    """Mean albedo of each place, (PLACES,): of pupil (`inside`), iris, and limbal tissue (`beyond` and on the wall)."""
+    fine = (np.arange(4) + 0.5) / 4
+    ring, turn = np.arange(IRIS)[:, None] // TURNS, np.arange(IRIS)[:, None] % TURNS
+    part, side = (v.ravel() for v in np.meshgrid(fine, fine))
+    r, a = _radius(ring + part, chamber.root_mm, chamber.reach_mm), 2 * np.pi * (turn + side) / TURNS
+    at = _in_plane(np.asarray(eye.stop.centre_mm), np.asarray(eye.stop.normal), r * np.cos(a), r * np.sin(a))
+    albedo = np.where(ring < ROOT_RINGS, iris, beyond)
+    albedo = np.mean(np.where(eye.stop.contains(at), inside, albedo), axis=1)
+    return np.append(albedo, np.full(TURNS * LEVELS, beyond))
+
+
+def _radius(ring: Floats, root: float, reach: float) -> Floats:
+    """Radius (mm) where so many rings end: those within the root have equal areas, and so have those beyond it."""
+    beyond = np.maximum(ring - ROOT_RINGS, 0) / (IRIS_RINGS - ROOT_RINGS)
+    return np.asarray(np.sqrt(root**2 * np.minimum(ring / ROOT_RINGS, 1) + (reach**2 - root**2) * beyond))
+
+
+@dataclass(frozen=True, slots=True)
+class _Walls:
+    """Surfaces about the chamber: refracting ones from outside inwards, their indices, film, plane and wall.
+
+    The wall is a cone about x with radius `rim` at x = `top`, which grows by `slope` per mm downwards. Where the cornea
+    has a back surface, which meets the plane of the iris, the wall is the rim of the cornea in front of that.
+    """
+
+    front: tuple[Surface, ...]
+    indices: tuple[float, ...]
+    film: float
+    centre: Floats
+    normal: Floats
+    limbus: float
+    rim: float
+    top: float
+    slope: float
+
+    @property
+    def layer(self) -> int:
+        """Medium that the wall bounds, as the number of surfaces in front of it."""
+        return max(len(self.front) - 1, 1)
+
+    def height(self, p: Floats) -> Floats:
+        """Height (n,) mm of points above the plane of the iris."""
+        return np.asarray((p - self.centre) @ self.normal)
+
+    def to_plane(self, o: Floats, d: Floats) -> Floats:
+        """Distance (n,) to the plane of the iris, infinite for rays that leave it."""
+        down = d @ self.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -self.height(o) / down
+        return np.where((down < -1e-9) & (t > _NEAR_MM), t, np.inf)
+
+    def to_wall(self, o: Floats, d: Floats) -> Floats:
+        """Distance (n,) to the wall above the plane, infinite where it is not met."""
+        r, s = self.rim + self.slope * (self.top - o[:, 0]), -self.slope * d[:, 0]
+        a = d[:, 1] ** 2 + d[:, 2] ** 2 - s * s
+        b = o[:, 1] * d[:, 1] + o[:, 2] * d[:, 2] - r * s
+        c = o[:, 1] ** 2 + o[:, 2] ** 2 - r * r
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root = np.sqrt(np.maximum(b * b - a * c, 0))
+            t = np.where(a > 0, (root - b) / a, -c / (b + root))
+        hit = o + np.where(np.isfinite(t), t, 0)[:, None] * d
+        there = (b * b > a * c) & (t > _NEAR_MM) & (hit[:, 0] < self.top) & (self.height(hit) > 0)
+        return np.where(there, t, np.inf)
+
+
+@lru_cache(maxsize=64)
+def _chamber(
+    front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],
+    radii: tuple[float, float], sclera: tuple[float, ...], foot: float | None,
+) -> Chamber:  # fmt: skip
+    walls = _walls(front, indices, film, plane, radii[1], sclera, foot)
+    reach = walls.rim + walls.slope * max(walls.top - walls.centre[0], 0)
+    root = min(radii[0], 0.99 * reach)
+    points, normals, valid = _places(walls, root, reach)
+    exchange = np.zeros((PLACES, PLACES))
+    leaving = np.zeros((PLACES, RAYS, 7))
+    rows = np.flatnonzero(valid)
+    o, d = _pattern(points[rows], normals[rows])
+    row = np.repeat(rows, RAYS)
+    left = leaving.reshape(-1, 7)
+    arrived = _traced(walls, o, d, np.where(row < IRIS, len(front), walls.layer))
+    slot = (row * RAYS + np.tile(np.arange(RAYS), len(rows)))[arrived.out]
+    left[slot] = np.concatenate([arrived.origin, arrived.way, arrived.weight[:, None]], axis=1)
+    for index, weight in _onto(arrived.back, arrived.on_wall, (root, reach), points, valid):
+        np.add.at(exchange, (row[arrived.ray], index), weight * arrived.share / RAYS)
+    exchange = _turned(exchange, valid)
+    return Chamber(root, reach, frozen(points), frozen(normals), valid, frozen(exchange), frozen(leaving))
+
+
+def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],
+           limbus: float, sclera: tuple[float, ...], foot: float | None) -> _Walls:  # fmt: skip
+    centre, normal = np.array(plane[:3]), np.array(plane[3:])
+    top = float(np.asarray(front[0].origin_mm)[0] + front[0].sag(np.array(limbus), np.array(0.0)))
+    bottom = centre[0] - _BELOW_MM
+    wide = np.sqrt(max((sclera[3] - _WALL_MM) ** 2 - (bottom - sclera[0]) ** 2, limbus**2))
+    if foot is not None:
+        bottom, wide = min(centre[0], top - 0.1), foot
+    return _Walls(front, indices, film, centre, normal, limbus, limbus, top, (wide - limbus) / (top - bottom))
+
+
+def _places(walls: _Walls, root: float, reach: float) -> tuple[Floats, Floats, Bools]:
+    n, c = walls.normal, walls.centre
+    ring, turn = np.arange(IRIS) // TURNS, np.arange(IRIS) % TURNS
+    radius, angle = _radius(np.asarray(ring + 0.5, dtype=float), root, reach), 2 * np.pi * (turn + 0.5) / TURNS
+    y, z = radius * np.cos(angle), radius * np.sin(angle)
+    grid = _in_plane(c, n, y, z)
+    inside = np.ones(IRIS, dtype=bool)
+    inner = walls.front[-1]
+    if len(walls.front) > 1:
+        inside &= inner.implicit(grid) * _sign(inner) < 0
+    angle = 2 * np.pi * (np.arange(TURNS * LEVELS) // LEVELS + 0.5) / TURNS
+    share = (np.arange(TURNS * LEVELS) % LEVELS + 0.5) / LEVELS
+    foot = c[0] - (n[1] * reach * np.cos(angle) + n[2] * reach * np.sin(angle)) / n[0]
+    x = walls.top + share * (foot - walls.top)
+    r = walls.rim + walls.slope * (walls.top - x)
+    wall = np.stack([x, r * np.cos(angle), r * np.sin(angle)], axis=-1)
+    steep = np.hypot(1.0, walls.slope)
+    across = np.stack([np.full_like(x, -walls.slope), -np.cos(angle), -np.sin(angle)], axis=-1) / steep
+    there = (walls.height(wall) > 0.02) & (walls.top - foot > 0.1)
+    points = np.concatenate([grid, wall + 1e-4 * across])
+    return points, np.concatenate([np.tile(n, (IRIS, 1)), across]), np.append(inside, there)
+
+
+def _sign(surface: Surface) -> float:
+    """Sign of the implicit function of a surface on its air side."""
+    apex = np.asarray(surface.origin_mm) + np.asarray(surface.rotation)[:, 0]
+    return float(np.sign(surface.implicit(apex[None])[0]))
+
+
+def _pattern(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
+    """Origins and cosine-distributed directions (n RAYS, 3): an additive sequence, shifted from point to point."""
+    phi = 1.324717957244746
+    k = np.arange(RAYS)
+    shift = np.arange(len(points))[:, None]
+    u = (0.5 + k / phi + shift * 0.6180339887498949) % 1.0
+    v = (0.5 + k / phi**2 + shift * 0.7548776662466927) % 1.0
+    helper = np.where(np.abs(normals[:, :1]) < 0.6, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    e1 = np.cross(helper, normals)
+    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    e2 = np.cross(normals, e1)
+    r, a = np.sqrt(u)[..., None], 2 * np.pi * v[..., None]
+    d = r * np.cos(a) * e1[:, None] + r * np.sin(a) * e2[:, None] + np.sqrt(1 - u)[..., None] * normals[:, None]
+    return np.repeat(points, RAYS, axis=0), d.reshape(-1, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrived:
+    """Where traced rays end: those that left (`out`: their numbers), and arrivals (`ray`: their numbers)."""
+
+    out: Ints
+    origin: Floats
+    way: Floats
+    weight: Floats
+    ray: Ints
+    share: Floats
+    back: Floats
+    on_wall: Bools
+
+
+@dataclass(slots=True)
+class _Rays:
+    """Rays on their way: numbers, weights, points, directions, and in which medium (surfaces in front of it)."""
+
+    number: Ints
+    weight: Floats
+    o: Floats
+    d: Floats
+    layer: Ints
+
+    def only(self, some: Bools) -> _Rays:
+        return _Rays(self.number[some], self.weight[some], self.o[some], self.d[some], self.layer[some])
+
+    def and_(self, other: _Rays) -> _Rays:
+        names = ("number", "weight", "o", "d", "layer")
+        return _Rays(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+
+
+def _traced(walls: _Walls, o: Floats, d: Floats, layer: Ints) -> _Arrived:
+    """Follow rays until they arrive at the plane or the wall; what first leaves through the front is kept.
+
+    The cornea's back refracts them; it mirrors only what it mirrors totally.
+    """
+    rays = _Rays(np.arange(len(o)), np.ones(len(o)), o, d, layer)
+    first = np.ones(len(o), dtype=bool)
+    ends, left = [], []
+    for _ in range(_STEPS):
+        if not len(rays.number):
+            break
+        outer, inner = _to_surfaces(walls, rays)
+        plane = np.where(rays.layer == len(walls.front), walls.to_plane(rays.o, rays.d), np.inf)
+        wall = np.where(rays.layer == walls.layer, walls.to_wall(rays.o, rays.d), np.inf)
+        nearest = np.minimum(np.minimum(plane, wall), np.minimum(outer, inner))
+        known = np.isfinite(nearest)
+        # Where the rim of a tilted cornea is above the wall's edge, rays pass between them: they meet the wall there.
+        arrives = ~known | (nearest == np.minimum(plane, wall))
+        at = rays.o + np.where(known, nearest, 0)[:, None] * rays.d
+        ends.append((rays.number[arrives], rays.weight[arrives], at[arrives], (~known | (wall < plane))[arrives]))
+        rays.o = at
+        known &= ~arrives
+        outwards = nearest == outer
+        at_front = rays.only(known & outwards & (rays.layer == 1))
+        at_front, gone = _mirrored(walls, at_front, first)
+        left.append(gone)
+        further = [at_front]
+        for k in range(1, len(walls.front)):
+            further.append(_crossed(walls, rays.only(known & outwards & (rays.layer == k + 1)), k, outwards=True))
+            further.append(_crossed(walls, rays.only(known & ~outwards & (rays.layer == k)), k, outwards=False))
+        rays = further[0]
+        for more in further[1:]:
+            rays = rays.and_(more)
+    arrived = [np.concatenate(column) for column in zip(*ends, strict=True)]
+    out = [np.concatenate(column) for column in zip(*left, strict=True)]
+    return _Arrived(out[0], out[1], out[2], out[3], *arrived)
+
+
+def _to_surfaces(walls: _Walls, rays: _Rays) -> tuple[Floats, Floats]:
+    """Distances (n,) to the surface in front of the rays' medium and to that behind it; infinite where it is missed."""
+    outer, inner = np.full(len(rays.number), np.inf), np.full(len(rays.number), np.inf)
+    for k, surface in enumerate(walls.front):
+        here = rays.layer == k + 1
+        t = _outward(surface, rays.o[here], rays.d[here])
+        if k == 0:
+            hit = rays.o[here] + np.where(np.isfinite(t), t, 0)[:, None] * rays.d[here]
+            local = surface.to_local(hit)
+            t[(np.hypot(local[:, 1], local[:, 2]) > walls.limbus) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
+        outer[here] = t
+        here = rays.layer == k
+        hit = surface.hit(components(rays.o[here] + _AHEAD_MM * rays.d[here]), components(rays.d[here]), True)
+        inner[here] = np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
+    return outer, inner
+
+
+def _mirrored(walls: _Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tuple[Ints, Floats, Floats, Floats]]:
+    """Mirror rays at the inner side of the front; also returns what leaves the eye there for the first time.
+
+    `first` marks the rays of which nothing has left.
+    """
+    n, w = walls.front[0].normal(rays.o), rays.d
+    cosine = np.sum(n * w, axis=1)
+    mirrored = fresnel(cosine, walls.indices[0], 1.0, walls.film).unpolarized
+    go = first[rays.number] & (mirrored < 1)
+    full = rays.weight * walls.indices[0] ** 2 * (1 - mirrored)
+    gone = rays.number[go], rays.o[go], _refracted(w[go], -n[go], walls.indices[0]), full[go]
+    first[rays.number[go]] = False
+    rays.d = w - 2 * cosine[:, None] * n
+    weak = mirrored < _WEAK
+    rays.weight = rays.weight * np.where(weak, _FEW * mirrored, mirrored)
+    return rays.only((rays.weight > 1e-3) & (~weak | (rays.number % _FEW == 0))), gone
+
+
+def _crossed(walls: _Walls, rays: _Rays, k: int, *, outwards: bool) -> _Rays:
+    """Refract rays at surface k behind the front, with the change of radiance between media; mirror the others."""
+    n = walls.front[k].normal(rays.o)
+    before, after = walls.indices[k - 1], walls.indices[k]
+    if outwards:
+        n, before, after = -n, after, before
+    eta = before / after
+    cosine = -np.sum(n * rays.d, axis=1)
+    passes = 1 - eta * eta * (1 - cosine * cosine) > 0
+    mirrored = rays.d + 2 * cosine[:, None] * n
+    rays.d = np.where(passes[:, None], _refracted(rays.d, n, eta), mirrored)
+    rays.weight = rays.weight * np.where(passes, eta * eta, 1.0)
+    rays.layer = rays.layer + np.where(passes, -1 if outwards else 1, 0)
+    return rays
+
+
+def _outward(surface: Surface, o: Floats, d: Floats) -> Floats:
+    """Distance (n,) to a surface from inside, infinite where it is not met."""
+    hit = surface.hit(components(o + _AHEAD_MM * d), components(d), False)
+    return np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
+
+
+def _refracted(d: Floats, n: Floats, eta: float) -> Floats:
+    """Refract directions at normals against them; grazing beyond total reflection."""
+    c = -np.sum(n * d, axis=1)
+    c2 = np.sqrt(np.maximum(1 - eta * eta * (1 - c * c), 0))
+    w = eta * d + (eta * c - c2)[:, None] * n
+    return np.asarray(w / np.linalg.norm(w, axis=1, keepdims=True))
+
+
+def _turned(exchange: Floats, valid: Bools) -> Floats:
+    """Exchange (PLACES, PLACES) averaged over neighbouring sectors, because an eye is nearly round."""
+    place = np.arange(PLACES)
+    on_wall = place >= IRIS
+    turn = np.where(on_wall, (place - IRIS) // LEVELS, place % TURNS)
+    total, weight = np.zeros_like(exchange), np.zeros(PLACES)
+    for shift, share in enumerate(_ALIKE, -(len(_ALIKE) // 2)):
+        moved = place + ((turn + shift) % TURNS - turn) * np.where(on_wall, LEVELS, 1)
+        total += share * exchange[np.ix_(moved, moved)]
+        weight += share * valid[moved]
+    return np.asarray(total * np.where(valid & (weight > 0), 1 / np.maximum(weight, 1), 0)[:, None])
+
+
+def _onto(
+    back: Floats, on_wall: Bools, radii: tuple[float, float], points: Floats, valid: Bools
+) -> list[tuple[Ints, Floats]]:
+    """Places that stand for points of arrival, each with its weight (n,): on the same side of the iris' root."""
+    turn = np.arctan2(back[:, 2], back[:, 1]) / (2 * np.pi) * TURNS % TURNS
+    root2, reach2 = np.square(radii)
+    r2 = back[:, 1] ** 2 + back[:, 2] ** 2
+    within = np.clip(ROOT_RINGS * r2 / root2 - 0.5, 0, ROOT_RINGS - 1)
+    beyond = ROOT_RINGS - 0.5 + (IRIS_RINGS - ROOT_RINGS) * (r2 - root2) / (reach2 - root2)
+    ring = np.where(r2 < root2, within, np.clip(beyond, ROOT_RINGS, IRIS_RINGS - 1))
+    before = np.floor(turn - 0.5).astype(int)
+    i = np.minimum(ring.astype(int), IRIS_RINGS - 2)
+    f, g = ring - i, turn - 0.5 - before
+    index, weight = [], []
+    for a in (0, 1):
+        for b in (0, 1):
+            k = (i + a) * TURNS + (before + b) % TURNS
+            index.append(k)
+            weight.append(np.abs(1 - a - f) * np.abs(1 - b - g) * valid[k])
+    total = np.sum(weight, axis=0)
+    # Arrivals whose four neighbours are all outside the chamber are next to the rim.
+    best = [np.where(total > 0, w / np.where(total > 0, total, 1), 0) for w in weight]
+    wall, sector = points[IRIS:], turn.astype(int) % TURNS
+    first, last = wall[sector * LEVELS, 0], wall[sector * LEVELS + LEVELS - 1, 0]
+    level = np.where(np.abs(back[:, 0] - first) < np.abs(back[:, 0] - last), 0, LEVELS - 1)
+    out = [(np.where(on_wall, 0, k), np.where(on_wall, 0, w)) for k, w in zip(index, best, strict=True)]
+    return [*out, (IRIS + sector * LEVELS + level, np.where(on_wall, 1.0, 0.0))]

@@ -1,0 +1,309 @@
+"""Light of all lamps: directly on matte surfaces, and through the cornea on the iris by manifold connections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..hits.interaction import EPSILON_MM, View, meet_sphere, opacity
+from ..records.frame import ALL, BITS, Frame, Lamp
+from ..records.surfaces import Surface
+from ..scene.region import sheen
+from .manifold import connect
+from .shadowmaps import LampViews
+
+
+def lamp_blocked(
+    frame: Frame, x: mi.Vector3f, lamp: mi.Vector3f, sphere: mi.Bool, cornea: mi.Bool, active: mi.Bool
+) -> mi.Bool:
+    """Whether anything stands between a point of the eye frame and a lamp.
+
+    `sphere` and `cornea` mark the lanes that the globe's sphere and the cornea's bulge can block.
+    """
+    d = lamp - x
+    distance = dr.norm(d)
+    d /= distance
+    r = x - frame.sclera.centre
+    along = dr.dot(r, d)
+    reach = frame.globe_reach
+    near = dr.squared_norm(r) - along * along < reach * reach
+    # Where only the bulge of the cornea can block, most rays pass the sphere about it.
+    way, bulge2 = frame.limbus.bulge - x, dr.square(frame.limbus.bulge_radius)
+    ahead, away2 = dr.dot(way, d), dr.squared_norm(way)
+    near &= mi.Bool(sphere) | ((away2 - ahead * ahead < bulge2) & ((ahead > 0) | (away2 < bulge2)))
+    blocked = dr.if_stmt(
+        (x, r, d, distance, mi.Bool(sphere), mi.Bool(cornea)),
+        near & (mi.Bool(sphere) | mi.Bool(cornea)),
+        lambda x, r, d, distance, sphere, cornea: _globe_blocks(frame, x, r, d, distance, sphere, cornea),
+        lambda x, r, d, distance, sphere, cornea: mi.Bool(False),
+    )
+    if not frame.structure.obstacles:
+        return blocked | (frame.point_to_scene(lamp).x < frame.backdrop_x)
+    ray = mi.Ray3f(mi.Point3f(frame.point_to_scene(x + EPSILON_MM * d)), frame.vector_to_scene(d))
+    ray.maxt = distance * (1 - 1e-4)
+    return dr.if_stmt(
+        (blocked,),
+        active & ~blocked,
+        lambda blocked: blocked | frame.scene.ray_test(ray, coherent=True, active=True),
+        lambda blocked: blocked,
+    )
+
+
+def _globe_blocks(
+    frame: Frame, x: mi.Vector3f, r: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
+) -> mi.Bool:
+    """Whether the globe blocks the way; r is the point relative to the sclera's centre."""
+    t, met = meet_sphere(r, d, frame.sclera.radius)
+    blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
+    front = frame.surfaces[0]
+    o, dl = front.point_in(x), front.vector_in(d)
+    t, met = front.hit(o, dl)
+    y = o + t * dl
+    rho2 = y.y * y.y + y.z * y.z
+    met &= (rho2 < frame.limbus.radius * frame.limbus.radius) & (y.x > frame.limbus.floor)
+    return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
+
+
+def straight(
+    lamp: Lamp, source: mi.Vector3f, view: View, mirror: tuple[mi.Vector3f, mi.Vector3f] | None = None
+) -> tuple[mi.Float, mi.Float]:
+    """Light that a lamp gives to matte points in air when nothing stands in the way.
+
+    Args:
+        lamp: the lamp.
+        source: points of the lamp.
+        view: the points that are lit.
+        mirror: normal of what mirrors and unit direction of the viewer (eye frame), if their sheen is wanted.
+
+    Returns:
+        Irradiance (mW/mm^2), and the radiance of the sheen towards the viewer.
+    """
+    to = source - view.point
+    inv2 = dr.rcp(dr.squared_norm(to))
+    to *= dr.sqrt(inv2)
+    cosine = dr.dot(to, view.normal)
+    received = dr.select(view.matte & (cosine > 0), lamp.radiant_intensity(-to) * cosine * inv2, 0)
+    return received, mi.Float(0) if mirror is None else received * sheen(mirror[0], to, mirror[1], view.gloss)
+
+
+def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vector3f) -> mi.Float:
+    """Irradiance (mW/mm^2) that a lamp's point `source` gives to points x when nothing stands in the way."""
+    to = source - x
+    inv2 = dr.rcp(dr.squared_norm(to))
+    to *= dr.sqrt(inv2)
+    cosine = dr.dot(to, normal)
+    return dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2, 0)
+
+
+def onto_points(
+    frame: Frame,
+    x: mi.Vector3f,
+    normal: mi.Vector3f,
+    other: mi.Bool,
+    u: mi.Float,
+    v: mi.Float,
+    views: LampViews | None = None,
+    on_sheet: mi.Bool | bool = False,
+) -> tuple[mi.Float, mi.Float]:
+    """Irradiance (mW/mm^2) of points in air (eye frame) straight from all lamps, and the same without shadows.
+
+    `other` marks points off the globe.
+
+    u, v: place on each lamp's disc, [0, 1). on_sheet: points on the outer side of a region's sheet of skin, for which
+    the lamps' views of it spare rays.
+    """
+    views = frame.textures.lamp_views
+    sine, cosine_v = dr.sincos(v * (2 * dr.pi))
+
+    def body(i: mi.UInt32, total: mi.Float, free: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        lamp: Lamp = frame.lights[i]
+        source = lamp.point(u, sine, cosine_v)
+        lit = irradiance(lamp, source, x, normal)
+        asked = lit > 0
+        if views is not None:
+            asked &= ~views.clear(i, frame.point_to_scene(x), asked & on_sheet)
+        blocked = lamp_blocked(frame, x, source, other, True, asked)
+        return i + 1, total + dr.select(blocked, 0, lit), free + lit
+
+    # One zero for both sums: whether Dr.Jit takes two for one varies, and with it the kernel.
+    dark = mi.Float(0) * x.x
+    state, labels = (mi.UInt32(0), dark, dark), ("i", "total", "free")
+    _, total, free = dr.while_loop(
+        state, lambda i, *_: i < frame.lights.count, body, labels=labels, label="lamps on places"
+    )
+    return total, free
+
+
+def light(frame: Frame, view: View, u: mi.Float, v: mi.Float, known: mi.Bool) -> tuple[mi.Float, mi.Float, mi.UInt32]:
+    """Light of the lamps on a bare eye.
+
+    The cornea is convex: where it faces a lamp it does not shadow itself.
+
+    Args:
+        frame: the frame.
+        view: the points that are lit.
+        u: place on each lamp's disc, [0, 1).
+        v: the same, second coordinate.
+        known: where the light at the first surface is not wanted.
+
+    Returns:
+        Irradiance (mW/mm^2) at the first surface where it is matte, the irradiance in the plane of the iris, and failed
+        paths.
+    """
+    sine, cosine = dr.sincos(v * (2 * dr.pi))
+
+    def onto_matte(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        lamp: Lamp = frame.lights[i]
+        source = lamp.point(u, sine, cosine)
+        direct, _ = straight(lamp, source, view)
+        blocked = lamp_blocked(frame, view.point, source, view.other, ~view.cornea, direct > 0)
+        return i + 1, total + dr.select(blocked, 0, direct)
+
+    matte = view.matte & ~known
+    state = (mi.UInt32(0), mi.Float(0))
+    _, direct = dr.while_loop(
+        state, lambda i, _: matte & (i < frame.lights.count), onto_matte, labels=("i", "direct"), label="lamps"
+    )
+    return direct, *through_cornea(frame, view.inner, view.lit_inside, u, v)
+
+
+def through_cornea(
+    frame: Frame,
+    inner: mi.Vector3f,
+    inside: mi.Bool,
+    u: mi.Float,
+    v: mi.Float,
+    normal: mi.Vector3f | None = None,
+    surfaces: tuple[Surface, ...] | None = None,
+) -> tuple[mi.Float, mi.UInt32]:
+    """Irradiance (mW/mm^2) of all lamps at points `inner` in the plane of the iris, where `inside`; failed paths.
+
+    u, v: place on each lamp's disc, [0, 1). normal: unit normals at the points; None for those of the plane. surfaces:
+    those in front of the points; None for all.
+    """
+    bent, left, rest = mi.Float(0), mi.UInt32(ALL), inside & behind((surfaces or frame.surfaces)[-1], inner)
+    if frame.lights.on_iris is not None:
+        bent, left = frame.lights.on_iris.at(frame, inner, rest)
+    many = frame.lights.count > BITS
+    sine, cosine = dr.sincos(v * (2 * dr.pi))
+
+    def more(i: mi.UInt32, *_: object) -> mi.Bool:
+        return rest & (i < frame.lights.count)
+
+    def body(
+        i: mi.UInt32, left: mi.UInt32, bent: mi.Float, failures: mi.UInt32
+    ) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.UInt32]:
+        lamp: Lamp = frame.lights[i]
+        path = LampPath.to(frame, lamp, lamp.point(u, sine, cosine), inner, rest, normal, surfaces)
+        failed = dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
+        left &= left - 1
+        following = dr.select(many, i + 1, dr.tzcnt(left))
+        return following, left, bent + dr.select(path.blocked, 0, path.gain), failures + failed
+
+    # Of the lamps whose light is not known, the next one is at the lowest bit; without bits the number is too high.
+    first = dr.select(left == 0, frame.lights.count, dr.select(many, 0, dr.tzcnt(left)))
+    state, labels = (first, left, bent, mi.UInt32(0)), ("i", "left", "bent", "failures")
+    _, _, bent, failures = dr.while_loop(state, more, body, labels=labels, label="lamps")
+    if normal is None and frame.lights.relief is not None:
+        bent *= frame.lights.relief.share(frame, inner, inside)
+    return bent, failures
+
+
+def off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float) -> mi.Float:
+    """Irradiance (mW/mm^2) of points before the eye (eye frame) from all lamps by way of the cornea as a mirror.
+
+    u, v: place on each lamp's disc, [0, 1).
+    """
+    sine, cosine = dr.sincos(v * (2 * dr.pi))
+    front, reach = frame.surfaces[:1], frame.limbus.radius
+
+    def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        lamp: Lamp = frame.lights[i]
+        source = lamp.point(u, sine, cosine)
+        path = connect(front, source, x, normal, x, reach, mi.Bool(True), mirror=True)
+        local = front[0].point_in(path.entry)
+        out = dr.sqrt(local.y * local.y + local.z * local.z)
+        there = path.found & (out < reach)
+        blocked = lamp_blocked(frame, path.entry, source, True, False, there)
+        blocked |= lamp_blocked(frame, path.entry, x, True, False, there & ~blocked)
+        lit = lamp.radiant_intensity(path.leaving) * path.transfer * (1 - opacity(frame, out))
+        return i + 1, total + dr.select(there & ~blocked, lit, 0)
+
+    state, labels = (mi.UInt32(0), mi.Float(0) * x.x), ("i", "total")
+    _, total = dr.while_loop(state, lambda i, _: i < frame.lights.count, body, labels=labels, label="mirrored lamps")
+    return total
+
+
+def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
+    """Whether points (eye frame) are behind a surface, or so far before it. No light comes to others through it.
+
+    The end of an iris may not be: a cornea with a shallow chamber ends behind the plane of the iris.
+    """
+    away = 8.0
+    o = surface.point_in(x) + mi.Vector3f(away, 0, 0)
+    t, met = surface.hit(o, mi.Vector3f(-1, 0, 0))
+    return met & (t < away + ahead_mm)
+
+
+def on_relief(frame: Frame, view: View) -> View:
+    """The view with the places on the relief of the iris that the rays meet, as their feet in its plane."""
+    if frame.lights.relief is None:
+        return view
+    seen = view.cornea & ~view.pupil & (view.passed > 0)
+    return replace(view, inner=frame.lights.relief.hit(frame, view.inner, view.slant, seen))
+
+
+@dataclass(frozen=True, slots=True)
+class LampPath:
+    """Light path from a point of a lamp through the cornea to a point behind it.
+
+    Attributes:
+        gain: irradiance (mW/mm^2) if nothing is in the way.
+        whole: the same if all of the cornea were clear.
+        out: radius about the front surface's axis where the path enters, mm.
+        entry: where the path enters the front surface (eye frame).
+        enters: whether there is a path, through the clear part of the cornea.
+        blocked: whether anything is in its way.
+        failed: whether the search for it did not converge.
+    """
+
+    gain: mi.Float
+    whole: mi.Float
+    out: mi.Float
+    entry: mi.Vector3f
+    enters: mi.Bool
+    blocked: mi.Bool
+    failed: mi.Bool
+
+    @classmethod
+    def to(
+        cls,
+        frame: Frame,
+        lamp: Lamp,
+        source: mi.Vector3f,
+        inner: mi.Vector3f,
+        active: mi.Bool,
+        normal: mi.Vector3f | None = None,
+        surfaces: tuple[Surface, ...] | None = None,
+        ahead_mm: float = 0.0,
+    ) -> LampPath:
+        """Find the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame).
+
+        ahead_mm: as for `connect`.
+        """
+        # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
+        scale, shift = frame.image.scale, frame.image.shift
+        aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
+        normal = frame.stop.normal if normal is None else normal
+        path = connect(
+            surfaces or frame.surfaces, source, inner, normal, aim, frame.limbus.radius, active, ahead_mm=ahead_mm
+        )
+        local = frame.surfaces[0].point_in(path.entry)
+        out = dr.sqrt(local.y * local.y + local.z * local.z)
+        clear = 1 - opacity(frame, out)
+        enters = path.found & (clear > 0)
+        blocked = lamp_blocked(frame, path.entry, source, True, False, enters)
+        whole = dr.select(path.found, lamp.radiant_intensity(path.leaving) * path.transfer, 0)
+        return cls(whole * clear, whole, out, path.entry, enters, blocked, path.failed)

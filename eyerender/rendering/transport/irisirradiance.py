@@ -1,0 +1,155 @@
+"""Light of the lamps on the iris, on a grid in its plane that is filled once per frame (see `irradiancegrid`).
+
+A lamp is hidden where anything stands in its way at one of the nodes about a cell. In front of an eye region the nodes
+must also be far from all hairs and lids as the lamp sees them (`lampviews`), so that nothing can hide between them.
+
+The rim of the cornea clouds within a millimetre. Where light of a lamp passes it, a cell holds what a clear rim would
+let pass and the radius at which the light enters, both of which change slowly. Every sample computes what the rim
+lets pass.
+
+A lamp is represented by its middle if it is small, else by four points whose mean is exact to the third order of its
+radius. Before lamps that are large and near, there is no grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..hits.interaction import STEEPEST, opacity
+from ..records.frame import BITS, Frame
+from ..records.irradiancegrid import BENT, IrradianceGrid, unevenness
+from .directlight import LampPath, behind
+
+_SIDE = 80
+_NODES = _SIDE * _SIDE
+_SPARE_MM = 0.45  # beyond the root of the iris: two cells
+_STEADY = 0.02  # as BENT, of what enters: without the edges of shadows, cubics are off by a hundredth of this
+_AHEAD_MM = 1.0  # before the back of the cornea, where nodes continue the light behind it
+
+
+@dataclass(kw_only=True)
+class IrisLight:
+    """The light of the lamps in the plane of the iris.
+
+    Attributes:
+        grid: the light of the lamps that nothing clouds.
+        behind_rim: lamps of each cell whose light passes the rim of the cornea, as bits.
+        paths: for these, what passes a clear rim at four nodes in a row, and the radii (mm) where it enters.
+    """
+
+    grid: IrradianceGrid
+    behind_rim: mi.UInt32
+    paths: mi.Float
+
+    def at(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
+        """Irradiance (mW/mm^2) at points of the plane of the iris (eye frame), and the lamps that it lacks, as bits."""
+        q = x - frame.stop.centre
+        scale = 0.5 * (_SIDE - 1) / _half(frame)
+        u, v = (dr.dot(q, axis) * scale + 0.5 * (_SIDE - 1) for axis in (frame.stop.u, frame.stop.v))
+        place = self.grid.place(u, v, active)
+        total, left = self.grid.at(place)
+        lamps = dr.gather(mi.UInt32, self.behind_rim, place.cell, place.inside)
+
+        def add(lamps: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            whole, out = mi.Float(0), mi.Float(0)
+            first = dr.tzcnt(lamps) * _NODES + place.cell
+            for k in range(4):
+                a, b = _rows(self.paths, first + k * _SIDE - _SIDE)
+                whole += place.down[k] * dr.dot(place.across, a)
+                out += place.down[k] * dr.dot(place.across, b)
+            return lamps & (lamps - 1), total + whole * (1 - opacity(frame, out))
+
+        _, total = dr.while_loop(
+            (lamps, total), lambda lamps, _: lamps != 0, add, labels=("lamps", "total"), label="behind the rim"
+        )
+        return total, left
+
+
+def _half(frame: Frame) -> mi.Float:
+    """Half the width of the grid, mm."""
+    return frame.iris.root_radius + _SPARE_MM
+
+
+def iris_light(frame: Frame, lamps: int, points: mi.UInt32) -> IrisLight:
+    """Fill the grid over the plane of the iris.
+
+    Args:
+        frame: the frame.
+        lamps: number of lamps; 0 where none may use a grid.
+        points: number of points that stand for a lamp.
+    """
+    if not lamps:
+        none = dr.zeros(mi.UInt32, _NODES)
+        dr.make_opaque(none)
+        return IrisLight(grid=IrradianceGrid.unknown(_SIDE), behind_rim=none, paths=dr.zeros(mi.Float, 8))
+    index = dr.arange(mi.UInt32, _NODES * lamps)
+    lamp = index // _NODES
+    lit, *paths = _at_nodes(frame, points, lamp, index - lamp * _NODES)
+    dr.eval(lit, paths)
+    rows = _four_in_a_row(paths, min(lamps, BITS), frame.lights.count)
+
+    def steady_behind_rim(k: mi.UInt32, cell: mi.UInt32, allowed: mi.Float) -> mi.Bool:
+        four = [_rows(rows, k * _NODES + cell + n * _SIDE - _SIDE) for n in range(4)]
+        whole, out = ([value for row in four for value in row[m]] for m in (0, 1))
+        bent, least, most = unevenness(whole)
+        steep = unevenness(out)[0] * most * STEEPEST * frame.limbus.gain
+        return (least > 0) & (bent + steep <= _STEADY / BENT * allowed)
+
+    grid, behind_rim = IrradianceGrid.build(_SIDE, lit, frame.lights.count, held=steady_behind_rim)
+    return IrisLight(grid=grid, behind_rim=behind_rim, paths=rows)
+
+
+def _four_in_a_row(paths: list[mi.Float], lamps: int, count: mi.UInt32) -> mi.Float:
+    """What passes a clear rim, and the radii where it enters, at each node and the three beside it."""
+    index = dr.arange(mi.UInt32, _NODES * lamps)
+    rows = dr.zeros(mi.Float, 8 * _NODES * lamps)
+    last = mi.Int32(dr.minimum(count, BITS) * _NODES) - 1
+    for n, path in enumerate(paths):
+        four = (dr.gather(mi.Float, path, mi.UInt32(dr.clip(mi.Int32(index) + k, 0, last))) for k in range(-1, 3))
+        dr.scatter(rows, mi.Vector4f(*four), 2 * index + n)
+    dr.eval(rows)
+    return rows
+
+
+def _rows(paths: mi.Float, node: mi.UInt32) -> tuple[mi.Vector4f, mi.Vector4f]:
+    """What passes a clear rim at nodes and the three beside them, and the radii where it enters."""
+    return dr.gather(mi.Vector4f, paths, 2 * node), dr.gather(mi.Vector4f, paths, 2 * node + 1)
+
+
+def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Irradiance of lamps i at nodes, the same behind a clear rim, and the radius (mm) where it enters.
+
+    Where anything may hide the lamps, or a path was not found, irradiances are negative. Behind a clear rim, that of a
+    lamp with several points is so, too.
+    """
+    stop, half, views = frame.stop, _half(frame), frame.textures.lamp_views
+    row = node // _SIDE
+    a, b = (half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (node - row * _SIDE, row))
+    x = stop.centre + a * stop.u + b * stop.v
+    lamp = frame.lights[i]
+    within = (a * a + b * b < dr.square(half)) & behind(frame.surfaces[-1], x, _AHEAD_MM)
+
+    def more(k: mi.UInt32, *_: object) -> mi.Bool:
+        return within & (k < points)
+
+    def body(k: mi.UInt32, total: mi.Float, whole: mi.Float, out: mi.Float, hidden: mi.Bool) -> tuple[Any, ...]:
+        source = lamp.node(k, points)
+        path = LampPath.to(frame, lamp, source, x, within, ahead_mm=_AHEAD_MM)
+        total += dr.select(path.blocked, 0, path.gain)
+        usable = ~path.blocked & (points == 1)
+        hidden |= path.failed
+        if views is not None:
+            free = views.clear(i, frame.point_to_scene(path.entry), path.whole > 0)
+            hidden |= path.enters & (path.blocked | ~free)
+            usable &= free
+        return k + 1, total, dr.select(usable, path.whole, -1), path.out, hidden
+
+    state = (mi.UInt32(0), mi.Float(0), mi.Float(-1), mi.Float(0), mi.Bool(False))
+    labels = ("k", "total", "whole", "out", "hidden")
+    _, total, whole, out, hidden = dr.while_loop(state, more, body, labels=labels, label="grid of the iris")
+    hidden |= ~within
+    return dr.select(hidden, -1, total / mi.Float(points)), dr.select(hidden, -1, whole), out

@@ -1,0 +1,161 @@
+"""Manifold next-event estimation: the light path from a lamp through every refracting surface to a point behind them.
+
+It uses Newton's method on the point y where the path enters the front surface, with exact ray differentials chained
+through the surfaces (Mitchell and Hanrahan 1992 for the principle; Hanika, Droske and Fascione 2015 for its use as
+next-event estimation). With the differentials a, b (per angle at the lamp) of the ray where it passes the target, w its
+direction there, r the miss, and ya, yb the differentials of y:
+
+    J = |w . (a x b)| = dA_perp / dOmega at the lamp,        E = I (1 - F) cos(theta) / J
+    y <- y + ya w.(r x b)/det + yb w.(a x r)/det,            det = w . (a x b)
+
+Steps in y, and not in the direction at the lamp, keep the problem well scaled at grazing incidence, where oblique lamps
+light the far side of the iris.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..records.surfaces import Bundle, Surface
+
+MAX_STEPS = 48
+TOLERANCE_MM = 1e-4  # changes the irradiance by less than 1e-4 of itself; float32 reaches about 1e-6 mm
+_STANDOFF_MM = 15.0
+_STEP_MM = 2.5
+_GRAZING = 0.01
+CORNEA_MM = 7.8  # radius of corneas, about
+_BISECTIONS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """The path: irradiance per radiant intensity (mm^-2), the entry point, the direction on leaving the lamp.
+
+    `found` marks existing paths. `failed` marks those where Newton's method did not converge although it never left the
+    part of the cornea that the lamp sees. Points in the cornea's own shadow have no path, and the steps towards them
+    cross the horizon.
+    """
+
+    transfer: mi.Float
+    entry: mi.Vector3f
+    leaving: mi.Vector3f
+    found: mi.Bool
+    failed: mi.Bool
+
+
+def connect(
+    surfaces: tuple[Surface, ...],
+    lamp: mi.Vector3f,
+    x: mi.Vector3f,
+    normal: mi.Vector3f,
+    aim: mi.Vector3f,
+    reach: mi.Float,
+    active: mi.Bool,
+    *,
+    mirror: bool = False,
+    ahead_mm: float = 0.0,
+) -> Connection:
+    """Paths from `lamp` to `x` through all `surfaces`, all points in the eye frame (mm).
+
+    Args:
+        surfaces: refracting surfaces, from the front.
+        lamp: points on the lamps.
+        x: points behind the surfaces.
+        normal: unit normals there, towards the light.
+        aim: where the straight line from the lamp is aimed at first: near the image of `x` seen from outside.
+        reach: radius about the front surface's axis (mm) beyond which no path enters.
+        active: lanes that matter.
+        mirror: whether the light comes to points before the first surface, which mirrors it, the only one.
+        ahead_mm: how far before the last surface points may be that are met when a path is extended backwards.
+    """
+    front = surfaces[0]
+    start = _mirror_guess(front, lamp, aim) if mirror else _entry_guess(front, lamp, aim)
+
+    def going(y: mi.Vector3f, last: mi.Vector3f, step: mi.UInt32, on: mi.Bool, *_: object) -> mi.Bool:
+        return on
+
+    def newton(
+        y: mi.Vector3f, last: mi.Vector3f, step: mi.UInt32, on: mi.Bool, dark: mi.Bool, transfer: mi.Float
+    ) -> tuple[mi.Vector3f, mi.Vector3f, mi.UInt32, mi.Bool, mi.Bool, mi.Float]:
+        y, form = front.on_surface(y)
+        d = y - lamp
+        distance = dr.norm(d)
+        d /= distance
+        e1, e2 = mi.coordinate_system(d)
+        b, passed, c = front.bend(Bundle(y, d, distance * e1, distance * e2, e1, e2), form, mirror=mirror)
+        y1, y2 = b.da, b.db
+        over = c < _GRAZING  # beyond the horizon, go half the way back
+        ok = ~over
+        for surface in surfaces[1:]:
+            b, share, good = surface.refract_bundle(b)
+            passed *= share
+            ok &= good
+        s = dr.dot(x - b.y, b.w)
+        r = x - (b.y + s * b.w)
+        a1, a2 = b.da + s * b.wa, b.db + s * b.wb
+        det = dr.dot(b.w, dr.cross(a1, a2))
+        done = on & ok & (s > -ahead_mm) & (dr.squared_norm(r) < TOLERANCE_MM * TOLERANCE_MM)
+        cosine = dr.maximum(-dr.dot(b.w, normal), 0)
+        transfer = dr.select(done, passed * cosine / dr.abs(det), transfer)
+        inv = dr.rcp(dr.select(dr.abs(det) > 1e-9, det, 1e-9))
+        move = (dr.dot(b.w, dr.cross(r, a2)) * inv) * y1 + (dr.dot(b.w, dr.cross(a1, r)) * inv) * y2
+        size = dr.norm(move)
+        move *= dr.minimum(1, _STEP_MM / dr.maximum(size, 1e-9))
+        after = dr.select(over, 0.5 * (y + last), y + move)  # the next step brings it to the surface
+        step += 1
+        local = front.point_in(y)
+        out = local.y * local.y + local.z * local.z > dr.square(reach + 1)
+        dark |= on & (over | out)
+        on &= ~done & (step < MAX_STEPS)
+        return dr.select(on, after, y), dr.select(on & ~over, y, last), step, on, dark, transfer
+
+    zero = mi.Float(0)
+    state = (start, mi.Vector3f(start), mi.UInt32(0), mi.Bool(active), mi.Bool(False), zero)
+    y, _, step, _, dark, transfer = dr.while_loop(
+        state, going, newton, labels=("y", "last", "step", "on", "dark", "transfer"), label="manifold"
+    )
+    found = mi.Bool(active) & (transfer > 0)
+    failed = mi.Bool(active) & ~found & (step >= MAX_STEPS) & ~dark
+    return Connection(transfer, y, dr.normalize(y - lamp), found, failed)
+
+
+def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vector3f:
+    """First guess of the entry point: where the straight line to `aim` enters.
+
+    Where that line misses the surface or enters at grazing incidence, the guess is the point whose normal halves the
+    angle between the lamp and the axis. Any lamp in front of the eye lights that point well.
+    """
+    d = dr.normalize(aim - lamp)
+    o = lamp + dr.maximum(-dr.dot(lamp, d) - _STANDOFF_MM, 0) * d
+    ol, dl = front.point_in(o), front.vector_in(d)
+    t, ok = front.hit(ol, dl)
+    straight = ol + t * dl
+    good = ok & (-dr.dot(front.normal(straight), dl) > 0.25)
+    centre = mi.Vector3f(-CORNEA_MM, 0, 0)
+    half = dr.normalize(dr.normalize(front.point_in(lamp) - centre) + mi.Vector3f(1, 0, 0))
+    local = dr.select(good, straight, centre + CORNEA_MM * half)
+    return front.vector_out(local) + front.origin
+
+
+def _mirror_guess(front: Surface, lamp: mi.Vector3f, x: mi.Vector3f) -> mi.Vector3f:
+    """First guess of the point that mirrors a lamp to `x`: that of a sphere, by bisection between both directions.
+
+    Of the two last points it is that nearer to the lamp, because Newton's method must not start in its shadow.
+    """
+    centre = mi.Vector3f(-CORNEA_MM, 0, 0)
+    a, b = front.point_in(lamp) - centre, front.point_in(x) - centre
+    to_lamp, to_x = dr.normalize(a), dr.normalize(b)
+
+    def normal(share: mi.Float) -> mi.Vector3f:
+        return dr.normalize(to_x + share * (to_lamp - to_x))
+
+    low, high = mi.Float(0), mi.Float(1)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        n = normal(middle)
+        near = dr.dot(n, dr.normalize(b - CORNEA_MM * n)) > dr.dot(n, dr.normalize(a - CORNEA_MM * n))
+        low, high = dr.select(near, middle, low), dr.select(near, high, middle)
+    return front.vector_out(centre + CORNEA_MM * normal(high)) + front.origin

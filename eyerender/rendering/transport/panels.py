@@ -1,0 +1,118 @@
+"""Emitting rectangles such as screens and windows: the radiance along rays, and the irradiance of matte surfaces.
+
+A panel's irradiance is Lambert's formula for a polygon, cut at the horizon of the lit surface,
+
+    E(n) = L / 2 sum_k theta_k n . g_k,
+
+where theta_k is the angle that edge k subtends and g_k the unit normal of the plane of edge and lit point (Lambert
+1760; Arvo 1995, equation 2.9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...arrays import Floats
+from ..records.frame import sent
+
+_WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
+
+
+@dataclass(frozen=True, slots=True)
+class Rectangle:
+    """One rectangle of the scene's frame; `right` and `up` are over the half sizes, so that |q . right| < 1 inside."""
+
+    centre: mi.Vector3f
+    normal: mi.Vector3f
+    right: mi.Vector3f
+    up: mi.Vector3f
+    radiance: mi.Float
+
+
+@dataclass(kw_only=True)
+class Panels:
+    """The rectangles of a frame, in one buffer, so kernels do not depend on their number.
+
+    Attributes:
+        count: number of rectangles.
+        rows: 13 numbers of each, as from `frame.panel_table`.
+    """
+
+    count: mi.UInt32
+    rows: mi.Float
+
+    @classmethod
+    def upload(cls, table: Floats) -> Panels:
+        """Send rectangles (n, 13) to the device."""
+        return cls(count=dr.opaque(mi.UInt32, len(table)), rows=sent(table if len(table) else np.zeros(_WIDTH)))
+
+    def __getitem__(self, i: mi.UInt32) -> Rectangle:
+        row = [dr.gather(mi.Float, self.rows, i * _WIDTH + k) for k in range(_WIDTH)]
+        centre, normal, right, up = (mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9))
+        return Rectangle(centre, normal, right, up, row[12])
+
+    def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """Radiance (mW/mm^2/sr) along rays of the scene's frame; overlapping panels add up."""
+
+        def met(panel: Rectangle) -> mi.Float:
+            facing = -dr.dot(d, panel.normal)
+            t = dr.dot(o - panel.centre, panel.normal) / dr.select(dr.abs(facing) > 1e-6, facing, 1)
+            q = o + t * d - panel.centre
+            inside = (dr.abs(dr.dot(q, panel.right)) < 1) & (dr.abs(dr.dot(q, panel.up)) < 1)
+            return dr.select(active & (facing > 1e-6) & (t > 0) & inside, panel.radiance, 0)
+
+        return self._sum(met, mi.Float(0) * d.x, "panels")
+
+    def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
+        """Irradiance (mW/mm^2) at points x with unit normals n of the scene's frame, unshadowed."""
+
+        def received(panel: Rectangle) -> mi.Float:
+            right, up = panel.right / dr.squared_norm(panel.right), panel.up / dr.squared_norm(panel.up)
+            middle = panel.centre - x
+            seen = polygon_irradiance(
+                [middle - right - up, middle + right - up, middle + right + up, middle - right + up], n
+            )
+            return dr.select(dr.dot(middle, panel.normal) < 0, panel.radiance * seen, 0)
+
+        return self._sum(received, mi.Float(0) * n.x, "panel light")
+
+    def _sum(self, share: Callable[[Rectangle], mi.Float], zero: mi.Float, label: str) -> mi.Float:
+        def more(i: mi.UInt32, *_: object) -> mi.Bool:
+            return i < self.count
+
+        def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            return i + 1, total + share(self[i])
+
+        return dr.while_loop((mi.UInt32(0), zero), more, body, labels=("i", "total"), label=label)[1]
+
+
+def polygon_irradiance(corners: list[mi.Vector3f], n: mi.Vector3f) -> mi.Float:
+    """Irradiance per radiance of a convex polygon, its corners given from the lit point, on a surface of normal n.
+
+    The part below the horizon is cut off. The parts of the edges above it and the arc of the horizon between them
+    remain.
+    """
+    total = mi.Float(0)
+    leave, enter = mi.Vector3f(0), mi.Vector3f(0)
+    for a, b in zip(corners, [*corners[1:], corners[0]], strict=True):
+        ha, hb = dr.dot(n, a), dr.dot(n, b)
+        above_a, above_b = ha > 0, hb > 0
+        crossing = above_a != above_b
+        cut = a + dr.select(crossing, ha / dr.select(crossing, ha - hb, 1), 0) * (b - a)
+        leave = dr.select(above_a & ~above_b, cut, leave)
+        enter = dr.select(above_b & ~above_a, cut, enter)
+        total += dr.select(above_a | above_b, _arc(dr.select(above_a, a, cut), dr.select(above_b, b, cut), n), 0)
+    total += dr.select(dr.squared_norm(leave) > 0, _arc(leave, enter, n), 0)
+    return 0.5 * dr.abs(total)
+
+
+def _arc(a: mi.Vector3f, b: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
+    """Angle between two directions times n . unit(a x b)."""
+    c = dr.cross(a, b)
+    s = dr.norm(c)
+    return dr.atan2(s, dr.dot(a, b)) * dr.dot(n, c) / dr.maximum(s, 1e-20)

@@ -1,0 +1,357 @@
+"""The relief of the iris: heights above its plane, parallax of camera rays, and the lamps' light on its slopes.
+
+The height h(y, z) above the plane of the stop is that of the pattern (`region.iris`), which stretches with the iris
+when the pupil changes, and of a gentle convexity. It is 0 at the pupil's margin and at the root, so outlines and labels
+are those of the plane. Once per frame it is put on a square grid. A ray meets it where X(z) = X(0) + z t, with t its
+lateral motion per mm of height, has the height z = h(X(z)); fixed-point steps find the place.
+
+The irradiance of a slope is that of the plane times
+
+    q = sum_l (E_l + h E'_l) V_l max(0, 1 - t_l . grad h) / (sqrt(1 + |grad h|^2) sum_l E_l)
+
+with E_l the lamp's irradiance of the plane, E'_l its change per mm of height (light converges behind the cornea), t_l
+the lamp's direction there as lateral motion per mm of height, and V_l whether it is seen over the heights beside. E_l,
+E'_l and t_l change slowly and are computed on a coarse grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..hits.interaction import iris_height
+from ..records.frame import Frame, Lights
+from ..records.job import RenderJob
+from ..records.parameters import StopParameters
+from ..records.recording import recorded
+from ..records.surfaces import Surface
+from .directlight import LampPath, behind
+
+_COARSE = 20  # places across, at which the lamps' directions are computed
+_CELL_PX, _LEAST, _MOST = 0.6, 320, 448  # size of a cell in the picture, cells across: fewer would flatten slopes
+_STEP = 16  # in the number of cells across: a new number has Dr.Jit record anew
+_STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
+_BLOCK, _SLANT = 4, 0.6  # cells of a block across; lateral motion per mm of light that is not very slanting
+_FIXED_POINT_STEPS = 4
+_SPARE_MM, _RAISED_MM = 0.1, 0.2
+
+
+@dataclass(kw_only=True)
+class ReliefShape:
+    """The heights of an iris on a grid, which do not depend on the pose.
+
+    Attributes:
+        heights: of the cells, mm.
+        corners: the heights of the four corners of every cell, side by side.
+        slopes: of the cells along the grid's rows and columns.
+        steepest: largest slope.
+        highest: largest height, mm.
+        near: largest height about each block of cells, as far as light comes from that is not very slanting, mm.
+    """
+
+    heights: mi.Float
+    corners: mi.Float
+    slopes: tuple[mi.Float, mi.Float]
+    steepest: mi.Float
+    highest: mi.Float
+    near: mi.Float
+
+
+@dataclass(kw_only=True)
+class ReliefGrid:
+    """A square grid over the plane of the iris, whose values are bilinear between its nodes.
+
+    Attributes:
+        stop: the aperture stop, in whose plane the grid lies.
+        half: half its width, mm.
+        count: number of nodes along a side.
+    """
+
+    stop: StopParameters
+    half: mi.Float
+    count: mi.UInt32
+
+    def nodes(self, number: int) -> tuple[mi.UInt32, mi.UInt32]:
+        """Columns and rows of all nodes, of which there are so many, row by row."""
+        index = dr.arange(mi.UInt32, number)
+        row = index // self.count
+        return index - row * self.count, row
+
+    def point(self, column: mi.Float, row: mi.Float) -> mi.Vector3f:
+        """Point of the plane (eye frame) at a place of the grid."""
+        per = 2 * self.half / mi.Float(self.count - 1)
+        return self.stop.centre + (column * per - self.half) * self.stop.u + (row * per - self.half) * self.stop.v
+
+    def cell(self, x: mi.Vector3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float]:
+        """Column and row of the cell of a point of the plane, and the place in it."""
+        q, most = x - self.stop.centre, mi.Float(self.count) - 1.001
+        scale = 0.5 * mi.Float(self.count - 1) / self.half
+        u, v = (dr.clip((dr.dot(q, axis) + self.half) * scale, 0, most) for axis in (self.stop.u, self.stop.v))
+        i, j = mi.UInt32(u), mi.UInt32(v)
+        return i, j, u - mi.Float(i), v - mi.Float(j)
+
+    def interpolate(self, corners: mi.Float, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """Interpolate what `corners_of` returned at points of the plane."""
+        i, j, s, t = self.cell(x)
+        c = dr.gather(mi.Vector4f, corners, j * self.count + i, active)
+        return dr.lerp(dr.lerp(c.x, c.y, s), dr.lerp(c.z, c.w, s), t)
+
+    def corners_of(self, values: mi.Float, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
+        """Put the values at the four corners of every cell side by side."""
+        last = self.count - 1
+        right, below = dr.minimum(column + 1, last), dr.minimum(row + 1, last)
+        places = [j * self.count + i for i, j in ((column, row), (right, row), (column, below), (right, below))]
+        corners = dr.zeros(mi.Float, 4 * dr.width(values))
+        dr.scatter(corners, mi.Vector4f(*(dr.gather(mi.Float, values, place) for place in places)), places[0])
+        return corners
+
+
+@dataclass(kw_only=True)
+class IrisRelief:
+    """Height of the iris above its plane and the lamps' light on it, on a grid over the plane.
+
+    Attributes:
+        count: number of nodes along a side of the grid.
+        raised: whether the iris has any heights.
+        heights: at the corners of the cells, mm.
+        shades: there, the q of the module's docstring.
+    """
+
+    count: mi.UInt32
+    raised: mi.Bool
+    heights: mi.Float
+    shades: mi.Float
+
+    def hit(self, frame: Frame, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+        """Foot in the plane (eye frame) of the place that rays meet.
+
+        Args:
+            frame: the frame.
+            x: where they would meet the plane.
+            slant: their lateral motion per mm of height above it.
+            active: the lanes that matter.
+        """
+        active &= self.raised
+        grid, z = relief_grid(frame, self.count), mi.Float(0)
+        for _ in range(_FIXED_POINT_STEPS):
+            z = grid.interpolate(self.heights, x + z * slant, active)
+        return dr.select(active, x + z * slant, x)
+
+    def share(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """The q of the module's docstring at feet `x`."""
+        active &= self.raised
+        return dr.select(active, relief_grid(frame, self.count).interpolate(self.shades, x, active), 1)
+
+
+class ReliefSize(NamedTuple):
+    """Numbers of a grid for a job, on the host: nodes along a side, blocks along a side, and blocks near a block."""
+
+    side: int
+    blocks: int
+    about: int
+
+    @classmethod
+    def of(cls, job: RenderJob) -> ReliefSize:
+        """Choose them by the size of the iris in the picture."""
+        half_mm = float(np.float32(job.eye.iris_root_radius_mm) + np.float32(_SPARE_MM))
+        across = 2 * half_mm * float(job.camera.scale_at(job.t)) / _CELL_PX
+        side = int(min(max(_STEP * np.ceil(across / _STEP), _LEAST), _MOST))
+        return cls(side, -(-side // _BLOCK), int(np.ceil((_REACH_MM * _SLANT * side / (2 * half_mm) + 2) / _BLOCK)))
+
+
+def relief_grid(frame: Frame, count: mi.UInt32) -> ReliefGrid:
+    """Make the grid over the iris with so many nodes along a side."""
+    return ReliefGrid(stop=frame.stop, half=frame.iris.root_radius + _SPARE_MM, count=count)
+
+
+def flat_relief(count: mi.UInt32) -> IrisRelief:
+    """Make the relief of an iris without heights."""
+    nothing = dr.zeros(mi.Float, 4)
+    dr.make_opaque(nothing)
+    return IrisRelief(count=count, raised=dr.opaque(mi.Bool, False), heights=nothing, shades=nothing)
+
+
+@recorded
+def relief_shape(
+    frame: Frame, pattern: mi.Texture2f, side: mi.UInt32, about: mi.UInt32, size: ReliefSize
+) -> ReliefShape:
+    """Compute the heights of an iris.
+
+    Args:
+        frame: the frame.
+        pattern: the map of heights.
+        side: number of nodes along a side, on the device.
+        about: number of blocks on each side that are near a block, on the device.
+        size: the same numbers on the host, of which only sizes of arrays depend.
+    """
+    grid = relief_grid(frame, side)
+    column, row = grid.nodes(size.side**2)
+    heights = iris_height(frame, pattern, grid.point(mi.Float(column), mi.Float(row)))
+    dr.eval(heights)
+    last = side - 1
+    per = mi.Float(last) / (2 * grid.half)
+
+    def slope(high: mi.UInt32, low: mi.UInt32, apart: mi.UInt32) -> mi.Float:
+        return (dr.gather(mi.Float, heights, high) - dr.gather(mi.Float, heights, low)) * per / mi.Float(apart)
+
+    left, right = dr.maximum(column, 1) - 1, dr.minimum(column + 1, last)
+    above, below = dr.maximum(row, 1) - 1, dr.minimum(row + 1, last)
+    hu = slope(row * side + right, row * side + left, right - left)
+    hv = slope(below * side + column, above * side + column, below - above)
+    corners = grid.corners_of(heights, column, row)
+    dr.eval(hu, hv, corners)
+    steepest, highest = dr.max(dr.sqrt(hu * hu + hv * hv)), dr.max(heights)
+    near = _highest_nearby(heights, side, about, size.blocks)
+    dr.eval(steepest, highest, near)
+    return ReliefShape(
+        heights=heights, corners=corners, slopes=(hu, hv), steepest=steepest, highest=highest, near=near
+    )  # fmt: skip
+
+
+def _highest_nearby(heights: mi.Float, side: mi.UInt32, about: mi.UInt32, blocks: int) -> mi.Float:
+    """Largest of the heights in and about every block of cells."""
+    index, last = dr.arange(mi.UInt32, blocks * blocks), side - 1
+    count = last // _BLOCK + 1  # the same as `blocks`, but no kernel is compiled for it
+    down = index // count
+    across = index - down * count
+    largest = mi.Float(0)
+    for k in range(_BLOCK * _BLOCK):
+        i, j = dr.minimum(across * _BLOCK + k % _BLOCK, last), dr.minimum(down * _BLOCK + k // _BLOCK, last)
+        largest = dr.maximum(largest, dr.gather(mi.Float, heights, j * side + i))
+    dr.eval(largest)
+    wide = 2 * about + 1
+
+    def beside(k: mi.UInt32, most: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        j = k // wide
+        i = across + (k - j * wide)
+        i, j = (dr.clip(mi.Int32(n) - mi.Int32(about), 0, mi.Int32(count) - 1) for n in (i, down + j))
+        return k + 1, dr.maximum(most, dr.gather(mi.Float, largest, mi.UInt32(j) * count + mi.UInt32(i)))
+
+    state = (mi.UInt32(0), dr.zeros(mi.Float, blocks * blocks))
+    return dr.while_loop(state, lambda k, _: k < wide * wide, beside, label="blocks beside")[1]
+
+
+def lit_relief(frame: Frame, shape: ReliefShape, side: mi.UInt32, each: mi.UInt32, size: tuple[int, int]) -> IrisRelief:
+    """Compute the lamps' light on an iris with heights.
+
+    Args:
+        frame: the frame.
+        shape: the heights.
+        side: number of nodes along a side.
+        each: number of points that stand for a lamp.
+        size: numbers of nodes, and of points of lamps.
+    """
+    grid = relief_grid(frame, side)
+    column, row = grid.nodes(size[0])
+    rows = _arriving(frame, grid, each, _COARSE * _COARSE * size[1])
+    shades = _shades(frame.lights, rows, shape, grid, each, column, row)
+    dr.eval(shades)
+    shades = grid.corners_of(shades, column, row)
+    dr.eval(shades)
+    return IrisRelief(count=side, raised=dr.opaque(mi.Bool, True), heights=shape.corners, shades=shades)
+
+
+def _arriving(frame: Frame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi.Float:
+    """E, E t_u, E t_v and E' of points of the lamps at coarse places, in rows."""
+    count = mi.UInt32(_COARSE)
+    coarse = ReliefGrid(stop=grid.stop, half=grid.half, count=count)
+    index = dr.arange(mi.UInt32, lanes)
+    spot = index // (_COARSE * _COARSE)
+    place = index - spot * (_COARSE * _COARSE)
+    row = place // count
+    x = coarse.point(mi.Float(place - row * count), mi.Float(row))
+    lamp = frame.lights[spot // each]
+    source = lamp.node(spot - (spot // each) * each, each)
+    normal = frame.stop.normal
+    # The search for paths to other points is long, and in vain.
+    reached = (frame.lights.count > 0) & behind(frame.surfaces[-1], x)
+    path = LampPath.to(frame, lamp, source, x, reached)
+    above = LampPath.to(frame, lamp, source, x + _RAISED_MM * normal, reached)
+    lit = dr.select(path.blocked, 0, path.gain)
+    more = dr.select(above.gain > 0, (above.gain - path.gain) / _RAISED_MM, 0)
+    lateral = _arrival(frame.surfaces, source, path.entry, normal)
+    rows = (lit, lit * dr.dot(lateral, frame.stop.u), lit * dr.dot(lateral, frame.stop.v), more)
+    out = dr.zeros(mi.Float, 4 * dr.width(index))
+    dr.scatter(out, mi.Vector4f(*(dr.select(lit > 0, value, 0) for value in rows)), index)
+    dr.eval(out)
+    return out
+
+
+def _shades(
+    lights: Lights,
+    rows: mi.Float,
+    shape: ReliefShape,
+    grid: ReliefGrid,
+    each: mi.UInt32,
+    column: mi.UInt32,
+    row: mi.UInt32,
+) -> mi.Float:
+    """The q of the module's docstring at nodes of the grid; `rows` as from `_arriving`."""
+    stop, node = grid.stop, row * grid.count + column
+    x = grid.point(mi.Float(column), mi.Float(row))
+    h, hu, hv = (dr.gather(mi.Float, values, node) for values in (shape.heights, *shape.slopes))
+    across = (grid.count + (_BLOCK - 1)) // _BLOCK
+    near = dr.gather(mi.Float, shape.near, row // _BLOCK * across + column // _BLOCK)
+    spots, coarse = lights.count * each, mi.UInt32(_COARSE)
+    i, j, s, t = ReliefGrid(stop=stop, half=grid.half, count=coarse).cell(x)
+    place = j * coarse + i
+
+    def lamp(k: mi.UInt32, whole: mi.Float, seen: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        first = k * (_COARSE * _COARSE) + place
+        a, b, c, d = (dr.gather(mi.Vector4f, rows, first + off) for off in (0, 1, coarse, coarse + 1))
+        both = dr.lerp(dr.lerp(a, b, s), dr.lerp(c, d, s), t)
+        inv = dr.rcp(dr.maximum(both.x, 1e-20))
+        tu, tv = both.y * inv, both.z * inv
+        facing = dr.maximum(1 - tu * hu - tv * hv, 0)
+        way = tu * stop.u + tv * stop.v
+        slant = dr.norm(way)
+        asked = (both.x > 0) & (facing > 0) & (slant * shape.steepest > 1)
+        above = dr.select(slant < _SLANT, near, shape.highest) - h
+        here = dr.maximum(both.x + h * both.w, 0)
+        hidden = _hidden(grid, shape.corners, x, h, way, dr.select(asked, above, 0))
+        return k + 1, whole + both.x, seen + here * facing * (1 - hidden)
+
+    state = (mi.UInt32(0), mi.Float(0) * h, mi.Float(0) * h)
+    labels = ("k", "whole", "seen")
+    _, whole, seen = dr.while_loop(state, lambda k, *_: k < spots, lamp, labels=labels, label="relief")
+    return dr.select(whole > 0, seen / whole * dr.rsqrt(1 + hu * hu + hv * hv), 1)
+
+
+def _hidden(
+    grid: ReliefGrid, corners: mi.Float, x: mi.Vector3f, h: mi.Float, way: mi.Vector3f, above: mi.Float
+) -> mi.Float:
+    """Share by which heights beside points hide what lies in the direction `way`, 0 to 1.
+
+    above: how much higher than the points these heights are at most, mm.
+    """
+
+    def rise(k: mi.UInt32) -> mi.Float:
+        part = mi.Float(k + 1) / _STEPS
+        return _REACH_MM * part * part
+
+    def step(k: mi.UInt32, hidden: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        up = rise(k)
+        over = grid.interpolate(corners, x + up * way, mi.Bool(True)) - h - up
+        return k + 1, dr.maximum(hidden, dr.clip(over / (_SOFT * up + 0.004), 0, 1))
+
+    def more(k: mi.UInt32, _: mi.Float) -> mi.Bool:
+        return (k < _STEPS) & (rise(k) < above)
+
+    state = (mi.UInt32(0), mi.Float(0) * h)
+    return dr.while_loop(state, more, step, labels=("k", "hidden"), label="shadows of the relief")[1]
+
+
+def _arrival(
+    surfaces: tuple[Surface, ...], source: mi.Vector3f, entry: mi.Vector3f, normal: mi.Vector3f
+) -> mi.Vector3f:
+    """Direction to a lamp behind the surfaces, as lateral motion per mm along `normal`, of light from `entry`."""
+    w = dr.normalize(entry - source)
+    x = entry - w
+    for surface in surfaces:
+        x, w, _, _ = surface.refract(x, w)
+    down = dr.dot(w, normal)
+    return w / dr.select(down < -0.05, down, -1) - normal

@@ -1,0 +1,1 @@
+"""Files: durable writes, limited reads, JSON lines, locks, and the private folder of caches."""

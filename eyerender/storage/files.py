@@ -1,0 +1,394 @@
+"""Files: durable, atomic writes; reads that trust nothing; strict JSON.
+
+A file is published in four steps: it is written under a temporary name beside its place, synced, renamed, and the
+folder is synced. After a power cut its place then holds the old content or the new one, never a part of either. Files
+may come from other people, so only regular files within a size limit are read.
+"""
+
+from __future__ import annotations
+
+import errno
+import glob
+import json
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from io import BufferedReader
+from itertools import islice
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from ..errors import EyerenderError, InputError
+
+# Text files that people write: scenes, specs, eye files, calibrations.
+MAX_TEXT_BYTES = 16 * 2**20
+# Files that this package or a user's own scene names: images, maps, meshes.
+MAX_FILE_BYTES = 2**31
+PART = ".part"
+# Patterns of a number that is too large for a float, or of an integer that takes long to parse: many digits, or three
+# in its exponent.
+_TO_ZEROS = bytes.maketrans(b"123456789E", b"000000000e")
+_LONG = (b"0" * 200, b"e000", b"e+000")
+_ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{1,30}):/+")  # a single letter is a drive
+_PLAIN = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
+
+
+@contextmanager
+def written(path: str | Path, *, sync: bool = True, ending: str = PART) -> Iterator[BinaryIO]:
+    """Open a new file for writing; it takes its place if the block succeeds, and leaves nothing if it fails.
+
+    Args:
+        path: the file to write; an old one is replaced.
+        sync: make it durable before the block's end: the file is synced before the rename, its folder after it. Without
+            it a power cut may leave an empty file, so use it only for what is synced later as a whole.
+        ending: end of the temporary name, for libraries that write to a name (`name` of the file) and choose the format
+            by its end.
+
+    Raises:
+        InputError: a folder, pipe, device or socket is in its place.
+        EyerenderError: the disk is full or not writable.
+    """
+    path = Path(path)
+    refuse_special(path)
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{ending}")
+    made = False
+    try:
+        # Exclusive mode does not follow or overwrite a link or a file that somebody put there.
+        with open(part, "xb") as file:
+            made = True
+            yield file
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+        os.replace(part, path)
+        made = False
+        if sync:
+            sync_folder(path.parent)
+    except OSError as error:
+        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        if made:
+            with suppress(OSError):
+                part.unlink()
+
+
+def refuse_special(path: str | Path) -> None:
+    """Check that a file may be written, so that replacing it cannot harm a device, and nothing waits for a pipe.
+
+    A link may be replaced, unless it leads to something else than a file.
+
+    Raises:
+        InputError: the path is an address; or a folder, pipe, device or socket is in its place; or it is in a folder of
+            devices.
+    """
+    refuse_address(path)
+    path = Path(path)
+    try:
+        state = path.stat()
+        folder = path.parent.resolve()
+    except (OSError, ValueError, RuntimeError):  # missing, or refused when it is made
+        return
+    if not stat.S_ISREG(state.st_mode):
+        raise InputError(f"is {_kind(state.st_mode)}, so it is not written to", source=str(path))
+    if folder in (Path("/dev"), Path("/dev/fd")):  # /dev/stdout may be a link to a file
+        raise InputError("is in a folder of devices, so it is not written to", source=str(path))
+
+
+def refuse_address(path: str | Path) -> None:
+    """Check that a path to write to is not an address such as `s3://bucket/x`, of which a path keeps one slash.
+
+    Raises:
+        InputError: it is an address.
+    """
+    address = _ADDRESS.match(str(path))
+    if address is not None:
+        where = f"{address[1]}://{str(path)[address.end() :]}"
+        raise InputError("is an address, and only files of this machine are written", source=where)
+
+
+def write_bytes(path: str | Path, data: bytes, *, sync: bool = True) -> None:
+    """Write a file, completely or not at all; raises as `written` does."""
+    with written(path, sync=sync) as file:
+        file.write(data)
+
+
+def write_text(path: str | Path, text: str, *, sync: bool = True) -> None:
+    """Write UTF-8 text, completely or not at all; raises as `written` does."""
+    write_bytes(path, text.encode(), sync=sync)
+
+
+def write_json(path: str | Path, data: Any, *, sync: bool = True) -> None:
+    """Write JSON, completely or not at all; raises as `written` does, and `ValueError` for NaN and infinity."""
+    write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n", sync=sync)
+
+
+def sync_file(path: str | Path) -> None:
+    """Make a file's content durable.
+
+    Raises:
+        OSError: it cannot be synced.
+    """
+    _sync(path, os.O_RDONLY)
+
+
+def sync_folder(path: str | Path) -> None:
+    """Make the names in a folder durable.
+
+    Nothing happens where folders cannot be opened (Windows) or the file system does not sync folders (some network
+    ones).
+
+    Raises:
+        OSError: it cannot be synced.
+    """
+    if hasattr(os, "O_DIRECTORY"):
+        try:
+            _sync(path, os.O_RDONLY | os.O_DIRECTORY)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
+                raise
+
+
+def make_folder(path: str | Path) -> bool:
+    """Make a folder and its missing parents, durably; returns whether it is new.
+
+    Raises:
+        InputError: the path is an address.
+        OSError: it cannot be made.
+    """
+    refuse_address(path)
+    path = Path(path)
+    missing = [p for p in (path, *path.parents) if not p.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    for place in missing:
+        sync_folder(place.parent)
+    return bool(missing)
+
+
+def remove_file(path: str | Path) -> None:
+    """Remove a file durably, if there is one.
+
+    Raises:
+        OSError: it cannot be removed.
+    """
+    path = Path(path)
+    try:
+        path.unlink()
+    except FileNotFoundError:
+        return
+    sync_folder(path.parent)
+
+
+def remove_parts(path: str | Path) -> None:
+    """Remove the temporary files that killed writers of a file left beside it.
+
+    Raises:
+        OSError: one cannot be removed.
+    """
+    path = Path(path)
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*{PART}"):
+        part.unlink(missing_ok=True)
+
+
+def sync_tree(path: str | Path) -> None:
+    """Make a folder durable with everything in it; links are not followed.
+
+    Several threads sync files, because a file system writes one journal entry for all that wait: 0.4 ms per file
+    instead of 4 on ext4.
+
+    Raises:
+        OSError: a file cannot be synced.
+    """
+    with ThreadPoolExecutor(8) as threads:
+        for place, _, names in os.walk(path, topdown=False):
+            paths = (os.path.join(place, name) for name in names)
+            files = (file for file in paths if stat.S_ISREG(os.lstat(file).st_mode))
+            # Files are taken in batches, because each one that waits for a thread takes some KB.
+            while batch := list(islice(files, 1024)):
+                for _ in threads.map(sync_file, batch):
+                    pass
+            sync_folder(place)
+
+
+@contextmanager
+def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> Iterator[BufferedReader]:
+    """Open a regular file for reading.
+
+    Args:
+        path: the file.
+        limit: the largest size that is opened, in bytes.
+        follow: whether the file may be a symbolic link.
+
+    Raises:
+        InputError: it is missing, not a regular file (a pipe, a device, a folder), too large, or may not be read.
+    """
+    source = str(path)
+    try:
+        # Opening a pipe for reading would wait for a writer.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+        handle = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)))
+    except OSError as error:
+        raise InputError(_why_unreadable(path, error), source=source) from None
+    except ValueError:
+        raise InputError("is not a valid file name", source=source) from None
+    state = os.fstat(handle)
+    if not stat.S_ISREG(state.st_mode):
+        os.close(handle)
+        raise InputError(f"is {_kind(state.st_mode)}, not a file", source=source)
+    with open(handle, "rb") as file:
+        if state.st_size > limit:
+            raise InputError(f"is too large ({_size(state.st_size)}; at most {_size(limit)} is read)", source=source)
+        yield file
+
+
+def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> bytes:
+    """Read a regular file; raises `InputError` as `opened` does."""
+    source = str(path)
+    with opened(path, limit=limit, follow=follow) as file:
+        try:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size + 1)  # Python takes memory for all that it is asked to read
+            if len(data) > size:  # the file has grown
+                data += file.read(limit + 1 - len(data))
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror or error})", source=source) from None
+    if len(data) > limit:
+        raise InputError(f"is too large (at most {_size(limit)} is read)", source=source)
+    return data
+
+
+def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = True) -> str:
+    """Read a UTF-8 text file; raises `InputError` as `read_bytes` does, and for other encodings."""
+    try:
+        return read_bytes(path, limit=limit, follow=follow).decode()
+    except UnicodeDecodeError:
+        raise InputError("cannot be read (not UTF-8 text)", source=str(path)) from None
+
+
+def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:
+    """Parse a JSON value: finite numbers only, integers of at most 300 digits.
+
+    Raises:
+        InputError: it is not valid.
+    """
+    try:
+        data, text = (text, text.decode()) if isinstance(text, bytes) else (text.encode(errors="replace"), text)
+        # A check of each number takes longer than everything else, so it is made only if a number is long enough to
+        # matter.
+        zeros = data.translate(_TO_ZEROS)
+        hooks: dict[str, Any] = {}
+        if any(long in zeros for long in _LONG):
+            hooks = {"parse_int": _integer, "parse_float": _finite}
+        return json.loads(text, parse_constant=_refuse, **hooks)
+    except RecursionError:
+        raise InputError("is not valid JSON: nested too deeply", source=source, path=path) from None
+    except UnicodeDecodeError:
+        raise InputError("is not valid JSON: not UTF-8 text", source=source, path=path) from None
+    except json.JSONDecodeError as error:
+        where = path or f"line {error.lineno}"
+        raise InputError(f"is not valid JSON: {error.msg}", source=source, path=where) from None
+    except ValueError as error:
+        raise InputError(f"is not valid JSON: {error}", source=source, path=path) from None
+
+
+def read_json(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = True) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+        InputError: it cannot be read, or is not an object.
+    """
+    data = parse_json(read_bytes(path, limit=limit, follow=follow), source=str(path))
+    if not isinstance(data, dict):
+        raise InputError("must be a JSON object", source=str(path))
+    return data
+
+
+def inside(folder: Path, name: object, *, source: str = "", path: str = "") -> Path:
+    """Path of the regular file `name` in a folder that somebody else may have made.
+
+    The name must be relative, with plain parts (no `..`, no control characters), and no part of it may be a link.
+
+    Raises:
+        InputError: the name leads out of the folder, or is not a regular file there.
+    """
+    if not is_plain(name):
+        raise InputError(f"must be a path inside the folder, not {shown(name)}", source=source, path=path)
+    # This uses text instead of paths for speed, because folders may have a million images.
+    place = str(folder)
+    parts = str(name).split("/")
+    for k, part in enumerate(parts):
+        place = os.path.join(place, part)
+        try:
+            mode = os.lstat(place).st_mode
+        except OSError as error:
+            raise InputError(f"{shown(name)}: {_why_unreadable(place, error)}", source=source, path=path) from None
+        if not (stat.S_ISREG(mode) if k == len(parts) - 1 else stat.S_ISDIR(mode)):
+            raise InputError(f"{shown(name)}: is {_kind(mode)}", source=source, path=path)
+    return Path(place)
+
+
+def is_plain(name: object) -> bool:
+    """Whether a name is a relative path of plain parts, with `/` between them."""
+    return (
+        isinstance(name, str)
+        and len(name) <= 1024
+        and all(_PLAIN.fullmatch(part) and part not in (".", "..") for part in name.split("/"))
+    )
+
+
+def shown(value: object, limit: int = 80) -> str:
+    """Format a value from a file for a message: one line of printable characters, not too long."""
+    text = repr(value) if not isinstance(value, int) or abs(value) < 10**limit else "a huge number"
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def _sync(path: str | Path, flags: int) -> None:
+    handle = os.open(path, flags)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _why_unreadable(path: str | Path, error: OSError) -> str:
+    if isinstance(error, FileNotFoundError):
+        return "no such file"
+    if os.path.islink(path):
+        return "is a symbolic link, not a file"
+    return f"cannot be read ({error.strerror or error})"
+
+
+def _kind(mode: int) -> str:
+    kinds = (
+        (stat.S_ISDIR, "a folder"),
+        (stat.S_ISREG, "a file"),
+        (stat.S_ISLNK, "a symbolic link"),
+        (stat.S_ISFIFO, "a pipe"),
+        (stat.S_ISSOCK, "a socket"),
+    )
+    return next((name for test, name in kinds if test(mode)), "a device")
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**20:.0f} MiB" if count >= 2**20 else f"{count} bytes"
+
+
+def _refuse(text: str) -> Any:
+    raise ValueError(f"{text} is not a number")
+
+
+def _integer(text: str) -> int:
+    if len(text) > 300:
+        raise ValueError(f"an integer of {len(text)} digits")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if value in (float("inf"), float("-inf")):
+        raise ValueError(f"the number {text[:40]} is too large")
+    return value

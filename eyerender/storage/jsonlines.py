@@ -1,0 +1,93 @@
+"""Files of one JSON object per line, read without keeping them: a few bytes per line store its offset."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from ..arrays import Ints
+from ..errors import InputError
+from .files import opened, parse_json
+
+# A line of metadata takes about 10 KB; one with a long list of targets takes more.
+MAX_LINE_BYTES = 4 * 2**20
+MAX_BYTES = 2**50  # only one line is in memory at a time
+_CHUNK = 2**20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JsonLines:
+    """A file of JSON lines; `starts` (n + 1,) are the byte offsets of its n lines and its end."""
+
+    path: Path
+    starts: Ints
+    state: tuple[int, int, int]
+
+    @classmethod
+    def index(cls, path: Path, *, limit: int = MAX_LINE_BYTES) -> JsonLines:
+        """Find the lines of a file in one pass, with 8 bytes of memory per line.
+
+        Args:
+            path: a regular file, not a link.
+            limit: the longest line, in bytes.
+
+        Raises:
+            InputError: the file cannot be read, or one of its lines is too long or blank.
+        """
+        parts = [np.zeros(1, dtype=np.int64)]
+        count = start = offset = 0  # number of complete lines, start of the current one, bytes read
+        with opened(path, limit=MAX_BYTES, follow=False) as file:
+            state = _state(file)
+            while chunk := file.read(_CHUNK):
+                ends = np.flatnonzero(np.frombuffer(chunk, dtype=np.uint8) == ord("\n")) + (offset + 1)
+                offset += len(chunk)
+                lengths = np.diff(ends, prepend=start, append=offset)
+                for wrong, reason in (
+                    (lengths > limit + 1, f"is too long (at most {limit} bytes are read)"),
+                    (lengths[:-1] < len("{}\n"), "must be a JSON object"),
+                ):
+                    if wrong.any():
+                        raise InputError(reason, source=str(path), path=f"line {count + int(wrong.argmax()) + 1}")
+                if len(ends):
+                    parts.append(ends)
+                    count, start = count + len(ends), int(ends[-1])
+        if offset > start:  # the last line has no line end
+            parts.append(np.array([offset], dtype=np.int64))
+        starts = np.concatenate(parts)
+        starts.setflags(write=False)
+        return cls(path, starts, state)
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    def read(self, rows: range) -> Iterator[dict[str, Any]]:
+        """Read the objects of some lines, counted from 0.
+
+        Raises:
+            InputError: a line is not a JSON object, or the file has changed since it was indexed.
+        """
+        if not len(rows):
+            return
+        source = str(self.path)
+        with opened(self.path, limit=MAX_BYTES, follow=False) as file:
+            if _state(file) != self.state:
+                raise InputError("has changed while it was read", source=source)
+            for row in rows:
+                start, end = int(self.starts[row]), int(self.starts[row + 1])
+                if file.tell() != start:
+                    file.seek(start)
+                where = f"line {row + 1}"
+                value = parse_json(file.read(end - start), source=source, path=where)
+                if not isinstance(value, dict):
+                    raise InputError("must be a JSON object", source=source, path=where)
+                yield value
+
+
+def _state(file: BinaryIO) -> tuple[int, int, int]:
+    state = os.fstat(file.fileno())
+    return state.st_ino, state.st_size, state.st_mtime_ns
