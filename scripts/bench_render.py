@@ -79,7 +79,7 @@ class Bench:
         import mitsuba as mi
 
         from eyerender.arrays import frozen
-        from eyerender.rendering.hits.interaction import look
+        from eyerender.rendering.hits.interaction import first_hit
         from eyerender.rendering.integrator.film import Pixels
         from eyerender.rendering.integrator.sampling import camera_ray
         from eyerender.rig.camera import Camera
@@ -114,7 +114,7 @@ class Bench:
         values = shown.frame
         u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, n * n))
         o, d, _ = camera_ray(values, mi.Float(u), mi.Float(v))
-        view = look(values, o, d, True)
+        view = first_hit(values, o, d, True)
         inner = view.inner.numpy().T
         rho = np.hypot(inner[:, 1], inner[:, 2]).reshape(n, n)
         cornea = view.cornea.numpy().astype(bool).reshape(n, n)
@@ -191,8 +191,8 @@ class Bench:
         """
         rigs = self.rigs
         rig = rigs.remote_rig()
-        look = rigs.PLAIN.model_copy(update={"limbus_width_mm": 0.0})
-        job = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(96, 96), look=look)
+        first_hit = rigs.PLAIN.model_copy(update={"limbus_width_mm": 0.0})
+        job = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(96, 96), look=first_hit)
         part = self.renderer.labels(job).part
         iris = part == 2
         for axis in (0, 1):
@@ -399,8 +399,8 @@ class Bench:
             focal_length_px=9000.0,
         ).build()  # fmt: skip
         rig = rigs.LampRig(camera, (rigs.remote_rig().lights[0],))
-        look = rigs.PLAIN.model_copy(update={"limbus_width_mm": 0.0})
-        job = rigs.job_of(rigs.eye_of("E2"), rig, (0, 0, 640, 480), look=look, labels=False)
+        first_hit = rigs.PLAIN.model_copy(update={"limbus_width_mm": 0.0})
+        job = rigs.job_of(rigs.eye_of("E2"), rig, (0, 0, 640, 480), look=first_hit, labels=False)
         return job, [365, 225, 390, 255]
 
     def surfaces_cost(self) -> Iterable[Row]:
@@ -582,8 +582,8 @@ class Bench:
         headset = replace(self._scene_job("headset", 4), labels=False)
 
         def subject(seed: int) -> Any:
-            look = headset.look.model_copy(update={"iris_seed": seed})
-            return replace(headset, region=headset.region.model_copy(update={"seed": seed}), look=look)
+            first_hit = headset.look.model_copy(update={"iris_seed": seed})
+            return replace(headset, region=headset.region.model_copy(update={"seed": seed}), look=first_hit)
 
         def both(seed: int) -> list[float]:
             return [1e3 * cpu_of(lambda: self.renderer.render(subject(seed), spp=4), 1)[0] for _ in range(2)]
@@ -640,10 +640,10 @@ class Bench:
                 replace(lamp, position_mm=lamp.position_mm + shift, intensity_mw_sr=float(rng.uniform(0.1, 0.5)))
                 for lamp in head.lights[: int(rng.integers(1, 6))]
             )
-            look = rigs.PLAIN.model_copy(update={"iris_albedo": float(rng.uniform(0.1, 0.5))})
+            first_hit = rigs.PLAIN.model_copy(update={"iris_albedo": float(rng.uniform(0.1, 0.5))})
             pose = (float(rng.uniform(-20, 20)), float(rng.uniform(-20, 20)))
             rig = rigs.LampRig(camera, lights)
-            yield rigs.job_of(eye, rig, (304, 224, 32, 32), pose, look=look, seed=int(rng.integers(1 << 40)))
+            yield rigs.job_of(eye, rig, (304, 224, 32, 32), pose, look=first_hit, seed=int(rng.integers(1 << 40)))
 
     def recompiles(self) -> Iterable[Row]:
         """Kernels that later frames launch and the first did not (by hash: a cache on disk hides nothing)."""

@@ -11,14 +11,14 @@ import numpy as np
 from ..arrays import Bools, Floats, Singles
 from ..folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from .glints.splatting import MirrorImages, Shine
-from .integrator.film import Exposed, begun, mean_radiance
-from .integrator.framebuilder import Stage
-from .integrator.hostdata import Prepared
+from .integrator.film import BoundFrame, mean_radiance, start
+from .integrator.framebuilder import FrameBuilder
+from .integrator.hostdata import HostData
 from .output.labels import PartLabels, highlights, part_labels
-from .output.window import RenderedWindow, Traced
+from .output.window import RawFrame, RenderedWindow
 from .records.job import RenderJob
 from .records.recording import uncollected
-from .scene.background import Obstacle, Surround
+from .scene.background import Background, Obstacle
 from .scene.blur import Blur
 from .scene.region import RegionScene
 
@@ -43,7 +43,7 @@ class Renderer:
         self.backend = backend
         self.spp = spp
         self._beside = ThreadPoolExecutor(1, "develop")
-        self._stage = Stage(self._beside, obstacles)
+        self._stage = FrameBuilder(self._beside, obstacles)
 
     def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
         """Render one window.
@@ -81,7 +81,9 @@ class Renderer:
         return self._beside.submit(self._traced(job, spp, moments, after).developed)
 
     @uncollected
-    def _traced(self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob], after: RenderJob | None) -> Traced:
+    def _traced(
+        self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob], after: RenderJob | None
+    ) -> RawFrame:
         """Trace a job, or its moments: the mean of their pictures, with labels and glints of the job itself."""
         shots = moments or (job,)
         spp = max(1, (spp or self.spp) // len(shots))
@@ -93,7 +95,7 @@ class Renderer:
         for shot in shots:
             shown, place = self._stage.set(shot, after=None if moments else after)
             blur = blur or (Blur.of(job, place.posed) if moments else shown.host.blur)
-            film = begun(shown, blur.window, spp, shot.seed, layered=blur.layered)
+            film = start(shown, blur.window, spp, shot.seed, layered=blur.layered)
             # The device is at work until something is read, so the host's own work comes first.
             found = _marks(shown, job) if shot.M is job.M and shot.t is job.t else None
             self._stage.prepare()
@@ -110,9 +112,9 @@ class Renderer:
             marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(shown, job)()
         mirrored, labels, margins, bright = marks
         picture = np.mean(pictures, axis=0) if moments else pictures[0]
-        return Traced(job, picture, tuple(glints), blur, mirrored, labels, failed, margins, bright)
+        return RawFrame(job, picture, tuple(glints), blur, mirrored, labels, failed, margins, bright)
 
-    def _mirror_images(self, host: Prepared) -> MirrorImages:
+    def _mirror_images(self, host: HostData) -> MirrorImages:
         """The lamps' mirror images, in the closed form of the cornea or in a mesh of it."""
         job = host.job
         if job.mesh_edge_mm is None:
@@ -128,7 +130,7 @@ class Renderer:
         """Compute the labels of a window alone."""
         return part_labels(self.bind(job, lit=False)[0], job.window)()
 
-    def bind(self, job: RenderJob, *, lit: bool = True) -> tuple[Exposed, Surround | RegionScene]:
+    def bind(self, job: RenderJob, *, lit: bool = True) -> tuple[BoundFrame, Background | RegionScene]:
         """Set up a job's frame on the device, with the surroundings of its eye.
 
         It is valid until the next call. `lit`: whether radiance is wanted, not only what is seen where.
@@ -136,7 +138,7 @@ class Renderer:
         return self._stage.set(job, lit=lit)
 
 
-def _marks(shown: Exposed, job: RenderJob) -> Callable[[], tuple[PartLabels | None, Any, Bools | None]]:
+def _marks(shown: BoundFrame, job: RenderJob) -> Callable[[], tuple[PartLabels | None, Any, Bools | None]]:
     """Begin with labels, margins of the lids (px) and highlights, as far as the job wants them."""
     labels = part_labels(shown, job.window) if job.labels else lambda: None
     return lambda: (

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from eyerender.imaging.capture import render_job
 from eyerender.optics.solve import apparent_points
-from eyerender.rendering.integrator.film import begun, mean_radiance
+from eyerender.rendering.integrator.film import mean_radiance, start
 from eyerender.rendering.records.job import RenderJob
 from eyerender.rendering.scene.blur import Blur
 from eyerender.rig import defocus, psf
@@ -55,7 +55,7 @@ def headset_job(focus_mm: float, window: tuple[int, int, int, int]) -> RenderJob
 
 def mean_parts(shown, window, spp, seed):
     """Parts of the scene (parts, 3, height, width), and the number of failed light paths."""
-    return begun(shown, window, spp, seed, layered=True).means()
+    return start(shown, window, spp, seed, layered=True).means()
 
 
 def blurred(renderer, job: RenderJob, spp: int) -> tuple[np.ndarray, np.ndarray]:

@@ -284,11 +284,11 @@ def test_kernels_do_not_depend_on_where_memory_lies(renderer, folder):
 
 @pytest.mark.parametrize("kind", [np.float32, np.uint32, np.float16])
 def test_aligned_copies_hold_the_same_and_lie_at_multiples_of_64_bytes(kind):
-    from eyerender.rendering.records.frame import aligned
+    from eyerender.rendering.records.frame import aligned_copy
 
     memory = np.arange(1000).astype(kind)
     for shift in range(40):
-        copy = aligned(memory[shift : shift + 96].reshape(12, 8))
+        copy = aligned_copy(memory[shift : shift + 96].reshape(12, 8))
         assert copy.ctypes.data % 64 == 0
         assert copy.flags.c_contiguous
         np.testing.assert_array_equal(copy.ravel(), memory[shift : shift + 96])

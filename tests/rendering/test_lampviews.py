@@ -27,7 +27,7 @@ def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_
 
     from eyerender.rendering.integrator import framebuilder as stage
     from eyerender.rendering.records.recording import forget
-    from eyerender.rendering.transport.shadowmaps import LampViews
+    from eyerender.rendering.transport.shadowmaps import ShadowMaps
 
     monkeypatch.setattr(stage, "iris_light", lambda *_: None)  # which uses the views too
     forget()
@@ -46,7 +46,7 @@ def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_
         asked.append(views)
         return mi.Bool(False)
 
-    monkeypatch.setattr(LampViews, "clear", never)
+    monkeypatch.setattr(ShadowMaps, "clear", never)
     forget()
     truth = renderer.radiance(job, spp=4)
     assert asked

@@ -162,7 +162,7 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
     import mitsuba as mi
 
     from eyerender.imaging.capture import render_job
-    from eyerender.rendering.hits.interaction import meet
+    from eyerender.rendering.hits.interaction import intersect
     from eyerender.rendering.integrator.film import Pixels
     from eyerender.rendering.integrator.sampling import camera_ray
 
@@ -186,7 +186,7 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
     u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, width * height))
     for du, dv in ((-0.45, -0.45), (0.45, -0.1), (0.0, 0.45)):
         o, d, _ = camera_ray(shown.frame, mi.Float(u) + du, mi.Float(v) + dv)
-        _, hit = meet(shown.frame, o, d, True)
+        _, hit = intersect(shown.frame, o, d, True)
         on_sheet = hit.is_valid() & shown.frame.textures.region.on_sheet(shown.frame.textures.region.face(hit))
         # A ray in a million or so slips between two triangles: Embree's test is not watertight.
         assert np.count_nonzero(~on_sheet.numpy().astype(bool)[plain]) <= 3

@@ -44,7 +44,7 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.hits.interaction import meet
+    from eyerender.rendering.hits.interaction import intersect
     from eyerender.rendering.hits.meniscus import through_water, wetted
 
     rig = head_rig()
@@ -60,7 +60,7 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
     o = np.asarray(rig.camera.nodal_point_mm)
     d = (x - o) / np.linalg.norm(x - o, axis=-1, keepdims=True)
     rays = mi.Vector3f(*o.tolist()), mi.Vector3f(*d.astype(np.float32).T)
-    view, _ = meet(values, *rays, dr.full(mi.Bool, True, len(d)))
+    view, _ = intersect(values, *rays, dr.full(mi.Bool, True, len(d)))
     film, wet = wetted(skin.water, *rays, view.distance)
     straight, on_sclera = view.point.numpy().T, (wet & view.sclera).numpy()
     seen, way = through_water(values, skin, film, wet, view, *rays)

@@ -205,7 +205,7 @@ def rings(renderer: Any, job: RenderJob) -> dict[str, Any]:
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.hits.interaction import meet
+    from eyerender.rendering.hits.interaction import intersect
     from eyerender.rendering.integrator.sampling import camera_ray
 
     shown, _ = renderer.bind(job, lit=False)
@@ -214,7 +214,7 @@ def rings(renderer: Any, job: RenderJob) -> dict[str, Any]:
     kinds = []
     for du, dv in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
         o, d, _ = camera_ray(shown.frame, mi.Float(u + du), mi.Float(v + dv))
-        view, hit = meet(shown.frame, mi.Vector3f(o + dr.zeros(mi.Float, len(u))), d, mi.Bool(True))
+        view, hit = intersect(shown.frame, mi.Vector3f(o + dr.zeros(mi.Float, len(u))), d, mi.Bool(True))
         region = shown.frame.textures.region
         sheet = view.other if region is None else view.other & region.on_sheet(region.face(hit))
         cornea, pupil, sclera, other = (np.array(k, dtype=bool) for k in (view.cornea, view.pupil, view.sclera, sheet))

@@ -117,12 +117,12 @@ def iris_irradiance(renderer: Renderer, job: RenderJob, points_mm: np.ndarray) -
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.transport.directlight import through_cornea
+    from eyerender.rendering.transport.directlight import irradiance_through_cornea
 
     shown, _ = renderer.bind(job, lit=False)
     x = mi.Vector3f(*np.asarray(points_mm, dtype=np.float32).T)
     corner = mi.Float(0)  # of the unit square, which is the disc's centre
-    bent, _ = through_cornea(shown.frame, x, dr.full(mi.Bool, True, len(points_mm)), corner, corner)
+    bent, _ = irradiance_through_cornea(shown.frame, x, dr.full(mi.Bool, True, len(points_mm)), corner, corner)
     return np.asarray(bent.numpy(), dtype=float)
 
 
@@ -131,7 +131,7 @@ def depths_mm(renderer: Renderer, job: RenderJob) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.hits.interaction import meet
+    from eyerender.rendering.hits.interaction import intersect
     from eyerender.rendering.integrator.film import Pixels
     from eyerender.rendering.integrator.sampling import camera_ray
 
@@ -139,5 +139,5 @@ def depths_mm(renderer: Renderer, job: RenderJob) -> np.ndarray:
     _, _, width, height = job.window
     u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, width * height))
     o, d, _ = camera_ray(shown.frame, mi.Float(u), mi.Float(v))
-    view, _ = meet(shown.frame, o, d, True)
+    view, _ = intersect(shown.frame, o, d, True)
     return dr.select(view.met, view.distance, dr.inf).numpy().reshape(height, width)

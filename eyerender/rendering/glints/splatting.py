@@ -13,7 +13,7 @@ from ...rig.camera import Window
 from ...rig.light import Lamp
 from ..hits.meshes import SurfaceMesh
 from ..records.job import RenderJob, sun_lamps
-from ..scene.background import Surround
+from ..scene.background import Background
 from ..scene.blur import Blur
 from ..scene.region import RegionScene, blockers
 from .cutdiscs import POINT, quadrature
@@ -106,7 +106,7 @@ class MirrorImages:
         nearness = scene.nearness(lamps) if near else np.full((len(lamps), 2), np.nan)
         return cls(job, lamps, scene, scene.images(lamps, job.sensor.psf_sigma_px), further, nearness)
 
-    def seen(self, place: Surround | RegionScene, blur: Blur, share: float = 1.0) -> tuple[Mirrored, list[Shine]]:
+    def seen(self, place: Background | RegionScene, blur: Blur, share: float = 1.0) -> tuple[Mirrored, list[Shine]]:
         """What is seen of the images in posed surroundings, and what they add to the blurred picture.
 
         The tables and reasons are those of the lamps alone. `share` is that of the exposure for which the job stands.
@@ -130,7 +130,7 @@ class MirrorImages:
         return Mirrored(glint_table(glints[:count]), others, reasons), shines
 
 
-def _reason(job: RenderJob, place: Surround | RegionScene, glint: Glint) -> str:
+def _reason(job: RenderJob, place: Background | RegionScene, glint: Glint) -> str:
     """State whether or why not a lamp's glint is visible."""
     image = glint.image
     open_ = glint.clear if place.obstructed else np.ones(len(glint.clear), dtype=bool)

@@ -34,7 +34,7 @@ _RING = (0.62, 0.95)  # share of the way from the pupil to the root over which a
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class SurfaceInteraction:
     """What a camera ray meets, with points and normals in the eye frame."""
 
     cornea: mi.Bool  # it enters through the clear part of the cornea
@@ -51,7 +51,7 @@ class View:
     pupil: mi.Bool  # the inner point lies in the pupil
     albedo: mi.Float  # of the region's mesh, where there is one
     gloss: mi.Float  # likewise, and of the wet sclera
-    received: mi.Vector4f  # of the region's mesh: what it receives from other surfaces (see `exchange`)
+    received: mi.Vector4f  # of the region's mesh: what it receives from other surfaces (see `radiosity`)
     level: mi.Vector3f | None = None  # normal without the relief of skin in which light spreads
 
     @property
@@ -114,13 +114,13 @@ class Textures:
         heights: height (mm) of the iris over the same.
         raised: whether the iris has any heights.
         sclera: relative albedo of the sclera.
-        surround: `surround.SurroundGeometry` of frames without a region.
+        surround: `background.BackgroundGeometry` of frames without a region.
         region: `region.SkinGeometry`.
         ambience: `environment.Ambience`.
-        lamp_views: `lampviews.LampViews`.
-        pupil: `pupillight.PupilLight`.
-        received: `exchange.Received`.
-        tissues: `subsurface.TissueLight`.
+        lamp_views: `shadowmaps.ShadowMaps`.
+        pupil: `fundusirradiance.FundusIrradiance`.
+        received: `radiosity.RadiosityField`.
+        tissues: `diffusion.DiffusedLight`.
     """
 
     iris: mi.Texture2f
@@ -130,7 +130,7 @@ class Textures:
     surround: Any = None
     region: Any = None
     ambience: Any = None
-    lamp_views: Any = None
+    shadow_maps: Any = None
     pupil: Any = None
     received: Any = None
     tissues: Any = None
@@ -194,14 +194,14 @@ def opacity(frame: Frame, rho: mi.Float) -> mi.Float:
     return s * s * (3 - 2 * s)
 
 
-def look(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> View:
+def first_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> SurfaceInteraction:
     """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris."""
-    view, hit = meet(frame, o, d, active)
+    view, hit = intersect(frame, o, d, active)
     return appearance(frame, view, hit, d)
 
 
-def appearance(frame: Frame, view: View, hit: Hit, d: mi.Vector3f) -> View:
-    """View of rays along which `meet` found `view` and `hit`, with the surface of what is not the eye."""
+def appearance(frame: Frame, view: SurfaceInteraction, hit: Hit, d: mi.Vector3f) -> SurfaceInteraction:
+    """View of rays along which `intersect` found `view` and `hit`, with the surface of what is not the eye."""
     region, surround = frame.textures.region, frame.textures.surround
     if region is not None:
         there = look_at_skin(frame, region, region.face(hit), hit.prim_uv, d, view.other)
@@ -218,12 +218,14 @@ def appearance(frame: Frame, view: View, hit: Hit, d: mi.Vector3f) -> View:
     )
 
 
-def meet(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True) -> tuple[View, Hit]:
+def intersect(
+    frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True
+) -> tuple[SurfaceInteraction, Hit]:
     """View of the globe along rays, and the hit of Embree or OptiX, whose surface is not evaluated yet.
 
     coherent: whether neighbouring rays are alike, as those of a camera.
     """
-    alone = meet_globe(frame, o, d)
+    alone = intersect_globe(frame, o, d)
     hit: Hit
     if frame.structure.obstacles:
         ray = _ray(alone, o, d)  # whatever is behind the eye does not matter
@@ -233,7 +235,7 @@ def meet(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coher
     return behind(alone, hit, active), hit
 
 
-def behind(alone: View, hit: Hit | RegionHit, active: mi.Bool) -> View:
+def behind(alone: SurfaceInteraction, hit: Hit | RegionHit, active: mi.Bool) -> SurfaceInteraction:
     """View of rays that meet the globe like `alone` where nothing is hit in front of it."""
     clear = ~hit.is_valid() & active
     on_cornea, on_sclera = alone.cornea & clear, alone.sclera & clear
@@ -243,14 +245,16 @@ def behind(alone: View, hit: Hit | RegionHit, active: mi.Bool) -> View:
     )
 
 
-def region_hit(skin: SkinGeometry, scene: mi.Scene, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> RegionHit:
+def region_hit(
+    skin: SkinGeometry, scene: mi.Scene, alone: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f
+) -> RegionHit:
     """Hits of camera rays on an eye region in front of the globe."""
     hit = scene.ray_intersect_preliminary(_ray(alone, o, d), coherent=True, active=True)
     return RegionHit(dr.select(hit.is_valid(), hit.t, dr.inf), skin.face(hit), hit.prim_uv)
 
 
-def hidden(frame: Frame, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
-    """Whether anything of the scene is in front of the globe, where the rays of `meet_globe` meet it."""
+def hidden(frame: Frame, alone: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
+    """Whether anything of the scene is in front of the globe, where the rays of `intersect_globe` meet it."""
     met = alone.cornea | alone.sclera
     if not frame.structure.obstacles:
         return met & PlaneHit.of(frame.backdrop_x, o, d, alone.distance).is_valid()
@@ -259,14 +263,14 @@ def hidden(frame: Frame, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool
     )
 
 
-def _ray(alone: View, o: mi.Vector3f, d: mi.Vector3f) -> mi.Ray3f:
+def _ray(alone: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> mi.Ray3f:
     """Rays as far as the globe."""
     ray = mi.Ray3f(mi.Point3f(o), d)
     ray.maxt = alone.distance
     return ray
 
 
-def meet_globe(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> View:
+def intersect_globe(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
     """View of the globe along rays, as if it stood alone; the distance of rays that miss it has no bound."""
     # In single precision the ray must start next to the eye.
     t0 = -dr.dot(o, d) - _NEAR_MM
@@ -277,7 +281,7 @@ def meet_globe(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> View:
     yl = ol + tc * dl
     rho = dr.sqrt(yl.y * yl.y + yl.z * yl.z)
     on_cornea &= (rho < frame.limbus.radius) & (yl.x > frame.limbus.floor)
-    ts, on_sclera = meet_sphere(oe - frame.sclera.centre, de, frame.sclera.radius)
+    ts, on_sclera = intersect_sphere(oe - frame.sclera.centre, de, frame.sclera.radius)
     # The sphere's front is behind the cornea, so a ray that meets the sphere first has met no clear cornea. This avoids
     # cracks, even where the rim of a tilted or toric cornea is no circle of the sphere.
     on_cornea &= ~on_sclera | (tc < ts)
@@ -292,7 +296,7 @@ def meet_globe(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> View:
         lambda *_: (mi.Vector3f(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Vector3f(0), mi.Bool(False)),
     )
     xs = oe + ts * de
-    return View(
+    return SurfaceInteraction(
         cornea=on_cornea,
         sclera=on_sclera,
         other=mi.Bool(False),
@@ -313,7 +317,7 @@ def meet_globe(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> View:
 
 def look_at_skin(
     frame: Frame, region: SkinGeometry, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, other: mi.Bool
-) -> View:
+) -> SurfaceInteraction:
     """View of rays that meet places on triangles of an eye region, where `other`."""
     skin = region.surface(face, uv, other)
     view = _matte(frame, skin.point, skin.normal, d, other)
@@ -321,10 +325,10 @@ def look_at_skin(
     return replace(view, albedo=skin.albedo, gloss=skin.gloss, received=skin.received, level=level)
 
 
-def _matte(frame: Frame, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector3f, other: mi.Bool) -> View:
+def _matte(frame: Frame, point: mi.Vector3f, facing: mi.Vector3f, d: mi.Vector3f, other: mi.Bool) -> SurfaceInteraction:
     """View of matte points of the scene; normals are turned to the viewer."""
     no, nothing = mi.Bool(False), mi.Float(0)
-    return View(
+    return SurfaceInteraction(
         cornea=no,
         sclera=no,
         other=other,
@@ -402,7 +406,7 @@ def stop_coordinates(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     return dr.dot(q, frame.stop.u) / a, dr.dot(q, frame.stop.v) / b
 
 
-def meet_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Bool]:
+def intersect_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Bool]:
     """Distance to the near side of a sphere about the origin, and whether it is met from outside."""
     b, c = dr.dot(o, d), dr.squared_norm(o) - radius * radius
     disc = b * b - c
@@ -446,7 +450,7 @@ def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
     return dr.select(left > 0, albedo, frame.limbus.albedo)
 
 
-def outer_albedo(frame: Frame, view: View) -> mi.Float:
+def outer_albedo(frame: Frame, view: SurfaceInteraction) -> mi.Float:
     """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
     return dr.if_stmt(
         (view.point, view.albedo),

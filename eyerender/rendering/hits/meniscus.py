@@ -18,7 +18,7 @@ import mitsuba as mi
 from ...optics.media import TEARS
 from ..records.frame import Frame
 from ..scene.region import SkinGeometry
-from .interaction import View, look_at_skin, meet_globe
+from .interaction import SurfaceInteraction, intersect_globe, look_at_skin
 
 _INDEX = float(TEARS.index(850.0))
 _LEAST = 0.1  # cosine below which a ray is not followed
@@ -34,14 +34,14 @@ def wetted(
     return film, film.is_valid()
 
 
-def on_water(frame: Frame, view: View, o: mi.Vector3f, d: mi.Vector3f) -> View:
+def on_water(frame: Frame, view: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
     """The view of camera rays where menisci are in front of it, else `view` itself."""
     region = frame.textures.region
     if region is None or region.water is None:
         return view
     film, wet = wetted(region.water, o, d, view.distance)
     water = look_at_skin(frame, region, region.on_water(film), film.prim_uv, d, wet)
-    return View(*(dr.select(wet, a, b) for a, b in zip(parts_of(water), parts_of(view), strict=True)))
+    return SurfaceInteraction(*(dr.select(wet, a, b) for a, b in zip(parts_of(water), parts_of(view), strict=True)))
 
 
 def through_water(
@@ -49,15 +49,15 @@ def through_water(
     skin: SkinGeometry,
     film: mi.PreliminaryIntersection3f,
     wet: mi.Bool,
-    view: View,
+    view: SurfaceInteraction,
     o: mi.Vector3f,
     d: mi.Vector3f,
-) -> tuple[View, mi.Vector3f]:
+) -> tuple[SurfaceInteraction, mi.Vector3f]:
     """What rays show of the globe behind a meniscus, where `wet`, and their directions in air before it."""
     wet &= ~view.other
 
     def bent(d: mi.Vector3f, *parts: Any) -> tuple[Any, ...]:
-        view = View(*parts)
+        view = SurfaceInteraction(*parts)
         x = o + film.t * d
         surface = skin.surface(skin.on_water(film), film.prim_uv, wet)
         below = frame.vector_to_scene(view.normal)
@@ -66,7 +66,7 @@ def through_water(
         deep = dr.dot(x - frame.point_to_scene(view.point), below)
         outside, leaves = _refracted(inside, below, _INDEX)
         way = dr.select(enters & leaves, outside, d)
-        seen = meet_globe(frame, x + (deep / cosine) * inside, way)
+        seen = intersect_globe(frame, x + (deep / cosine) * inside, way)
         found = enters & leaves & (seen.cornea | seen.sclera)
         # Below the water nothing mirrors the lamps. The distance is that at which the depth is the one without water.
         forward = frame.camera.forward
@@ -78,12 +78,12 @@ def through_water(
         )
 
     d, *parts = dr.if_stmt((d, *parts_of(view)), wet, bent, lambda *unchanged: unchanged)
-    return View(*parts), d
+    return SurfaceInteraction(*parts), d
 
 
-def parts_of(view: View) -> tuple[Any, ...]:
-    """Fields of a view but for the last one, which `meet_globe` does not set."""
-    return tuple(getattr(view, f.name) for f in fields(View) if f.name != "level")
+def parts_of(view: SurfaceInteraction) -> tuple[Any, ...]:
+    """Fields of a view but for the last one, which `intersect_globe` does not set."""
+    return tuple(getattr(view, f.name) for f in fields(SurfaceInteraction) if f.name != "level")
 
 
 def _refracted(d: mi.Vector3f, normal: mi.Vector3f, eta: mi.Float) -> tuple[mi.Vector3f, mi.Bool]:

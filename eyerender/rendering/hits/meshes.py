@@ -26,7 +26,7 @@ from ...arrays import Bools, Floats, Ints
 from ...eye.meshes import Patch, cornea_patches
 from ...eye.model import EyeModel
 from ...geometry.surfaces import Surface as ExactSurface
-from ..records.frame import aligned, sent
+from ..records.frame import aligned_copy, upload_array
 from ..records.surfaces import Bundle, NormalForm, Surface
 
 _ABOVE_MM = 40.0  # beyond every cornea along its axis
@@ -82,7 +82,7 @@ class MeshGeometry:
         corners[:, :3] = faces
         records = np.zeros((len(vertices), 8), np.float32)
         records[:, 0:3], records[:, 4:7] = vertices, normals
-        return cls(scene=scene, faces=mi.UInt32(aligned(corners.ravel())), vertices=sent(records))
+        return cls(scene=scene, faces=mi.UInt32(aligned_copy(corners.ravel())), vertices=upload_array(records))
 
     def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> mi.PreliminaryIntersection3f:
         """First hit of rays of the surface's frame."""
@@ -166,7 +166,7 @@ class SurfaceMesh:
             Points (n, 3) and normals (n, 3) (not unit), their derivatives by y and z (n, 3, 2), and whether the mesh
             reaches there.
         """
-        hit = self.geometry.above(*(mi.Float(aligned(c.astype(np.float32))) for c in q.T))
+        hit = self.geometry.above(*(mi.Float(aligned_copy(c.astype(np.float32))) for c in q.T))
         valid, face = hit.is_valid(), hit.prim_index
         dr.eval(valid, face)
         there = np.asarray(valid.numpy(), dtype=bool)

@@ -23,11 +23,11 @@ import numpy as np
 
 from ...arrays import Bools, Ints, Singles, frozen
 from ...rig.camera import Window
-from ..hits.interaction import RegionHit, View, meet, meet_globe, region_hit
-from ..records.frame import SMALL, Frame, Lamp, aligned, quotient
+from ..hits.interaction import RegionHit, SurfaceInteraction, intersect, intersect_globe, region_hit
+from ..records.frame import SMALL, Frame, Lamp, aligned_copy, quotient
 from ..records.recording import recorded
 from .groups import Group, shade_group
-from .hostdata import Prepared
+from .hostdata import HostData
 from .sampling import Pattern, Samples, camera_ray, lattice_generator
 from .shading import shade
 
@@ -42,11 +42,11 @@ _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and betw
 
 
 @dataclass(frozen=True, slots=True)
-class Exposed:
+class BoundFrame:
     """A bound frame for rendering, on the device, and what NumPy makes of its job."""
 
     frame: Frame
-    host: Prepared
+    host: HostData
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ class Film:
     """A window whose samples are being taken: the device may still be at work until `means` reads the sums.
 
     Attributes:
-        sums: over the samples of each pixel: the radiance, or for each part what `begun` says.
+        sums: over the samples of each pixel: the radiance, or for each part what `start` says.
         failed: number of failed light paths.
         shape: height and width of the window.
         spp: samples per pixel.
@@ -118,7 +118,7 @@ class Film:
     layered: bool
 
     def means(self) -> tuple[Singles, int]:
-        """Read the means over the samples (see `begun`), and the number of failed light paths."""
+        """Read the means over the samples (see `start`), and the number of failed light paths."""
         means = [total.numpy().reshape(self.shape) / np.float32(self.spp) for total in self.sums]
         failed = int(self.failed.numpy()[0])
         if self.layered:
@@ -127,12 +127,12 @@ class Film:
         return np.maximum(means[0], 0, out=means[0]), failed
 
 
-def mean_radiance(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
+def mean_radiance(shown: BoundFrame, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
-    return begun(shown, window, spp, seed, layered=False).means()
+    return start(shown, window, spp, seed, layered=False).means()
 
 
-def begun(shown: Exposed, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
+def start(shown: BoundFrame, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
     """Begin to take the samples of a window.
 
     Its `means` are those of `mean_radiance`. If `layered`, there are three numbers for each part of the scene, from
@@ -170,7 +170,7 @@ def _samples(u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = 
     return Samples((u & mi.UInt32(0xFFFF)) | (v << mi.UInt32(16)), pattern, fine)
 
 
-def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[list[mi.Float], mi.UInt32]:
+def _adaptive(shown: BoundFrame, window: Window, spp: int, seed: int) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums of radiance over the samples of each pixel, (height * width,); failed light paths.
 
     Four samples of each pixel are taken first. Where they agree, and their mean is not far from those of the eight
@@ -188,7 +188,7 @@ def _adaptive(shown: Exposed, window: Window, spp: int, seed: int) -> tuple[list
         each = dr.opaque(mi.UInt32, len(numbers))
         place = index // each
         pixel = dr.gather(mi.UInt32, pixels, place)
-        k = dr.gather(mi.UInt32, mi.UInt32(aligned(numbers.astype(np.uint32))), index - place * each)
+        k = dr.gather(mi.UInt32, mi.UInt32(aligned_copy(numbers.astype(np.uint32))), index - place * each)
         (radiance,), failures = take(pixel, k, False)
         failed += failures
         return radiance
@@ -255,7 +255,7 @@ def _first_samples(count: int) -> Ints:
 
 
 def _singles(
-    shown: Exposed, window: Window, *, spp: int, seed: int, first: int, count: int, layered: bool
+    shown: BoundFrame, window: Window, *, spp: int, seed: int, first: int, count: int, layered: bool
 ) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums over `count` samples of each pixel, one per lane."""
     index = dr.arange(mi.UInt32, window[2] * window[3] * count)
@@ -267,7 +267,7 @@ def _singles(
 
 
 def _taken_by(
-    shown: Exposed, window: Window, spp: int, seed: int
+    shown: BoundFrame, window: Window, spp: int, seed: int
 ) -> Callable[[mi.UInt32, mi.UInt32, bool], tuple[list[mi.Float], mi.UInt32]]:
     """The function that takes samples of a window's pixels."""
     return partial(_taken, shown.frame, Pixels.of(window), Pattern.of(spp, seed))
@@ -286,7 +286,7 @@ def _taken(
     cosine = cosine * cosine
     lanes = [radiance * cosine * cosine]
     if layered:
-        view, _ = meet(frame, o, d, True)
+        view, _ = intersect(frame, o, d, True)
         near = view.nearness(frame, d)
         parts = (view.other, view.cornea | view.sclera)
         lanes = [dr.select(part, x, 0) for part in parts for x in (lanes[0], mi.Float(1), near)]
@@ -297,7 +297,7 @@ def _taken(
 
 
 def _groups(
-    shown: Exposed,
+    shown: BoundFrame,
     window: Window,
     plain: tuple[Bools, int],
     *,
@@ -319,8 +319,8 @@ def _groups(
     )
     pattern, (marks, chosen) = Pattern.of(spp, seed, times=times), shown.host.fine(window)
     if times == 1:
-        marks, chosen = aligned(marks & 3), chosen[:0]
-    fine, seen = mi.UInt32(marks), mi.UInt8(aligned(tiles.ravel().astype(np.uint8)))
+        marks, chosen = aligned_copy(marks & 3), chosen[:0]
+    fine, seen = mi.UInt32(marks), mi.UInt8(aligned_copy(tiles.ravel().astype(np.uint8)))
     hits = _hits_of(shown, window, pattern, chosen, (first * size * times, count * size * times))
     return _shaded(
         *(shown.frame, grid, pattern, fine, hits, seen),
@@ -330,7 +330,7 @@ def _groups(
 
 
 def _hits_of(
-    shown: Exposed, window: Window, pattern: Pattern, chosen: Ints, numbers: tuple[int, int]
+    shown: BoundFrame, window: Window, pattern: Pattern, chosen: Ints, numbers: tuple[int, int]
 ) -> tuple[mi.Float, mi.UInt32, mi.Float, mi.Float]:
     """What samples of chosen pixels hit of the region (distance, triangle, place on it), those of a pixel side by side.
 
@@ -344,7 +344,7 @@ def _hits_of(
     each = dr.opaque(mi.UInt32, numbers[1])
     index = dr.arange(mi.UInt32, len(chosen) * numbers[1])
     place = index // each
-    pixel = dr.gather(mi.UInt32, mi.UInt32(aligned(chosen.astype(np.uint32))), place)
+    pixel = dr.gather(mi.UInt32, mi.UInt32(aligned_copy(chosen.astype(np.uint32))), place)
     k = index - place * each + dr.opaque(mi.UInt32, numbers[0])
     dr.eval(pixel, k)
     return _hits(shown.frame, Pixels.of(window), pattern, pixel, k)
@@ -358,7 +358,7 @@ def _hits(
     u, v = pixels.at(pixel)
     spot = _samples(u, v, pattern, mi.Bool(True)).in_pixel(k)
     o, d, _ = camera_ray(frame, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
-    hit = region_hit(frame.textures.region, frame.scene, meet_globe(frame, o, d), o, d)
+    hit = region_hit(frame.textures.region, frame.scene, intersect_globe(frame, o, d), o, d)
     found = hit.t, hit.face, hit.prim_uv.x, hit.prim_uv.y
     dr.eval(found)
     return found
@@ -414,7 +414,7 @@ def _shaded(
     traced = marks >> 2
     first_hit = ((traced - 1) * count + (packet - tile * count)) * each
 
-    def hit(j: mi.UInt32, alone: View, o: mi.Vector3f, d: mi.Vector3f) -> RegionHit:
+    def hit(j: mi.UInt32, alone: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> RegionHit:
         def known() -> RegionHit:
             t, face, a, b = (dr.gather(type(part), part, first_hit + j) for part in hits)
             return RegionHit(t, face, mi.Point2f(a, b))

@@ -17,23 +17,23 @@ from ...region.mesh import RegionMesh, region_mesh
 from ...rig.imaging import Ambient
 from ..hits.interaction import Textures
 from ..hits.meshes import Meshes, meshed
-from ..records.eyecache import KeptForEye
-from ..records.frame import Frame, Lights, Structure, sent
+from ..records.eyecache import EyeCache
+from ..records.frame import Frame, Lights, Structure, upload_array
 from ..records.job import LampTable, RenderJob, boundary_waves, kinds, panel_lamps, panel_table, tables
 from ..records.recording import forget, recorded
-from ..scene.background import Obstacle, Surround
+from ..scene.background import Background, Obstacle
 from ..scene.head import place_scene
 from ..scene.region import RegionScene
-from ..transport.diffusion import tissue_light
+from ..transport.diffusion import diffused_light
 from ..transport.environment import Ambience, Maps, bright_lamps
-from ..transport.fundusirradiance import PupilLight, pupil_light
-from ..transport.globeirradiance import matte_light
-from ..transport.irisirradiance import IrisLight, iris_light
-from ..transport.radiosity import Exchange
+from ..transport.fundusirradiance import FundusIrradiance, fundus_irradiance
+from ..transport.globeirradiance import globe_irradiance
+from ..transport.irisirradiance import IrisIrradiance, iris_irradiance
+from ..transport.radiosity import RadiositySolver
 from ..transport.reliefmapping import IrisRelief, ReliefShape, ReliefSize, flat_relief, lit_relief, relief_shape
-from ..transport.shadowmaps import LampViews
-from .film import Exposed
-from .hostdata import Prepared
+from ..transport.shadowmaps import ShadowMaps
+from .film import BoundFrame
+from .hostdata import HostData
 
 _REGIONS, _TEXTURES = 4, 8  # kept
 _REMEMBERED = 32  # subjects; then recordings are made anew, because those of sizes that never come back take 3 MB each
@@ -46,7 +46,7 @@ class _Next:
 
     job: RenderJob
     posed: Future[RegionMesh] | None = None
-    host: Future[Prepared] | None = None
+    host: Future[HostData] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,16 +63,16 @@ class _GridSizes:
 def _grids_behind_cornea(
     frame: Frame, shape: ReliefShape | None, side: mi.UInt32, points: mi.UInt32, factors: mi.Float | None,
     sizes: _GridSizes,
-) -> tuple[IrisLight | None, IrisRelief, PupilLight]:  # fmt: skip
+) -> tuple[IrisIrradiance | None, IrisRelief, FundusIrradiance]:  # fmt: skip
     """Fill the grids of the lamps' light on the iris, on its relief, and on the fundus."""
-    pupil = pupil_light(frame, factors)
-    on_iris = iris_light(frame, sizes.lamps, points) if sizes.gridded else None
+    pupil = fundus_irradiance(frame, factors)
+    on_iris = iris_irradiance(frame, sizes.lamps, points) if sizes.gridded else None
     if shape is None:
         return on_iris, flat_relief(side), pupil
     return on_iris, lit_relief(frame, shape, side, points, (sizes.nodes, sizes.points)), pupil
 
 
-class Stage:
+class FrameBuilder:
     """Scenes, textures and maps.
 
     Args:
@@ -82,15 +82,15 @@ class Stage:
 
     def __init__(self, beside: Executor, obstacles: Sequence[Obstacle] = ()) -> None:
         self._beside = beside
-        self._surround = Surround(obstacles)
+        self._surround = Background(obstacles)
         self._textures: dict[Any, Textures] = {}
         self._regions: dict[Any, RegionScene] = {}  # the one that was used last is last
         self._filled = 0
         self._replaced: deque[Any] = deque(maxlen=_REGIONS)  # subjects whose scenes others took
         self._maps = Maps()
         self.meshes = Meshes()
-        self._exchange = Exchange()
-        self._shapes: KeptForEye[ReliefShape] = KeptForEye()
+        self._exchange = RadiositySolver()
+        self._shapes: EyeCache[ReliefShape] = EyeCache()
         self._next: _Next | None = None
 
     def _expect(self, job: RenderJob) -> None:
@@ -108,11 +108,11 @@ class Stage:
         if after.posed is not None and after.posed.exception():
             return  # its own frame shall raise the error
         posed = None if after.posed is None else after.posed.result()
-        after.host = self._beside.submit(Prepared.made, after.job, posed)
+        after.host = self._beside.submit(HostData.made, after.job, posed)
 
     def set(
         self, job: RenderJob, *, lit: bool = True, after: RenderJob | None = None
-    ) -> tuple[Exposed, Surround | RegionScene]:
+    ) -> tuple[BoundFrame, Background | RegionScene]:
         """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call.
 
         Args:
@@ -125,7 +125,7 @@ class Stage:
         textures = self._textures_of(job)
         # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
         if isinstance(place, RegionScene):
-            textures = replace(textures, region=place.skin, lamp_views=LampViews.of(host.views, place))
+            textures = replace(textures, region=place.skin, shadow_maps=ShadowMaps.of(host.views, place))
         else:
             textures = replace(textures, surround=place.geometry)
         structure = Structure(
@@ -143,16 +143,16 @@ class Stage:
         if job.mesh_edge_mm is not None:
             frame.surfaces = meshed(frame.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
         if lit and structure.scattering and region is not None:
-            textures.tissues = tissue_light(job, frame, host.lamps, region, host.tissue_cells)
+            textures.tissues = diffused_light(job, frame, host.lamps, region, host.tissue_cells)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
             panels = panel_table(job.ambient, job.anchor_mm)
             textures.ambience = Ambience.upload(even, panels, job.ambient.map, self._maps)
         if lit:
             self._light(host, frame, place, after)
-        return Exposed(frame, host), place
+        return BoundFrame(frame, host), place
 
-    def _light(self, host: Prepared, frame: Frame, place: Surround | RegionScene, after: RenderJob | None) -> None:
+    def _light(self, host: HostData, frame: Frame, place: Background | RegionScene, after: RenderJob | None) -> None:
         """Add the light between surfaces, and the grids of the lamps' light that the frame can use."""
         job = host.job
         parts = panel_lamps(job.ambient, job.anchor_mm) + bright_lamps(job.ambient.map, self._maps, job.anchor_mm)
@@ -165,9 +165,9 @@ class Stage:
         if not place.obstructed:
             reach = dr.opaque(mi.Float, min(host.reach_mm, _FARTHEST_MM))
             points = dr.opaque(mi.UInt32, host.lamps.points)
-            frame.lights.on_matte = matte_light(frame, reach, points, host.lamps.gridded)
+            frame.lights.on_matte = globe_irradiance(frame, reach, points, host.lamps.gridded)
 
-    def _fill_grids(self, host: Prepared, frame: Frame, place: Surround | RegionScene) -> None:
+    def _fill_grids(self, host: HostData, frame: Frame, place: Background | RegionScene) -> None:
         """Add the light of the lamps behind the cornea."""
         job, lamps, heights = host.job, host.lamps, frame.textures.heights
         size = ReliefSize.of(job)
@@ -182,22 +182,22 @@ class Stage:
         points = lamps.points * max(len(lamps), 1)
         sizes = _GridSizes(gridded, len(lamps) if lamps.gridded else 0, size.side**2, points)
         factors = host.returned.factors
-        sent_factors = sent(factors) if len(lamps) and factors.any() else None
+        sent_factors = upload_array(factors) if len(lamps) and factors.any() else None
         lights, textures = frame.lights, frame.textures
         lights.on_iris, lights.relief, textures.pupil = _grids_behind_cornea(
             frame, shape, side, dr.opaque(mi.UInt32, lamps.points), sent_factors, sizes
         )
 
-    def _prepared(self, job: RenderJob) -> tuple[Prepared, Surround | RegionScene]:
+    def _prepared(self, job: RenderJob) -> tuple[HostData, Background | RegionScene]:
         """What NumPy makes of a job, and its posed surroundings."""
         expected, self._next = self._next, None
         host = None
         if expected is not None and expected.job is job and expected.host is not None:
             host = expected.host.result()
         place = self._place(job, None if host is None else host.posed)
-        return host or Prepared(job, place.posed), place
+        return host or HostData(job, place.posed), place
 
-    def _place(self, job: RenderJob, known: RegionMesh | None) -> Surround | RegionScene:
+    def _place(self, job: RenderJob, known: RegionMesh | None) -> Background | RegionScene:
         """Posed surroundings; the mesh of a region may be known."""
         if job.region is None:
             self._surround.show(job.look)

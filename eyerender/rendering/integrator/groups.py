@@ -9,11 +9,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import RegionHit, View, behind, look_at_skin, meet_globe, outer_albedo
+from ..hits.interaction import RegionHit, SurfaceInteraction, behind, intersect_globe, look_at_skin, outer_albedo
 from ..hits.meniscus import parts_of, through_water, wetted
 from ..records.frame import Frame, Lamp
 from ..scene.region import SkinGeometry, film_normal, glossy_normal
-from ..transport.directlight import lamp_blocked, on_relief, straight, through_cornea
+from ..transport.directlight import direct_light, irradiance_through_cornea, lamp_blocked, on_relief
 from .shading import direct, indirect, off_eye
 
 _FAINT = 1e-3  # highlights so weak, relative to the other light or to a white surface, need no ray for their shadow
@@ -46,7 +46,7 @@ class Group:
     count: mi.UInt32
     halved: mi.Bool
     ray: Callable[[mi.UInt32], tuple[mi.Vector3f, mi.Vector3f, mi.Float]]
-    hit: Callable[[mi.UInt32, View, mi.Vector3f, mi.Vector3f], RegionHit]
+    hit: Callable[[mi.UInt32, SurfaceInteraction, mi.Vector3f, mi.Vector3f], RegionHit]
     spot: Callable[[mi.UInt32], mi.Point2f]
     shared_spot: mi.Point2f
     asked: Callable[[mi.UInt32], mi.UInt32]
@@ -83,7 +83,18 @@ def shade_group(frame: Frame, group: Group) -> tuple[tuple[Part, ...], mi.Float,
     shading = _GroupShading(frame, frame.textures.region, group)
     no = mi.Bool(False)
     depths = tuple(mi.Float(0) for _ in range(3)) if group.layered else ()
-    state = (mi.UInt32(0), no, mi.Float(0), OnGlobe.none(), Kept.none(), Kept.none(), no, no, mi.UInt32(0), depths)
+    state = (
+        mi.UInt32(0),
+        no,
+        mi.Float(0),
+        GlobeSamples.none(),
+        RegionSample.none(),
+        RegionSample.none(),
+        no,
+        no,
+        mi.UInt32(0),
+        depths,
+    )
     names = ("i", "settled", "total", "globe", "sheet", "before", "known", "blocked", "failures", "depths")
     i, settled, total, globe, sheet, before, _, _, failures, depths = dr.while_loop(
         state, shading.goes_on, shading.trace_sample, labels=names, label="group"
@@ -92,7 +103,7 @@ def shade_group(frame: Frame, group: Group) -> tuple[tuple[Part, ...], mi.Float,
     traced = sheet.weight
     sheet = shading.with_untraced(sheet, i, settled)
 
-    def with_region(total: mi.Float, kept: Kept, on_sheet: bool) -> mi.Float:
+    def with_region(total: mi.Float, kept: RegionSample, on_sheet: bool) -> mi.Float:
         return dr.if_stmt(
             (total,), kept.weight > 0, lambda total: shading.add_region(total, kept, on_sheet), lambda total: total
         )
@@ -139,14 +150,25 @@ class _GroupShading:
         i: mi.UInt32,
         settled: mi.Bool,
         total: mi.Float,
-        globe: OnGlobe,
-        sheet: Kept,
-        before: Kept,
+        globe: GlobeSamples,
+        sheet: RegionSample,
+        before: RegionSample,
         known: mi.Bool,
         blocked: mi.Bool,
         failures: mi.UInt32,
         depths: tuple[mi.Float, ...],
-    ) -> tuple[mi.UInt32, mi.Bool, mi.Float, OnGlobe, Kept, Kept, mi.Bool, mi.Bool, mi.UInt32, tuple[mi.Float, ...]]:
+    ) -> tuple[
+        mi.UInt32,
+        mi.Bool,
+        mi.Float,
+        GlobeSamples,
+        RegionSample,
+        RegionSample,
+        mi.Bool,
+        mi.Bool,
+        mi.UInt32,
+        tuple[mi.Float, ...],
+    ]:
         """Trace one sample: shade the globe if the sample hits it, else keep the hit on the region.
 
         `known` says whether the previous sample has sent its own ray to the lamp, `blocked` whether that ray met
@@ -156,7 +178,7 @@ class _GroupShading:
         j = self.number(i)
         o, d, weight = group.ray(j)
 
-        view = meet_globe(frame, o, d)
+        view = intersect_globe(frame, o, d)
         hit = group.hit(j, view, o, d)
         view, face = behind(view, hit, mi.Bool(True)), hit.face
         at = o + hit.t * d
@@ -165,10 +187,10 @@ class _GroupShading:
             total, d, *parts = dr.if_stmt(
                 (total, d, *parts_of(view)),
                 group.wet,
-                lambda total, d, *parts: self.past_water(total, d, View(*parts), o, j, weight),
+                lambda total, d, *parts: self.past_water(total, d, SurfaceInteraction(*parts), o, j, weight),
                 lambda *unchanged: unchanged,
             )
-            view = View(*parts)
+            view = SurfaceInteraction(*parts)
         if group.layered:
             # Before the branches below: Dr.Jit would reuse their values outside of them.
             add = weight * view.nearness(frame, d)
@@ -185,7 +207,7 @@ class _GroupShading:
         lit, shaded, failures = dr.if_stmt(
             (globe.lit, globe.shaded, failures), on_globe & in_turn, shade, lambda *unchanged: unchanged
         )
-        globe = OnGlobe(lit, shaded, globe.weight + dr.select(on_globe, weight, 0))
+        globe = GlobeSamples(lit, shaded, globe.weight + dr.select(on_globe, weight, 0))
         alone = view.other & group.fine
         if self.soft:
             alone &= ~on_sheet
@@ -208,28 +230,28 @@ class _GroupShading:
         return i + 1, settled, total, globe, sheet, before, known, blocked, failures, depths
 
     def past_water(
-        self, total: mi.Float, d: mi.Vector3f, view: View, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
+        self, total: mi.Float, d: mi.Vector3f, view: SurfaceInteraction, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
     ) -> tuple[Any, ...]:
         """Add what menisci mirror to `total`; the direction in air, and the parts of the view, of what is behind."""
         frame, skin, no = self.frame, self.skin, mi.Bool(False)
         film, wet = wetted(skin.water, o, d, view.distance)
         # Mirror images of lamps in water are smaller than a pixel, so no sample stands for others.
-        drop = Kept.none().with_(wet, j, skin.on_water(film), film.prim_uv, weight, no, no)
+        drop = RegionSample.none().with_(wet, j, skin.on_water(film), film.prim_uv, weight, no, no)
         total = dr.if_stmt((total,), wet, lambda total: self.add_region(total, drop, False), lambda total: total)
         view, d = through_water(frame, skin, film, wet, view, o, d)
         return total, d, *parts_of(view)
 
-    def globe_radiance(self, view: View, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
+    def globe_radiance(self, view: SurfaceInteraction, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
         """Radiance of the globe along sample j's ray, and failed light paths."""
         frame, group = self.frame, self.group
         seen = on_relief(frame, replace(view, other=mi.Bool(False)))
-        inner, missed = through_cornea(frame, seen.inner, seen.lit_inside, *group.spot(j))
+        inner, missed = irradiance_through_cornea(frame, seen.inner, seen.lit_inside, *group.spot(j))
         albedo = outer_albedo(frame, seen)
         received = frame.textures.received.globe(frame.point_to_scene(seen.point))
         rest = indirect(frame, seen, d, albedo, inner, received)
         return rest + self.lamps_on_globe(seen, albedo, -frame.vector_to_eye(d), j), missed
 
-    def lamps_on_globe(self, seen: View, albedo: mi.Float, back: mi.Vector3f, j: mi.UInt32) -> mi.Float:
+    def lamps_on_globe(self, seen: SurfaceInteraction, albedo: mi.Float, back: mi.Vector3f, j: mi.UInt32) -> mi.Float:
         """Radiance of the matte globe at sample j: the light of all lamps, less what is kept from it.
 
         The samples of a pixel share the rays to the lamps. So only shadows that end within the pixel are noisy.
@@ -242,7 +264,7 @@ class _GroupShading:
 
         def lit_by(lamp: Lamp, matte: mi.Float) -> tuple[mi.Vector3f, mi.Float]:
             source = lamp.point(u, *turn)
-            return source, direct(seen, matte, *straight(lamp, source, seen, mirror))
+            return source, direct(seen, matte, *direct_light(lamp, source, seen, mirror))
 
         if self.soft:
             # What went through the tissue is known, and what remains is the film's highlight.
@@ -275,7 +297,7 @@ class _GroupShading:
         _, total = dr.while_loop(state, lambda k, _: k < asked, subtract, labels=("k", "total"), label="shadows")
         return total
 
-    def with_untraced(self, sheet: Kept, i: mi.UInt32, settled: mi.Bool) -> Kept:
+    def with_untraced(self, sheet: RegionSample, i: mi.UInt32, settled: mi.Bool) -> RegionSample:
         """Add to the skin's hit the weights of the samples from the i-th on, which a plain pixel left untraced."""
 
         def more(i: mi.UInt32, *_: object) -> mi.Bool:
@@ -293,12 +315,12 @@ class _GroupShading:
         self, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, asked: mi.Bool
     ) -> mi.Bool:
         """Whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
-        frame, views = self.frame, self.frame.textures.lamp_views
+        frame, views = self.frame, self.frame.textures.shadow_maps
         # Where the lamp's own view shows bare skin alone, only the globe may be in the way.
         clear = views.clear(lamp.number, frame.point_to_scene(x), asked & on_sheet)
         return lamp_blocked(frame, x, source, True, True, asked & ~clear)
 
-    def add_region(self, total: mi.Float, kept: Kept, on_sheet: bool) -> mi.Float:
+    def add_region(self, total: mi.Float, kept: RegionSample, on_sheet: bool) -> mi.Float:
         """Add to `total` the radiance of a kept hit on the region, from the lamps that the group uses."""
         frame, group = self.frame, self.group
         _, d, _ = group.ray(kept.j)
@@ -322,7 +344,7 @@ class _GroupShading:
         def lamp_light(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             lamp, share = group.shared(k)
             source = lamp.point(group.shared_spot.x, *turn)
-            outer, shine = straight(lamp, source, view, mirror)
+            outer, shine = direct_light(lamp, source, view, mirror)
             lit = direct(view, matte, outer, shine) * share
             if sees is not None:
                 return k + 1, total + lit * kept.weight * sees(lamp.number)
@@ -336,7 +358,7 @@ class _GroupShading:
 
 
 @dataclass
-class OnGlobe:
+class GlobeSamples:
     """A group's samples on the globe: radiance times weight of the shaded ones, their weight, and that of all."""
 
     lit: mi.Float = None
@@ -344,7 +366,7 @@ class OnGlobe:
     weight: mi.Float = None
 
     @classmethod
-    def none(cls) -> OnGlobe:
+    def none(cls) -> GlobeSamples:
         """Return the sums of no samples."""
         return cls(mi.Float(0), mi.Float(0), mi.Float(0))
 
@@ -355,7 +377,7 @@ class OnGlobe:
 
 
 @dataclass
-class Kept:
+class RegionSample:
     """The hit that represents all samples of a group on one kind of surface.
 
     It holds the sample's number and two weights: that of the samples without a ray of their own to the lamp (`shared`),
@@ -370,7 +392,7 @@ class Kept:
     clear: mi.Float = None
 
     @classmethod
-    def none(cls) -> Kept:
+    def none(cls) -> RegionSample:
         """Return an empty hit."""
         return cls(mi.UInt32(0), mi.UInt32(0), mi.Point2f(0), mi.Float(0), mi.Float(0), mi.Float(0))
 
@@ -383,11 +405,11 @@ class Kept:
         weight: mi.Float,
         alone: mi.Bool,
         blocked: mi.Bool,
-    ) -> Kept:
+    ) -> RegionSample:
         """Add sample `j` where it has `met` the surface; the first sample stands for all."""
         taken = met & (self.weight == 0)
         weight = dr.select(met, weight, 0)
-        return Kept(
+        return RegionSample(
             dr.select(taken, j, self.j),
             dr.select(taken, face, self.face),
             dr.select(taken, uv, self.uv),

@@ -14,19 +14,19 @@ from ...region.mesh import RegionMesh
 from ...rig.camera import Window
 from ..glints.occlusion import lid_margins_px
 from ..glints.splatting import MirrorImages
-from ..records.frame import aligned
+from ..records.frame import aligned_copy
 from ..records.job import LampTable, RenderJob, parameters_of, returned_light, sun_lamps
 from ..records.parameters import Parameters
 from ..scene.blur import Blur
-from ..scene.diffusiongrids import TissueCells
-from ..scene.pixels import fine_pixels, plain_tiles
+from ..scene.diffusiongrids import DiffusionGrids
+from ..scene.pixels import skin_only_tiles, supersampled_pixels
 from ..transport.patches import GlobePlaces, globe_places
-from ..transport.shadowmaps import view_table
+from ..transport.shadowmaps import shadow_map_table
 
 _NO_TILES = frozen([[False]], bool)
 
 
-class Prepared:
+class HostData:
     """What NumPy alone makes of a job. Every part is made when it is first asked for, or all by `made`.
 
     Args:
@@ -40,7 +40,7 @@ class Prepared:
         self._fine: dict[Window, tuple[NDArray[np.uint32], Ints]] = {}
 
     @classmethod
-    def made(cls, job: RenderJob, posed: RegionMesh | None) -> Prepared:
+    def made(cls, job: RenderJob, posed: RegionMesh | None) -> HostData:
         """Make all that a picture needs."""
         made = cls(job, posed)
         _ = made.parameters, made.lamps, made.returned, made.places, made.lid_margins_px
@@ -96,7 +96,7 @@ class Prepared:
     @cached_property
     def views(self) -> Singles:
         """Numbers of the lamps' views of a region, the sun's too."""
-        return view_table(self.sunlit.lights, self.job.anchor_mm, self.reach_mm)
+        return shadow_map_table(self.sunlit.lights, self.job.anchor_mm, self.reach_mm)
 
     @cached_property
     def mirror_images(self) -> MirrorImages:
@@ -109,10 +109,10 @@ class Prepared:
         return globe_places(self.job.globe, self.posed)
 
     @cached_property
-    def tissue_cells(self) -> TissueCells:
+    def tissue_cells(self) -> DiffusionGrids:
         """Where light in the tissues of a procedural region is computed."""
         assert self.posed is not None
-        return TissueCells.of(self.job, self.posed, self.blur.border_px)
+        return DiffusionGrids.of(self.job, self.posed, self.blur.border_px)
 
     @cached_property
     def lid_margins_px(self) -> dict[str, list[list[float]]] | None:
@@ -124,7 +124,9 @@ class Prepared:
         if window not in self._tiles:
             posed, job = self.posed, self.job
             nothing = _NO_TILES, max(window[2:])
-            self._tiles[window] = nothing if posed is None else plain_tiles(posed, job.camera, job.anchor_mm, window)
+            self._tiles[window] = (
+                nothing if posed is None else skin_only_tiles(posed, job.camera, job.anchor_mm, window)
+            )
         return self._tiles[window]
 
     def fine(self, window: Window) -> tuple[NDArray[np.uint32], Ints]:
@@ -135,9 +137,9 @@ class Prepared:
             k-th of those that may show either; and the indices of these.
         """
         if window not in self._fine:
-            fine, wet = fine_pixels(self.posed, self.job.camera, self.job.anchor_mm, window)
+            fine, wet = supersampled_pixels(self.posed, self.job.camera, self.job.anchor_mm, window)
             chosen = np.flatnonzero(fine)
-            marks = aligned((fine + 2 * wet).astype(np.uint32).ravel())
+            marks = aligned_copy((fine + 2 * wet).astype(np.uint32).ravel())
             marks[chosen] |= 4 * np.arange(1, len(chosen) + 1, dtype=np.uint32)
             self._fine[window] = marks, chosen
         return self._fine[window]

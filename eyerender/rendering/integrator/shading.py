@@ -11,10 +11,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import EPSILON_MM, View, iris_albedo, look, outer_albedo, stop_coordinates
+from ..hits.interaction import EPSILON_MM, SurfaceInteraction, first_hit, iris_albedo, outer_albedo, stop_coordinates
 from ..records.frame import Frame
 from ..scene.region import film_normal, film_reflectance
-from ..transport.directlight import light, on_relief
+from ..transport.directlight import lamp_light, on_relief
 
 _FLAT_MM = 1e-2  # from the plane of a surround
 
@@ -24,24 +24,24 @@ def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float
 
     u, v: place on each lamp's disc, [0, 1).
     """
-    view = on_relief(frame, look(frame, o, d, mi.Bool(True)))
+    view = on_relief(frame, first_hit(frame, o, d, mi.Bool(True)))
     known, outer_known = mi.Bool(False), mi.Float(0)
     if frame.lights.on_matte is not None:
         outer_known, known = frame.lights.on_matte.at(frame, view)
-    outer, inner, failures = light(frame, view, u, v, known)
+    outer, inner, failures = lamp_light(frame, view, u, v, known)
     albedo = outer_albedo(frame, view)
     received = of_surroundings(frame, view, known)
     seen = indirect(frame, view, d, albedo, inner, received) + direct(view, albedo, outer + outer_known, mi.Float(0))
     return seen, failures
 
 
-def direct(view: View, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
+def direct(view: SurfaceInteraction, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
     """Radiance of matte surfaces lit by the lamps: from their irradiance, and from their sheen."""
     return dr.select(view.met, _cover(view) * (albedo * outer * dr.inv_pi + shine), 0)
 
 
-def of_surroundings(frame: Frame, view: View, known: mi.Bool) -> mi.Vector4f:
-    """What points of a bare globe and of its surround receive from other surfaces (see `exchange.Received`).
+def of_surroundings(frame: Frame, view: SurfaceInteraction, known: mi.Bool) -> mi.Vector4f:
+    """What points of a bare globe and of its surround receive from other surfaces (see `radiosity.RadiosityField`).
 
     Obstacles receive nothing. The light from other surfaces on the globe is left out where it is `known`.
     """
@@ -60,7 +60,7 @@ def of_surroundings(frame: Frame, view: View, known: mi.Bool) -> mi.Vector4f:
 
 
 def indirect(
-    frame: Frame, view: View, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float, received: mi.Vector4f
+    frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float, received: mi.Vector4f
 ) -> mi.Float:
     """Radiance other than `direct`.
 
@@ -70,7 +70,7 @@ def indirect(
         d: directions of the rays (scene's frame).
         albedo: of what is matte.
         inner: irradiance of the lamps in the plane of the iris.
-        received: what the first surface receives from other surfaces (see `exchange.Received`).
+        received: what the first surface receives from other surfaces (see `radiosity.RadiosityField`).
     """
     index = frame.inner_index
     rest = off_eye(frame, view, d, albedo, received)
@@ -93,7 +93,9 @@ def indirect(
     return dr.select(view.met, rest, 0)
 
 
-def off_eye(frame: Frame, view: View, d: mi.Vector3f, albedo: mi.Float, received: mi.Vector4f) -> mi.Float:
+def off_eye(
+    frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, received: mi.Vector4f
+) -> mi.Float:
     """The same of what is not the clear cornea; see `indirect`."""
     even, mirrored = received.x, mi.Float(0)
     if frame.structure.ambient:
@@ -104,7 +106,7 @@ def off_eye(frame: Frame, view: View, d: mi.Vector3f, albedo: mi.Float, received
     return dr.select(view.met, _cover(view) * albedo * even * dr.inv_pi + mirrored, 0)
 
 
-def _cover(view: View) -> mi.Float:
+def _cover(view: SurfaceInteraction) -> mi.Float:
     """Share of the first surface that is matte."""
     return dr.select(view.cornea, view.opacity, 1)
 
@@ -115,7 +117,7 @@ def _leaving(frame: Frame, pupil: mi.Bool, x: mi.Vector3f, lit: mi.Float) -> mi.
     return albedo * (lit + frame.textures.received.iris(x))
 
 
-def _mirrored(frame: Frame, view: View, d: mi.Vector3f, clear: mi.Float) -> mi.Float:
+def _mirrored(frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, clear: mi.Float) -> mi.Float:
     """Radiance that wet surfaces mirror to the camera, but for that of the lamps.
 
     The front cornea, where it is `clear`, mirrors the ambient light and the surfaces about it. The film of tears

@@ -13,14 +13,14 @@ import numpy as np
 from ...arrays import ArrayValue, Bools, Bytes, frozen, sealed
 from ...folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ...rig.camera import Window
-from ..hits.interaction import View, hidden, look, meet_globe, outer_albedo
+from ..hits.interaction import SurfaceInteraction, first_hit, hidden, intersect_globe, outer_albedo
 from ..hits.meniscus import on_water
-from ..integrator.film import Exposed, Pixels
+from ..integrator.film import BoundFrame, Pixels
 from ..integrator.sampling import camera_ray
 from ..records.frame import Frame
 from ..records.recording import recorded
 from ..scene.region import glossy_normal
-from ..transport.directlight import lamp_blocked, straight
+from ..transport.directlight import direct_light, lamp_blocked
 
 _HIGHLIGHT = 0.5  # of the scattered light
 _ACROSS = 3  # points of a pixel across and down that are looked at
@@ -51,7 +51,7 @@ class PartLabels(ArrayValue):
         return both / whole if whole else float("nan")
 
 
-def part_labels(shown: Exposed, window: Window) -> Callable[[], PartLabels]:
+def part_labels(shown: BoundFrame, window: Window) -> Callable[[], PartLabels]:
     """Begin to compute the labels of a window; the result waits for them. Rays that miss the globe are not traced."""
     _, _, width, height = window
     found = _parts(shown.frame.bare(), Pixels.of(window), width * height)
@@ -63,7 +63,7 @@ def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8
     """What the centres of pixels show, with and without occluders."""
     u, v = pixels.at(dr.arange(mi.UInt32, count))
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
-    alone = meet_globe(frame, o, d)
+    alone = intersect_globe(frame, o, d)
     clear = alone.cornea & (alone.opacity < 0.5)
     inside = dr.select(alone.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
     amodal = dr.select(clear, inside, dr.select(alone.cornea | alone.sclera, mi.UInt8(SCLERA), mi.UInt8(BACKGROUND)))
@@ -72,7 +72,7 @@ def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8
     return part, amodal
 
 
-def highlights(shown: Exposed, window: Window) -> Bools:
+def highlights(shown: BoundFrame, window: Window) -> Bools:
     """Pixels (height, width) whose skin, lids, lashes and tears mirror lamps: more than half of what they scatter.
 
     Both are light of the lamps alone, with its shadows. Lens and sensor do not matter, nor do glints of the cornea.
@@ -83,16 +83,16 @@ def highlights(shown: Exposed, window: Window) -> Bools:
     for i in range(_ACROSS * _ACROSS if frame.structure.region else 0):
         place = ((i % _ACROSS + 0.5) / _ACROSS - 0.5, (i // _ACROSS + 0.5) / _ACROSS - 0.5)
         o, d = _rays(shown, window, *(dr.opaque(mi.Float, c) for c in place))
-        view = look(frame, o, d, mi.Bool(True))
+        view = first_hit(frame, o, d, mi.Bool(True))
         albedo = outer_albedo(frame, view)  # of what is below the water
         view = on_water(frame, view, o, d)
         mirror = (glossy_normal(view.normal, view.gloss), -frame.vector_to_eye(d))
 
         def add(
-            k: mi.UInt32, shine: mi.Float, even: mi.Float, view: View = view, mirror: Any = mirror
+            k: mi.UInt32, shine: mi.Float, even: mi.Float, view: SurfaceInteraction = view, mirror: Any = mirror
         ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
             lamp = lights[k]
-            received, sheen = straight(lamp, lamp.position, view, mirror)
+            received, sheen = direct_light(lamp, lamp.position, view, mirror)
             barred = lamp_blocked(frame, view.point, lamp.position, view.other, ~view.cornea, received > 0)
             return k + 1, shine + dr.select(barred, 0, sheen), even + dr.select(barred, 0, received)
 
@@ -109,7 +109,7 @@ def highlights(shown: Exposed, window: Window) -> Bools:
     return frozen(marked.reshape(window[3], window[2]), np.bool_)
 
 
-def _rays(shown: Exposed, window: Window, right: mi.Float, down: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
+def _rays(shown: BoundFrame, window: Window, right: mi.Float, down: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Camera rays through places beside the centres of a window's pixels (px)."""
     u, v = Pixels.of(window).at(dr.arange(mi.UInt32, window[2] * window[3]))
     o, d, _ = camera_ray(shown.frame, mi.Float(u) + right, mi.Float(v) + down)

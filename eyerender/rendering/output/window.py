@@ -50,7 +50,7 @@ class RenderedWindow(ArrayValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Traced(ArrayValue):
+class RawFrame(ArrayValue):
     """A frame before the lens and the sensor.
 
     Attributes:

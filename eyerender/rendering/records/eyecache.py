@@ -11,7 +11,7 @@ _T = TypeVar("_T")
 _EYES = 4  # kept: two of a person, and those of the next
 
 
-class KeptForEye(Generic[_T]):
+class EyeCache(Generic[_T]):
     """Results of a few eyes. Eyes are compared by identity, for comparing their numbers takes longer than is gained."""
 
     def __init__(self) -> None:

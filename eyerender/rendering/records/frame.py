@@ -39,7 +39,7 @@ ALL, BITS = 0xFFFFFFFF, 32  # marks of lamps
 _LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
 
 
-def aligned(values: NDArray[Any]) -> NDArray[Any]:
+def aligned_copy(values: NDArray[Any]) -> NDArray[Any]:
     """Copy an array so that it starts at a multiple of 64 bytes.
 
     Dr.Jit shares NumPy's memory. It gathers several numbers at once only from aligned memory, so without this the place
@@ -52,14 +52,14 @@ def aligned(values: NDArray[Any]) -> NDArray[Any]:
     return copy
 
 
-def sent(numbers: Reals) -> mi.Float:
+def upload_array(numbers: Reals) -> mi.Float:
     """Send numbers to the device, row by row."""
-    return mi.Float(aligned(np.asarray(numbers, dtype=np.float32).ravel()))
+    return mi.Float(aligned_copy(np.asarray(numbers, dtype=np.float32).ravel()))
 
 
-def one_by_one(numbers: NDArray[np.float32]) -> list[mi.Float]:
+def upload_scalars(numbers: NDArray[np.float32]) -> list[mi.Float]:
     """Send numbers to the device as arrays of size one, in one transfer and one kernel."""
-    return _apart(mi.Float(aligned(numbers)), dr.opaque(mi.UInt32, 0), numbers.size)
+    return _apart(mi.Float(aligned_copy(numbers)), dr.opaque(mi.UInt32, 0), numbers.size)
 
 
 @recorded
@@ -100,7 +100,7 @@ class Frame:
         structure: what kernels are compiled for.
         boundary: the shape of the pupil's boundary.
         lights: the lamps, with the grids of their light.
-        textures: the maps of the eye, the surroundings, and the light of other surfaces (`view.Textures`).
+        textures: the maps of the eye, the surroundings, and the light of other surfaces (`interaction.Textures`).
         scene: what may stand in the way.
     """
 
@@ -146,7 +146,7 @@ class Frame:
             textures: as the attribute.
             scene: as the attribute.
         """
-        left = iter(one_by_one(packed(parameters)))
+        left = iter(upload_scalars(packed(parameters)))
 
         def leaf(size: int) -> mi.Float | mi.Vector3f | tuple[mi.Float, ...]:
             part = [next(left) for _ in range(size)]
@@ -155,7 +155,9 @@ class Frame:
         sent_parameters = rebuilt(parameters, leaf)
         others = {f.name: getattr(sent_parameters, f.name) for f in fields(Parameters)}
         surfaces = tuple(
-            Surface(s.origin, s.axes, s.shape, s.eta, kind, None if table is None else mi.Float(aligned(table)), s.film)
+            Surface(
+                s.origin, s.axes, s.shape, s.eta, kind, None if table is None else mi.Float(aligned_copy(table)), s.film
+            )
             for s, (kind, _), table in zip(others.pop("surfaces"), structure.surfaces, tables, strict=True)
         )
         boundary = PupilBoundary.upload(waves)
@@ -205,7 +207,7 @@ class PupilBoundary:
         """Send z_k = c_k - i s_k, (n, 2), to the device."""
         table = np.zeros((HARMONICS, 2), np.float32)
         table[: len(waves)] = waves
-        return cls(count=dr.opaque(mi.UInt32, len(waves)), waves=mi.Float(aligned(table.ravel())))
+        return cls(count=dr.opaque(mi.UInt32, len(waves)), waves=mi.Float(aligned_copy(table.ravel())))
 
     def radius(self, x: mi.Float, y: mi.Float) -> mi.Float:
         """Radius r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
@@ -233,9 +235,9 @@ class Lights:
         count: number of lamps.
         suns: 1 if the last lamp is a sun with sharp shadows, else 0.
         rows: the numbers of the lamps, as in `LampTable`.
-        on_iris: their light in the plane of the iris, where a grid of it is used (`irislight.IrisLight`).
-        on_matte: their light on matte surfaces, where grids of it are used (`mattelight.MatteLight`).
-        relief: the relief of the iris in their light (`irisrelief.IrisRelief`).
+        on_iris: their light in the plane of the iris, where a grid of it is used (`irisirradiance.IrisIrradiance`).
+        on_matte: their light on matte surfaces, where grids of it are used (`globeirradiance.GlobeIrradiance`).
+        relief: the relief of the iris in their light (`reliefmapping.IrisRelief`).
     """
 
     count: mi.UInt32
@@ -252,7 +254,7 @@ class Lights:
         rows[: len(table), : table.rows.shape[1]] = table.rows
         sharp = table.suns and table.widths[-1] < SMALL
         count, suns = (dr.opaque(mi.UInt32, n) for n in (len(table), table.suns if sharp else 0))
-        return cls(count=count, suns=suns, rows=sent(rows))
+        return cls(count=count, suns=suns, rows=upload_array(rows))
 
     def __getitem__(self, i: mi.UInt32) -> Lamp:
         # Four numbers are gathered at once.

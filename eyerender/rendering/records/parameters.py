@@ -1,7 +1,7 @@
 """The parameters of a frame: the numbers that change from frame to frame, by name.
 
-The same classes are used on both sides. On the host (`frame.parameters_of`) their leaves are NumPy numbers in float64.
-On the device (`values.Frame`) they are Dr.Jit arrays of size one: a Float, a Vector3f for three numbers, or a tuple of
+The same classes are used on both sides. On the host (`job.parameters_of`) their leaves are NumPy numbers in float64.
+On the device (`frame.Frame`) they are Dr.Jit arrays of size one: a Float, a Vector3f for three numbers, or a tuple of
 Floats. Nothing here depends on Mitsuba.
 """
 

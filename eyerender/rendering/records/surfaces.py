@@ -93,7 +93,7 @@ class Surface:
         """Distance to the point where a ray from outside enters, and whether it does, in the surface's frame.
 
         The origin must be within some centimetres, or single precision costs more than a micrometre. A measured surface
-        is replaced by the conic that is like it, which is enough for shadows and first guesses; `meet` is exact.
+        is replaced by the conic that is like it, which is enough for shadows and first guesses; `intersect` is exact.
         """
         t, ok = self._near(o, d)
         if self.kind == "biconic":

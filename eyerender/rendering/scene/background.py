@@ -20,7 +20,7 @@ from ...geometry.vectors import lengths
 from ...region.look import Look
 from ...region.mapcache import kept
 from ...region.texture import skin_texture
-from ..records.frame import aligned
+from ..records.frame import aligned_copy
 from ..records.recording import recorded
 
 HALF_MM = 500.0
@@ -47,7 +47,7 @@ class Matte:
 
 
 @dataclass(kw_only=True)
-class SurroundGeometry:
+class BackgroundGeometry:
     """The triangles of the surround for the kernels, and the map of its plane.
 
     Kernels read them from buffers and do not call methods of Mitsuba's shapes and materials: the code of such a call
@@ -64,17 +64,17 @@ class SurroundGeometry:
     map: Any
 
     @classmethod
-    def of(cls, faces: Ints) -> SurroundGeometry:
+    def of(cls, faces: Ints) -> BackgroundGeometry:
         """Send the triangles (m, 3) to the device."""
         corners = np.zeros((len(faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = faces
         blank, texture = mi.TensorXf(np.zeros((2, 2, 1), np.float32)), cast(Any, mi.Texture2f)
         plane = texture(blank, use_accel=False, wrap_mode=dr.WrapMode.Repeat)
-        return cls(corners=mi.UInt32(aligned(corners.ravel())), vertices=mi.Float(0), map=plane)
+        return cls(corners=mi.UInt32(aligned_copy(corners.ravel())), vertices=mi.Float(0), map=plane)
 
     def place(self, vertices: Floats, albedo: Floats) -> None:
         """Set the vertices (n, 3) mm and their albedos (n,); negative ones stand for the map of the plane."""
-        self.vertices = mi.Float(aligned(np.column_stack([vertices, albedo]).astype(np.float32).ravel()))
+        self.vertices = mi.Float(aligned_copy(np.column_stack([vertices, albedo]).astype(np.float32).ravel()))
 
     def paint(self, tile: Floats) -> None:
         """Set the map of the plane's albedo, which repeats."""
@@ -92,7 +92,7 @@ class SurroundGeometry:
         return Matte(mi.Vector3f(at.x, at.y, at.z), normal, dr.select(a.w < 0, mapped, a.w))
 
 
-class Surround:
+class Background:
     """The Mitsuba scene of the surround; `show` changes its look in place."""
 
     posed = None  # no region
@@ -116,7 +116,7 @@ class Surround:
         # Without robust intersections rays slip between neighbouring triangles on some processors.
         self.scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surround": mesh})
         self._params: Any = mi.traverse(self.scene)
-        self.geometry = SurroundGeometry.of(triangles)
+        self.geometry = BackgroundGeometry.of(triangles)
         self.obstructed = len(obstacles) > 0
         self._shown: tuple[float, float, float] | None = None
 
@@ -158,7 +158,7 @@ def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
     step = max(1 << len(a).bit_length() >> 3, _FEWEST)
     count = -(-len(a) // step) * step
     table = _between(a, b)[np.minimum(np.arange(count), len(a) - 1)]
-    return ~np.asarray(_met(scene, mi.Float(aligned(table.ravel())), count).numpy()[: len(a)], dtype=bool)
+    return ~np.asarray(_met(scene, mi.Float(aligned_copy(table.ravel())), count).numpy()[: len(a)], dtype=bool)
 
 
 @recorded

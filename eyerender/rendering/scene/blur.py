@@ -69,7 +69,7 @@ class Blur:
         """Blur a picture, smaller by the reach on every side.
 
         Args:
-            pictures: (height, width) radiance; of a layered blur its parts (`film.begun`).
+            pictures: (height, width) radiance; of a layered blur its parts (`film.start`).
         """
         if not self.layered:
             return defocus.defocused(pictures, self.subject_px)

@@ -1,4 +1,4 @@
-"""Which cells of the grids of light in the tissues matter in a pose (see `subsurface`), found with NumPy alone."""
+"""Which cells of the grids of light in the tissues matter in a pose (see `diffusion`), found with NumPy alone."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _EDGE_MM = 0.4  # about the lids' margins, where the globe may be seen
 
 
 @dataclass(frozen=True, slots=True)
-class TissueCells:
+class DiffusionGrids:
     """The cells of a pose, and how far light spreads in skin and sclera (d, mm)."""
 
     sheet: SheetCells
@@ -33,7 +33,7 @@ class TissueCells:
     thin_mm: float
 
     @classmethod
-    def of(cls, job: RenderJob, posed: RegionMesh, spare_px: int) -> TissueCells:
+    def of(cls, job: RenderJob, posed: RegionMesh, spare_px: int) -> DiffusionGrids:
         """Find the cells of a job with scattering and a posed region; `spare_px` beyond the window are rendered."""
         scattering = job.look.scattering
         assert scattering is not None
@@ -84,7 +84,7 @@ class SheetCells:
 
 @dataclass(frozen=True, slots=True)
 class GlobeCells:
-    """Numbers of cells of the grid over the globe, as in `subsurface.GlobeGrid`."""
+    """Numbers of cells of the grid over the globe, as in `diffusion.GlobeGrid`."""
 
     between: Ints
     under: Ints

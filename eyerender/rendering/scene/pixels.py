@@ -22,10 +22,10 @@ _THICK_PX, _FINE_STEP_PX, _SLACK_PX = 2.0, 0.5, 0.02
 _NEAREST_MM = 3.0  # if hairs are closer to the camera, nothing is plain
 
 
-def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, int]:
+def skin_only_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, int]:
     """Tiles (rows, columns) of a window that show nothing but skin and thin hairs, and the size of a tile in pixels.
 
-    `fine_pixels` tells where the thin hairs are. No tile is like that where the region's border is unknown or hairs
+    `supersampled_pixels` tells where the thin hairs are. No tile is like that where the region's border is unknown or hairs
     come too close to the camera.
     """
     nothing = np.zeros((1, 1), dtype=bool), max(window[2:])
@@ -56,7 +56,7 @@ def plain_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, wi
     return (outlines[1] != 0) & (outlines[0] == 0) & ~marked, tile
 
 
-def fine_pixels(
+def supersampled_pixels(
     region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window
 ) -> tuple[Bools, Bools]:
     """Pixels (height, width) of a window at menisci and those that hairs at most two pixels thick touch.

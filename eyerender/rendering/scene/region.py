@@ -25,7 +25,7 @@ from ...region.lids import FINE, ROWS
 from ...region.mapcache import kept
 from ...region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_ends
 from ...region.skin import SHEET_ROWS, skin_texels
-from ..records.frame import aligned
+from ..records.frame import aligned_copy
 from .background import clear_between, rays_between
 from .diffusiongrids import GRID_COLUMNS, GRID_ROWS
 
@@ -83,7 +83,7 @@ class RegionScene:
     def _dress(self, spec: Region, globe: Globe, posed: RegionMesh) -> None:
         """Take the appearance of a subject."""
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
-        pixels = aligned(self._look(spec))
+        pixels = aligned_copy(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         mirror = -1.0 if globe.mirrored else 1.0
         inner = self._inner()
@@ -145,7 +145,7 @@ class RegionScene:
     def _pose_skin(self, posed: RegionMesh) -> None:
         """Send places and normals of the vertices to the kernels."""
         self._records[:, 0:3], self._records[:, 4:7] = posed.vertices, posed.normals
-        self.skin.vertices = mi.Float(aligned(self._records.ravel()))
+        self.skin.vertices = mi.Float(aligned_copy(self._records.ravel()))
 
     def _posed(self, spec: Region, globe: Globe) -> RegionMesh:
         return region_mesh(spec, globe)
@@ -170,17 +170,17 @@ def _mean_slopes(pixels: NDArray[np.float16]) -> dict[int, mi.Float]:
     parts = [slopes[i::down, j::across].astype(np.float32) for i in range(down) for j in range(across)]
     fine: Singles = np.asarray(sum(parts) / len(parts), dtype=np.float32)
     coarse = 0.25 * (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2])
-    return {len(means): mi.Float(aligned(means.ravel())) for means in (fine, coarse)}
+    return {len(means): mi.Float(aligned_copy(means.ravel())) for means in (fine, coarse)}
 
 
 def _floats(values: Floats) -> mi.Float:
-    return mi.Float(aligned(values.astype(np.float32).ravel()))
+    return mi.Float(aligned_copy(values.astype(np.float32).ravel()))
 
 
 def _faces(layout: RegionLayout, vertices: slice, faces: slice) -> mi.UInt32:
     """Some of the triangles, with numbers of some of the vertices."""
     triangles = layout.faces[faces] - vertices.start
-    return mi.UInt32(aligned(triangles.astype(np.uint32).ravel()))
+    return mi.UInt32(aligned_copy(triangles.astype(np.uint32).ravel()))
 
 
 def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
@@ -202,7 +202,7 @@ def _instance(mesh: mi.Mesh) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Points of the region: place, normals with and without relief, albedo, gloss, received light (see `exchange`)."""
+    """Points of the region: place, normals with and without relief, albedo, gloss, received light (see `radiosity`)."""
 
     point: mi.Vector3f
     normal: mi.Vector3f
@@ -223,7 +223,7 @@ class SkinGeometry:
         faces: four entries for each triangle: its vertices, and 1 unless it is a part inside the sheet of skin.
         vertices: eight numbers for each vertex: place (scene's frame, mm), first coordinate of the map, normal, second
             coordinate of the map.
-        received: four numbers for each vertex: the light of other surfaces, as in `exchange.Received`.
+        received: four numbers for each vertex: the light of other surfaces, as in `radiosity.RadiosityField`.
         sheet: number of the triangles of the sheet, which come first.
         film: number of the first triangle of the menisci.
         mirror: -1 for a left eye, else 1.
@@ -257,7 +257,7 @@ class SkinGeometry:
         faces[: layout.face_ends[0], 3] = False if inner is None else ~inner
         sheet, film = (dr.opaque(mi.UInt32, int(layout.face_ends[k])) for k in (0, -2))
         return cls(
-            map=look, water=water, is_sheet=inner is not None, faces=mi.UInt32(aligned(faces.ravel())),
+            map=look, water=water, is_sheet=inner is not None, faces=mi.UInt32(aligned_copy(faces.ravel())),
             vertices=mi.Float(0), received=mi.Float(0), sheet=sheet, film=film, mirror=dr.opaque(mi.Float, mirror),
         )  # fmt: skip
 

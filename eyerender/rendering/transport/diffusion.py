@@ -30,10 +30,10 @@ from ...arrays import Ints
 from ...optics.diffusion import rings, transmitted
 from ...region.skin import BANDS, SHEET_ROWS
 from ..hits.interaction import EPSILON_MM
-from ..records.frame import Frame, aligned, quotient
+from ..records.frame import Frame, aligned_copy, quotient
 from ..records.job import LampTable, RenderJob
 from ..records.recording import recorded
-from ..scene.diffusiongrids import SIDE, WIDTH, GlobeCells, SheetCells, TissueCells
+from ..scene.diffusiongrids import SIDE, WIDTH, DiffusionGrids, GlobeCells, SheetCells
 from ..scene.region import SHEET_COLUMNS, RegionScene, SkinGeometry
 from .directlight import irradiance, lamp_blocked
 
@@ -125,7 +125,7 @@ class Places:
         turn = 2 * np.pi * (np.arange(_TURNS)[:, None] + 0.5 + 0.5 * (np.arange(_RINGS) % 2)) / _TURNS
         place = rings(_RINGS)[:, None] * length_mm * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
         steps = np.diff(place, axis=1, prepend=np.zeros((_TURNS, 1, 2)))
-        return cls(mi.Float(aligned(np.concatenate([place, steps], axis=-1).astype(np.float32).ravel())))
+        return cls(mi.Float(aligned_copy(np.concatenate([place, steps], axis=-1).astype(np.float32).ravel())))
 
     def share(
         self,
@@ -164,7 +164,7 @@ class Places:
 
 
 @dataclass(kw_only=True)
-class TissueLight:
+class DiffusedLight:
     """Light of the lamps on skin and globe, each after its way through the tissue.
 
     Attributes:
@@ -207,9 +207,9 @@ def _globe_cell(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     return _globe_place(frame.vector_to_scene(x - frame.sclera.centre))
 
 
-def tissue_light(
-    job: RenderJob, frame: Frame, lamps: LampTable, place: RegionScene, cells: TissueCells
-) -> TissueLight:  # fmt: skip
+def diffused_light(
+    job: RenderJob, frame: Frame, lamps: LampTable, place: RegionScene, cells: DiffusionGrids
+) -> DiffusedLight:  # fmt: skip
     """Compute the light on the tissues of a frame.
 
     Args:
@@ -235,7 +235,7 @@ def tissue_light(
         count,
     )
     sheet, between = make.both(skin, globe, Places.of(cells.thick_mm), Places.of(cells.thin_mm))
-    return TissueLight(size=skin.size, skin=sheet, globe=between, lamps=dr.maximum(frame.lights.count, 1))
+    return DiffusedLight(size=skin.size, skin=sheet, globe=between, lamps=dr.maximum(frame.lights.count, 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,7 +317,7 @@ class _Maker:
         def of_lamp(i: mi.UInt32, total: mi.Vector3f) -> tuple[mi.UInt32, mi.Vector3f]:
             lamp = lights[i]
             before = spread | (dr.dot(lamp.position - x, facing) > 0)
-            clear = self.frame.textures.lamp_views.clear(i, at, before)
+            clear = self.frame.textures.shadow_maps.clear(i, at, before)
             count = dr.select(before, dr.select(clear & ~spread, 1, points), 0)
 
             def at_point(k: mi.UInt32, flux: mi.Vector3f, free: mi.Float) -> tuple[mi.UInt32, mi.Vector3f, mi.Float]:
@@ -499,7 +499,7 @@ class SheetGrid:
         rows, columns = cells.rows, cells.columns
         size = Size(dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns))
         sent = tuple(_numbers(numbers) for numbers in cells.numbers)
-        return cls(rows, columns, size, sent, *(mi.Float(aligned(at)) for at in (cells.edges, cells.middles)))
+        return cls(rows, columns, size, sent, *(mi.Float(aligned_copy(at)) for at in (cells.edges, cells.middles)))
 
     def measured(self, skin: SkinGeometry) -> SheetGrid:
         """The same grid with its metric on a posed surface."""
@@ -648,7 +648,7 @@ class _Cells:
 
 def _numbers(cells: Ints) -> mi.UInt32:
     """Numbers of cells on the device, at least one of them."""
-    return mi.UInt32(aligned((cells if cells.size else np.zeros(1)).astype(np.uint32)))
+    return mi.UInt32(aligned_copy((cells if cells.size else np.zeros(1)).astype(np.uint32)))
 
 
 def _globe_place(n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:

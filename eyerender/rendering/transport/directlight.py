@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import EPSILON_MM, View, meet_sphere, opacity
+from ..hits.interaction import EPSILON_MM, SurfaceInteraction, intersect_sphere, opacity
 from ..records.frame import ALL, BITS, Frame, Lamp
 from ..records.surfaces import Surface
 from ..scene.region import sheen
 from .manifold import connect
-from .shadowmaps import LampViews
+from .shadowmaps import ShadowMaps
 
 
 def lamp_blocked(
@@ -55,7 +55,7 @@ def _globe_blocks(
     frame: Frame, x: mi.Vector3f, r: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
 ) -> mi.Bool:
     """Whether the globe blocks the way; r is the point relative to the sclera's centre."""
-    t, met = meet_sphere(r, d, frame.sclera.radius)
+    t, met = intersect_sphere(r, d, frame.sclera.radius)
     blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
     front = frame.surfaces[0]
     o, dl = front.point_in(x), front.vector_in(d)
@@ -66,8 +66,8 @@ def _globe_blocks(
     return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
 
 
-def straight(
-    lamp: Lamp, source: mi.Vector3f, view: View, mirror: tuple[mi.Vector3f, mi.Vector3f] | None = None
+def direct_light(
+    lamp: Lamp, source: mi.Vector3f, view: SurfaceInteraction, mirror: tuple[mi.Vector3f, mi.Vector3f] | None = None
 ) -> tuple[mi.Float, mi.Float]:
     """Light that a lamp gives to matte points in air when nothing stands in the way.
 
@@ -97,14 +97,14 @@ def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vecto
     return dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2, 0)
 
 
-def onto_points(
+def irradiance_at(
     frame: Frame,
     x: mi.Vector3f,
     normal: mi.Vector3f,
     other: mi.Bool,
     u: mi.Float,
     v: mi.Float,
-    views: LampViews | None = None,
+    views: ShadowMaps | None = None,
     on_sheet: mi.Bool | bool = False,
 ) -> tuple[mi.Float, mi.Float]:
     """Irradiance (mW/mm^2) of points in air (eye frame) straight from all lamps, and the same without shadows.
@@ -114,7 +114,7 @@ def onto_points(
     u, v: place on each lamp's disc, [0, 1). on_sheet: points on the outer side of a region's sheet of skin, for which
     the lamps' views of it spare rays.
     """
-    views = frame.textures.lamp_views
+    views = frame.textures.shadow_maps
     sine, cosine_v = dr.sincos(v * (2 * dr.pi))
 
     def body(i: mi.UInt32, total: mi.Float, free: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
@@ -136,7 +136,9 @@ def onto_points(
     return total, free
 
 
-def light(frame: Frame, view: View, u: mi.Float, v: mi.Float, known: mi.Bool) -> tuple[mi.Float, mi.Float, mi.UInt32]:
+def lamp_light(
+    frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, known: mi.Bool
+) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     """Light of the lamps on a bare eye.
 
     The cornea is convex: where it faces a lamp it does not shadow itself.
@@ -157,7 +159,7 @@ def light(frame: Frame, view: View, u: mi.Float, v: mi.Float, known: mi.Bool) ->
     def onto_matte(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         lamp: Lamp = frame.lights[i]
         source = lamp.point(u, sine, cosine)
-        direct, _ = straight(lamp, source, view)
+        direct, _ = direct_light(lamp, source, view)
         blocked = lamp_blocked(frame, view.point, source, view.other, ~view.cornea, direct > 0)
         return i + 1, total + dr.select(blocked, 0, direct)
 
@@ -166,10 +168,10 @@ def light(frame: Frame, view: View, u: mi.Float, v: mi.Float, known: mi.Bool) ->
     _, direct = dr.while_loop(
         state, lambda i, _: matte & (i < frame.lights.count), onto_matte, labels=("i", "direct"), label="lamps"
     )
-    return direct, *through_cornea(frame, view.inner, view.lit_inside, u, v)
+    return direct, *irradiance_through_cornea(frame, view.inner, view.lit_inside, u, v)
 
 
-def through_cornea(
+def irradiance_through_cornea(
     frame: Frame,
     inner: mi.Vector3f,
     inside: mi.Bool,
@@ -211,7 +213,7 @@ def through_cornea(
     return bent, failures
 
 
-def off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float) -> mi.Float:
+def irradiance_off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float) -> mi.Float:
     """Irradiance (mW/mm^2) of points before the eye (eye frame) from all lamps by way of the cornea as a mirror.
 
     u, v: place on each lamp's disc, [0, 1).
@@ -247,7 +249,7 @@ def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
     return met & (t < away + ahead_mm)
 
 
-def on_relief(frame: Frame, view: View) -> View:
+def on_relief(frame: Frame, view: SurfaceInteraction) -> SurfaceInteraction:
     """The view with the places on the relief of the iris that the rays meet, as their feet in its plane."""
     if frame.lights.relief is None:
         return view

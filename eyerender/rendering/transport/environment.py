@@ -31,7 +31,7 @@ from ...rig.light import Lamp
 from ...rig.surroundings import paint
 from ...spec import file_digest
 from ...storage.files import opened
-from ..records.frame import one_by_one
+from ..records.frame import upload_scalars
 from ..scene.exr import second_thread
 from .panels import Panels
 
@@ -298,7 +298,9 @@ class Ambience:
         texture, table, made = maps.of(spec)
         scale = 0.0 if spec is None else spec.scale_w_m2_sr * 1e-3
         M = np.eye(3) if spec is None else map_rotation(spec)
-        n = one_by_one(np.array([even_mw_mm2, scale, len(made.values), made.ceiling, *M.T.ravel()], dtype=np.float32))
+        n = upload_scalars(
+            np.array([even_mw_mm2, scale, len(made.values), made.ceiling, *M.T.ravel()], dtype=np.float32)
+        )
         a, b, c = (mi.Vector3f(*n[k : k + 3]) for k in (4, 7, 10))
         return cls(
             panels=Panels.upload(panels), texture=texture, table=table, even=n[0], scale=n[1], rows=n[2], ceiling=n[3],

@@ -17,7 +17,7 @@ from .directlight import LampPath
 
 
 @dataclass(kw_only=True)
-class PupilLight:
+class FundusIrradiance:
     """Radiance in air (mW/mm^2/sr) that leaves the pupil, before the transmittance of the cornea, on a square grid."""
 
     cells: mi.Float
@@ -35,7 +35,7 @@ class PupilLight:
         return dr.lerp(low, high, t)
 
 
-def pupil_light(frame: Frame, factors: mi.Float | None) -> PupilLight:
+def fundus_irradiance(frame: Frame, factors: mi.Float | None) -> FundusIrradiance:
     """Fill the grid.
 
     Args:
@@ -45,7 +45,7 @@ def pupil_light(frame: Frame, factors: mi.Float | None) -> PupilLight:
     if factors is None:
         dark = dr.zeros(mi.Float, CELLS * CELLS)
         dr.make_opaque(dark)
-        return PupilLight(cells=dark)
+        return FundusIrradiance(cells=dark)
     index = dr.arange(mi.UInt32, CELLS * CELLS)
     row = index // CELLS
     u, v = ((mi.Float(k) + 0.5) * (2 * EDGE / CELLS) - EDGE for k in (index - row * CELLS, row))
@@ -66,4 +66,4 @@ def pupil_light(frame: Frame, factors: mi.Float | None) -> PupilLight:
         state, lambda i, _: i < frame.lights.count, body, labels=labels, label="light of the fundus"
     )
     dr.eval(total)
-    return PupilLight(cells=total)
+    return FundusIrradiance(cells=total)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import GLOBE_EDGE, View, globe_map
+from ..hits.interaction import GLOBE_EDGE, SurfaceInteraction, globe_map
 from ..records.frame import Frame
 from ..records.irradiancegrid import IrradianceGrid, grid_nodes
 from ..records.recording import recorded
@@ -31,7 +31,7 @@ _LOW, _SLOPE = 0.1, 0.6  # cosines: of a lamp about to set, and of one that the 
 
 
 @dataclass(kw_only=True)
-class MatteLight:
+class GlobeIrradiance:
     """The light that matte surfaces of a bare eye receive from lamps, and the globe from other surfaces.
 
     Attributes:
@@ -44,7 +44,7 @@ class MatteLight:
     plane: IrradianceGrid
     reach: mi.Float
 
-    def at(self, frame: Frame, view: View) -> tuple[mi.Float, mi.Bool]:
+    def at(self, frame: Frame, view: SurfaceInteraction) -> tuple[mi.Float, mi.Bool]:
         """Irradiance (mW/mm^2) at points that are seen, and whether it is known: not on the rim of the cornea."""
 
         def on_plane(point: mi.Vector3f) -> tuple[mi.Float, mi.UInt32]:
@@ -62,7 +62,7 @@ class MatteLight:
 
 
 @recorded
-def matte_light(frame: Frame, reach: mi.Float, points: mi.UInt32, gridded: bool) -> MatteLight:
+def globe_irradiance(frame: Frame, reach: mi.Float, points: mi.UInt32, gridded: bool) -> GlobeIrradiance:
     """Fill the grids.
 
     Args:
@@ -72,7 +72,7 @@ def matte_light(frame: Frame, reach: mi.Float, points: mi.UInt32, gridded: bool)
         gridded: whether the lamps may have grids.
     """
     if not gridded:
-        return MatteLight(globe=IrradianceGrid.unknown(_SIDE), plane=IrradianceGrid.unknown(_SIDE), reach=reach)
+        return GlobeIrradiance(globe=IrradianceGrid.unknown(_SIDE), plane=IrradianceGrid.unknown(_SIDE), reach=reach)
     a, b = (mi.Float(k) * (2 / (_SIDE - 1)) - 1 for k in grid_nodes(_SIDE))
     polar = dr.sqrt(a * a + b * b)
     sine, cosine = dr.sincos(polar * GLOBE_EDGE)
@@ -91,7 +91,7 @@ def matte_light(frame: Frame, reach: mi.Float, points: mi.UInt32, gridded: bool)
     one = dr.opaque(mi.UInt32, 1)  # the sum over the lamps stands for a single one
     globe, _ = IrradianceGrid.build(_SIDE, on_globe, one, more=more)
     plane, _ = IrradianceGrid.build(_SIDE, on_plane, one)
-    return MatteLight(globe=globe, plane=plane, reach=reach)
+    return GlobeIrradiance(globe=globe, plane=plane, reach=reach)
 
 
 def _lit(

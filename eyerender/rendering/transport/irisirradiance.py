@@ -32,7 +32,7 @@ _AHEAD_MM = 1.0  # before the back of the cornea, where nodes continue the light
 
 
 @dataclass(kw_only=True)
-class IrisLight:
+class IrisIrradiance:
     """The light of the lamps in the plane of the iris.
 
     Attributes:
@@ -74,7 +74,7 @@ def _half(frame: Frame) -> mi.Float:
     return frame.iris.root_radius + _SPARE_MM
 
 
-def iris_light(frame: Frame, lamps: int, points: mi.UInt32) -> IrisLight:
+def iris_irradiance(frame: Frame, lamps: int, points: mi.UInt32) -> IrisIrradiance:
     """Fill the grid over the plane of the iris.
 
     Args:
@@ -85,7 +85,7 @@ def iris_light(frame: Frame, lamps: int, points: mi.UInt32) -> IrisLight:
     if not lamps:
         none = dr.zeros(mi.UInt32, _NODES)
         dr.make_opaque(none)
-        return IrisLight(grid=IrradianceGrid.unknown(_SIDE), behind_rim=none, paths=dr.zeros(mi.Float, 8))
+        return IrisIrradiance(grid=IrradianceGrid.unknown(_SIDE), behind_rim=none, paths=dr.zeros(mi.Float, 8))
     index = dr.arange(mi.UInt32, _NODES * lamps)
     lamp = index // _NODES
     lit, *paths = _at_nodes(frame, points, lamp, index - lamp * _NODES)
@@ -100,7 +100,7 @@ def iris_light(frame: Frame, lamps: int, points: mi.UInt32) -> IrisLight:
         return (least > 0) & (bent + steep <= _STEADY / BENT * allowed)
 
     grid, behind_rim = IrradianceGrid.build(_SIDE, lit, frame.lights.count, held=steady_behind_rim)
-    return IrisLight(grid=grid, behind_rim=behind_rim, paths=rows)
+    return IrisIrradiance(grid=grid, behind_rim=behind_rim, paths=rows)
 
 
 def _four_in_a_row(paths: list[mi.Float], lamps: int, count: mi.UInt32) -> mi.Float:
@@ -126,7 +126,7 @@ def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) ->
     Where anything may hide the lamps, or a path was not found, irradiances are negative. Behind a clear rim, that of a
     lamp with several points is so, too.
     """
-    stop, half, views = frame.stop, _half(frame), frame.textures.lamp_views
+    stop, half, views = frame.stop, _half(frame), frame.textures.shadow_maps
     row = node // _SIDE
     a, b = (half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (node - row * _SIDE, row))
     x = stop.centre + a * stop.u + b * stop.v

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import Floats
-from ..records.frame import sent
+from ..records.frame import upload_array
 
 _WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
 
@@ -49,7 +49,7 @@ class Panels:
     @classmethod
     def upload(cls, table: Floats) -> Panels:
         """Send rectangles (n, 13) to the device."""
-        return cls(count=dr.opaque(mi.UInt32, len(table)), rows=sent(table if len(table) else np.zeros(_WIDTH)))
+        return cls(count=dr.opaque(mi.UInt32, len(table)), rows=upload_array(table if len(table) else np.zeros(_WIDTH)))
 
     def __getitem__(self, i: mi.UInt32) -> Rectangle:
         row = [dr.gather(mi.Float, self.rows, i * _WIDTH + k) for k in range(_WIDTH)]

@@ -32,12 +32,12 @@ from ...geometry.vectors import dots, lengths
 from ...region.globe import Globe
 from ...region.look import Look
 from ...rig.imaging import Ambient
-from ..hits.interaction import appearance, iris_albedo, meet, outer_albedo
-from ..records.eyecache import KeptForEye
-from ..records.frame import Frame, Lamp, Lights, aligned, one_by_one, sent
+from ..hits.interaction import appearance, intersect, iris_albedo, outer_albedo
+from ..records.eyecache import EyeCache
+from ..records.frame import Frame, Lamp, Lights, aligned_copy, upload_array, upload_scalars
 from ..records.job import LampTable, RenderJob
 from ..records.recording import recorded
-from ..scene.background import Surround
+from ..scene.background import Background
 from ..scene.region import RegionScene
 from .chamber import (
     IRIS,
@@ -52,7 +52,7 @@ from .chamber import (
     through_limbus,
 )
 from .chamber import TURNS as IRIS_TURNS
-from .directlight import irradiance, off_cornea, onto_points, through_cornea
+from .directlight import irradiance, irradiance_at, irradiance_off_cornea, irradiance_through_cornea
 from .manifold import CORNEA_MM
 from .patches import (
     GLOBE_COLUMNS,
@@ -85,7 +85,7 @@ _SHUFFLED = 0x9E3779B1
 
 
 @dataclass(kw_only=True)
-class Received:
+class RadiosityField:
     """What the places receive, for the kernels: irradiance by way of other surfaces, and the share of open sky.
 
     Every surface has four numbers a place: irradiance from other surfaces, share of the sky that is open, whole
@@ -124,7 +124,7 @@ class Received:
     on_iris: mi.Float
 
     @classmethod
-    def dark(cls, on: bool, chamber: Chamber, globe: GlobePlaces, plane: tuple[float, float, float]) -> Received:
+    def dark(cls, on: bool, chamber: Chamber, globe: GlobePlaces, plane: tuple[float, float, float]) -> RadiosityField:
         """Send the places to the device; they receive nothing.
 
         Args:
@@ -134,17 +134,17 @@ class Received:
             plane: as the attribute.
         """
         rim = [chamber.root_mm**2, chamber.reach_mm**2]
-        n = one_by_one(np.array([*globe.table[:5], *rim, *plane], dtype=np.float32))
-        none = sent(np.zeros(4))
+        n = upload_scalars(np.array([*globe.table[:5], *rim, *plane], dtype=np.float32))
+        none = upload_array(np.zeros(4))
         return cls(
             on=dr.opaque(mi.Bool, on), between=globe.columns == GLOBE_COLUMNS, columns=globe.columns, rows=globe.rows,
             centre=mi.Vector3f(*n[:3]), first=n[3], per_mm=n[4], root2=n[5], reach2=n[6], plane=(n[7], n[8], n[9]),
-            ends=sent(globe.table[5:]), on_globe=none, on_other=none, on_iris=none,
+            ends=upload_array(globe.table[5:]), on_globe=none, on_other=none, on_iris=none,
         )  # fmt: skip
 
-    def filled(self, globe: Floats, other: Floats, iris: Floats) -> Received:
+    def filled(self, globe: Floats, other: Floats, iris: Floats) -> RadiosityField:
         """The same places with what they receive, in the order of the attributes `on_globe`, `on_other`, `on_iris`."""
-        return replace(self, on_globe=sent(globe), on_other=sent(other), on_iris=sent(iris))
+        return replace(self, on_globe=upload_array(globe), on_other=upload_array(other), on_iris=upload_array(iris))
 
     def globe(self, x: mi.Vector3f) -> mi.Vector4f:
         """Numbers of points of the globe, given in the scene's frame."""
@@ -291,7 +291,7 @@ class _Interior:
         limbus = through_limbus(eye, chamber, look.limbus_width_mm) * look.limbus_transmittance
         rows = np.column_stack([chamber.points, chamber.normals, chamber.valid])
         rays, gain = bundles(chamber, halvings)
-        return cls(chamber, chamber.exchange * albedo, limbus, sent(rows), sent(rays), gain)
+        return cls(chamber, chamber.exchange * albedo, limbus, upload_array(rows), upload_array(rays), gain)
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,12 +324,15 @@ class _Plan:
             count[on_globe : on_globe + others] = _SKIN_RAYS
             count[on_globe + on_skin : on_globe + others] = _INNER_RAYS
             table = np.stack([skin.nearest, skin.behind + on_skin], axis=1)
-            stands_for = mi.Int32(aligned(table.astype(np.int32).ravel()))
-            near, weight = mi.UInt32(aligned(skin.near.T.astype(np.uint32).ravel())), sent(skin.weight.T.ravel())
+            stands_for = mi.Int32(aligned_copy(table.astype(np.int32).ravel()))
+            near, weight = (
+                mi.UInt32(aligned_copy(skin.near.T.astype(np.uint32).ravel())),
+                upload_array(skin.weight.T.ravel()),
+            )
         rays = int(count.sum())
         of_place = np.zeros(_rounded(rays, _LANES), np.uint32)
         of_place[:rays] = np.repeat(np.arange(len(count)), count)
-        return cls(skin, count, mi.UInt32(aligned(of_place)), stands_for, near, weight)
+        return cls(skin, count, mi.UInt32(aligned_copy(of_place)), stands_for, near, weight)
 
     @property
     def rays(self) -> int:
@@ -337,11 +340,11 @@ class _Plan:
         return int(self.count.sum())
 
     def at_vertices(self, places: Floats) -> mi.Float:
-        """Four numbers of every vertex, as in `Received`, from those of places (n, 4); the last is the whole sky."""
+        """Four numbers of every vertex, as in `RadiosityField`, from those of places (n, 4); the last is the whole sky."""
         assert self.skin is not None
         vertices, each = self.skin.near.shape
         count = dr.opaque(mi.UInt32, vertices)
-        return _at_vertices(sent(places), self.near, self.weight, count, vertices, each)
+        return _at_vertices(upload_array(places), self.near, self.weight, count, vertices, each)
 
 
 @recorded
@@ -376,18 +379,18 @@ def _shares(count: Ints, gain: csr_array) -> csr_array:
     )
 
 
-class Exchange:
+class RadiositySolver:
     """Computes what the places of a frame receive; keeps what does not change between frames of a subject."""
 
     def __init__(self) -> None:
         self._skins: list[tuple[tuple[Any, ...], Globe, _Plan]] = []  # of subjects
         self._bare: _Plan | None = None
-        self._interiors: KeptForEye[_Interior] = KeptForEye()
+        self._interiors: EyeCache[_Interior] = EyeCache()
 
     def begun(
         self, job: RenderJob, lamps: LampTable, places_on_globe: GlobePlaces, frame: Frame, panels: LampTable,
-        place: Surround | RegionScene,
-    ) -> Callable[[], Callable[[], Received]]:  # fmt: skip
+        place: Background | RegionScene,
+    ) -> Callable[[], Callable[[], RadiosityField]]:  # fmt: skip
         """Begin to find what the places of a frame receive straight from the lamps, and what they see of each other.
 
         Returns:
@@ -404,13 +407,13 @@ class Exchange:
         """
         region = place if isinstance(place, RegionScene) else None
         places = self._places(job, places_on_globe, region)
-        numbers = Received.dark(job.interreflection, places.chamber, places.grid, places.plane)
+        numbers = RadiosityField.dark(job.interreflection, places.chamber, places.grid, places.plane)
         if not job.interreflection and not frame.structure.ambient:
             return lambda: lambda: numbers.filled(*places.dark(region))
         tables, sizes = _tables(places, lamps, panels)
         found = _light_places(frame, Lights.upload(panels), numbers, tables, sizes)
 
-        def read() -> Callable[[], Received]:
+        def read() -> Callable[[], RadiosityField]:
             known = found.read(places, sizes)
             return lambda: numbers.filled(*places.solved(region, known))
 
@@ -504,7 +507,7 @@ class _Places:
         """Tables, as for `Received.filled`, of nothing but light straight from the lamps."""
         other = np.tile([0.0, 1.0, 0.0, 0.0], (len(self.points) if region is None else len(region.posed.vertices), 1))
         if region is not None:
-            region.skin.received = sent(other)
+            region.skin.received = upload_array(other)
         return np.tile([0.0, 1.0, 0.0, 0.0], (self.on_globe, 1)), other, np.zeros(IRIS)
 
     def _on_iris(self, values: Floats, along: float) -> Floats:
@@ -689,7 +692,7 @@ def _tables(places: _Places, lamps: LampTable, panels: LampTable) -> tuple[_Tabl
     rows = None
     if len(near):
         padded = np.append(near, np.full(sizes.near_cornea - len(near), near[0]))
-        rows = sent(np.column_stack([places.points[padded], places.normals[padded]]))
+        rows = upload_array(np.column_stack([places.points[padded], places.normals[padded]]))
     counts = (
         places.on_globe, places.on_skin, places.outside - IRIS_TURNS, places.outside, plan.rays, plan.rays + inside
     )  # fmt: skip
@@ -700,7 +703,7 @@ def _tables(places: _Places, lamps: LampTable, panels: LampTable) -> tuple[_Tabl
         for width in (2 * places.outside, sizes.near_cornea, PLACES)
     )
     tables = _Tables(
-        outer=sent(np.resize(places.outer, (sizes.outside, 6))), inside=interior.rows, near_cornea=rows,
+        outer=upload_array(np.resize(places.outer, (sizes.outside, 6))), inside=interior.rows, near_cornea=rows,
         leaving=interior.leaving, of_place=plan.of_place, stands_for=plan.stands_for, on_globe=on_globe,
         on_skin=on_skin, before_limbus=before_limbus, outside=outside, rays_outside=rays_outside, rays=rays,
         spots=(outer, mirrored, within),
@@ -768,10 +771,10 @@ def _mean(found: Sequence[Sequence[mi.Float]], width: int) -> Floats:
 
 
 @recorded
-def _light_places(frame: Frame, panels: Lights, numbers: Received, tables: _Tables, sizes: _Sizes) -> _Found:
+def _light_places(frame: Frame, panels: Lights, numbers: RadiosityField, tables: _Tables, sizes: _Sizes) -> _Found:
     """Find the light that the places of a frame receive straight from all lamps, and what they see of each other."""
     # Shadows of panels are found with rays alone.
-    lit_by_panels = replace(frame, lights=panels, textures=replace(frame.textures, lamp_views=None))
+    lit_by_panels = replace(frame, lights=panels, textures=replace(frame.textures, shadow_maps=None))
     outer, mirrored, within = tables.spots
     direct = [_onto_outer(frame, tables, first, sizes.outside) for first in outer]
     soft = hard = free = shaded = None
@@ -808,7 +811,7 @@ def _onto_outer(frame: Frame, tables: _Tables, first: mi.UInt32 | None, count: i
     start, facing = frame.point_to_eye(x + _START_MM * normal), frame.vector_to_eye(normal)
     u, v = (mi.Float(0), mi.Float(0)) if first is None else _spots(index + first)
     sheet = away & (index < tables.on_globe + tables.on_skin)
-    found = onto_points(frame, start, facing, away, u, v, sheet)
+    found = irradiance_at(frame, start, facing, away, u, v, sheet)
     dr.eval(found)
     return found
 
@@ -819,7 +822,7 @@ def _off_cornea(frame: Frame, rows: mi.Float, first: mi.UInt32, count: int) -> m
     n = _row(rows, 6, index)
     normal = mi.Vector3f(*n[3:])
     x, facing = frame.point_to_eye(mi.Vector3f(*n[:3]) + _START_MM * normal), frame.vector_to_eye(normal)
-    lit = off_cornea(frame, x, facing, *_spots(index + first))
+    lit = irradiance_off_cornea(frame, x, facing, *_spots(index + first))
     dr.eval(lit)
     return lit
 
@@ -833,7 +836,7 @@ def _inside(frame: Frame, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
         x, inside, normal = mi.Vector3f(*n[:3]), n[6] > 0, mi.Vector3f(*n[3:6])
         u, v = _spots(index + first)
         surfaces = frame.surfaces if inner else frame.surfaces[:-1]
-        return through_cornea(frame, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
+        return irradiance_through_cornea(frame, x, inside, u, v, normal=normal, surfaces=surfaces)[0]
 
     # If there is a back of the cornea, the wall is the rim of the cornea, in front of it.
     parts = [of(0, PLACES, True)] if len(frame.surfaces) == 1 else [of(0, IRIS, True), of(IRIS, PLACES, False)]
@@ -850,7 +853,9 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
     return (r * c) * e1 + (r * s) * e2 + dr.sqrt(1 - u) * normal
 
 
-def _rays_of(frame: Frame, numbers: Received, tables: _Tables, lanes: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+def _rays_of(
+    frame: Frame, numbers: RadiosityField, tables: _Tables, lanes: int
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """What the rays of places meet: the columns of `_Seen` but for `lit`, and places on skin (see `_met`).
 
     The first rays belong to places outside the eye. There are more lanes than rays.
@@ -907,7 +912,7 @@ def _at_spots(frame: Frame, spot: tuple[Any, ...], tables: _Tables, lanes: int) 
     def light(_: mi.Bool, x: mi.Vector3f, normal: mi.Vector3f, number: mi.UInt32) -> mi.Float:
         start = x + _START_MM * normal
         u, v = _spots(number * mi.UInt32(_SHUFFLED))
-        return onto_points(frame, start, normal, mi.Bool(True), u, v, mi.Bool(True))[0]
+        return irradiance_at(frame, start, normal, mi.Bool(True), u, v, mi.Bool(True))[0]
 
     lit = dr.if_stmt(state, on_skin, light, lambda *_: mi.Float(-1))
     dr.eval(lit)
@@ -915,14 +920,20 @@ def _at_spots(frame: Frame, spot: tuple[Any, ...], tables: _Tables, lanes: int) 
 
 
 def _met(
-    frame: Frame, numbers: Received, o: mi.Vector3f, d: mi.Vector3f, index: mi.UInt32, active: mi.Bool, tables: _Tables
+    frame: Frame,
+    numbers: RadiosityField,
+    o: mi.Vector3f,
+    d: mi.Vector3f,
+    index: mi.UInt32,
+    active: mi.Bool,
+    tables: _Tables,
 ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Float, tuple[mi.Bool, mi.Vector3f, mi.Vector3f]]:
     """What is met along rays with these numbers.
 
     The place, the share of its irradiance that is sent back, whether nothing is met, the distance, and for the outer
     side of the sheet of skin (a mark) point and normal in the eye frame.
     """
-    view, hit = meet(frame, o, d, active, coherent=False)
+    view, hit = intersect(frame, o, d, active, coherent=False)
     view = appearance(frame, view, hit, d)
     albedo = outer_albedo(frame, view)
     # One of the four places about a point stands for it, each as often as linear interpolation gives it weight.

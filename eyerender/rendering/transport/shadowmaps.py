@@ -3,7 +3,7 @@
 The view of every lamp, a stereographic map of the directions from its middle, is divided into cells. A cell is marked
 if it may show a hair, an end of the sheet of skin, or a triangle of the sheet that turns its back to any point of the
 lamp. A ray through a cell without marks meets the sheet from its front only. The crossings from the
-front, less those from the back, are at most one, because the sheet is one surface with a hole (see `plain`). So a point
+front, less those from the back, are at most one, because the sheet is one surface with a hole (see `pixels`). So a point
 of the sheet in such a cell is the only one there, and the lamp lights it.
 
 A lamp of radius r is more than its middle. Seen from another of its points, an occluder at the distance a shifts
@@ -23,7 +23,7 @@ from ...arrays import Floats, Singles
 from ...geometry.vectors import crosses
 from ...region.mesh import HAIRS, RegionMesh
 from ...rig.light import Lamp
-from ..records.frame import quotient, sent
+from ..records.frame import quotient, upload_array
 from ..records.recording import recorded
 from ..scene.region import RegionScene, SkinGeometry
 
@@ -35,11 +35,11 @@ _LARGEST = 0.85  # half the width of a map: tan of half the angle to the axis
 
 
 @dataclass(kw_only=True)
-class LampViews:
+class ShadowMaps:
     """The maps of all lamps for one pose of a region, on the device.
 
     Attributes:
-        table: numbers of the lamps' views (see `view_table`).
+        table: numbers of the lamps' views (see `shadow_map_table`).
         known: whether the sheet is known to be one surface; else every cell counts as marked.
         marks: 1 for the marked cells of each map, else 0.
     """
@@ -49,17 +49,17 @@ class LampViews:
     marks: mi.UInt8
 
     @classmethod
-    def of(cls, table: Singles, region: RegionScene) -> LampViews:
-        """Draw the maps of lamps, whose numbers are in a `view_table`, before a posed region."""
+    def of(cls, table: Singles, region: RegionScene) -> ShadowMaps:
+        """Draw the maps of lamps, whose numbers are in a `shadow_map_table`, before a posed region."""
         # Without lamps nothing reads the table, but kernels cannot be compiled for an empty one.
-        views = sent(table if len(table) else np.zeros(_WIDTH))
+        views = upload_array(table if len(table) else np.zeros(_WIDTH))
         skin, known = region.skin, dr.opaque(mi.Bool, region.skin.is_sheet)
         if not skin.is_sheet:
             return cls(table=views, known=known, marks=dr.zeros(mi.UInt8, 1))
         pieces = _pieces(region.posed)
         counts = region.sheet_faces, len(pieces)
         on_device = dr.opaque(mi.UInt32, counts[0]), dr.opaque(mi.UInt32, counts[1])
-        hairs = sent(pieces if len(pieces) else np.zeros(8))
+        hairs = upload_array(pieces if len(pieces) else np.zeros(8))
         return cls(table=views, known=known, marks=_marked(views, skin, hairs, on_device, counts, len(table)))
 
     def clear(self, lamp: mi.UInt32, x: mi.Vector3f, active: mi.Bool) -> mi.Bool:
@@ -231,7 +231,7 @@ class _Edge:
         return dr.square(x - t * self._du) + dr.square(y - t * self._dv)
 
 
-def view_table(lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float) -> Singles:
+def shadow_map_table(lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float) -> Singles:
     """Numbers of the views of lamps (lamps, 16), with NumPy alone.
 
     Args:
