@@ -25,7 +25,7 @@ def test_the_grid_gives_the_light_of_exact_paths(renderer, model, name):
     u, v = (np.asarray(eye.stop.rotation)[:, k] for k in (1, 2))
     x = np.asarray(eye.stop.centre_mm) + np.outer(rho * np.cos(turn), u) + np.outer(rho * np.sin(turn), v)
     shown, _ = renderer.bind(job)
-    grid = shown.frame.lights.on_iris
+    grid = shown.frame.caches.iris
     places = mi.Vector3f(*x.astype(np.float32).T)
     found, left = (k.numpy() for k in grid.at(shown.frame, places, behind(shown.frame.surfaces[-1], places)))
     lacked = left[left != ALL, None] >> np.arange(len(job.lights)) & 1
@@ -44,7 +44,7 @@ def test_shadows_on_the_iris_keep_their_edges(renderer):
     job = rigs.job_of(rigs.eye_of("E2"), rig, rig.window(280, 200), region=Region(seed=3, blink=0.4), labels=False)
     found = renderer.radiance(job, spp=4)
     shown, _ = renderer.bind(job)
-    shown.frame.lights.on_iris = None
+    shown.frame.caches.iris = None
     from eyerender.rendering.integrator.film import mean_radiance
 
     truth, _ = mean_radiance(shown, job.window, 4, job.seed)

@@ -29,7 +29,7 @@ def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_
     from eyerender.rendering.records.recording import forget
     from eyerender.rendering.transport.shadowmaps import ShadowMaps
 
-    monkeypatch.setattr(stage, "iris_light", lambda *_: None)  # which uses the views too
+    monkeypatch.setattr(stage, "iris_irradiance", lambda *_: None)  # which uses the views too
     forget()
     rig = rigs.RIGS[name](radius_mm=radius_mm)
     eye = rigs.eye_of(model, side)

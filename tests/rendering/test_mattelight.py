@@ -17,10 +17,10 @@ def test_the_grids_change_no_pixel(renderer, monkeypatch, model, name, pose):
     eye, rig = rigs.eye_of(model), rigs.RIGS[name](radius_mm=0.0)
     job = rigs.job_of(eye, rig, rig.window(240, 180), pose, labels=False)
     found, part = renderer.radiance(job, spp=4), renderer.labels(job).part
-    grids = renderer.bind(job)[0].frame.lights.on_matte
+    grids = renderer.bind(job)[0].frame.caches.globe
     used = [float(np.mean(grid.left.numpy() == 0)) for grid in (grids.globe, grids.plane)]
     assert min(used) > 0.2
-    monkeypatch.setattr(stage, "matte_light", lambda *_: None)
+    monkeypatch.setattr(stage, "globe_irradiance", lambda *_: None)
     truth = renderer.radiance(job, spp=4)
     for kind in (0, 1):
         error = np.abs(found / truth - 1)[part == kind]

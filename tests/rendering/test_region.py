@@ -187,12 +187,12 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
     for du, dv in ((-0.45, -0.45), (0.45, -0.1), (0.0, 0.45)):
         o, d, _ = camera_ray(shown.frame, mi.Float(u) + du, mi.Float(v) + dv)
         _, hit = intersect(shown.frame, o, d, True)
-        on_sheet = hit.is_valid() & shown.frame.textures.region.on_sheet(shown.frame.textures.region.face(hit))
+        on_sheet = hit.is_valid() & shown.frame.region.on_sheet(shown.frame.region.face(hit))
         # A ray in a million or so slips between two triangles: Embree's test is not watertight.
         assert np.count_nonzero(~on_sheet.numpy().astype(bool)[plain]) <= 3
     quick = renderer.radiance(job)
     monkeypatch.setattr(
-        "eyerender.rendering.integrator.hostdata.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000)
+        "eyerender.rendering.integrator.hostdata.skin_only_tiles", lambda *_: (np.zeros((1, 1), bool), 1000)
     )
     slow = renderer.radiance(job)
     # And that pixel then lacks a sample, where each is asked.
@@ -212,7 +212,7 @@ def test_plain_tiles_leave_no_seam_where_fine_shadows_begin(renderer, monkeypatc
     job = replace(render_job(s.frames(), 0), window=(0, 0, 640, 320))
     quick = renderer.radiance(job)
     monkeypatch.setattr(
-        "eyerender.rendering.integrator.hostdata.plain_tiles", lambda *_: (np.zeros((1, 1), bool), 1000)
+        "eyerender.rendering.integrator.hostdata.skin_only_tiles", lambda *_: (np.zeros((1, 1), bool), 1000)
     )
     slow = renderer.radiance(job)
     # Some pixels lack a sample without plain tiles, as above.

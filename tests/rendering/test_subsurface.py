@@ -142,10 +142,10 @@ def test_shut_lids_transmit_light(renderer):
 
     shut = job("remote", region=BARE.model_copy(update={"blink": 1.0}))
     shown, place = renderer.bind(shut)
-    assert shown.frame.textures.tissues is not None
+    assert shown.frame.caches.diffusion is not None
     upper = place.posed.upper_margin
     up = upper[np.argmin(np.abs(upper[:, 1]))]  # where the lids meet before the eye
-    inside = float(shown.frame.textures.tissues.on_globe(shown.frame, mi.Vector3f(*(float(v) for v in up))).numpy()[0])
+    inside = float(shown.frame.caches.diffusion.on_globe(shown.frame, mi.Vector3f(*(float(v) for v in up))).numpy()[0])
     lamp = shut.lights[0]
     way = lamp.position_mm - up
     outside = lamp.intensity_mw_sr / float(way @ way)  # more than what falls on the slope of the lid

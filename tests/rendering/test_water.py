@@ -51,7 +51,7 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
     region = Region.from_mapping({"tears": {"unevenness": 0.0}})
     job = job_of(eye_of("E2"), rig, rig.window(32, 32), (12.0, 0.0), look=PLAIN, region=region)
     shown, place = renderer.bind(job, lit=False)
-    values, skin = shown.frame, shown.frame.textures.region
+    values, skin = shown.frame, shown.frame.region
     ends, face_ends = place.posed.layout.vertex_ends, place.posed.layout.face_ends
     faces = place.posed.layout.faces[face_ends[-2] :]
     weights = np.random.default_rng(4).dirichlet(np.ones(3), 60000)

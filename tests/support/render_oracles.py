@@ -215,7 +215,7 @@ def rings(renderer: Any, job: RenderJob) -> dict[str, Any]:
     for du, dv in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
         o, d, _ = camera_ray(shown.frame, mi.Float(u + du), mi.Float(v + dv))
         view, hit = intersect(shown.frame, mi.Vector3f(o + dr.zeros(mi.Float, len(u))), d, mi.Bool(True))
-        region = shown.frame.textures.region
+        region = shown.frame.region
         sheet = view.other if region is None else view.other & region.on_sheet(region.face(hit))
         cornea, pupil, sclera, other = (np.array(k, dtype=bool) for k in (view.cornea, view.pupil, view.sclera, sheet))
         ring = 1 + np.digitize(

@@ -107,33 +107,19 @@ class SurfaceInteraction:
 
 @dataclass(kw_only=True)
 class Textures:
-    """Maps of the eye, and the light and the surroundings of a frame.
+    """Maps of the eye.
 
     Attributes:
         iris: relative albedo (mean 1) of the iris over (angle, pupil to root).
         heights: height (mm) of the iris over the same.
         raised: whether the iris has any heights.
         sclera: relative albedo of the sclera.
-        surround: `background.BackgroundGeometry` of frames without a region.
-        region: `region.SkinGeometry`.
-        ambience: `environment.Ambience`.
-        lamp_views: `shadowmaps.ShadowMaps`.
-        pupil: `fundusirradiance.FundusIrradiance`.
-        received: `radiosity.RadiosityField`.
-        tissues: `diffusion.DiffusedLight`.
     """
 
     iris: mi.Texture2f
     heights: mi.Texture2f
     raised: bool
     sclera: mi.Texture2f
-    surround: Any = None
-    region: Any = None
-    ambience: Any = None
-    shadow_maps: Any = None
-    pupil: Any = None
-    received: Any = None
-    tissues: Any = None
 
     @classmethod
     def of(cls, look: Look) -> Textures:
@@ -202,11 +188,11 @@ def first_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> 
 
 def appearance(frame: Frame, view: SurfaceInteraction, hit: Hit, d: mi.Vector3f) -> SurfaceInteraction:
     """View of rays along which `intersect` found `view` and `hit`, with the surface of what is not the eye."""
-    region, surround = frame.textures.region, frame.textures.surround
+    region, background = frame.region, frame.background
     if region is not None:
         there = look_at_skin(frame, region, region.face(hit), hit.prim_uv, d, view.other)
     else:
-        matte = surround.surface(hit.prim_index, hit.prim_uv, view.other)
+        matte = background.surface(hit.prim_index, hit.prim_uv, view.other)
         there = replace(_matte(frame, matte.point, matte.normal, d, view.other), albedo=matte.albedo)
     return replace(
         view,

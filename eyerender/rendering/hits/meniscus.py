@@ -36,7 +36,7 @@ def wetted(
 
 def on_water(frame: Frame, view: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
     """The view of camera rays where menisci are in front of it, else `view` itself."""
-    region = frame.textures.region
+    region = frame.region
     if region is None or region.water is None:
         return view
     film, wet = wetted(region.water, o, d, view.distance)

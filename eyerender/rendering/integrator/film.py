@@ -358,7 +358,7 @@ def _hits(
     u, v = pixels.at(pixel)
     spot = _samples(u, v, pattern, mi.Bool(True)).in_pixel(k)
     o, d, _ = camera_ray(frame, mi.Float(u) + (spot.x - 0.5), mi.Float(v) + (spot.y - 0.5))
-    hit = region_hit(frame.textures.region, frame.scene, intersect_globe(frame, o, d), o, d)
+    hit = region_hit(frame.region, frame.scene, intersect_globe(frame, o, d), o, d)
     found = hit.t, hit.face, hit.prim_uv.x, hit.prim_uv.y
     dr.eval(found)
     return found
@@ -383,7 +383,7 @@ def _shaded(
     """
     # Embree traces sixteen neighbouring lanes together. They are one group of 4 x 4 pixels each, so that their camera
     # rays are close and their lamp rays go the same way.
-    skin = frame.textures.region
+    skin = frame.region
     index = dr.arange(mi.UInt32, packets * _TILE * _TILE)
     packet = index // (_TILE * _TILE)
     lane = index - packet * (_TILE * _TILE)

@@ -124,10 +124,7 @@ class FrameBuilder:
         region = place if isinstance(place, RegionScene) else None
         textures = self._textures_of(job)
         # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
-        if isinstance(place, RegionScene):
-            textures = replace(textures, region=place.skin, shadow_maps=ShadowMaps.of(host.views, place))
-        else:
-            textures = replace(textures, surround=place.geometry)
+        shadow_maps = None if region is None else ShadowMaps.of(host.views, region)
         structure = Structure(
             kinds(job.eye),
             bool(np.any(job.camera.distortion)),
@@ -139,15 +136,18 @@ class FrameBuilder:
         frame = Frame.upload(
             structure, host.parameters, boundary_waves(job.eye), tables(job.eye),
             lights=Lights.upload(host.lamps), textures=textures, scene=place.scene,
+            region=None if region is None else region.skin,
+            background=place.geometry if isinstance(place, Background) else None,
         )  # fmt: skip
+        frame.caches.shadow_maps = shadow_maps
         if job.mesh_edge_mm is not None:
             frame.surfaces = meshed(frame.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
         if lit and structure.scattering and region is not None:
-            textures.tissues = diffused_light(job, frame, host.lamps, region, host.tissue_cells)
+            frame.caches.diffusion = diffused_light(job, frame, host.lamps, region, host.tissue_cells)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
             panels = panel_table(job.ambient, job.anchor_mm)
-            textures.ambience = Ambience.upload(even, panels, job.ambient.map, self._maps)
+            frame.caches.ambience = Ambience.upload(even, panels, job.ambient.map, self._maps)
         if lit:
             self._light(host, frame, place, after)
         return BoundFrame(frame, host), place
@@ -161,11 +161,11 @@ class FrameBuilder:
             self._expect(after)
         solved = read()
         self._fill_grids(host, frame, place)
-        frame.textures.received = solved()
+        frame.caches.radiosity = solved()
         if not place.obstructed:
             reach = dr.opaque(mi.Float, min(host.reach_mm, _FARTHEST_MM))
             points = dr.opaque(mi.UInt32, host.lamps.points)
-            frame.lights.on_matte = globe_irradiance(frame, reach, points, host.lamps.gridded)
+            frame.caches.globe = globe_irradiance(frame, reach, points, host.lamps.gridded)
 
     def _fill_grids(self, host: HostData, frame: Frame, place: Background | RegionScene) -> None:
         """Add the light of the lamps behind the cornea."""
@@ -183,8 +183,8 @@ class FrameBuilder:
         sizes = _GridSizes(gridded, len(lamps) if lamps.gridded else 0, size.side**2, points)
         factors = host.returned.factors
         sent_factors = upload_array(factors) if len(lamps) and factors.any() else None
-        lights, textures = frame.lights, frame.textures
-        lights.on_iris, lights.relief, textures.pupil = _grids_behind_cornea(
+        caches = frame.caches
+        caches.iris, caches.relief, caches.fundus = _grids_behind_cornea(
             frame, shape, side, dr.opaque(mi.UInt32, lamps.points), sent_factors, sizes
         )
 

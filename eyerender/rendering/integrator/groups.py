@@ -80,7 +80,7 @@ def shade_group(frame: Frame, group: Group) -> tuple[tuple[Part, ...], mi.Float,
     tears), at the first sample that hits it. The result is multiplied by the number of hits on that surface. In a plain
     pixel the first sample that hits the skin represents the others.
     """
-    shading = _GroupShading(frame, frame.textures.region, group)
+    shading = _GroupShading(frame, frame.region, group)
     no = mi.Bool(False)
     depths = tuple(mi.Float(0) for _ in range(3)) if group.layered else ()
     state = (
@@ -247,7 +247,7 @@ class _GroupShading:
         seen = on_relief(frame, replace(view, other=mi.Bool(False)))
         inner, missed = irradiance_through_cornea(frame, seen.inner, seen.lit_inside, *group.spot(j))
         albedo = outer_albedo(frame, seen)
-        received = frame.textures.received.globe(frame.point_to_scene(seen.point))
+        received = frame.caches.radiosity.globe(frame.point_to_scene(seen.point))
         rest = indirect(frame, seen, d, albedo, inner, received)
         return rest + self.lamps_on_globe(seen, albedo, -frame.vector_to_eye(d), j), missed
 
@@ -268,7 +268,7 @@ class _GroupShading:
 
         if self.soft:
             # What went through the tissue is known, and what remains is the film's highlight.
-            tissues = self.frame.textures.tissues
+            tissues = self.frame.caches.diffusion
             covered, share = ~seen.cornea | (seen.opacity > 0), tissues.globe_sees(self.frame, seen.point)
 
             def shine(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
@@ -315,7 +315,7 @@ class _GroupShading:
         self, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, asked: mi.Bool
     ) -> mi.Bool:
         """Whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
-        frame, views = self.frame, self.frame.textures.shadow_maps
+        frame, views = self.frame, self.frame.caches.shadow_maps
         # Where the lamp's own view shows bare skin alone, only the globe may be in the way.
         clear = views.clear(lamp.number, frame.point_to_scene(x), asked & on_sheet)
         return lamp_blocked(frame, x, source, True, True, asked & ~clear)
@@ -329,7 +329,7 @@ class _GroupShading:
         inside, matte, sees = mi.Float(0), view.albedo, None
         soft = self.soft and on_sheet
         if soft:
-            tissues = self.frame.textures.tissues
+            tissues = self.frame.caches.diffusion
             on_map = self.skin.map_place(kept.face, kept.uv, kept.weight > 0)
             on_skin, sees = tissues.on_skin(*on_map), tissues.skin_sees(*on_map)
             inside, matte = direct(view, view.albedo, on_skin, mi.Float(0)), mi.Float(0)

@@ -26,8 +26,8 @@ def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float
     """
     view = on_relief(frame, first_hit(frame, o, d, mi.Bool(True)))
     known, outer_known = mi.Bool(False), mi.Float(0)
-    if frame.lights.on_matte is not None:
-        outer_known, known = frame.lights.on_matte.at(frame, view)
+    if frame.caches.globe is not None:
+        outer_known, known = frame.caches.globe.at(frame, view)
     outer, inner, failures = lamp_light(frame, view, u, v, known)
     albedo = outer_albedo(frame, view)
     received = of_surroundings(frame, view, known)
@@ -45,7 +45,7 @@ def of_surroundings(frame: Frame, view: SurfaceInteraction, known: mi.Bool) -> m
 
     Obstacles receive nothing. The light from other surfaces on the globe is left out where it is `known`.
     """
-    received, nothing = frame.textures.received, mi.Vector4f(0, 1, 0, 0)
+    received, nothing = frame.caches.radiosity, mi.Vector4f(0, 1, 0, 0)
 
     def of_plane(x: mi.Vector3f) -> mi.Vector4f:
         return dr.select(dr.abs(x.x - frame.backdrop_x) < _FLAT_MM, received.surround(x), nothing)
@@ -86,9 +86,9 @@ def indirect(
         * dr.inv_pi
         / (index * index)
     )
-    if frame.textures.pupil is not None:
+    if frame.caches.fundus is not None:
         seen = view.cornea & view.pupil
-        leaving += dr.select(seen, frame.textures.pupil.at(*stop_coordinates(frame, view.inner), seen), 0)
+        leaving += dr.select(seen, frame.caches.fundus.at(*stop_coordinates(frame, view.inner), seen), 0)
     rest += dr.select(view.cornea, (1 - view.opacity) * view.passed * leaving, 0)
     return dr.select(view.met, rest, 0)
 
@@ -101,7 +101,7 @@ def off_eye(
     if frame.structure.ambient:
         facing = view.normal if view.level is None else view.level
         x, normal = frame.point_to_scene(view.point), frame.vector_to_scene(facing)
-        even += received.y * frame.textures.ambience.irradiance(x, normal)
+        even += received.y * frame.caches.ambience.irradiance(x, normal)
         mirrored = _mirrored(frame, view, d, 1 - _cover(view))
     return dr.select(view.met, _cover(view) * albedo * even * dr.inv_pi + mirrored, 0)
 
@@ -114,7 +114,7 @@ def _cover(view: SurfaceInteraction) -> mi.Float:
 def _leaving(frame: Frame, pupil: mi.Bool, x: mi.Vector3f, lit: mi.Float) -> mi.Float:
     """Radiosity of points in the plane of the iris that have the irradiance `lit` from the lamps."""
     albedo = dr.if_stmt((x,), ~pupil, lambda x: iris_albedo(frame, x), lambda x: mi.Float(frame.pupil_albedo))
-    return albedo * (lit + frame.textures.received.iris(x))
+    return albedo * (lit + frame.caches.radiosity.iris(x))
 
 
 def _mirrored(frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, clear: mi.Float) -> mi.Float:
@@ -123,7 +123,7 @@ def _mirrored(frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, clear: mi.
     The front cornea, where it is `clear`, mirrors the ambient light and the surfaces about it. The film of tears
     elsewhere mirrors the ambient light.
     """
-    received = frame.textures.received
+    received = frame.caches.radiosity
     normal, share = view.normal, view.mirrored * clear
     seen, wet = mi.Float(0), view.cornea & (clear > 0)
     film = mi.Bool(False)
@@ -136,15 +136,15 @@ def _mirrored(frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, clear: mi.
     way = d - 2 * dr.dot(d, normal) * normal
     start = frame.point_to_scene(view.point) + EPSILON_MM * normal
     if frame.structure.ambient:
-        seen = frame.ambient_irradiance * dr.inv_pi + frame.textures.ambience.radiance(start, way, wet | film)
+        seen = frame.ambient_irradiance * dr.inv_pi + frame.caches.ambience.radiance(start, way, wet | film)
     else:
         wet &= received.on
     if frame.structure.obstacles:
         hit = frame.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
         barred = hit.is_valid()
         surface = mi.Float(0)
-        if frame.textures.region is not None:
-            skin = frame.textures.region.surface(frame.textures.region.face(hit), hit.prim_uv, barred & wet)
+        if frame.region is not None:
+            skin = frame.region.surface(frame.region.face(hit), hit.prim_uv, barred & wet)
             surface = dr.select(wet, skin.albedo * skin.received.z * dr.inv_pi, 0)
         seen = dr.select(barred, surface, seen)
     else:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Floats, Reals, Singles
+from .caches import Caches
 from .job import LampTable
 from .parameters import (
     CameraParameters,
@@ -99,8 +100,11 @@ class Frame:
     Attributes:
         structure: what kernels are compiled for.
         boundary: the shape of the pupil's boundary.
-        lights: the lamps, with the grids of their light.
-        textures: the maps of the eye, the surroundings, and the light of other surfaces (`interaction.Textures`).
+        lights: the lamps.
+        textures: the maps of the eye (`albedo.Textures`).
+        region: the eye region (`region.SkinGeometry`), if there is one.
+        background: else what is about the eye (`background.BackgroundGeometry`).
+        caches: light that was computed before the samples.
         scene: what may stand in the way.
     """
 
@@ -121,6 +125,9 @@ class Frame:
     ambient_irradiance: mi.Float
     lights: Lights
     textures: Any
+    region: Any
+    background: Any
+    caches: Caches
     scene: mi.Scene
 
     @classmethod
@@ -133,6 +140,8 @@ class Frame:
         *,
         lights: Lights | None = None,
         textures: Any = None,
+        region: Any = None,
+        background: Any = None,
         scene: mi.Scene | None = None,
     ) -> Frame:
         """Send the numbers to the device.
@@ -144,6 +153,8 @@ class Frame:
             tables: the cells of measured surfaces.
             lights: the lamps.
             textures: as the attribute.
+            region: as the attribute.
+            background: as the attribute.
             scene: as the attribute.
         """
         left = iter(upload_scalars(packed(parameters)))
@@ -161,12 +172,12 @@ class Frame:
             for s, (kind, _), table in zip(others.pop("surfaces"), structure.surfaces, tables, strict=True)
         )
         boundary = PupilBoundary.upload(waves)
-        seen: dict[str, Any] = {"lights": lights, "textures": textures, "scene": scene}
-        return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, **seen)
+        seen: dict[str, Any] = {"lights": lights, "textures": textures, "region": region, "background": background}
+        return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, **seen, scene=scene, caches=Caches())
 
     def bare(self) -> Frame:
-        """The frame without lamps and textures, for recordings that should last when these change."""
-        without: dict[str, Any] = {"lights": None, "textures": None}
+        """The frame without lamps, textures and light, for recordings that should last when these change."""
+        without: dict[str, Any] = {"lights": None, "textures": None, "caches": Caches()}
         return replace(self, **without)
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
@@ -235,17 +246,11 @@ class Lights:
         count: number of lamps.
         suns: 1 if the last lamp is a sun with sharp shadows, else 0.
         rows: the numbers of the lamps, as in `LampTable`.
-        on_iris: their light in the plane of the iris, where a grid of it is used (`irisirradiance.IrisIrradiance`).
-        on_matte: their light on matte surfaces, where grids of it are used (`globeirradiance.GlobeIrradiance`).
-        relief: the relief of the iris in their light (`reliefmapping.IrisRelief`).
     """
 
     count: mi.UInt32
     suns: mi.UInt32
     rows: mi.Float
-    on_iris: Any = None
-    on_matte: Any = None
-    relief: Any = None
 
     @classmethod
     def upload(cls, table: LampTable) -> Lights:

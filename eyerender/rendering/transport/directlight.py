@@ -114,7 +114,7 @@ def irradiance_at(
     u, v: place on each lamp's disc, [0, 1). on_sheet: points on the outer side of a region's sheet of skin, for which
     the lamps' views of it spare rays.
     """
-    views = frame.textures.shadow_maps
+    views = frame.caches.shadow_maps
     sine, cosine_v = dr.sincos(v * (2 * dr.pi))
 
     def body(i: mi.UInt32, total: mi.Float, free: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
@@ -186,8 +186,8 @@ def irradiance_through_cornea(
     those in front of the points; None for all.
     """
     bent, left, rest = mi.Float(0), mi.UInt32(ALL), inside & behind((surfaces or frame.surfaces)[-1], inner)
-    if frame.lights.on_iris is not None:
-        bent, left = frame.lights.on_iris.at(frame, inner, rest)
+    if frame.caches.iris is not None:
+        bent, left = frame.caches.iris.at(frame, inner, rest)
     many = frame.lights.count > BITS
     sine, cosine = dr.sincos(v * (2 * dr.pi))
 
@@ -208,8 +208,8 @@ def irradiance_through_cornea(
     first = dr.select(left == 0, frame.lights.count, dr.select(many, 0, dr.tzcnt(left)))
     state, labels = (first, left, bent, mi.UInt32(0)), ("i", "left", "bent", "failures")
     _, _, bent, failures = dr.while_loop(state, more, body, labels=labels, label="lamps")
-    if normal is None and frame.lights.relief is not None:
-        bent *= frame.lights.relief.share(frame, inner, inside)
+    if normal is None and frame.caches.relief is not None:
+        bent *= frame.caches.relief.share(frame, inner, inside)
     return bent, failures
 
 
@@ -251,10 +251,10 @@ def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
 
 def on_relief(frame: Frame, view: SurfaceInteraction) -> SurfaceInteraction:
     """The view with the places on the relief of the iris that the rays meet, as their feet in its plane."""
-    if frame.lights.relief is None:
+    if frame.caches.relief is None:
         return view
     seen = view.cornea & ~view.pupil & (view.passed > 0)
-    return replace(view, inner=frame.lights.relief.hit(frame, view.inner, view.slant, seen))
+    return replace(view, inner=frame.caches.relief.hit(frame, view.inner, view.slant, seen))
 
 
 @dataclass(frozen=True, slots=True)

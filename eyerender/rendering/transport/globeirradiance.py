@@ -83,7 +83,7 @@ def globe_irradiance(frame: Frame, reach: mi.Float, points: mi.UInt32, gridded: 
     local = frame.surfaces[0].point_in(x)
     outside = (local.y * local.y + local.z * local.z > dr.square(frame.limbus.radius)) | (normal.x < 0)
     on_globe = _lit(frame, points, x, normal, mi.Bool(False), outside)
-    more = frame.textures.received.globe(frame.point_to_scene(x)).x
+    more = frame.caches.radiosity.globe(frame.point_to_scene(x)).x
     seen = frame.point_to_eye(mi.Vector3f(frame.backdrop_x, reach * a, reach * b))
     yes, normal = mi.Bool(True), frame.vector_to_eye(mi.Vector3f(1, 0, 0))
     on_plane = _lit(frame, points, seen, normal, yes, yes)

@@ -126,7 +126,7 @@ def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) ->
     Where anything may hide the lamps, or a path was not found, irradiances are negative. Behind a clear rim, that of a
     lamp with several points is so, too.
     """
-    stop, half, views = frame.stop, _half(frame), frame.textures.shadow_maps
+    stop, half, views = frame.stop, _half(frame), frame.caches.shadow_maps
     row = node // _SIDE
     a, b = (half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (node - row * _SIDE, row))
     x = stop.centre + a * stop.u + b * stop.v

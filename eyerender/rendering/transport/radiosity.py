@@ -33,6 +33,7 @@ from ...region.globe import Globe
 from ...region.look import Look
 from ...rig.imaging import Ambient
 from ..hits.interaction import appearance, intersect, iris_albedo, outer_albedo
+from ..records.caches import Caches
 from ..records.eyecache import EyeCache
 from ..records.frame import Frame, Lamp, Lights, aligned_copy, upload_array, upload_scalars
 from ..records.job import LampTable, RenderJob
@@ -774,13 +775,13 @@ def _mean(found: Sequence[Sequence[mi.Float]], width: int) -> Floats:
 def _light_places(frame: Frame, panels: Lights, numbers: RadiosityField, tables: _Tables, sizes: _Sizes) -> _Found:
     """Find the light that the places of a frame receive straight from all lamps, and what they see of each other."""
     # Shadows of panels are found with rays alone.
-    lit_by_panels = replace(frame, lights=panels, textures=replace(frame.textures, shadow_maps=None))
+    lit_by_panels = replace(frame, lights=panels, caches=Caches(ambience=frame.caches.ambience))
     outer, mirrored, within = tables.spots
     direct = [_onto_outer(frame, tables, first, sizes.outside) for first in outer]
     soft = hard = free = shaded = None
     if frame.structure.ambient:
         n = _row(tables.outer, 6, dr.arange(mi.UInt32, sizes.outside))
-        soft, hard = frame.textures.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
+        soft, hard = frame.caches.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
         dr.eval(soft, hard)
     if sizes.panels:
         shaded, free = _onto_outer(lit_by_panels, tables, None, sizes.outside)
@@ -874,8 +875,8 @@ def _rays_of(
     target, weight, open_, distance, spot = _met(frame, numbers, o, d, index, active, tables)
     sky = mi.Float(0) * o.x
     if frame.structure.ambient:
-        sky = dr.pi * frame.textures.ambience.soft(d, outside | open_)
-    bare = mi.Float(-1) if frame.textures.region is None else _bare(frame.lights, *spot)
+        sky = dr.pi * frame.caches.ambience.soft(d, outside | open_)
+    bare = mi.Float(-1) if frame.region is None else _bare(frame.lights, *spot)
     results = (target, weight, mi.Float(distance < _TOUCHING_MM), dr.select(open_, sky, 0), sky, bare)
     dr.eval(results, spot)
     return results, spot
@@ -940,14 +941,14 @@ def _met(
     s, t = _spots(index * mi.UInt32(_SHUFFLED))
     first = tables.on_globe
     at = frame.point_to_scene(view.point)
-    if frame.textures.region is not None:
-        face = frame.textures.region.face(hit)
-        inner = frame.textures.region.from_behind(face, hit.prim_uv, d, view.other)
-        corner = frame.textures.region.corner(face, hit.prim_uv, s, view.other)
+    if frame.region is not None:
+        face = frame.region.face(hit)
+        inner = frame.region.from_behind(face, hit.prim_uv, d, view.other)
+        corner = frame.region.corner(face, hit.prim_uv, s, view.other)
         which = dr.gather(mi.Int32, tables.stands_for, 2 * corner + dr.select(inner, 1, 0), view.other)
         other = first + mi.UInt32(which)
         matte = view.other & (~inner | (which >= mi.Int32(tables.on_skin)))
-        on_skin = view.other & ~inner & frame.textures.region.on_sheet(face)
+        on_skin = view.other & ~inner & frame.region.on_sheet(face)
     else:
         on_skin = mi.Bool(False)
         ring, turn = numbers.surround_place(at)
