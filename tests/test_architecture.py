@@ -71,7 +71,7 @@ ORDER = [
     "scene",
 ]
 # The sub-packages of the renderer: each may import those before it, and `renderer` all of them.
-RENDERING = ["records", "scene", "hits", "materials", "transport", "glints", "integrator", "output", "renderer"]
+RENDERING = ["records", "scene", "materials", "hits", "transport", "glints", "integrator", "output", "renderer"]
 
 
 def modules():
@@ -83,19 +83,33 @@ def room(path: Path) -> str:
     return parts[0]
 
 
+def imports_of_names(path: Path):
+    """The same with the name that is imported, which may be a module, at its end."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                single = ast.ImportFrom(node.module, [alias], node.level, lineno=node.lineno)
+                yield f"{resolved(path, single)}.{alias.name}", node.lineno
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, node.lineno
+
+
+def resolved(path: Path, node: ast.ImportFrom) -> str:
+    """Dotted module that an import is from."""
+    package = path.relative_to(PACKAGE.parent).with_suffix("").parts[:-1]
+    base = package[: len(package) - node.level + 1] if node.level else ()
+    return ".".join((*base, *((node.module or "").split(".") if node.module else ())))
+
+
 def imports(path: Path):
     """(level-resolved dotted module, line) of every import, inside functions and TYPE_CHECKING too."""
-    inside = path.relative_to(PACKAGE.parent).with_suffix("").parts
-    package = inside if path.name == "__init__.py" else inside[:-1]
-    if path.name == "__init__.py":
-        package = inside[:-1]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield alias.name, node.lineno
         elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else ()
-            stem = ".".join((*base, *((node.module or "").split(".") if node.module else ())))
+            stem = resolved(path, node)
             if node.module is None or stem == "eyerender":
                 for alias in node.names:
                     yield f"{stem}.{alias.name}", node.lineno
@@ -121,6 +135,44 @@ def test_imports_point_down(path):
             assert ORDER.index(there) < ORDER.index(here), f"{path.name}:{line}: {here} imports {there}"
         else:
             assert FLOORS[there] < FLOORS[here], f"{path.name}:{line}: {here} imports {there}, which is above it"
+
+
+def test_sub_packages_of_the_renderer_have_one_direction():
+    for path in modules():
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        if parts[0] != "rendering" or parts[1] == "__init__":
+            continue
+        for name, line in imports(path):
+            there = name.split(".")
+            if there[:2] == ["eyerender", "rendering"] and there[2] != parts[1]:
+                assert RENDERING.index(there[2]) < RENDERING.index(parts[1]), f"{path}:{line}: {name}"
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Modules that import each other by way of others: those left when all that import nothing left are taken away."""
+    left = {name: set(used) for name, used in graph.items()}
+    while ends := [name for name, used in left.items() if not used & set(left)]:
+        for name in ends:
+            del left[name]
+    reach = {name: {name} for name in left}
+    for _ in left:
+        reach = {name: seen.union(*(left[n] & set(left) for n in seen)) for name, seen in reach.items()}
+    return sorted(
+        {tuple(sorted(n for n in left if n in reach[m] and m in reach[n])) for m in left} - {(m,) for m in left}
+    )
+
+
+def test_no_circle_of_imports_inside_packages():
+    """Imports for types alone and those inside functions count. Commands register themselves at their application."""
+    names = {
+        ".".join(p.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): p for p in modules()
+    }
+    graph = {}
+    for name, path in names.items():
+        used = {found if found in names else found.rpartition(".")[0] for found, _ in imports_of_names(path)}
+        graph[name] = {u for u in used if u in names and u != name}
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == [("b", "c")]
+    assert [c for c in circles(graph) if not all(m.startswith("eyerender.cli") for m in c)] == []
 
 
 @pytest.mark.parametrize(

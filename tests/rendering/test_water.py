@@ -95,12 +95,12 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
 def test_a_cylinder_of_water_mirrors_as_much_as_an_ideal_one(renderer, monkeypatch):
     import mitsuba as mi
 
-    from eyerender.rendering.scene import region
+    from eyerender.rendering.materials import gloss as glossiness
 
     # A cylinder of radius r mirrors E F r / 2 cos(i) of parallel light into a radian of its plane. Its roughness
     # spreads this along the axis: slopes of GGX have the density 1 / (2 a) at 0, and a tilt m turns the mirrored ray
     # by 2 m cos(i). The camera at right angles to the axis sees E F r / (8 a).
-    monkeypatch.setattr(region, "_RIPPLES", ())
+    monkeypatch.setattr(glossiness, "_RIPPLES", ())
     rough = region._ROUGH_WET
     turn = np.linspace(-0.6, 0.6, 40001)
     normal = mi.Vector3f(*np.stack([np.cos(turn), np.sin(turn), 0 * turn]).astype(np.float32))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -15,8 +15,8 @@ import numpy as np
 from ...errors import InputError
 from ...region.mesh import RegionMesh, region_mesh
 from ...rig.imaging import Ambient
-from ..hits.interaction import Textures
 from ..hits.meshes import Meshes, meshed
+from ..materials.albedo import Textures
 from ..records.eyecache import EyeCache
 from ..records.frame import Frame, Lights, Structure, upload_array
 from ..records.job import LampTable, RenderJob, boundary_waves, kinds, panel_lamps, panel_table, tables

@@ -11,8 +11,9 @@ import mitsuba as mi
 
 from ..hits.interaction import RegionHit, SurfaceInteraction, behind, intersect_globe, look_at_skin, outer_albedo
 from ..hits.meniscus import parts_of, through_water, wetted
+from ..materials.gloss import film_normal, glossy_normal
 from ..records.frame import Frame, Lamp
-from ..scene.region import SkinGeometry, film_normal, glossy_normal
+from ..scene.region import SkinGeometry
 from ..transport.directlight import direct_light, irradiance_through_cornea, lamp_blocked, on_relief
 from .shading import direct, indirect, off_eye
 

@@ -11,9 +11,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import EPSILON_MM, SurfaceInteraction, first_hit, iris_albedo, outer_albedo, stop_coordinates
+from ..hits.interaction import EPSILON_MM, SurfaceInteraction, first_hit, outer_albedo
+from ..materials.albedo import iris_albedo, stop_coordinates
+from ..materials.gloss import film_normal, film_reflectance
 from ..records.frame import Frame
-from ..scene.region import film_normal, film_reflectance
 from ..transport.directlight import lamp_light, on_relief
 
 _FLAT_MM = 1e-2  # from the plane of a surround

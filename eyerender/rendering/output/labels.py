@@ -17,9 +17,9 @@ from ..hits.interaction import SurfaceInteraction, first_hit, hidden, intersect_
 from ..hits.meniscus import on_water
 from ..integrator.film import BoundFrame, Pixels
 from ..integrator.sampling import camera_ray
+from ..materials.gloss import glossy_normal
 from ..records.frame import Frame
 from ..records.recording import recorded
-from ..scene.region import glossy_normal
 from ..transport.directlight import direct_light, lamp_blocked
 
 _HIGHLIGHT = 0.5  # of the scattered light

@@ -173,7 +173,9 @@ class Frame:
         )
         boundary = PupilBoundary.upload(waves)
         seen: dict[str, Any] = {"lights": lights, "textures": textures, "region": region, "background": background}
-        return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, **seen, scene=scene, caches=Caches())
+        return cls(
+            structure=structure, boundary=boundary, surfaces=surfaces, **others, **seen, scene=scene, caches=Caches()
+        )
 
     def bare(self) -> Frame:
         """The frame without lamps, textures and light, for recordings that should last when these change."""

@@ -25,7 +25,7 @@ _NEAREST_MM = 3.0  # if hairs are closer to the camera, nothing is plain
 def skin_only_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, int]:
     """Tiles (rows, columns) of a window that show nothing but skin and thin hairs, and the size of a tile in pixels.
 
-    `supersampled_pixels` tells where the thin hairs are. No tile is like that where the region's border is unknown or hairs
+    `supersampled_pixels` tells where thin hairs are. No tile is like that where the region's border is unknown or hairs
     come too close to the camera.
     """
     nothing = np.zeros((1, 1), dtype=bool), max(window[2:])

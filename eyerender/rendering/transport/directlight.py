@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import EPSILON_MM, SurfaceInteraction, intersect_sphere, opacity
+from ..hits.interaction import EPSILON_MM, SurfaceInteraction, intersect_sphere
+from ..materials.albedo import opacity
+from ..materials.gloss import sheen
 from ..records.frame import ALL, BITS, Frame, Lamp
 from ..records.surfaces import Surface
-from ..scene.region import sheen
 from .manifold import connect
 from .shadowmaps import ShadowMaps
 

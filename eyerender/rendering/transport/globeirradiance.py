@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import GLOBE_EDGE, SurfaceInteraction, globe_map
+from ..hits.interaction import SurfaceInteraction
+from ..materials.albedo import GLOBE_EDGE, globe_map
 from ..records.frame import Frame
 from ..records.irradiancegrid import IrradianceGrid, grid_nodes
 from ..records.recording import recorded

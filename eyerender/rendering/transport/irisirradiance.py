@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import STEEPEST, opacity
+from ..materials.albedo import STEEPEST, opacity
 from ..records.frame import BITS, Frame
 from ..records.irradiancegrid import BENT, IrradianceGrid, unevenness
 from .directlight import LampPath, behind

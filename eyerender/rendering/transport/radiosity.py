@@ -32,7 +32,8 @@ from ...geometry.vectors import dots, lengths
 from ...region.globe import Globe
 from ...region.look import Look
 from ...rig.imaging import Ambient
-from ..hits.interaction import appearance, intersect, iris_albedo, outer_albedo
+from ..hits.interaction import appearance, intersect, outer_albedo
+from ..materials.albedo import iris_albedo
 from ..records.caches import Caches
 from ..records.eyecache import EyeCache
 from ..records.frame import Frame, Lamp, Lights, aligned_copy, upload_array, upload_scalars
@@ -341,7 +342,7 @@ class _Plan:
         return int(self.count.sum())
 
     def at_vertices(self, places: Floats) -> mi.Float:
-        """Four numbers of every vertex, as in `RadiosityField`, from those of places (n, 4); the last is the whole sky."""
+        """Four numbers of each vertex, as in `RadiosityField`, from those of places (n, 4); the last is the whole sky."""
         assert self.skin is not None
         vertices, each = self.skin.near.shape
         count = dr.opaque(mi.UInt32, vertices)

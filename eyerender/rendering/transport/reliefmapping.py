@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..hits.interaction import iris_height
+from ..materials.albedo import iris_height
 from ..records.frame import Frame, Lights
 from ..records.job import RenderJob
 from ..records.parameters import StopParameters

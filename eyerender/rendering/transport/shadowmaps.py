@@ -4,7 +4,7 @@ The view of every lamp, a stereographic map of the directions from its middle, i
 if it may show a hair, an end of the sheet of skin, or a triangle of the sheet that turns its back to any point of the
 lamp. A ray through a cell without marks meets the sheet from its front only. The crossings from the
 front, less those from the back, are at most one, because the sheet is one surface with a hole (see `pixels`). So a point
-of the sheet in such a cell is the only one there, and the lamp lights it.
+point of the sheet in such a cell is the only one there, and the lamp lights it.
 
 A lamp of radius r is more than its middle. Seen from another of its points, an occluder at the distance a shifts
 against a receiver at the distance b by r (1 / a - 1 / b) at most. The marks are as much wider.

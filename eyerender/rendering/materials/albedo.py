@@ -1,0 +1,121 @@
+"""Albedo and relief of iris and sclera, from maps over their own coordinates, and opacity of the cornea's rim."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...region.iris import WIDTH_MM, DrawnPattern, iris_maps
+from ...region.look import Look
+from ...region.mapcache import kept
+from ...region.texture import sclera_texture
+from ..records.frame import Frame
+
+GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of maps of the globe
+_WIDE_MM = 2.5  # width of an iris whose relief has its full height
+STEEPEST = 1.5  # slope of the opacity of the cornea's rim where it is steepest, times the width of the rim
+_RING = (0.62, 0.95)  # share of the way from the pupil to the root over which a limbal ring grows dark
+
+
+@dataclass(kw_only=True)
+class Textures:
+    """Maps of the eye.
+
+    Attributes:
+        iris: relative albedo (mean 1) of the iris over (angle, pupil to root).
+        heights: height (mm) of the iris over the same.
+        raised: whether the iris has any heights.
+        sclera: relative albedo of the sclera.
+    """
+
+    iris: mi.Texture2f
+    heights: mi.Texture2f
+    raised: bool
+    sclera: mi.Texture2f
+
+    @classmethod
+    def of(cls, look: Look) -> Textures:
+        """Make the textures of one eye."""
+        maps = kept(iris_maps, DrawnPattern.of(look.iris_seed, look.iris))
+        # The texture repeats so that the angle wraps. Additional rows separate the ends along the radius.
+        maps = np.concatenate([maps[:, :1], maps, maps[:, -1:]], axis=1)
+        texture: Any = mi.Texture2f
+        iris, heights = (
+            texture(mi.TensorXf(rows[..., None]), use_accel=False, wrap_mode=dr.WrapMode.Repeat) for rows in maps
+        )
+        sclera = texture(mi.TensorXf(kept(sclera_texture, look.iris_seed)[..., None]), use_accel=False)
+        raised = look.iris.relief > 0 or look.iris.convexity_mm > 0
+        return cls(iris=iris, heights=heights, raised=raised, sclera=sclera)
+
+
+def opacity(frame: Frame, rho: mi.Float) -> mi.Float:
+    """Share by which the cornea's rim has turned to sclera at radius `rho` (mm): a smooth step up to the limbus."""
+    s = dr.clip((rho - frame.limbus.radius) * frame.limbus.gain + 1, 0, 1)
+    return s * s * (3 - 2 * s)
+
+
+def stop_coordinates(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """Coordinates of points of the stop's plane along its semi-axes, in units of these."""
+    q = x - frame.stop.centre
+    a, b = frame.stop.axes
+    return dr.dot(q, frame.stop.u) / a, dr.dot(q, frame.stop.v) / b
+
+
+def _iris_place(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+    """Place of points of the iris' plane: share of the way from margin to root, turn, distance to the root, width."""
+    pu, pv = stop_coordinates(frame, x)
+    a, b = frame.stop.axes
+    beyond = (dr.sqrt(pu * pu + pv * pv) - frame.boundary.radius(pu, pv)) * dr.sqrt(a * b)
+    left = frame.iris.root_radius - dr.sqrt(x.y * x.y + x.z * x.z)
+    width = dr.maximum(beyond + dr.maximum(left, 0), 1e-4)
+    return dr.clip(beyond / width, 0, 1), dr.atan2(pv, pu) / (2 * dr.pi), left, width
+
+
+def _on_iris(texture: mi.Texture2f, s: mi.Float, turn: mi.Float) -> mi.Float:
+    rows = texture.shape[0]
+    return texture.eval(mi.Point2f(turn, (1 + s * (rows - 2)) / rows))[0]
+
+
+def iris_height(frame: Frame, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float:
+    """Height (mm) of the iris above points of its plane, 0 in the pupil and beyond the root, by the map of its heights.
+
+    The pattern stretches with the iris. A narrow iris is as steep as a wide one, so its heights are less.
+    """
+    s, turn, left, width = _iris_place(frame, x)
+    bulge = frame.iris.convexity * dr.minimum(width / WIDTH_MM, 1) * 4 * s * (1 - s)
+    pattern = frame.iris.relief * dr.minimum(width / _WIDE_MM, 1) * _on_iris(heights, s, turn)
+    return dr.select((s > 0) & (left > 0), bulge + pattern, 0)
+
+
+def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
+    """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
+    s, turn, left, _ = _iris_place(frame, x)
+    texture = _on_iris(frame.textures.iris, s, turn)
+    albedo = frame.iris.albedo * dr.maximum(1 + frame.iris.contrast * (texture - 1), 0.02)
+    edge = dr.clip((s - _RING[0]) / (_RING[1] - _RING[0]), 0, 1)
+    albedo *= 1 - frame.iris.ring * edge * edge * (3 - 2 * edge)
+    return dr.select(left > 0, albedo, frame.limbus.albedo)
+
+
+def globe_map(frame: Frame, point: mi.Vector3f) -> mi.Point2f:
+    """Place in [0, 1]^2 of points of the globe (eye frame) in the azimuthal equidistant map of its front."""
+    r = point - frame.sclera.centre
+    polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / GLOBE_EDGE
+    inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
+    return mi.Point2f(0.5 + 0.5 * polar * r.y * inv, 0.5 + 0.5 * polar * r.z * inv)
+
+
+def sclera_albedo(frame: Frame, point: mi.Vector3f) -> mi.Float:
+    """Albedo of the sclera at points of the globe (eye frame), with the grey ring of the limbus."""
+    texture = frame.textures.sclera.eval(globe_map(frame, point))[0]
+    sclera = frame.sclera.albedo * dr.maximum(1 + frame.sclera.contrast * (texture - 1), 0.02)
+    # The grey ring of the limbus fades into the white over its width, on the side of the sclera.
+    local = frame.surfaces[0].point_in(point)
+    away = dr.sqrt(local.y * local.y + local.z * local.z) - frame.limbus.radius
+    s = dr.clip(0.5 + 0.5 * away * frame.limbus.gain, 0, 1)
+    s = s * s * (3 - 2 * s)
+    return frame.limbus.albedo + s * (sclera - frame.limbus.albedo)

@@ -1,0 +1,63 @@
+"""Gloss of skin and of wet tissue: films of oil and tears, whose highlights have the shape of their roughness."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+_F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
+_ROUGH_OIL, _THINNER = 0.05, 0.15  # roughness of a film of oil at a gloss of 0.5, and how much it grows per gloss below
+_ROUGH_WET = 0.02
+_WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
+_RIPPLES = ((0.13, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
+
+
+def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, gloss: mi.Float) -> mi.Float:
+    """Mirror-like reflectance f (1/sr) of skin (gloss below 0.5) and of wet tissue (above), about a `glossy_normal`.
+
+        f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
+
+    with h half way between lamp and camera (GGX: Walter et al. 2007; the visibility term: Kelemen, Szirmay-Kalos 2001;
+    F: Schlick 1994). The roughness a of skin stands for what is finer than its map, so no oil on it mirrors like
+    water; it is rougher the thinner the film. Oil on tears, which makes their gloss higher than `_WATER`, mirrors more.
+    """
+    wet = gloss > 0.5
+    half = dr.normalize(to_lamp + to_camera)
+    lh = dr.maximum(dr.dot(to_lamp, half), 0.05)
+    nh = dr.maximum(dr.dot(normal, half), 0)
+    water = (2 * gloss - 1) * (1 + 10 * dr.maximum(gloss - _WATER, 0))
+    weight = dr.select(wet, water, gloss * (1 / 0.45))
+    D = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL + _THINNER * (0.5 - gloss)))
+    return weight * D * _schlick(lh, dr.select(wet, _F0_TEARS, _F0_OIL)) * 0.25 / (lh * lh)
+
+
+def _ggx(nh: mi.Float, a: mi.Float) -> mi.Float:
+    """Distribution D (1/sr) of the normals of a surface of roughness a."""
+    a2 = a * a
+    base = nh * nh * (a2 - 1) + 1
+    return a2 * dr.inv_pi / (base * base)
+
+
+def glossy_normal(normal: mi.Vector3f, gloss: mi.Float) -> mi.Vector3f:
+    """Normal (eye frame) of what mirrors: of skin itself, or of the tear film on wet tissue."""
+    return dr.select(gloss > 0.5, film_normal(normal), normal)
+
+
+def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
+    """Normal of the tear film (eye frame); the uneven conjunctiva below it breaks up its highlights."""
+    tilted = normal
+    for slope, wave in _RIPPLES:
+        p, q = wave * (71 * normal.y + 23 * normal.z), wave * (67 * normal.z - 29 * normal.y)
+        tilted = tilted + slope * mi.Vector3f(0, dr.sin(p + 1.7 * dr.sin(q)), dr.sin(q + 1.7 * dr.sin(p)))
+    return dr.normalize(tilted)
+
+
+def film_reflectance(cosine: mi.Float, gloss: mi.Float) -> mi.Float:
+    """Share of the light from wide surroundings that the film of wet tissue mirrors."""
+    return (2 * gloss - 1) * _schlick(dr.clip(cosine, 0, 1), mi.Float(_F0_TEARS))
+
+
+def _schlick(cosine: mi.Float, f0: mi.Float) -> mi.Float:
+    s = 1 - cosine
+    s2 = s * s
+    return f0 + (1 - f0) * s2 * s2 * s
