@@ -101,13 +101,13 @@ def test_a_cylinder_of_water_mirrors_as_much_as_an_ideal_one(renderer, monkeypat
     # spreads this along the axis: slopes of GGX have the density 1 / (2 a) at 0, and a tilt m turns the mirrored ray
     # by 2 m cos(i). The camera at right angles to the axis sees E F r / (8 a).
     monkeypatch.setattr(glossiness, "_RIPPLES", ())
-    rough = region._ROUGH_WET
+    rough = glossiness._ROUGH_WET
     turn = np.linspace(-0.6, 0.6, 40001)
     normal = mi.Vector3f(*np.stack([np.cos(turn), np.sin(turn), 0 * turn]).astype(np.float32))
-    full, gloss = 2 * region._WATER - 1, mi.Float(region._WATER)
+    full, gloss = 2 * glossiness._WATER - 1, mi.Float(glossiness._WATER)
     for half in (0.0, 0.15, 0.4):  # half of the angle between lamp and camera
         lamp, camera = (np.array([np.cos(s), np.sin(s), 0.0]) for s in (half, -half))
-        f = region.sheen(normal, mi.Vector3f(*lamp.tolist()), mi.Vector3f(*camera.tolist()), gloss).numpy()
+        f = glossiness.sheen(normal, mi.Vector3f(*lamp.tolist()), mi.Vector3f(*camera.tolist()), gloss).numpy()
         lit = np.maximum(np.cos(turn - half), 0) * np.maximum(np.cos(turn + half), 0) * f
         reflectance = 0.0202 + (1 - 0.0202) * (1 - np.cos(half)) ** 5  # of water, close to the mirror's angle
         seen = np.sum(lit) * (turn[1] - turn[0])
