@@ -1,4 +1,7 @@
+from . import dataset as dataset
 from . import gaze as gaze
+from . import region as region
+from . import rig as rig
 from .analytic.observer import AnalyticObserver as AnalyticObserver
 from .analytic.observer import trace as trace
 from .applications.quickstart import compare_folder as compare_folder

@@ -268,13 +268,17 @@ assert not [m for m in ("numba", "cv2", "mitsuba") if m in sys.modules]
     assert (tmp_path / "out.json").stat().st_size > 0
 
 
-@pytest.mark.parametrize("package", [eyerender, eyerender.gaze], ids=lambda package: package.__name__)
+@pytest.mark.parametrize(
+    "package",
+    [eyerender, eyerender.dataset, eyerender.gaze, eyerender.region, eyerender.rig],
+    ids=lambda package: package.__name__,
+)
 def test_every_public_name_of_the_stub_loads(package):
     stub = Path(package.__file__).with_suffix(".pyi")
     imports = [node for node in ast.parse(stub.read_text()).body if isinstance(node, ast.ImportFrom)]
     names = [alias.name for node in imports for alias in node.names]
     assert package.__all__ == dir(package) == sorted(set(names))
-    assert len(names) == len(set(names)) > 20
+    assert len(names) == len(set(names)) > 5
     for name in names:
         assert getattr(package, name) is not None
 
