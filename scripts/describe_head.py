@@ -51,7 +51,14 @@ def example(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     eye = load_eye("E2").build()
     limbus, centre = float(eye.limbus_radius_mm), np.asarray(eye.sclera.centre_mm)
-    globe = Globe(eye.front[0], limbus, centre, float(eye.sclera.radius_mm), np.eye(3), np.zeros(3))
+    globe = Globe(
+        cornea=eye.front[0],
+        limbus_radius_mm=limbus,
+        centre_mm=centre,
+        radius_mm=float(eye.sclera.radius_mm),
+        M=np.eye(3),
+        t=np.zeros(3),
+    )
     mesh = region_mesh(Region(), globe)
     lines, start = [], 1
     for name in PARTS:

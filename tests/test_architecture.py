@@ -148,7 +148,7 @@ def test_sub_packages_of_the_renderer_have_one_direction():
                 assert RENDERING.index(there[2]) < RENDERING.index(parts[1]), f"{path}:{line}: {name}"
 
 
-def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+def circles(graph: dict[str, set[str]]) -> list[tuple[str, ...]]:
     """Modules that import each other by way of others: those left when all that import nothing left are taken away."""
     left = {name: set(used) for name, used in graph.items()}
     while ends := [name for name, used in left.items() if not used & set(left)]:

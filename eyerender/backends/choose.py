@@ -32,7 +32,7 @@ KERNELS = "DRJIT_CACHE_DIR"
 VARIANTS: dict[BackendName, str] = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono"}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Backend:
     """The backend with which this process renders.
 

@@ -15,7 +15,7 @@ from .probe import cpu_name
 from .remedies import llvm_fix
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorReport:
     """State of an installation: `ok` where a backend renders, `chosen` the one that "auto" takes."""
 

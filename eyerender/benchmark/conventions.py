@@ -15,7 +15,7 @@ from ..geometry.ellipse import Ellipse
 from ..storage.files import shown
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Conventions:
     """Conventions of an extractor for places, axes and angles; the defaults are this package's own.
 

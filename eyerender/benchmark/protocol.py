@@ -90,7 +90,7 @@ class Request:
         return json.dumps({**data, "hints": dict(self.hints)}, allow_nan=False) + "\n"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
     """Result of an extractor, in this package's conventions.
 
@@ -123,7 +123,15 @@ class Reply:
         if data.get("id") != request_id:
             raise InputError(f"must be {request_id}, not {shown(data.get('id'))}", path="id")
         if data.get("error") is not None:
-            return cls(None, None, None, (), None, None, _words(data["error"]) or "no reason given")
+            return cls(
+                ellipse=None,
+                reason=None,
+                confidence=None,
+                glints=(),
+                cpu_s=None,
+                wall_s=None,
+                error=_words(data["error"]) or "no reason given",
+            )
         record = data.get("record")
         if not isinstance(record, dict) or not isinstance(record.get("pupil"), dict):
             raise InputError("must hold the pupil", path="record")
@@ -135,12 +143,12 @@ class Reply:
             raise InputError(f"must be 'ok' or 'missing', not {shown(pupil.get('status'))}", path="pupil.status")
         reason = pupil.get("reason")
         return cls(
-            ellipse,
-            _words(reason) if reason else None,
-            _optional(pupil.get("confidence"), "pupil.confidence"),
-            _glints(record.get("glints"), conventions),
-            _optional(data.get("cpu_s"), "cpu_s"),
-            _optional(data.get("wall_s"), "wall_s"),
+            ellipse=ellipse,
+            reason=_words(reason) if reason else None,
+            confidence=_optional(pupil.get("confidence"), "pupil.confidence"),
+            glints=_glints(record.get("glints"), conventions),
+            cpu_s=_optional(data.get("cpu_s"), "cpu_s"),
+            wall_s=_optional(data.get("wall_s"), "wall_s"),
         )
 
 

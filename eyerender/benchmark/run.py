@@ -185,7 +185,15 @@ def _thumbnails(run: Run, images: Sequence[LabelledImage]) -> list[Thumbnail]:
         for k in which[:THUMBNAILS]:
             image, _, _ = read_any_image(images[k].path)
             text = f"{outcome}: {reason}; {images[k].name}"
-            out.append(Thumbnail(run.extractor.name, text, image, images[k].pupil, run.scores[k].ellipse))
+            out.append(
+                Thumbnail(
+                    extractor=run.extractor.name,
+                    text=text,
+                    image=image,
+                    truth=images[k].pupil,
+                    found=run.scores[k].ellipse,
+                )
+            )
     return out
 
 

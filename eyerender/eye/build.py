@@ -128,7 +128,12 @@ def surface_of(placed: PlacedSpec) -> Surface:
         conic_constant = shape.conic_constant if isinstance(shape, ConicSpec) else 0.0
         return Quadric.conic(shape.radius_mm, conic_constant, position, rotation)
     if isinstance(shape, BiconicSpec):
-        return Biconic(position, rotation, np.array(shape.radii_mm), np.array(shape.conic_constants))
+        return Biconic(
+            origin_mm=position,
+            rotation=rotation,
+            radii_mm=np.array(shape.radii_mm),
+            conic_constants=np.array(shape.conic_constants),
+        )
     if isinstance(shape, ZernikeSpec):
         return zernike_surface(shape).placed(position, rotation)
     if isinstance(shape, GridSpec):

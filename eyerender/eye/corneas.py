@@ -46,7 +46,16 @@ def grid_surface(shape: GridSpec) -> GridSurface:
 
     def on_biconic(outer: Floats, rest: Floats) -> GridSurface:
         coefficients = spline_coefficients(rest)[None]
-        return GridSurface(origin, np.eye(3), outer, _window(zone), middle, spacing, np.array(0), coefficients)
+        return GridSurface(
+            origin_mm=origin,
+            rotation=np.eye(3),
+            outer=outer,
+            window_mm=_window(zone),
+            centre_mm=middle,
+            spacing_mm=spacing,
+            row=np.array(0),
+            table=coefficients,
+        )
 
     # On a plane first (a biconic of no curvature), only to find the biconic.
     flat = np.array([np.inf, np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])

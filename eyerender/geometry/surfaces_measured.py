@@ -329,7 +329,16 @@ class GridSurface(Measured):
             whole[pad : pad + surface.table.shape[-1], pad : pad + surface.table.shape[-1]] = surface.coefficients_mm
         parts = zip(*(surface._parts()[:-2] for surface in surfaces), strict=True)
         o, r, outer, window, centre, spacing = (stacked(part) for part in parts)
-        return cls(o, r, outer, window, centre, spacing, np.arange(len(surfaces)), table)
+        return cls(
+            origin_mm=o,
+            rotation=r,
+            outer=outer,
+            window_mm=window,
+            centre_mm=centre,
+            spacing_mm=spacing,
+            row=np.arange(len(surfaces)),
+            table=table,
+        )
 
 
 def splines(share: Floats, spacing: FloatLike, second: bool) -> tuple[Floats, ...]:

@@ -51,7 +51,7 @@ class FeatureErrors(ArrayValue):
         }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
     """Analytic and image-derived observations of the same frames, with feature errors and gaze errors of both.
 
@@ -167,7 +167,15 @@ def compare(
         except InputError as error:
             gaze.append(None)
             reason = str(error)
-    return Comparison(truth, found, feature_errors(truth, found), name, gaze[0], gaze[1], reason)
+    return Comparison(
+        truth=truth,
+        found=found,
+        features=feature_errors(truth, found),
+        estimator=name,
+        gaze_truth=gaze[0],
+        gaze_found=gaze[1],
+        gaze_reason=reason,
+    )
 
 
 def _distances(errors: Floats) -> dict[str, Any]:

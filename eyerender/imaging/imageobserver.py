@@ -42,7 +42,7 @@ _BATCH = 256
 LEAST_FOR_POOL = 128
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ImageObserver:
     """The observer of pixels: the pupil ellipse and the glints that the extractor finds; it never uses the truth.
 
@@ -274,7 +274,7 @@ def detect(
     """
     several = [images] if isinstance(images, EyeImage) else images
     told = (replace(image, frame=image.frame.seen_by(rig)) for image in several)
-    return ImageObserver(settings or ExtractionSettings()).observe_images(told)
+    return ImageObserver(settings=settings or ExtractionSettings()).observe_images(told)
 
 
 def scene_of(folder: ImageFolder) -> Scene:

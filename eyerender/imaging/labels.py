@@ -30,7 +30,7 @@ _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EyeInWindow:
     """An eye in a window, without the image: row `row` of frames, its `camera` and `window`.
 
@@ -51,7 +51,7 @@ class EyeInWindow:
         index, scene = frames.index, frames.scene
         camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
         M, t = eye_motion(frames, row)
-        return cls(row, camera, scene.window(camera, head, side), scene.eye(EYES[side]), M, t)
+        return cls(row=row, camera=camera, window=scene.window(camera, head, side), eye=scene.eye(EYES[side]), M=M, t=t)
 
 
 def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ..storage.files import written
 from .imageobserver import ImageObserver, colour_warning
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class VideoSummary:
     """How many frames a video has, how many pupils were looked for in them, and how many were found."""
 
@@ -90,7 +90,9 @@ def observe_video(
                 progress(count, max(reader.count, count), "")
     if coloured and warn is not None:
         warn([colour_warning(coloured, "frames")])
-    return VideoSummary(str(path), count, pupils, ok, None if output is None else str(output))
+    return VideoSummary(
+        source=str(path), frames=count, pupils=pupils, found=ok, records=None if output is None else str(output)
+    )
 
 
 def _line(record: dict[str, Any], time_s: float, found: Extraction) -> bytes:

@@ -70,7 +70,7 @@ class Order:
     extract: bool = True
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Shown:
     """An answer to an order: a picture, or what prevents it.
 
@@ -106,7 +106,7 @@ class Shown:
 Deliver = Callable[[Shown], None]
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, kw_only=True)
 class _Canvas:
     """The work on one order: the mean of its passes."""
 
@@ -151,7 +151,7 @@ class Pace:
         self._times.clear()
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, kw_only=True)
 class Painter:
     """Renders the orders of all tabs with one renderer; `start` it, and `close` it in the end.
 
@@ -195,7 +195,7 @@ class Painter:
         with self._changed:
             tab = self._tabs.get(key)
             if tab is not None:
-                tab.canvas, tab.fresh = _Canvas(order, time.monotonic()), True
+                tab.canvas, tab.fresh = _Canvas(order=order, since=time.monotonic()), True
                 self._changed.notify()
 
     def drop(self, key: str) -> None:
@@ -228,7 +228,7 @@ class Painter:
                     if not self._stopped:
                         tab.deliver(shown)
             except Exception as error:
-                tab.deliver(Shown(canvas.order.number, problem=line_of(error)))
+                tab.deliver(Shown(number=canvas.order.number, problem=line_of(error)))
                 canvas.samples = self.goal
             if fresh:
                 canvas.since = time.monotonic()

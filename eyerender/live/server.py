@@ -56,7 +56,7 @@ def serve(
         BackendError: no backend renders.
     """
     with _listening(port) as listener:
-        painter = Painter(backend, threads)
+        painter = Painter(backend=backend, threads=threads)
         deadline = threading.Timer(_ENDING_S, _end)
         deadline.daemon = True
         try:

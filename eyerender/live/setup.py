@@ -18,7 +18,7 @@ from ..scene.scene import demand_d
 from ..scene.spec import MOST_ACCOMMODATION_D, EyeDirection, SceneSpec
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
     """A scene with one fixation and one head position, taken from a scene that may have many.
 
@@ -48,7 +48,7 @@ class Setup:
         if spec.person is not None or spec.subject.accommodation_d == "targets":
             demand = min(demand_d(spec, scene.targets_mm), MOST_ACCOMMODATION_D)
             scene = scene.with_({"subject.accommodation_d": demand})
-        start = cls(spec, scene, spec.subject.eyes[0])
+        start = cls(origin=spec, scene=scene, eye=spec.subject.eyes[0])
         return start.following(0).with_head(0)
 
     @property

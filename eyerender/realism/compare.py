@@ -55,7 +55,14 @@ def measure_folder(
         rows.append((name, measure(picture, scaled)))
         tiles.append(_tile(scaled))
     return FolderFigures(
-        str(path), len(source.names), known, origin, source.landmarks, tuple(rows), tuple(skipped), tuple(tiles)
+        path=str(path),
+        images=len(source.names),
+        gamma=known,
+        gamma_from=origin,
+        landmarks=source.landmarks,
+        rows=tuple(rows),
+        skipped=tuple(skipped),
+        tiles=tuple(tiles),
     )
 
 

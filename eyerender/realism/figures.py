@@ -67,7 +67,7 @@ class EyePicture:
     parts: Bytes | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Scaled:
     """A picture with linear levels in which R is 50 px, with the distances of its pixels from the eye.
 

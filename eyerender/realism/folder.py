@@ -59,7 +59,7 @@ class Source:
         return "masks" if self.entries else "found in the picture"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FolderFigures:
     """The figures of a folder.
 

@@ -25,7 +25,13 @@ def write(path: Path, found: Sequence[FolderFigures], ratios: Mapping[str, float
     sections += [Section(f"Pictures of {f.path}", text=[_about(f)], figures=_montage(f)) for f in found]
     skipped = [[f.path, s.name, s.reason] for f in found for s in f.skipped[:50]]
     if skipped:
-        table = Table(("folder", "image", "reason"), skipped, "Images that were not measured", (2,), folded=True)
+        table = Table(
+            header=("folder", "image", "reason"),
+            rows=skipped,
+            caption="Images that were not measured",
+            wide=(2,),
+            folded=True,
+        )
         sections.append(Section("Not measured", tables=[table]))
     cards = [Card(f"{len(f.rows)} of {f.images}", f"images of {f.path} measured") for f in found]
     lead = [
@@ -64,7 +70,7 @@ def _table(found: Sequence[FolderFigures], ratios: Mapping[str, float | None] | 
         if ratios is not None:
             row.append(text(ratios[name]))
         rows.append([*row, meaning])
-    return Table(header, rows, wide=(len(header) - 1,))
+    return Table(header=header, rows=rows, wide=(len(header) - 1,))
 
 
 def _cell(f: FolderFigures, name: str) -> str:

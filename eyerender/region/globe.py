@@ -22,7 +22,7 @@ _POLAR, _TURNS = 241, 96
 _WIDEST = np.radians(40.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Globe(ArrayValue):
     """A posed globe.
 
@@ -51,7 +51,14 @@ class Globe(ArrayValue):
     @classmethod
     def sphere(cls, radius_mm: float = 12.0, depth_mm: float = 13.0) -> Globe:
         """Make an average globe at rest, without a cornea."""
-        return cls(None, 0.0, np.array([-depth_mm, 0.0, 0.0]), radius_mm, np.eye(3), np.zeros(3))
+        return cls(
+            cornea=None,
+            limbus_radius_mm=0.0,
+            centre_mm=np.array([-depth_mm, 0.0, 0.0]),
+            radius_mm=radius_mm,
+            M=np.eye(3),
+            t=np.zeros(3),
+        )
 
     @property
     def centre(self) -> Floats:

@@ -43,7 +43,7 @@ _SOFT_MM = 9.0
 _ON_GLOBE = (1.0, 0.8, 0.5, 0.2)  # share of the globe's normal in those of the conjunctiva's first rows
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Sheet(ArrayValue):
     """The posed sheet.
 
@@ -87,7 +87,14 @@ def sheet(spec: Region, globe: Globe) -> Sheet:
     share, first = np.array(_ON_GLOBE)[:, None, None], slice(len(_ON_GLOBE))
     normals[first] = unit(share * unit(fine[first] - globe.centre) + (1 - share) * normals[first])
     coarse, coarse_normals = sealed(beyond[2:]), sealed(normals_beyond[2:])
-    return Sheet(sealed(fine), sealed(normals), coarse, coarse_normals, c, frozen(lash_line))
+    return Sheet(
+        fine=sealed(fine),
+        fine_normals=sealed(normals),
+        coarse=coarse,
+        coarse_normals=coarse_normals,
+        contour=c,
+        lash_line=frozen(lash_line),
+    )
 
 
 def halved(grid: Floats) -> Floats:

@@ -88,7 +88,16 @@ def skin_map(spec: Region) -> Singles:
     height = np.empty((SHEET_ROWS, _COLUMNS), np.float32)
     for first in range(0, SHEET_ROWS, _STRIP):
         k = slice(first, first + _STRIP)
-        strip = _Strip(tiles, y[k], z[k], out_mm[k], rows[k, None].astype(np.float32), turn[None, :], slow, k)
+        strip = _Strip(
+            tiles=tiles,
+            y=y[k],
+            z=z[k],
+            out_mm=out_mm[k],
+            rows=rows[k, None].astype(np.float32),
+            turn=turn[None, :],
+            slow=slow,
+            strip=k,
+        )
         out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k])
     _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
     _normalise(out[:SHEET_ROWS, :, 0], y, z, rows, spec.skin.albedo)
@@ -288,7 +297,7 @@ def _hollows(behind: Padded, y: Singles, z: Singles) -> Singles:
     return np.asarray(np.clip(0.05 * Places(153, y, z, 153.0).sample(behind), -0.05, 0.25))
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Strip:
     """Some rows of the map: all of it is made for them, except the slopes.
 

@@ -28,7 +28,7 @@ _PANELS = 4
 _MOST = 24  # thumbnails of an extractor
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Thumbnail:
     """A failure: the extractor, what failed, the image (h, w), the true pupil and the reported one."""
 
@@ -79,7 +79,12 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
         Section("How this was made", _how(data), tables=(_convention_table(entries),)),
     ]
     if data["not_run"]:
-        table = Table(("extractor", "why"), [(e["name"], e["reason"]) for e in data["not_run"]], "Not run", wide=(1,))
+        table = Table(
+            header=("extractor", "why"),
+            rows=[(e["name"], e["reason"]) for e in data["not_run"]],
+            caption="Not run",
+            wide=(1,),
+        )
         sections[3] = replace(sections[3], tables=(_failure_table(entries), table))
     write_page(path, Page(f"{data['folder']}: extractors compared", lead, cards, sections))
 
@@ -267,7 +272,7 @@ def _pupil_table(entries: Sequence[Row]) -> Table:
         "milliseconds per image on one core, without reading the image; in brackets the round trip, if an extractor "
         "does not report its own time."
     )
-    return Table(header, rows, caption)
+    return Table(header=header, rows=rows, caption=caption)
 
 
 def _rate_table(entries: Sequence[Row]) -> Table:
@@ -279,7 +284,7 @@ def _rate_table(entries: Sequence[Row]) -> Table:
         worst = s["centre_px_of_all_found"]
         rows.append((e["name"], *rates, absent, _px(worst["p95"]), _px(worst["worst"])))
     header = ("extractor", "right", "wrong", "none", "error", "pupil where none is", "all found: 95 %", "worst")
-    return Table(header, rows, "Rates, and the centre errors (px) including wrong pupils.")
+    return Table(header=header, rows=rows, caption="Rates, and the centre errors (px) including wrong pupils.")
 
 
 def _glint_table(entries: Sequence[Row]) -> Table:
@@ -298,10 +303,10 @@ def _glint_table(entries: Sequence[Row]) -> Table:
         )  # fmt: skip
     header = ("extractor", "found", "recall", "precision", "identity swaps", "error: median", "95 %")
     return Table(
-        header,
-        rows,
-        "Glints: a reported glint matches a true one within 2 px. Errors are in px. Swaps: matches with the wrong "
-        "light, of the matches with a light. A dash means that the extractor does not look for glints.",
+        header=header,
+        rows=rows,
+        caption="Glints: a reported glint matches a true one within 2 px. Errors are in px. Swaps: matches with the wrong"
+        " light, of the matches with a light. A dash means that the extractor does not look for glints.",
     )
 
 
@@ -326,7 +331,7 @@ def _factor_table(data: Row, name: str) -> Table:
         "wrong", "none", "error", "centre: median", "95 %", "bias x", "bias y", "efficiency", "boundary",
         "glint recall",
     )  # fmt: skip
-    return Table(header, rows, f"By {what['what']}", folded=True)
+    return Table(header=header, rows=rows, caption=f"By {what['what']}", folded=True)
 
 
 def _failure_table(entries: Sequence[Row]) -> Table:
@@ -336,7 +341,9 @@ def _failure_table(entries: Sequence[Row]) -> Table:
         for f in e["failures"]
     ]  # fmt: skip
     caption = "Every reason why an image has no right pupil." if rows else "Every extractor found every pupil right."
-    return Table(("extractor", "outcome", "images", "reason", "first image"), rows, caption, wide=(3,))
+    return Table(
+        header=("extractor", "outcome", "images", "reason", "first image"), rows=rows, caption=caption, wide=(3,)
+    )
 
 
 def _convention_table(entries: Sequence[Row]) -> Table:
@@ -349,9 +356,9 @@ def _convention_table(entries: Sequence[Row]) -> Table:
         )  # fmt: skip
         rows.append((e["name"], e["given"], e["says"] or "-", words))
     return Table(
-        ("extractor", "given as", "calls itself", "declares"),
-        rows,
-        "Declared conventions; answers are converted before they are compared.",
+        header=("extractor", "given as", "calls itself", "declares"),
+        rows=rows,
+        caption="Declared conventions; answers are converted before they are compared.",
         wide=(3,),
     )
 

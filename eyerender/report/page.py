@@ -32,7 +32,7 @@ class Figure:
     caption: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """Header, rows of text, a caption; `wide` columns (by index) hold sentences and may wrap."""
 

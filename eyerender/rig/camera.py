@@ -228,7 +228,7 @@ class Camera(Spec):
         return PinholeCamera.of(K, R, -R @ position, self.resolution_px, self.distortion, self.name)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PinholeCamera(ArrayValue):
     """A pinhole camera with lens distortion.
 
@@ -259,7 +259,9 @@ class PinholeCamera(ArrayValue):
         name: str = "camera",
     ) -> PinholeCamera:
         """Make a camera from array-like values."""
-        return cls(frozen(K), frozen(R), frozen(t), frozen(distortion), resolution_px, name)
+        return cls(
+            K=frozen(K), R=frozen(R), t=frozen(t), distortion=frozen(distortion), resolution_px=resolution_px, name=name
+        )
 
     @property
     def nodal_point_mm(self) -> Floats:

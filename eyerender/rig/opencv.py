@@ -32,7 +32,7 @@ _ONLY = "; only k1, k2, p1, p2, k3 of a pinhole camera are supported"
 _MODELS = ("plumb_bob", "rational_polynomial", "pinhole", "", None)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OpenCvCalibration:
     """What a calibration file says.
 
@@ -76,7 +76,7 @@ def read_opencv(path: str | Path) -> OpenCvCalibration:
     size = _size(data, problems)
     problems.check()
     assert K is not None
-    return OpenCvCalibration(K, distortion, R, t, size)
+    return OpenCvCalibration(K=K, distortion=distortion, R=R, t=t, size_px=size)
 
 
 def _mapping(text: str, source: str) -> dict[str, Any]:

@@ -132,7 +132,7 @@ def test_doctor_reports_both_backends_and_is_plain_data() -> None:
 
 
 def test_backend_cannot_be_changed() -> None:
-    backend = Backend("llvm", VARIANTS["llvm"], "cpu", 1, "3.9.1", "1.5.0")
+    backend = Backend(name="llvm", variant=VARIANTS["llvm"], device="cpu", threads=1, mitsuba="3.9.1", drjit="1.5.0")
     with pytest.raises(dataclasses.FrozenInstanceError):
         backend.threads = 2  # type: ignore[misc]
 

@@ -30,7 +30,7 @@ IMAGE = LabelledImage(
 
 
 def found(ellipse, glints=(), **more):
-    return Reply(ellipse, None, None, tuple(glints), None, None, **more)
+    return Reply(ellipse=ellipse, reason=None, confidence=None, glints=tuple(glints), cpu_s=None, wall_s=None, **more)
 
 
 def test_outcomes():

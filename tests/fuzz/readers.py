@@ -400,7 +400,9 @@ def main(name: str, seconds: str, seed: str, place: str) -> None:
             os._exit(0)  # libFuzzer's own end does not join the threads of Mitsuba
         proper(lambda: reader.case(data, folder / "case"))
 
-    atheris.Setup(["fuzz", *(f"-{key}={value}" for key, value in options.items()), str(folder / "corpus")], one)
+    atheris.Setup(
+        origin=["fuzz", *(f"-{key}={value}" for key, value in options.items()), str(folder / "corpus")], scene=one
+    )
     atheris.Fuzz()
 
 

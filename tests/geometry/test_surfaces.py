@@ -28,8 +28,18 @@ SURFACES = {
     "ellipsoid": Quadric.ellipsoid((10.67, 9.08, 9.09), (-10.67, 0.22, -0.22), TILT),
     "ellipsoid back": Quadric.ellipsoid((10.67, 9.08, 9.09), (-12.0, 0.22, -0.22), TILT, front=False),
     "plane": Quadric.plane((-3.6, 0.0, 0.0), TILT),
-    "biconic": Biconic(np.array([0.0, 0.22, -0.23]), TILT, np.array([7.76, 7.74]), np.array([-0.272, -0.361])),
-    "biconic back": Biconic(np.array([-7.0, 0.0, 0.0]), np.eye(3), np.array([-6.0, -6.9]), np.array([-0.8, 0.4])),
+    "biconic": Biconic(
+        origin_mm=np.array([0.0, 0.22, -0.23]),
+        rotation=TILT,
+        radii_mm=np.array([7.76, 7.74]),
+        conic_constants=np.array([-0.272, -0.361]),
+    ),
+    "biconic back": Biconic(
+        origin_mm=np.array([-7.0, 0.0, 0.0]),
+        rotation=np.eye(3),
+        radii_mm=np.array([-6.0, -6.9]),
+        conic_constants=np.array([-0.8, 0.4]),
+    ),
 }
 for _name, _shape in measured_shapes().items():
     SURFACES[_name] = surface_of(PlacedSpec(shape=_shape, position_mm=(-0.5, 0.1, -0.2), tilt_deg=(1.0, -2.0, 3.0)))
@@ -181,7 +191,12 @@ def test_the_graph_is_the_surface_with_its_derivatives(surface):
 
 
 def test_a_biconic_of_equal_meridians_is_a_conic():
-    biconic = Biconic(np.array([0.0, 0.2, -0.2]), TILT, np.array([7.8, 7.8]), np.array([-0.25, -0.25]))
+    biconic = Biconic(
+        origin_mm=np.array([0.0, 0.2, -0.2]),
+        rotation=TILT,
+        radii_mm=np.array([7.8, 7.8]),
+        conic_constants=np.array([-0.25, -0.25]),
+    )
     conic = Quadric.conic(7.8, -0.25, (0.0, 0.2, -0.2), TILT)
     points = points_on(biconic)
     assert np.abs(conic.implicit(points)).max() < 1e-13

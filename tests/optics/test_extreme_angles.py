@@ -25,7 +25,14 @@ def cornea(rng, biconics):
             turn = tilt_rotation([rng.uniform(-1.0, 1.0) if is_biconic else 0.0, *rng.uniform(-0.06, 0.06, 2)])
             if is_biconic:
                 radii = (radius, radius * rng.uniform(0.95, 1.05))
-                surfaces.append(Biconic(apex, turn, np.array(radii), rng.uniform(-0.5, 0.3, 2)))
+                surfaces.append(
+                    Biconic(
+                        origin_mm=apex,
+                        rotation=turn,
+                        radii_mm=np.array(radii),
+                        conic_constants=rng.uniform(-0.5, 0.3, 2),
+                    )
+                )
             else:
                 surfaces.append(Quadric.conic(radius, rng.uniform(-0.5, 0.3), apex, turn))
             x -= rng.uniform(0.1, 0.7)

@@ -268,10 +268,16 @@ def test_the_apparent_point_of_a_plane_is_snells():
 def test_surfaces_without_a_common_graph_are_solved_too():
     """Two biconics in different frames have no common graph; shooting serves them."""
     outer = Biconic(
-        np.array([0.0, 0.2, -0.2]), tilt_rotation([0.0, 0.02, 0.05]), np.array([7.8, 7.6]), np.array([-0.2, -0.3])
+        origin_mm=np.array([0.0, 0.2, -0.2]),
+        rotation=tilt_rotation([0.0, 0.02, 0.05]),
+        radii_mm=np.array([7.8, 7.6]),
+        conic_constants=np.array([-0.2, -0.3]),
     )
     inner = Biconic(
-        np.array([-0.55, 0.1, 0.0]), tilt_rotation([0.0, -0.03, 0.01]), np.array([6.5, 6.4]), np.array([-0.1, 0.2])
+        origin_mm=np.array([-0.55, 0.1, 0.0]),
+        rotation=tilt_rotation([0.0, -0.03, 0.01]),
+        radii_mm=np.array([6.5, 6.4]),
+        conic_constants=np.array([-0.1, 0.2]),
     )
     found = apparent_points(
         [outer, inner], [1.376, 1.336], load_eye("E4").build().stop.boundary(8), [500.0, 50.0, -90.0]

@@ -32,7 +32,13 @@ def posed(model, pose_deg, side="right"):
     M, t = rigid_motion(Poses.from_degrees(pose_deg[:1], pose_deg[1:]), eye)
     sclera = eye.sclera
     globe = Globe(
-        eye.front[0], float(eye.limbus_radius_mm), sclera.centre_mm, float(sclera.radius_mm), M[0], t[0], side == "left"
+        cornea=eye.front[0],
+        limbus_radius_mm=float(eye.limbus_radius_mm),
+        centre_mm=sclera.centre_mm,
+        radius_mm=float(sclera.radius_mm),
+        M=M[0],
+        t=t[0],
+        mirrored=side == "left",
     )
     return eye, globe
 

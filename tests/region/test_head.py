@@ -20,7 +20,9 @@ CENTRE_MM = np.array([-13.0, 0.4, 0.1])
 
 def globe(left: bool = False) -> Globe:
     centre = CENTRE_MM * (1, -1, 1) if left else CENTRE_MM
-    return Globe(None, 0.0, centre, 12.0, np.eye(3), np.zeros(3), left)
+    return Globe(
+        cornea=None, limbus_radius_mm=0.0, centre_mm=centre, radius_mm=12.0, M=np.eye(3), t=np.zeros(3), mirrored=left
+    )
 
 
 def shell(path, scale: float = 1.0) -> trimesh.Trimesh:

@@ -54,7 +54,13 @@ def test_lids_behind_the_camera_have_no_margins_in_its_picture():
     M, t = rigid_motion(Poses.from_degrees([0.0], [0.0]), eye)
     sclera = eye.sclera
     globe = Globe(
-        eye.front[0], float(eye.limbus_radius_mm), sclera.centre_mm, float(sclera.radius_mm), M[0], t[0], False
+        cornea=eye.front[0],
+        limbus_radius_mm=float(eye.limbus_radius_mm),
+        centre_mm=sclera.centre_mm,
+        radius_mm=float(sclera.radius_mm),
+        M=M[0],
+        t=t[0],
+        mirrored=False,
     )
     mesh, camera = region_mesh(scene.spec.region, globe), scene.rig.cameras[0]
     assert np.isfinite(list(lid_margins_px(mesh, camera, np.zeros(3)).values())).all()

@@ -121,13 +121,13 @@ def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
     """Posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
     sclera = eye.sclera
     return Globe(
-        eye.front[0],
-        float(eye.limbus_radius_mm),
-        np.asarray(sclera.centre_mm),
-        float(sclera.radius_mm),
-        M,
-        t,
-        eye.side == "left",
+        cornea=eye.front[0],
+        limbus_radius_mm=float(eye.limbus_radius_mm),
+        centre_mm=np.asarray(sclera.centre_mm),
+        radius_mm=float(sclera.radius_mm),
+        M=M,
+        t=t,
+        mirrored=eye.side == "left",
     )
 
 
