@@ -19,7 +19,7 @@ from eyerender.rig.light import Lamp
 from tests.support.render_oracles import cos4, rings
 from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of
 
-pytestmark = [pytest.mark.render, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.render, pytest.mark.timeout(1800)]
 
 # The exported scene has no soft rims, and no light inside tissue or through the limbus. The film of tears has an oracle
 # of its own.
@@ -102,6 +102,19 @@ def plain(renderer, monkeypatch):
     return Renderer(renderer.backend)
 
 
+def test_light_between_globe_and_background_against_path(plain, tmp_path):
+    # The bars of the long proofs below. A picture without interreflection is 5 to 6 % darker, so this test would see it.
+    job = job_in(remote(32), "E2", lights=large_lamps(LOW))
+    found = against_path(plain, job, tmp_path, 1024)
+    assert found.keys() == {"sclera", "other"}
+    for name, (away, noise) in found.items():
+        assert noise < 0.002
+        assert abs(away) < 0.005 + 2 * noise, (name, found)
+    alone = against_path(plain, replace(job, interreflection=False), tmp_path / "alone", 1024)
+    assert all(away < -0.04 for away, _ in alone.values()), alone
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_all_light_of_lamps_against_path(plain, tmp_path, case):
     # .5 % and two standard errors in rings of the iris, on sclera, and on surround or skin: those of the oracle, and in
@@ -127,6 +140,7 @@ def test_all_light_of_lamps_against_path(plain, tmp_path, case):
         assert abs(away) < 0.005 + 2 * np.hypot(noise, own), (name, found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["E2", "E4"])
 def test_a_wide_sun_against_path(plain, tmp_path, model):
     # A disc of 40 degrees instead of half a one, so that the oracle finds it behind the cornea.
@@ -136,6 +150,7 @@ def test_a_wide_sun_against_path(plain, tmp_path, model):
     assert all(abs(away) < 0.005 + 2 * noise for away, noise in found.values()), found
 
 
+@pytest.mark.slow
 def test_the_sun_before_a_face_against_path(plain, tmp_path):
     # Sharp shadows of lids, lashes and nose: the sun as it is, which the oracle cannot find behind the cornea.
     ambient = Ambient(sun=Sun(azimuth_deg=40.0, elevation_deg=30.0, irradiance_w_m2=1e3))
@@ -144,6 +159,7 @@ def test_the_sun_before_a_face_against_path(plain, tmp_path):
         assert abs(found[name][0]) < 0.005 + 2 * found[name][1], found
 
 
+@pytest.mark.slow
 def test_a_panel_against_path(plain, tmp_path):
     # Its light on the iris is that of 16 parts, which also tell how much of it is hidden from matte surfaces.
     panel = Panel(centre_mm=(210.0, 150.0, 150.0), size_mm=(240.0, 180.0), radiance_w_m2_sr=1e3)
@@ -156,6 +172,7 @@ def test_a_panel_against_path(plain, tmp_path):
     assert abs(found["sclera"][0]) < 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["disc", "office", "outdoors"])
 def test_a_map_against_path(plain, tmp_path, monkeypatch, place):
     # A disc of 40 degrees on black, and painted surroundings. The plane of the surround must end at the horizon: light

@@ -109,17 +109,17 @@ def test_lid_margins_follow_the_blink(renderer):
     assert abs(height[1]) < 1.0
 
 
-def test_moving_lids_compile_nothing_new(renderer):
+def test_moving_lids_need_no_new_kernel(renderer):
+    """Neither compiled nor read from the disk: every kernel of another pose is in memory after three frames."""
     import drjit as dr
 
-    list(images(renderer, poses=((0, 0), (5, 5)), region={}))
-    before = dr.kernel_history() if dr.flag(dr.JitFlag.KernelHistory) else None
-    del before
+    list(images(renderer, poses=((0, 0), (5, 5), (3, -4)), region={}))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         list(images(renderer, poses=((10, -12), (-14, 8)), region={"blink": 0.3}))
-        missed = [k for k in dr.kernel_history() if k.get("type") == dr.KernelType.JIT and not k["cache_hit"]]
-    assert not missed
+        kernels = [k for k in dr.kernel_history() if k.get("type") == dr.KernelType.JIT]
+    assert len(kernels) > 5
+    assert not [k for k in kernels if not k["cache_hit"] or k["cache_disk"]]
 
 
 def test_two_runs_are_the_same(renderer):
