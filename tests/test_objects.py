@@ -38,7 +38,7 @@ def test_objects_give_the_scene_of_the_file(name):
     assert made == loaded.spec
     assert made.digest() == loaded.spec.digest()
     parts = {key: getattr(made, key) for key in type(made).model_fields if key not in ("subject", "rig", "eye")}
-    scene = er.Scene(spec=er.Subject(made.eye, **rebuilt_fields(made.subject)), eye_spec=made.rig, **parts)
+    scene = er.Scene(er.Subject(made.eye, **rebuilt_fields(made.subject)), made.rig, **parts)
     assert scene.spec == loaded.spec
     assert scene == loaded
 
@@ -89,8 +89,7 @@ def test_what_is_no_value_at_all_is_refused():
 def test_an_eye_can_be_given_as_its_own_record():
     spec = er.load_eye("E2")
     inline, named = (
-        er.Scene(spec=er.Subject(er.Eye.load(model)), eye_spec=RIG, targets=er.Targets(grid=(2, 1)))
-        for model in (spec, "E2")
+        er.Scene(er.Subject(er.Eye.load(model)), RIG, targets=er.Targets(grid=(2, 1))) for model in (spec, "E2")
     )
     assert inline.eye_spec == named.eye_spec
     np.testing.assert_array_equal(er.trace(inline).pupil.points_px, er.trace(named).pupil.points_px)
@@ -150,7 +149,7 @@ def test_a_camera_in_an_eye_is_warned_of():
          "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t_mm": [0, 32, 0]}}
     )  # fmt: skip
     rig = er.Rig(cameras=(camera,), lights=RIG.lights, screen=RIG.screen)
-    scene = er.Scene(spec=er.Subject(er.Eye("E1"), ipd_mm=64), eye_spec=rig, targets=er.Targets(grid=(1, 1)))
+    scene = er.Scene(er.Subject(er.Eye("E1"), ipd_mm=64), rig, targets=er.Targets(grid=(1, 1)))
     assert any("the camera is in the right eye" in str(warning) for warning in scene.warnings())
     assert set(scene.windows().values()) == {(0, 0, 640, 480)}
 

@@ -105,7 +105,7 @@ class Frame(Frames):
     __slots__ = ()
 
 
-@dataclass(frozen=True, slots=True, init=False, kw_only=True)
+@dataclass(frozen=True, slots=True, init=False)
 class Scene:
     """A scene ready to be observed: what the scene's file says, the eye's spec and the numeric rig.
 

@@ -50,7 +50,7 @@ class Subject(SubjectSpec):
         Raises:
             InputError: a value does not fit, or a target that no pose of an eye fixates.
         """
-        return Scene(spec=self, eye_spec=rig, targets=Targets.at(targets_mm), **scene).frames()
+        return Scene(self, rig, targets=Targets.at(targets_mm), **scene).frames()
 
     def looking(self, directions_deg: ArrayLike, rig: Rig, **scene: Any) -> Frames:
         """The frames in which the optic axes of the eyes have directions, one after the other.
@@ -63,4 +63,4 @@ class Subject(SubjectSpec):
         Raises:
             InputError: a value does not fit.
         """
-        return Scene(spec=self, eye_spec=rig, poses=EyeDirection.listed(directions_deg), **scene).frames()
+        return Scene(self, rig, poses=EyeDirection.listed(directions_deg), **scene).frames()

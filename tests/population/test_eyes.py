@@ -108,7 +108,7 @@ def test_entrance_pupil_is_what_a_distant_camera_sees(people):
         position_mm=(away, y, 0.0), look_at_mm=(0.0, y, 0.0), focal_length_px=1e6, resolution_px=(400, 400)
     )
     rig = er.Rig(cameras=(camera,), lights=(er.Led(position_mm=(away, y, 10.0), radius_mm=1.0, intensity_mw_sr=1.0),))
-    scene = er.Scene(spec=subject, eye_spec=rig, poses=[{"azimuth_deg": 0.0, "elevation_deg": 0.0}])
+    scene = er.Scene(subject, rig, poses=[{"azimuth_deg": 0.0, "elevation_deg": 0.0}])
     a, b = er.trace(scene).pupil.semi_axes_px[0]
     # The image lies some 3 mm behind the cornea, and the outline is no exact ellipse.
     assert 2 * np.sqrt(a * b) * away / 1e6 == pytest.approx(person.entrance_pupil_mm(), rel=6e-4)

@@ -48,7 +48,7 @@ def test_a_scene_has_the_person_of_the_draw(scene):
     assert scene.spec.person == person
     assert scene.spec.subject.ipd_mm == person.ipd_mm
     assert scene.spec.region == person.region()
-    same = er.Scene(spec=drawn.subject(1), eye_spec=scene.spec.rig, name="x", targets=scene.spec.targets)
+    same = er.Scene(drawn.subject(1), scene.spec.rig, name="x", targets=scene.spec.targets)
     assert same.spec == scene.spec
     assert same.eye_spec == scene.eye_spec
     assert same.left_eye_spec == scene.left_eye_spec
