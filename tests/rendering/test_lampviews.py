@@ -46,7 +46,7 @@ def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_
         asked.append(views)
         return mi.Bool(False)
 
-    monkeypatch.setattr(ShadowMaps, "clear", never)
+    monkeypatch.setattr(ShadowMaps, "at", never)
     forget()
     truth = renderer.radiance(job, spp=4)
     assert asked

@@ -318,7 +318,7 @@ class _GroupShading:
         """Whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
         frame, views = self.frame, self.frame.caches.shadow_maps
         # Where the lamp's own view shows bare skin alone, only the globe may be in the way.
-        clear = views.clear(lamp.number, frame.point_to_scene(x), asked & on_sheet)
+        clear = views.at(lamp.number, frame.point_to_scene(x), asked & on_sheet)
         return lamp_blocked(frame, x, source, True, True, asked & ~clear)
 
     def add_region(self, total: mi.Float, kept: RegionSample, on_sheet: bool) -> mi.Float:

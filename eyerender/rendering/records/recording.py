@@ -1,4 +1,4 @@
-"""Functions that Dr.Jit records when they are called first, and plays back later without tracing them again."""
+"""Decorators of kernels: Python's own loops and branches, and recordings that are played back without tracing."""
 
 from __future__ import annotations
 
@@ -16,6 +16,17 @@ _R = TypeVar("_R")
 _KEPT = 16  # recordings of a function with given plain values, one for each set of sizes of its arrays
 _VARIANTS = 32  # sets of plain values for which a function keeps recordings
 _played: list[OrderedDict[Any, Any]] = []
+
+
+def syntax(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let a function loop and branch on Dr.Jit arrays: `drjit.syntax`, with the function's type and all its defaults.
+
+    Every local variable that a loop or branch reads becomes part of its state, unless `dr.hint` excludes it. Records
+    are excluded.
+    """
+    kernel = dr.syntax(function)
+    kernel.__kwdefaults__ = function.__kwdefaults__
+    return wraps(function)(kernel)
 
 
 def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:

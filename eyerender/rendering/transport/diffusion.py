@@ -317,7 +317,7 @@ class _Maker:
         def of_lamp(i: mi.UInt32, total: mi.Vector3f) -> tuple[mi.UInt32, mi.Vector3f]:
             lamp = lights[i]
             before = spread | (dr.dot(lamp.position - x, facing) > 0)
-            clear = self.frame.caches.shadow_maps.clear(i, at, before)
+            clear = self.frame.caches.shadow_maps.at(i, at, before)
             count = dr.select(before, dr.select(clear & ~spread, 1, points), 0)
 
             def at_point(k: mi.UInt32, flux: mi.Vector3f, free: mi.Float) -> tuple[mi.UInt32, mi.Vector3f, mi.Float]:

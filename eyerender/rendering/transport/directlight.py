@@ -11,9 +11,9 @@ from ..hits.interaction import EPSILON_MM, SurfaceInteraction, intersect_sphere
 from ..materials.albedo import opacity
 from ..materials.gloss import sheen
 from ..records.frame import ALL, BITS, Frame, Lamp
+from ..records.recording import syntax
 from ..records.surfaces import Surface
 from .manifold import connect
-from .shadowmaps import ShadowMaps
 
 
 def lamp_blocked(
@@ -26,6 +26,17 @@ def lamp_blocked(
     d = lamp - x
     distance = dr.norm(d)
     d /= distance
+    blocked = _globe_blocks(frame, x, d, distance, mi.Bool(sphere), mi.Bool(cornea))
+    if not frame.structure.obstacles:
+        return blocked | (frame.point_to_scene(lamp).x < frame.backdrop_x)
+    return _scene_blocks(frame, x, d, distance, blocked, active)
+
+
+@syntax
+def _globe_blocks(
+    frame: Frame, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
+) -> mi.Bool:
+    """Whether the globe blocks the way from points (eye frame) in unit directions."""
     r = x - frame.sclera.centre
     along = dr.dot(r, d)
     reach = frame.globe_reach
@@ -33,38 +44,31 @@ def lamp_blocked(
     # Where only the bulge of the cornea can block, most rays pass the sphere about it.
     way, bulge2 = frame.limbus.bulge - x, dr.square(frame.limbus.bulge_radius)
     ahead, away2 = dr.dot(way, d), dr.squared_norm(way)
-    near &= mi.Bool(sphere) | ((away2 - ahead * ahead < bulge2) & ((ahead > 0) | (away2 < bulge2)))
-    blocked = dr.if_stmt(
-        (x, r, d, distance, mi.Bool(sphere), mi.Bool(cornea)),
-        near & (mi.Bool(sphere) | mi.Bool(cornea)),
-        lambda x, r, d, distance, sphere, cornea: _globe_blocks(frame, x, r, d, distance, sphere, cornea),
-        lambda x, r, d, distance, sphere, cornea: mi.Bool(False),
-    )
-    if not frame.structure.obstacles:
-        return blocked | (frame.point_to_scene(lamp).x < frame.backdrop_x)
+    near &= sphere | ((away2 - ahead * ahead < bulge2) & ((ahead > 0) | (away2 < bulge2)))
+    blocked = mi.Bool(False)
+    if dr.hint(near & (sphere | cornea), exclude=[frame]):
+        t, met = intersect_sphere(r, d, frame.sclera.radius)
+        blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
+        front = frame.surfaces[0]
+        o, way_in = front.point_in(x), front.vector_in(d)
+        t, met = front.hit(o, way_in)
+        y = o + t * way_in
+        rho2 = y.y * y.y + y.z * y.z
+        met &= (rho2 < frame.limbus.radius * frame.limbus.radius) & (y.x > frame.limbus.floor)
+        blocked |= met & cornea & (t > EPSILON_MM) & (t < distance)
+    return blocked
+
+
+@syntax
+def _scene_blocks(
+    frame: Frame, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, blocked: mi.Bool, active: mi.Bool
+) -> mi.Bool:
+    """Whether points (eye frame) are `blocked`, or something of the scene blocks the way in unit directions."""
     ray = mi.Ray3f(mi.Point3f(frame.point_to_scene(x + EPSILON_MM * d)), frame.vector_to_scene(d))
     ray.maxt = distance * (1 - 1e-4)
-    return dr.if_stmt(
-        (blocked,),
-        active & ~blocked,
-        lambda blocked: blocked | frame.scene.ray_test(ray, coherent=True, active=True),
-        lambda blocked: blocked,
-    )
-
-
-def _globe_blocks(
-    frame: Frame, x: mi.Vector3f, r: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
-) -> mi.Bool:
-    """Whether the globe blocks the way; r is the point relative to the sclera's centre."""
-    t, met = intersect_sphere(r, d, frame.sclera.radius)
-    blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
-    front = frame.surfaces[0]
-    o, dl = front.point_in(x), front.vector_in(d)
-    t, met = front.hit(o, dl)
-    y = o + t * dl
-    rho2 = y.y * y.y + y.z * y.z
-    met &= (rho2 < frame.limbus.radius * frame.limbus.radius) & (y.x > frame.limbus.floor)
-    return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
+    if dr.hint(active & ~blocked, exclude=[frame, ray]):
+        blocked |= frame.scene.ray_test(ray, coherent=True, active=True)
+    return blocked
 
 
 def direct_light(
@@ -98,51 +102,50 @@ def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vecto
     return dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2, 0)
 
 
+@syntax
 def irradiance_at(
-    frame: Frame,
-    x: mi.Vector3f,
-    normal: mi.Vector3f,
-    other: mi.Bool,
-    u: mi.Float,
-    v: mi.Float,
-    views: ShadowMaps | None = None,
-    on_sheet: mi.Bool | bool = False,
+    frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float, *, off_globe: mi.Bool, on_sheet: mi.Bool
 ) -> tuple[mi.Float, mi.Float]:
-    """Irradiance (mW/mm^2) of points in air (eye frame) straight from all lamps, and the same without shadows.
+    """Irradiance of points in air straight from all lamps.
 
-    `other` marks points off the globe.
+    Args:
+        frame: the frame.
+        x: the points (eye frame).
+        normal: unit normals there.
+        u: place on each lamp's disc, [0, 1).
+        v: the same, second coordinate.
+        off_globe: marks points off the globe.
+        on_sheet: marks points on the outer side of a region's sheet of skin, for which the shadow maps spare rays.
 
-    u, v: place on each lamp's disc, [0, 1). on_sheet: points on the outer side of a region's sheet of skin, for which
-    the lamps' views of it spare rays.
+    Returns:
+        Irradiance (mW/mm^2), and the same without shadows.
     """
-    views = frame.caches.shadow_maps
-    sine, cosine_v = dr.sincos(v * (2 * dr.pi))
-
-    def body(i: mi.UInt32, total: mi.Float, free: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-        lamp: Lamp = frame.lights[i]
-        source = lamp.point(u, sine, cosine_v)
-        lit = irradiance(lamp, source, x, normal)
-        asked = lit > 0
-        if views is not None:
-            asked &= ~views.clear(i, frame.point_to_scene(x), asked & on_sheet)
-        blocked = lamp_blocked(frame, x, source, other, True, asked)
-        return i + 1, total + dr.select(blocked, 0, lit), free + lit
-
+    sine, cosine = dr.sincos(v * (2 * dr.pi))
     # One zero for both sums: whether Dr.Jit takes two for one varies, and with it the kernel.
     dark = mi.Float(0) * x.x
-    state, labels = (mi.UInt32(0), dark, dark), ("i", "total", "free")
-    _, total, free = dr.while_loop(
-        state, lambda i, *_: i < frame.lights.count, body, labels=labels, label="lamps on places"
-    )
+    i, total, free = mi.UInt32(0), mi.Float(dark), mi.Float(dark)
+    while dr.hint(i < frame.lights.count, label="lamps on places", exclude=[frame]):
+        lamp = frame.lights[i]
+        source = lamp.point(u, sine, cosine)
+        lit = irradiance(lamp, source, x, normal)
+        clear = shadowless(frame, i, frame.point_to_scene(x), (lit > 0) & on_sheet)
+        blocked = lamp_blocked(frame, x, source, off_globe, True, (lit > 0) & ~clear)
+        total += dr.select(blocked, 0, lit)
+        free += lit
+        i += 1
     return total, free
+
+
+def shadowless(frame: Frame, lamp: mi.UInt32, x: mi.Vector3f, on_sheet: mi.Bool) -> mi.Bool:
+    """Whether the shadow maps show that nothing stands between points of the sheet (scene's frame) and a lamp."""
+    maps = frame.caches.shadow_maps
+    return mi.Bool(False) if maps is None else maps.at(lamp, x, on_sheet)
 
 
 def lamp_light(
     frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, known: mi.Bool
 ) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     """Light of the lamps on a bare eye.
-
-    The cornea is convex: where it faces a lamp it does not shadow itself.
 
     Args:
         frame: the frame.
@@ -155,23 +158,29 @@ def lamp_light(
         Irradiance (mW/mm^2) at the first surface where it is matte, the irradiance in the plane of the iris, and failed
         paths.
     """
-    sine, cosine = dr.sincos(v * (2 * dr.pi))
-
-    def onto_matte(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        lamp: Lamp = frame.lights[i]
-        source = lamp.point(u, sine, cosine)
-        direct, _ = direct_light(lamp, source, view)
-        blocked = lamp_blocked(frame, view.point, source, view.other, ~view.cornea, direct > 0)
-        return i + 1, total + dr.select(blocked, 0, direct)
-
-    matte = view.matte & ~known
-    state = (mi.UInt32(0), mi.Float(0))
-    _, direct = dr.while_loop(
-        state, lambda i, _: matte & (i < frame.lights.count), onto_matte, labels=("i", "direct"), label="lamps"
-    )
+    direct = _onto_matte(frame, view, u, v, view.matte & ~known)
     return direct, *irradiance_through_cornea(frame, view.inner, view.lit_inside, u, v)
 
 
+@syntax
+def _onto_matte(frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, wanted: mi.Bool) -> mi.Float:
+    """Irradiance of the first surface straight from all lamps.
+
+    The cornea is convex: where it faces a lamp it does not shadow itself.
+    """
+    sine, cosine = dr.sincos(v * (2 * dr.pi))
+    i, total = mi.UInt32(0), mi.Float(0)
+    while dr.hint(wanted & (i < frame.lights.count), label="lamps", exclude=[frame, view]):
+        lamp = frame.lights[i]
+        source = lamp.point(u, sine, cosine)
+        direct, _ = direct_light(lamp, source, view)
+        blocked = lamp_blocked(frame, view.point, source, view.other, ~view.cornea, direct > 0)
+        total += dr.select(blocked, 0, direct)
+        i += 1
+    return total
+
+
+@syntax
 def irradiance_through_cornea(
     frame: Frame,
     inner: mi.Vector3f,
@@ -181,61 +190,57 @@ def irradiance_through_cornea(
     normal: mi.Vector3f | None = None,
     surfaces: tuple[Surface, ...] | None = None,
 ) -> tuple[mi.Float, mi.UInt32]:
-    """Irradiance (mW/mm^2) of all lamps at points `inner` in the plane of the iris, where `inside`; failed paths.
+    """Irradiance (mW/mm^2) of all lamps at points behind the cornea, and failed paths.
 
-    u, v: place on each lamp's disc, [0, 1). normal: unit normals at the points; None for those of the plane. surfaces:
-    those in front of the points; None for all.
+    Args:
+        frame: the frame.
+        inner: the points (eye frame).
+        inside: where they are wanted.
+        u: place on each lamp's disc, [0, 1).
+        v: the same, second coordinate.
+        normal: unit normals at the points; None for points of the plane of the iris.
+        surfaces: those in front of the points; None for all.
     """
-    bent, left, rest = mi.Float(0), mi.UInt32(ALL), inside & behind((surfaces or frame.surfaces)[-1], inner)
-    if frame.caches.iris is not None:
-        bent, left = frame.caches.iris.at(frame, inner, rest)
-    many = frame.lights.count > BITS
+    wanted = inside & behind((surfaces or frame.surfaces)[-1], inner)
+    cached, count = frame.caches.iris, frame.lights.count
+    total, left = (mi.Float(0), mi.UInt32(ALL)) if cached is None else cached.at(frame, inner, wanted)
+    many = count > BITS
     sine, cosine = dr.sincos(v * (2 * dr.pi))
-
-    def more(i: mi.UInt32, *_: object) -> mi.Bool:
-        return rest & (i < frame.lights.count)
-
-    def body(
-        i: mi.UInt32, left: mi.UInt32, bent: mi.Float, failures: mi.UInt32
-    ) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.UInt32]:
-        lamp: Lamp = frame.lights[i]
-        path = LampPath.to(frame, lamp, lamp.point(u, sine, cosine), inner, rest, normal, surfaces)
-        failed = dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
-        left &= left - 1
-        following = dr.select(many, i + 1, dr.tzcnt(left))
-        return following, left, bent + dr.select(path.blocked, 0, path.gain), failures + failed
-
     # Of the lamps whose light is not known, the next one is at the lowest bit; without bits the number is too high.
-    first = dr.select(left == 0, frame.lights.count, dr.select(many, 0, dr.tzcnt(left)))
-    state, labels = (first, left, bent, mi.UInt32(0)), ("i", "left", "bent", "failures")
-    _, _, bent, failures = dr.while_loop(state, more, body, labels=labels, label="lamps")
-    if normal is None and frame.caches.relief is not None:
-        bent *= frame.caches.relief.share(frame, inner, inside)
-    return bent, failures
+    i = dr.select(left == 0, count, dr.select(many, 0, dr.tzcnt(left)))
+    failures = mi.UInt32(0)
+    while dr.hint(wanted & (i < count), label="lamps", exclude=[frame, normal, surfaces, cached]):
+        lamp = frame.lights[i]
+        path = LampPath.find(frame, lamp, lamp.point(u, sine, cosine), inner, wanted, normal=normal, surfaces=surfaces)
+        total += dr.select(path.blocked, 0, path.gain)
+        failures += dr.select(path.failed, mi.UInt32(1), mi.UInt32(0))
+        left &= left - 1
+        i = dr.select(many, i + 1, dr.tzcnt(left))
+    relief = frame.caches.relief if normal is None else None
+    return total if relief is None else total * relief.at(frame, inner, inside), failures
 
 
+@syntax
 def irradiance_off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float) -> mi.Float:
     """Irradiance (mW/mm^2) of points before the eye (eye frame) from all lamps by way of the cornea as a mirror.
 
     u, v: place on each lamp's disc, [0, 1).
     """
     sine, cosine = dr.sincos(v * (2 * dr.pi))
-    front, reach = frame.surfaces[:1], frame.limbus.radius
-
-    def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        lamp: Lamp = frame.lights[i]
+    reach = frame.limbus.radius
+    i, total = mi.UInt32(0), mi.Float(0) * x.x
+    while dr.hint(i < frame.lights.count, label="mirrored lamps", exclude=[frame]):
+        lamp = frame.lights[i]
         source = lamp.point(u, sine, cosine)
-        path = connect(front, source, x, normal, x, reach, mi.Bool(True), mirror=True)
-        local = front[0].point_in(path.entry)
+        path = connect(frame.surfaces[:1], source, x, normal, x, reach, mi.Bool(True), mirror=True)
+        local = frame.surfaces[0].point_in(path.entry)
         out = dr.sqrt(local.y * local.y + local.z * local.z)
         there = path.found & (out < reach)
         blocked = lamp_blocked(frame, path.entry, source, True, False, there)
         blocked |= lamp_blocked(frame, path.entry, x, True, False, there & ~blocked)
         lit = lamp.radiant_intensity(path.leaving) * path.transfer * (1 - opacity(frame, out))
-        return i + 1, total + dr.select(there & ~blocked, lit, 0)
-
-    state, labels = (mi.UInt32(0), mi.Float(0) * x.x), ("i", "total")
-    _, total = dr.while_loop(state, lambda i, _: i < frame.lights.count, body, labels=labels, label="mirrored lamps")
+        total += dr.select(there & ~blocked, lit, 0)
+        i += 1
     return total
 
 
@@ -281,7 +286,7 @@ class LampPath:
     failed: mi.Bool
 
     @classmethod
-    def to(
+    def find(
         cls,
         frame: Frame,
         lamp: Lamp,

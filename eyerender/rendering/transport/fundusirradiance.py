@@ -57,7 +57,7 @@ def fundus_irradiance(frame: Frame, factors: mi.Float | None) -> FundusIrradianc
     def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         factor = dr.gather(mi.Float, factors, i * (CELLS * CELLS) + index)
         lamp = frame.lights[i]
-        path = LampPath.to(frame, lamp, lamp.position, x, factor > 0)
+        path = LampPath.find(frame, lamp, lamp.position, x, factor > 0)
         return i + 1, total + dr.select(path.blocked, 0, path.gain * factor)
 
     state = (mi.UInt32(0), mi.Float(0) * x.x)

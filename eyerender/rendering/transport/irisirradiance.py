@@ -138,12 +138,12 @@ def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) ->
 
     def body(k: mi.UInt32, total: mi.Float, whole: mi.Float, out: mi.Float, hidden: mi.Bool) -> tuple[Any, ...]:
         source = lamp.node(k, points)
-        path = LampPath.to(frame, lamp, source, x, within, ahead_mm=_AHEAD_MM)
+        path = LampPath.find(frame, lamp, source, x, within, ahead_mm=_AHEAD_MM)
         total += dr.select(path.blocked, 0, path.gain)
         usable = ~path.blocked & (points == 1)
         hidden |= path.failed
         if views is not None:
-            free = views.clear(i, frame.point_to_scene(path.entry), path.whole > 0)
+            free = views.at(i, frame.point_to_scene(path.entry), path.whole > 0)
             hidden |= path.enters & (path.blocked | ~free)
             usable &= free
         return k + 1, total, dr.select(usable, path.whole, -1), path.out, hidden

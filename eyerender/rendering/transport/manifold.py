@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..records.recording import syntax
 from ..records.surfaces import Bundle, Surface
 
 MAX_STEPS = 48
@@ -46,6 +47,7 @@ class Connection:
     failed: mi.Bool
 
 
+@syntax
 def connect(
     surfaces: tuple[Surface, ...],
     lamp: mi.Vector3f,
@@ -72,54 +74,64 @@ def connect(
         ahead_mm: how far before the last surface points may be that are met when a path is extended backwards.
     """
     front = surfaces[0]
-    start = _mirror_guess(front, lamp, aim) if mirror else _entry_guess(front, lamp, aim)
-
-    def going(y: mi.Vector3f, last: mi.Vector3f, step: mi.UInt32, on: mi.Bool, *_: object) -> mi.Bool:
-        return on
-
-    def newton(
-        y: mi.Vector3f, last: mi.Vector3f, step: mi.UInt32, on: mi.Bool, dark: mi.Bool, transfer: mi.Float
-    ) -> tuple[mi.Vector3f, mi.Vector3f, mi.UInt32, mi.Bool, mi.Bool, mi.Float]:
+    y = _mirror_guess(front, lamp, aim) if mirror else _entry_guess(front, lamp, aim)
+    last, steps, transfer = mi.Vector3f(y), mi.UInt32(0), mi.Float(0)
+    on, dark = mi.Bool(active), mi.Bool(False)
+    while dr.hint(on, label="manifold", exclude=[surfaces, front, mirror, ahead_mm]):
         y, form = front.on_surface(y)
         d = y - lamp
         distance = dr.norm(d)
         d /= distance
         e1, e2 = mi.coordinate_system(d)
-        b, passed, c = front.bend(Bundle(y, d, distance * e1, distance * e2, e1, e2), form, mirror=mirror)
-        y1, y2 = b.da, b.db
-        over = c < _GRAZING  # beyond the horizon, go half the way back
-        ok = ~over
-        for surface in surfaces[1:]:
-            b, share, good = surface.refract_bundle(b)
-            passed *= share
-            ok &= good
+        b, passed, cosine = front.bend(Bundle(y, d, distance * e1, distance * e2, e1, e2), form, mirror=mirror)
+        ya, yb = b.da, b.db
+        over = cosine < _GRAZING  # beyond the horizon, go half the way back
+        b, share, good = _refract_all(surfaces[1:], b)
         s = dr.dot(x - b.y, b.w)
-        r = x - (b.y + s * b.w)
-        a1, a2 = b.da + s * b.wa, b.db + s * b.wb
-        det = dr.dot(b.w, dr.cross(a1, a2))
-        done = on & ok & (s > -ahead_mm) & (dr.squared_norm(r) < TOLERANCE_MM * TOLERANCE_MM)
-        cosine = dr.maximum(-dr.dot(b.w, normal), 0)
-        transfer = dr.select(done, passed * cosine / dr.abs(det), transfer)
-        inv = dr.rcp(dr.select(dr.abs(det) > 1e-9, det, 1e-9))
-        move = (dr.dot(b.w, dr.cross(r, a2)) * inv) * y1 + (dr.dot(b.w, dr.cross(a1, r)) * inv) * y2
-        size = dr.norm(move)
-        move *= dr.minimum(1, _STEP_MM / dr.maximum(size, 1e-9))
+        miss = x - (b.y + s * b.w)
+        done = on & ~over & good & (s > -ahead_mm) & (dr.squared_norm(miss) < TOLERANCE_MM * TOLERANCE_MM)
+        move, det = _newton_step(b, s, miss, ya, yb)
+        transfer = dr.select(done, passed * share * dr.maximum(-dr.dot(b.w, normal), 0) / dr.abs(det), transfer)
         after = dr.select(over, 0.5 * (y + last), y + move)  # the next step brings it to the surface
-        step += 1
+        steps += 1
         local = front.point_in(y)
         out = local.y * local.y + local.z * local.z > dr.square(reach + 1)
         dark |= on & (over | out)
-        on &= ~done & (step < MAX_STEPS)
-        return dr.select(on, after, y), dr.select(on & ~over, y, last), step, on, dark, transfer
-
-    zero = mi.Float(0)
-    state = (start, mi.Vector3f(start), mi.UInt32(0), mi.Bool(active), mi.Bool(False), zero)
-    y, _, step, _, dark, transfer = dr.while_loop(
-        state, going, newton, labels=("y", "last", "step", "on", "dark", "transfer"), label="manifold"
-    )
+        on &= ~done & (steps < MAX_STEPS)
+        last = dr.select(on & ~over, y, last)
+        y = dr.select(on, after, y)
     found = mi.Bool(active) & (transfer > 0)
-    failed = mi.Bool(active) & ~found & (step >= MAX_STEPS) & ~dark
+    failed = mi.Bool(active) & ~found & (steps >= MAX_STEPS) & ~dark
     return Connection(transfer, y, dr.normalize(y - lamp), found, failed)
+
+
+def _refract_all(surfaces: tuple[Surface, ...], b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
+    """Refract a bundle at surfaces one after the other: the bundle behind them, the transmittance, and success."""
+    passed, ok = mi.Float(1), mi.Bool(True)
+    for surface in surfaces:
+        b, share, good = surface.refract_bundle(b)
+        passed *= share
+        ok &= good
+    return b, passed, ok
+
+
+def _newton_step(
+    b: Bundle, s: mi.Float, miss: mi.Vector3f, ya: mi.Vector3f, yb: mi.Vector3f
+) -> tuple[mi.Vector3f, mi.Float]:
+    """Motion of the entry point that takes the `miss` away, at most `_STEP_MM` long, and the determinant.
+
+    Args:
+        b: the bundle behind the surfaces.
+        s: distance from there to the target.
+        miss: from the ray to the target.
+        ya: motion of the entry point with the first differential.
+        yb: the same with the second.
+    """
+    a1, a2 = b.da + s * b.wa, b.db + s * b.wb
+    det = dr.dot(b.w, dr.cross(a1, a2))
+    inv = dr.rcp(dr.select(dr.abs(det) > 1e-9, det, 1e-9))
+    move = (dr.dot(b.w, dr.cross(miss, a2)) * inv) * ya + (dr.dot(b.w, dr.cross(a1, miss)) * inv) * yb
+    return move * dr.minimum(1, _STEP_MM / dr.maximum(dr.norm(move), 1e-9)), det
 
 
 def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vector3f:

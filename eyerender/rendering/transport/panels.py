@@ -10,7 +10,6 @@ where theta_k is the angle that edge k subtends and g_k the unit normal of the p
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -19,6 +18,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ..records.frame import upload_array
+from ..records.recording import syntax
 
 _WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
 
@@ -56,39 +56,33 @@ class Panels:
         centre, normal, right, up = (mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9))
         return Rectangle(centre, normal, right, up, row[12])
 
+    @syntax
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Radiance (mW/mm^2/sr) along rays of the scene's frame; overlapping panels add up."""
-
-        def met(panel: Rectangle) -> mi.Float:
+        i, total = mi.UInt32(0), mi.Float(0) * d.x
+        while dr.hint(i < self.count, label="panels", exclude=[self]):
+            panel = self[i]
             facing = -dr.dot(d, panel.normal)
             t = dr.dot(o - panel.centre, panel.normal) / dr.select(dr.abs(facing) > 1e-6, facing, 1)
             q = o + t * d - panel.centre
             inside = (dr.abs(dr.dot(q, panel.right)) < 1) & (dr.abs(dr.dot(q, panel.up)) < 1)
-            return dr.select(active & (facing > 1e-6) & (t > 0) & inside, panel.radiance, 0)
+            total += dr.select(active & (facing > 1e-6) & (t > 0) & inside, panel.radiance, 0)
+            i += 1
+        return total
 
-        return self._sum(met, mi.Float(0) * d.x, "panels")
-
+    @syntax
     def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) at points x with unit normals n of the scene's frame, unshadowed."""
-
-        def received(panel: Rectangle) -> mi.Float:
+        i, total = mi.UInt32(0), mi.Float(0) * n.x
+        while dr.hint(i < self.count, label="panel light", exclude=[self]):
+            panel = self[i]
             right, up = panel.right / dr.squared_norm(panel.right), panel.up / dr.squared_norm(panel.up)
             middle = panel.centre - x
-            seen = polygon_irradiance(
-                [middle - right - up, middle + right - up, middle + right + up, middle - right + up], n
-            )
-            return dr.select(dr.dot(middle, panel.normal) < 0, panel.radiance * seen, 0)
-
-        return self._sum(received, mi.Float(0) * n.x, "panel light")
-
-    def _sum(self, share: Callable[[Rectangle], mi.Float], zero: mi.Float, label: str) -> mi.Float:
-        def more(i: mi.UInt32, *_: object) -> mi.Bool:
-            return i < self.count
-
-        def body(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            return i + 1, total + share(self[i])
-
-        return dr.while_loop((mi.UInt32(0), zero), more, body, labels=("i", "total"), label=label)[1]
+            corners = [middle - right - up, middle + right - up, middle + right + up, middle - right + up]
+            seen = polygon_irradiance(corners, n)
+            total += dr.select(dr.dot(middle, panel.normal) < 0, panel.radiance * seen, 0)
+            i += 1
+        return total
 
 
 def polygon_irradiance(corners: list[mi.Vector3f], n: mi.Vector3f) -> mi.Float:

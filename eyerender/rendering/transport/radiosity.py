@@ -813,7 +813,7 @@ def _onto_outer(frame: Frame, tables: _Tables, first: mi.UInt32 | None, count: i
     start, facing = frame.point_to_eye(x + _START_MM * normal), frame.vector_to_eye(normal)
     u, v = (mi.Float(0), mi.Float(0)) if first is None else _spots(index + first)
     sheet = away & (index < tables.on_globe + tables.on_skin)
-    found = irradiance_at(frame, start, facing, away, u, v, on_sheet=sheet)
+    found = irradiance_at(frame, start, facing, u, v, off_globe=away, on_sheet=sheet)
     dr.eval(found)
     return found
 
@@ -914,7 +914,7 @@ def _at_spots(frame: Frame, spot: tuple[Any, ...], tables: _Tables, lanes: int) 
     def light(_: mi.Bool, x: mi.Vector3f, normal: mi.Vector3f, number: mi.UInt32) -> mi.Float:
         start = x + _START_MM * normal
         u, v = _spots(number * mi.UInt32(_SHUFFLED))
-        return irradiance_at(frame, start, normal, mi.Bool(True), u, v, on_sheet=mi.Bool(True))[0]
+        return irradiance_at(frame, start, normal, u, v, off_globe=mi.Bool(True), on_sheet=mi.Bool(True))[0]
 
     lit = dr.if_stmt(state, on_skin, light, lambda *_: mi.Float(-1))
     dr.eval(lit)

@@ -141,7 +141,7 @@ class IrisRelief:
             z = grid.interpolate(self.heights, x + z * slant, active)
         return dr.select(active, x + z * slant, x)
 
-    def share(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    def at(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """The q of the module's docstring at feet `x`."""
         active &= self.raised
         return dr.select(active, relief_grid(frame, self.count).interpolate(self.shades, x, active), 1)
@@ -269,8 +269,8 @@ def _arriving(frame: Frame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi
     normal = frame.stop.normal
     # The search for paths to other points is long, and in vain.
     reached = (frame.lights.count > 0) & behind(frame.surfaces[-1], x)
-    path = LampPath.to(frame, lamp, source, x, reached)
-    above = LampPath.to(frame, lamp, source, x + _RAISED_MM * normal, reached)
+    path = LampPath.find(frame, lamp, source, x, reached)
+    above = LampPath.find(frame, lamp, source, x + _RAISED_MM * normal, reached)
     lit = dr.select(path.blocked, 0, path.gain)
     more = dr.select(above.gain > 0, (above.gain - path.gain) / _RAISED_MM, 0)
     lateral = _arrival(frame.surfaces, source, path.entry, normal)

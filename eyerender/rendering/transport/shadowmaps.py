@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +25,7 @@ from ...geometry.vectors import crosses
 from ...region.mesh import HAIRS, RegionMesh
 from ...rig.light import Lamp
 from ..records.frame import quotient, upload_array
-from ..records.recording import recorded
+from ..records.recording import recorded, syntax
 from ..scene.region import RegionScene, SkinGeometry
 
 _CELLS = 256  # along each side of a map
@@ -62,7 +63,7 @@ class ShadowMaps:
         hairs = upload_array(pieces if len(pieces) else np.zeros(8))
         return cls(table=views, known=known, marks=_marked(views, skin, hairs, on_device, counts, len(table)))
 
-    def clear(self, lamp: mi.UInt32, x: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+    def at(self, lamp: mi.UInt32, x: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         """Whether nothing of the region stands between points of the sheet (scene's frame) and any point of a lamp."""
         place = _View.of(self.table, lamp).place(x)
         u, v = place.u, place.v
@@ -116,6 +117,7 @@ def _mark_hairs(
     _mark(marks, lamp, [p, q], thick, edge, view.scale, mi.Bool(True))
 
 
+@syntax
 def _mark(
     marks: mi.UInt8,
     lamp: mi.UInt32,
@@ -126,33 +128,26 @@ def _mark(
     marked: mi.Bool,
 ) -> None:
     """Mark the cells within `thick` and the lamp's own size of bodies with these corners, where `marked`."""
-    lowest, highest, spread = [places[0].u, places[0].v], [places[0].u, places[0].v], places[0].wide
-    for p in places[1:]:
-        spread = dr.maximum(spread, p.wide)
-        lowest = [dr.minimum(k, x) for k, x in zip(lowest, (p.u, p.v), strict=True)]
-        highest = [dr.maximum(k, x) for k, x in zip(highest, (p.u, p.v), strict=True)]
+    corners = [mi.Point2f(p.u, p.v) for p in places]
+    lowest, highest = reduce(dr.minimum, corners), reduce(dr.maximum, corners)
     # Straight edges are arcs in a map, of a radius of one unit at least.
-    slack = spread + 0.02 + (dr.square(highest[0] - lowest[0]) + dr.square(highest[1] - lowest[1])) / (8 * scale)
-    first = [mi.Int32(dr.clip(dr.floor(k - slack - thick), -1, _CELLS)) for k in lowest]
-    last = [mi.Int32(dr.clip(dr.floor(k + slack + thick), -1, _CELLS)) for k in highest]
-    columns = mi.UInt32(dr.maximum(last[0] - first[0] + 1, 0))
-    count = dr.select(marked, columns * mi.UInt32(dr.maximum(last[1] - first[1] + 1, 0)), 0)
+    size = dr.square(highest - lowest)
+    slack = reduce(dr.maximum, [p.wide for p in places]) + 0.02 + (size.x + size.y) / (8 * scale)
+    first = mi.Point2i(dr.clip(dr.floor(lowest - slack - thick), -1, _CELLS))
+    last = mi.Point2i(dr.clip(dr.floor(highest + slack + thick), -1, _CELLS))
+    columns, rows = mi.Point2u(dr.maximum(last - first + 1, 0))
+    count = dr.select(marked, columns * rows, 0)
     # What is thin covers few of the cells about it: those near the longest edge.
     reach = edge.width + slack + 0.71
-
-    def more(k: mi.UInt32) -> mi.Bool:
-        return k < count
-
-    def mark(k: mi.UInt32) -> mi.UInt32:
+    k = mi.UInt32(0)
+    while dr.hint(k < count, label="marks", exclude=[marks, edge, places]):
         row = quotient(k, columns)
-        u, v = first[0] + mi.Int32(k - row * columns), first[1] + mi.Int32(row)
+        u, v = first.x + mi.Int32(k - row * columns), first.y + mi.Int32(row)
         near = edge.distance2(mi.Float(u) + 0.5, mi.Float(v) + 0.5) < reach * reach
         inside = (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
         cell = (lamp * _CELLS + mi.UInt32(v)) * _CELLS + mi.UInt32(u)
         dr.scatter(marks, mi.UInt8(1), cell, near & inside)
-        return k + 1
-
-    dr.while_loop((mi.UInt32(0),), more, lambda k: (mark(k),), labels=("k",), label="marks")
+        k += 1
     dr.eval(marks)
 
 
