@@ -25,11 +25,11 @@ pytestmark = pytest.mark.render
 def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_mm, pose, blink):
     import mitsuba as mi
 
-    from eyerender.rendering.integrator import framebuilder as stage
     from eyerender.rendering.records.recording import forget
+    from eyerender.rendering.transport.irisirradiance import IrisIrradiance
     from eyerender.rendering.transport.shadowmaps import ShadowMaps
 
-    monkeypatch.setattr(stage, "iris_irradiance", lambda *_: None)  # which uses the views too
+    monkeypatch.setattr(IrisIrradiance, "build", lambda *_: None)  # which uses the views too
     forget()
     rig = rigs.RIGS[name](radius_mm=radius_mm)
     eye = rigs.eye_of(model, side)

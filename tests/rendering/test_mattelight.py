@@ -12,7 +12,7 @@ pytestmark = pytest.mark.render
 
 @pytest.mark.parametrize(("model", "name", "pose"), [("E2", "head", (20.0, -12.0)), ("E5", "remote", (-25.0, 10.0))])
 def test_the_grids_change_no_pixel(renderer, monkeypatch, model, name, pose):
-    from eyerender.rendering.integrator import framebuilder as stage
+    from eyerender.rendering.transport.globeirradiance import GlobeIrradiance
 
     eye, rig = rigs.eye_of(model), rigs.RIGS[name](radius_mm=0.0)
     job = rigs.job_of(eye, rig, rig.window(240, 180), pose, labels=False)
@@ -20,7 +20,7 @@ def test_the_grids_change_no_pixel(renderer, monkeypatch, model, name, pose):
     grids = renderer.bind(job)[0].frame.caches.globe
     used = [float(np.mean(grid.left.numpy() == 0)) for grid in (grids.globe, grids.plane)]
     assert min(used) > 0.2
-    monkeypatch.setattr(stage, "globe_irradiance", lambda *_: None)
+    monkeypatch.setattr(GlobeIrradiance, "build", lambda *_: None)
     truth = renderer.radiance(job, spp=4)
     for kind in (0, 1):
         error = np.abs(found / truth - 1)[part == kind]

@@ -26,11 +26,11 @@ from ..scene.head import place_scene
 from ..scene.region import RegionScene
 from ..transport.diffusion import diffused_light
 from ..transport.environment import Ambience, Maps, bright_lamps
-from ..transport.fundusirradiance import FundusIrradiance, fundus_irradiance
-from ..transport.globeirradiance import globe_irradiance
-from ..transport.irisirradiance import IrisIrradiance, iris_irradiance
+from ..transport.fundusirradiance import FundusIrradiance
+from ..transport.globeirradiance import GlobeIrradiance
+from ..transport.irisirradiance import IrisIrradiance
 from ..transport.radiosity import RadiositySolver
-from ..transport.reliefmapping import IrisRelief, ReliefShape, ReliefSize, flat_relief, lit_relief, relief_shape
+from ..transport.reliefmapping import IrisRelief, ReliefShape, ReliefSize, relief_shape
 from ..transport.shadowmaps import ShadowMaps
 from .film import BoundFrame
 from .hostdata import HostData
@@ -65,11 +65,9 @@ def _grids_behind_cornea(
     sizes: _GridSizes,
 ) -> tuple[IrisIrradiance | None, IrisRelief, FundusIrradiance]:  # fmt: skip
     """Fill the grids of the lamps' light on the iris, on its relief, and on the fundus."""
-    pupil = fundus_irradiance(frame, factors)
-    on_iris = iris_irradiance(frame, sizes.lamps, points) if sizes.gridded else None
-    if shape is None:
-        return on_iris, flat_relief(side), pupil
-    return on_iris, lit_relief(frame, shape, side, points, (sizes.nodes, sizes.points)), pupil
+    pupil = FundusIrradiance.build(frame, factors)
+    on_iris = IrisIrradiance.build(frame, sizes.lamps, points) if sizes.gridded else None
+    return on_iris, IrisRelief.build(frame, shape, side, points, (sizes.nodes, sizes.points)), pupil
 
 
 class FrameBuilder:
@@ -124,7 +122,7 @@ class FrameBuilder:
         region = place if isinstance(place, RegionScene) else None
         textures = self._textures_of(job)
         # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
-        shadow_maps = None if region is None else ShadowMaps.of(host.views, region)
+        shadow_maps = None if region is None else ShadowMaps.build(region, host.views)
         structure = Structure(
             kinds(job.eye),
             bool(np.any(job.camera.distortion)),
@@ -165,7 +163,7 @@ class FrameBuilder:
         if not place.obstructed:
             reach = dr.opaque(mi.Float, min(host.reach_mm, _FARTHEST_MM))
             points = dr.opaque(mi.UInt32, host.lamps.points)
-            frame.caches.globe = globe_irradiance(frame, reach, points, host.lamps.gridded)
+            frame.caches.globe = GlobeIrradiance.build(frame, reach, points, host.lamps.gridded)
 
     def _fill_grids(self, host: HostData, frame: Frame, place: Background | RegionScene) -> None:
         """Add the light of the lamps behind the cornea."""

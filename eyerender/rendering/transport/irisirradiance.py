@@ -14,7 +14,6 @@ radius. Before lamps that are large and near, there is no grid.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +21,7 @@ import mitsuba as mi
 from ..materials.albedo import STEEPEST, opacity
 from ..records.frame import BITS, Frame
 from ..records.irradiancegrid import BENT, IrradianceGrid, unevenness
+from ..records.recording import syntax
 from .directlight import LampPath, behind
 
 _SIDE = 80
@@ -45,6 +45,36 @@ class IrisIrradiance:
     behind_rim: mi.UInt32
     paths: mi.Float
 
+    @classmethod
+    def build(cls, frame: Frame, lamps: int, points: mi.UInt32) -> IrisIrradiance:
+        """Fill the grid over the plane of the iris.
+
+        Args:
+            frame: the frame.
+            lamps: number of lamps; 0 where none may use a grid.
+            points: number of points that stand for a lamp.
+        """
+        if not lamps:
+            none = dr.zeros(mi.UInt32, _NODES)
+            dr.make_opaque(none)
+            return cls(grid=IrradianceGrid.unknown(_SIDE), behind_rim=none, paths=dr.zeros(mi.Float, 8))
+        index = dr.arange(mi.UInt32, _NODES * lamps)
+        lamp = index // _NODES
+        lit, *paths = _at_nodes(frame, points, lamp, index - lamp * _NODES)
+        dr.eval(lit, paths)
+        rows = _four_in_a_row(paths, min(lamps, BITS), frame.lights.count)
+
+        def steady_behind_rim(k: mi.UInt32, cell: mi.UInt32, allowed: mi.Float) -> mi.Bool:
+            four = [_rows(rows, k * _NODES + cell + n * _SIDE - _SIDE) for n in range(4)]
+            whole, out = ([value for row in four for value in row[m]] for m in (0, 1))
+            bent, least, most = unevenness(whole)
+            steep = unevenness(out)[0] * most * STEEPEST * frame.limbus.gain
+            return (least > 0) & (bent + steep <= _STEADY / BENT * allowed)
+
+        grid, behind_rim = IrradianceGrid.build(_SIDE, lit, frame.lights.count, held=steady_behind_rim)
+        return cls(grid=grid, behind_rim=behind_rim, paths=rows)
+
+    @syntax
     def at(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
         """Irradiance (mW/mm^2) at points of the plane of the iris (eye frame), and the lamps that it lacks, as bits."""
         q = x - frame.stop.centre
@@ -53,54 +83,21 @@ class IrisIrradiance:
         place = self.grid.place(u, v, active)
         total, left = self.grid.at(place)
         lamps = dr.gather(mi.UInt32, self.behind_rim, place.cell, place.inside)
-
-        def add(lamps: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        while dr.hint(lamps != 0, label="behind the rim", exclude=[self, frame, place]):
             whole, out = mi.Float(0), mi.Float(0)
             first = dr.tzcnt(lamps) * _NODES + place.cell
             for k in range(4):
                 a, b = _rows(self.paths, first + k * _SIDE - _SIDE)
                 whole += place.down[k] * dr.dot(place.across, a)
                 out += place.down[k] * dr.dot(place.across, b)
-            return lamps & (lamps - 1), total + whole * (1 - opacity(frame, out))
-
-        _, total = dr.while_loop(
-            (lamps, total), lambda lamps, _: lamps != 0, add, labels=("lamps", "total"), label="behind the rim"
-        )
+            lamps &= lamps - 1
+            total += whole * (1 - opacity(frame, out))
         return total, left
 
 
 def _half(frame: Frame) -> mi.Float:
     """Half the width of the grid, mm."""
     return frame.iris.root_radius + _SPARE_MM
-
-
-def iris_irradiance(frame: Frame, lamps: int, points: mi.UInt32) -> IrisIrradiance:
-    """Fill the grid over the plane of the iris.
-
-    Args:
-        frame: the frame.
-        lamps: number of lamps; 0 where none may use a grid.
-        points: number of points that stand for a lamp.
-    """
-    if not lamps:
-        none = dr.zeros(mi.UInt32, _NODES)
-        dr.make_opaque(none)
-        return IrisIrradiance(grid=IrradianceGrid.unknown(_SIDE), behind_rim=none, paths=dr.zeros(mi.Float, 8))
-    index = dr.arange(mi.UInt32, _NODES * lamps)
-    lamp = index // _NODES
-    lit, *paths = _at_nodes(frame, points, lamp, index - lamp * _NODES)
-    dr.eval(lit, paths)
-    rows = _four_in_a_row(paths, min(lamps, BITS), frame.lights.count)
-
-    def steady_behind_rim(k: mi.UInt32, cell: mi.UInt32, allowed: mi.Float) -> mi.Bool:
-        four = [_rows(rows, k * _NODES + cell + n * _SIDE - _SIDE) for n in range(4)]
-        whole, out = ([value for row in four for value in row[m]] for m in (0, 1))
-        bent, least, most = unevenness(whole)
-        steep = unevenness(out)[0] * most * STEEPEST * frame.limbus.gain
-        return (least > 0) & (bent + steep <= _STEADY / BENT * allowed)
-
-    grid, behind_rim = IrradianceGrid.build(_SIDE, lit, frame.lights.count, held=steady_behind_rim)
-    return IrisIrradiance(grid=grid, behind_rim=behind_rim, paths=rows)
 
 
 def _four_in_a_row(paths: list[mi.Float], lamps: int, count: mi.UInt32) -> mi.Float:
@@ -120,36 +117,35 @@ def _rows(paths: mi.Float, node: mi.UInt32) -> tuple[mi.Vector4f, mi.Vector4f]:
     return dr.gather(mi.Vector4f, paths, 2 * node), dr.gather(mi.Vector4f, paths, 2 * node + 1)
 
 
+@syntax
 def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Irradiance of lamps i at nodes, the same behind a clear rim, and the radius (mm) where it enters.
 
     Where anything may hide the lamps, or a path was not found, irradiances are negative. Behind a clear rim, that of a
     lamp with several points is so, too.
     """
-    stop, half, views = frame.stop, _half(frame), frame.caches.shadow_maps
+    half, lamp = _half(frame), frame.lights[i]
     row = node // _SIDE
-    a, b = (half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (node - row * _SIDE, row))
-    x = stop.centre + a * stop.u + b * stop.v
-    lamp = frame.lights[i]
+    column = node - row * _SIDE
+    a, b = (half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (column, row))
+    x = frame.stop.centre + a * frame.stop.u + b * frame.stop.v
     within = (a * a + b * b < dr.square(half)) & behind(frame.surfaces[-1], x, _AHEAD_MM)
-
-    def more(k: mi.UInt32, *_: object) -> mi.Bool:
-        return within & (k < points)
-
-    def body(k: mi.UInt32, total: mi.Float, whole: mi.Float, out: mi.Float, hidden: mi.Bool) -> tuple[Any, ...]:
-        source = lamp.node(k, points)
-        path = LampPath.find(frame, lamp, source, x, within, ahead_mm=_AHEAD_MM)
+    k, total, whole, out, hidden = mi.UInt32(0), mi.Float(0), mi.Float(-1), mi.Float(0), mi.Bool(False)
+    while dr.hint(within & (k < points), label="grid of the iris", exclude=[frame, lamp]):
+        path = LampPath.find(frame, lamp, lamp.node(k, points), x, within, ahead_mm=_AHEAD_MM)
+        shadow, usable = _shadow(frame, i, path)
         total += dr.select(path.blocked, 0, path.gain)
-        usable = ~path.blocked & (points == 1)
-        hidden |= path.failed
-        if views is not None:
-            free = views.at(i, frame.point_to_scene(path.entry), path.whole > 0)
-            hidden |= path.enters & (path.blocked | ~free)
-            usable &= free
-        return k + 1, total, dr.select(usable, path.whole, -1), path.out, hidden
-
-    state = (mi.UInt32(0), mi.Float(0), mi.Float(-1), mi.Float(0), mi.Bool(False))
-    labels = ("k", "total", "whole", "out", "hidden")
-    _, total, whole, out, hidden = dr.while_loop(state, more, body, labels=labels, label="grid of the iris")
+        whole = dr.select(usable & (points == 1), path.whole, -1)
+        out = mi.Float(path.out)
+        hidden |= shadow
+        k += 1
     hidden |= ~within
     return dr.select(hidden, -1, total / mi.Float(points)), dr.select(hidden, -1, whole), out
+
+
+def _shadow(frame: Frame, lamp: mi.UInt32, path: LampPath) -> tuple[mi.Bool, mi.Bool]:
+    """Whether a path is in a shadow or near one, or unknown, and whether a clear rim would let it pass."""
+    if frame.caches.shadow_maps is None:
+        return path.failed, ~path.blocked
+    free = frame.caches.shadow_maps.at(lamp, frame.point_to_scene(path.entry), path.whole > 0)
+    return path.failed | (path.enters & (path.blocked | ~free)), ~path.blocked & free

@@ -24,10 +24,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..materials.albedo import iris_height
-from ..records.frame import Frame, Lights
+from ..records.frame import Frame
 from ..records.job import RenderJob
 from ..records.parameters import StopParameters
-from ..records.recording import recorded
+from ..records.recording import recorded, syntax
 from ..records.surfaces import Surface
 from .directlight import LampPath, behind
 
@@ -126,6 +126,32 @@ class IrisRelief:
     heights: mi.Float
     shades: mi.Float
 
+    @classmethod
+    def build(
+        cls, frame: Frame, shape: ReliefShape | None, side: mi.UInt32, each: mi.UInt32, size: tuple[int, int]
+    ) -> IrisRelief:
+        """Compute the lamps' light on the heights of an iris.
+
+        Args:
+            frame: the frame.
+            shape: the heights; None for a flat iris.
+            side: number of nodes along a side.
+            each: number of points that stand for a lamp.
+            size: numbers of nodes, and of points of lamps.
+        """
+        if shape is None:
+            nothing = dr.zeros(mi.Float, 4)
+            dr.make_opaque(nothing)
+            return cls(count=side, raised=dr.opaque(mi.Bool, False), heights=nothing, shades=nothing)
+        grid = relief_grid(frame, side)
+        column, row = grid.nodes(size[0])
+        rows = _arriving(frame, grid, each, _COARSE * _COARSE * size[1])
+        shades = _shades(frame.lights.count * each, rows, shape, grid, column, row)
+        dr.eval(shades)
+        shades = grid.corners_of(shades, column, row)
+        dr.eval(shades)
+        return cls(count=side, raised=dr.opaque(mi.Bool, True), heights=shape.corners, shades=shades)
+
     def hit(self, frame: Frame, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Foot in the plane (eye frame) of the place that rays meet.
 
@@ -168,13 +194,6 @@ def relief_grid(frame: Frame, count: mi.UInt32) -> ReliefGrid:
     return ReliefGrid(stop=frame.stop, half=frame.iris.root_radius + _SPARE_MM, count=count)
 
 
-def flat_relief(count: mi.UInt32) -> IrisRelief:
-    """Make the relief of an iris without heights."""
-    nothing = dr.zeros(mi.Float, 4)
-    dr.make_opaque(nothing)
-    return IrisRelief(count=count, raised=dr.opaque(mi.Bool, False), heights=nothing, shades=nothing)
-
-
 @recorded
 def relief_shape(
     frame: Frame, pattern: mi.Texture2f, side: mi.UInt32, about: mi.UInt32, size: ReliefSize
@@ -212,6 +231,7 @@ def relief_shape(
     )  # fmt: skip
 
 
+@syntax
 def _highest_nearby(heights: mi.Float, side: mi.UInt32, about: mi.UInt32, blocks: int) -> mi.Float:
     """Largest of the heights in and about every block of cells."""
     index, last = dr.arange(mi.UInt32, blocks * blocks), side - 1
@@ -224,35 +244,14 @@ def _highest_nearby(heights: mi.Float, side: mi.UInt32, about: mi.UInt32, blocks
         largest = dr.maximum(largest, dr.gather(mi.Float, heights, j * side + i))
     dr.eval(largest)
     wide = 2 * about + 1
-
-    def beside(k: mi.UInt32, most: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        j = k // wide
-        i = across + (k - j * wide)
-        i, j = (dr.clip(mi.Int32(n) - mi.Int32(about), 0, mi.Int32(count) - 1) for n in (i, down + j))
-        return k + 1, dr.maximum(most, dr.gather(mi.Float, largest, mi.UInt32(j) * count + mi.UInt32(i)))
-
-    state = (mi.UInt32(0), dr.zeros(mi.Float, blocks * blocks))
-    return dr.while_loop(state, lambda k, _: k < wide * wide, beside, label="blocks beside")[1]
-
-
-def lit_relief(frame: Frame, shape: ReliefShape, side: mi.UInt32, each: mi.UInt32, size: tuple[int, int]) -> IrisRelief:
-    """Compute the lamps' light on an iris with heights.
-
-    Args:
-        frame: the frame.
-        shape: the heights.
-        side: number of nodes along a side.
-        each: number of points that stand for a lamp.
-        size: numbers of nodes, and of points of lamps.
-    """
-    grid = relief_grid(frame, side)
-    column, row = grid.nodes(size[0])
-    rows = _arriving(frame, grid, each, _COARSE * _COARSE * size[1])
-    shades = _shades(frame.lights, rows, shape, grid, each, column, row)
-    dr.eval(shades)
-    shades = grid.corners_of(shades, column, row)
-    dr.eval(shades)
-    return IrisRelief(count=side, raised=dr.opaque(mi.Bool, True), heights=shape.corners, shades=shades)
+    k, most = mi.UInt32(0), dr.zeros(mi.Float, blocks * blocks)
+    while dr.hint(k < wide * wide, label="blocks beside", exclude=[largest]):
+        row = k // wide
+        place = across + (k - row * wide), down + row
+        x, y = (mi.UInt32(dr.clip(mi.Int32(n) - mi.Int32(about), 0, mi.Int32(count) - 1)) for n in place)
+        most = dr.maximum(most, dr.gather(mi.Float, largest, y * count + x))
+        k += 1
+    return most
 
 
 def _arriving(frame: Frame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi.Float:
@@ -281,46 +280,40 @@ def _arriving(frame: Frame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi
     return out
 
 
+@syntax
 def _shades(
-    lights: Lights,
-    rows: mi.Float,
-    shape: ReliefShape,
-    grid: ReliefGrid,
-    each: mi.UInt32,
-    column: mi.UInt32,
-    row: mi.UInt32,
+    spots: mi.UInt32, rows: mi.Float, shape: ReliefShape, grid: ReliefGrid, column: mi.UInt32, row: mi.UInt32
 ) -> mi.Float:
-    """The q of the module's docstring at nodes of the grid; `rows` as from `_arriving`."""
-    stop, node = grid.stop, row * grid.count + column
+    """The q of the module's docstring at nodes of the grid; `rows` as from `_arriving` for so many points of lamps."""
+    node = row * grid.count + column
     x = grid.point(mi.Float(column), mi.Float(row))
     h, hu, hv = (dr.gather(mi.Float, values, node) for values in (shape.heights, *shape.slopes))
     across = (grid.count + (_BLOCK - 1)) // _BLOCK
     near = dr.gather(mi.Float, shape.near, row // _BLOCK * across + column // _BLOCK)
-    spots, coarse = lights.count * each, mi.UInt32(_COARSE)
-    i, j, s, t = ReliefGrid(stop=stop, half=grid.half, count=coarse).cell(x)
+    coarse = mi.UInt32(_COARSE)
+    i, j, s, t = ReliefGrid(stop=grid.stop, half=grid.half, count=coarse).cell(x)
     place = j * coarse + i
-
-    def lamp(k: mi.UInt32, whole: mi.Float, seen: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+    k, whole, seen = mi.UInt32(0), mi.Float(0) * h, mi.Float(0) * h
+    while dr.hint(k < spots, label="relief", exclude=[rows, shape, grid]):
         first = k * (_COARSE * _COARSE) + place
         a, b, c, d = (dr.gather(mi.Vector4f, rows, first + off) for off in (0, 1, coarse, coarse + 1))
         both = dr.lerp(dr.lerp(a, b, s), dr.lerp(c, d, s), t)
         inv = dr.rcp(dr.maximum(both.x, 1e-20))
         tu, tv = both.y * inv, both.z * inv
         facing = dr.maximum(1 - tu * hu - tv * hv, 0)
-        way = tu * stop.u + tv * stop.v
+        way = tu * grid.stop.u + tv * grid.stop.v
         slant = dr.norm(way)
         asked = (both.x > 0) & (facing > 0) & (slant * shape.steepest > 1)
         above = dr.select(slant < _SLANT, near, shape.highest) - h
         here = dr.maximum(both.x + h * both.w, 0)
         hidden = _hidden(grid, shape.corners, x, h, way, dr.select(asked, above, 0))
-        return k + 1, whole + both.x, seen + here * facing * (1 - hidden)
-
-    state = (mi.UInt32(0), mi.Float(0) * h, mi.Float(0) * h)
-    labels = ("k", "whole", "seen")
-    _, whole, seen = dr.while_loop(state, lambda k, *_: k < spots, lamp, labels=labels, label="relief")
+        whole += both.x
+        seen += here * facing * (1 - hidden)
+        k += 1
     return dr.select(whole > 0, seen / whole * dr.rsqrt(1 + hu * hu + hv * hv), 1)
 
 
+@syntax
 def _hidden(
     grid: ReliefGrid, corners: mi.Float, x: mi.Vector3f, h: mi.Float, way: mi.Vector3f, above: mi.Float
 ) -> mi.Float:
@@ -328,21 +321,19 @@ def _hidden(
 
     above: how much higher than the points these heights are at most, mm.
     """
-
-    def rise(k: mi.UInt32) -> mi.Float:
-        part = mi.Float(k + 1) / _STEPS
-        return _REACH_MM * part * part
-
-    def step(k: mi.UInt32, hidden: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        up = rise(k)
+    k, hidden = mi.UInt32(0), mi.Float(0) * h
+    while dr.hint((k < _STEPS) & (_rise(k) < above), label="shadows of the relief", exclude=[grid, corners]):
+        up = _rise(k)
         over = grid.interpolate(corners, x + up * way, mi.Bool(True)) - h - up
-        return k + 1, dr.maximum(hidden, dr.clip(over / (_SOFT * up + 0.004), 0, 1))
+        hidden = dr.maximum(hidden, dr.clip(over / (_SOFT * up + 0.004), 0, 1))
+        k += 1
+    return hidden
 
-    def more(k: mi.UInt32, _: mi.Float) -> mi.Bool:
-        return (k < _STEPS) & (rise(k) < above)
 
-    state = (mi.UInt32(0), mi.Float(0) * h)
-    return dr.while_loop(state, more, step, labels=("k", "hidden"), label="shadows of the relief")[1]
+def _rise(k: mi.UInt32) -> mi.Float:
+    """Height (mm) of step k of a search above its start; the steps grow."""
+    part = mi.Float(k + 1) / _STEPS
+    return _REACH_MM * part * part
 
 
 def _arrival(

@@ -50,8 +50,8 @@ class ShadowMaps:
     marks: mi.UInt8
 
     @classmethod
-    def of(cls, table: Singles, region: RegionScene) -> ShadowMaps:
-        """Draw the maps of lamps, whose numbers are in a `shadow_map_table`, before a posed region."""
+    def build(cls, region: RegionScene, table: Singles) -> ShadowMaps:
+        """Draw the maps of lamps before a posed region; `table` as from `shadow_map_table`."""
         # Without lamps nothing reads the table, but kernels cannot be compiled for an empty one.
         views = upload_array(table if len(table) else np.zeros(_WIDTH))
         skin, known = region.skin, dr.opaque(mi.Bool, region.skin.is_sheet)
