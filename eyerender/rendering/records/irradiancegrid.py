@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from .frame import ALL, BITS
+from .recording import syntax
 
 BENT = 0.004  # largest third difference about a cell over its irradiance
+Held = Callable[..., Any]  # (lamp, cell, allowed difference) -> mi.Bool
 
 
 @dataclass(kw_only=True)
@@ -41,14 +44,9 @@ class IrradianceGrid:
         return grid
 
     @classmethod
+    @syntax
     def build(
-        cls,
-        side: int,
-        nodes: mi.Float,
-        lamps: mi.UInt32,
-        *,
-        more: mi.Float | None = None,
-        held: Callable[[mi.UInt32, mi.UInt32, mi.Float], mi.Bool] | None = None,
+        cls, side: int, nodes: mi.Float, lamps: mi.UInt32, *, more: mi.Float | None = None, held: Held | None = None
     ) -> tuple[IrradianceGrid, mi.UInt32]:
         """Build a grid from the irradiance of its nodes.
 
@@ -67,45 +65,30 @@ class IrradianceGrid:
         row = cell // side
         column = cell - row * side
         within = (column > 0) & (row > 0) & (column < side - 2) & (row < side - 2)
-        around = nodes_about(cell, side)
-        many = lamps > BITS
-
-        def add_lamp(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            return k + 1, total + dr.maximum(dr.gather(mi.Float, nodes, k * side**2 + cell), 0)
-
-        state = (mi.UInt32(0), mi.Float(0) * mi.Float(cell))
-        _, total = dr.while_loop(state, lambda k, _: k < lamps, add_lamp, labels=("k", "total"), label="all lamps")
-        usual = total / mi.Float(lamps)
-
-        def examine(
-            k: mi.UInt32, left: mi.UInt32, elsewhere: mi.UInt32, *sums: mi.Float
-        ) -> tuple[mi.UInt32 | mi.Float, ...]:
+        around, many = nodes_about(cell, side), lamps > BITS
+        usual = _sum_of_lamps(nodes, lamps, cell, side) / mi.Float(lamps)
+        # An array of its own for each: Dr.Jit writes the results of the loop into them.
+        none, dark = mi.UInt32(0) * cell, mi.Float(0) * mi.Float(cell)
+        k, left, elsewhere, sums = mi.UInt32(0), mi.UInt32(none), mi.UInt32(none), [mi.Float(dark) for _ in around]
+        while dr.hint(k < lamps, label="cells", exclude=[cls, side, nodes, around, more, held]):
             values = [dr.gather(mi.Float, nodes, k * side**2 + node) for node in around]
             bent, least, most = unevenness(values)
             allowed = BENT * dr.maximum(most, usual)
             good = (least >= 0) & (bent <= allowed)
-            kept, bit = mi.Bool(False), mi.UInt32(1) << k
-            if held is not None:
-                kept = dr.if_stmt(
-                    (k, cell, allowed), within & ~good & ~many, held, lambda *_: mi.Bool(False)
-                )  # fmt: skip
+            kept = mi.Bool(False) if held is None else _ask(held, k, cell, allowed, within & ~good & ~many)
+            bit = mi.UInt32(1) << k
             left |= dr.select(good | kept, 0, dr.select(many, ALL, bit))
             elsewhere |= dr.select(kept, bit, 0)
-            return k + 1, left, elsewhere, *(s + dr.select(good, v, 0) for s, v in zip(sums, values, strict=True))
-
-        # An array of its own for each: Dr.Jit writes the results of the loop into them.
-        none, dark = mi.UInt32(0) * cell, mi.Float(0) * mi.Float(cell)
-        state = (mi.UInt32(0), mi.UInt32(none), mi.UInt32(none), *(mi.Float(dark) for _ in around))
-        labels = ("k", "left", "elsewhere", *(f"sum{n}" for n in range(16)))
-        _, left, elsewhere, *sums = dr.while_loop(state, lambda k, *_: k < lamps, examine, labels=labels, label="cells")
+            sums = _sum(sums, [dr.select(good, value, 0) for value in values])
+            k += 1
         left = dr.select(within, left, ALL)
-        if more is not None:
-            sums = [s + dr.gather(mi.Float, more, node) for s, node in zip(sums, around, strict=True)]
-        sums = [dr.select(within & ~(many & (left != 0)), s, 0) for s in sums]
+        if dr.hint(more is not None, mode="scalar"):
+            sums = _sum(sums, [dr.gather(mi.Float, more, node) for node in around])
+        sums = [dr.select(within & ~(many & (left != 0)), total, 0) for total in sums]
         dr.eval(sums, left, elsewhere)
         cells = dr.zeros(mi.Float, 16 * side**2)
-        for k in range(4):
-            dr.scatter(cells, mi.Vector4f(*sums[4 * k : 4 * k + 4]), 4 * cell + k)
+        for n in range(4):
+            dr.scatter(cells, mi.Vector4f(*sums[4 * n : 4 * n + 4]), 4 * cell + n)
         dr.eval(cells)
         return cls(side=side, cells=cells, left=left), elsewhere
 
@@ -134,6 +117,29 @@ class Place:
     across: mi.Vector4f
     down: mi.Vector4f
     inside: mi.Bool
+
+
+@syntax
+def _sum_of_lamps(nodes: mi.Float, lamps: mi.UInt32, node: mi.UInt32, side: int) -> mi.Float:
+    """Irradiance of nodes from all lamps whose light is known there."""
+    k, total = mi.UInt32(0), mi.Float(0) * mi.Float(node)
+    while dr.hint(k < lamps, label="all lamps", exclude=[nodes, side]):
+        total += dr.maximum(dr.gather(mi.Float, nodes, k * side**2 + node), 0)
+        k += 1
+    return total
+
+
+@syntax
+def _ask(held: Held, lamp: mi.UInt32, cell: mi.UInt32, allowed: mi.Float, asked: mi.Bool) -> mi.Bool:
+    """Ask whether the caller holds a lamp's light, where this is to be `asked`."""
+    kept = mi.Bool(False)
+    if dr.hint(asked, exclude=[held]):
+        kept = held(lamp, cell, allowed)
+    return kept
+
+
+def _sum(a: list[mi.Float], b: list[mi.Float]) -> list[mi.Float]:
+    return [x + y for x, y in zip(a, b, strict=True)]
 
 
 def grid_nodes(side: int) -> tuple[mi.UInt32, mi.UInt32]:
