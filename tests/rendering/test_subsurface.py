@@ -37,28 +37,35 @@ def grids(renderer, bound):
 
     from eyerender.rendering.scene.diffusiongrids import SIDE, GlobeCells, SheetCells
     from eyerender.rendering.scene.region import SHEET_COLUMNS
-    from eyerender.rendering.transport import diffusion as light
+    from eyerender.rendering.transport import tissuegrids as light
 
     shown, place = renderer.bind(bound)
-    sheet = light.SheetGrid.of(SheetCells.of(place.posed, bound, 100.0, 0)).measured(place.skin)
-    row, column = sheet.sent[0] // sheet.columns, sheet.sent[0] % sheet.columns
+    sheet = light.SheetGrid.upload(SheetCells.of(place.posed, bound, 100.0, 0))
+    row, column = sheet.cells[0] // sheet.columns, sheet.cells[0] % sheet.columns
     across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / sheet.columns)
     x, _ = place.skin.sheet_point(sheet.vertex_row(row, mi.Float(0.5)), across)
     on_sheet = np.zeros((sheet.rows * sheet.columns, 3), np.float32)
-    on_sheet[sheet.sent[0].numpy()] = x.numpy().T
-    globe = light.GlobeGrid.of(GlobeCells.of(place.posed, bound.globe, 8.0))
-    n = light._globe_direction(*(mi.Float(k) for k in np.divmod(np.arange(SIDE**2), SIDE)))
+    on_sheet[sheet.cells[0].numpy()] = x.numpy().T
+    globe = light.GlobeGrid.upload(GlobeCells.of(place.posed, bound.globe, 8.0))
+    n = light.globe_direction(*(mi.Float(k) for k in np.divmod(np.arange(SIDE**2), SIDE)))
     on_globe = float(bound.eye.sclera.radius_mm) * n.numpy().T
-    return sheet, on_sheet.reshape(sheet.rows, sheet.columns, 3), globe, on_globe, shown.frame.sclera.radius
+    return (
+        (sheet, place.skin),
+        on_sheet.reshape(sheet.rows, sheet.columns, 3),
+        (globe, shown.frame.sclera.radius),
+        on_globe,
+    )
 
 
-def spread(grid, lit, length_mm, *radius):
-    """What leaves a grid's cells of the light that falls on them, as NumPy arrays."""
+def spread(grid, lit, length_mm, on):
+    """What leaves a grid's cells of the light that falls on them, as NumPy arrays; `on`: surface, or radius (mm)."""
     import mitsuba as mi
 
-    from eyerender.rendering.transport.diffusion import Places
+    from eyerender.rendering.transport import diffusion
+    from eyerender.rendering.transport.tissuegrids import SheetGrid
 
-    return grid.spread(mi.Float(lit.astype(np.float32).ravel()), *radius, Places.of(length_mm)).numpy()
+    spreads = diffusion.spread_in_skin if isinstance(grid, SheetGrid) else diffusion.spread_in_globe
+    return spreads(grid, on, mi.Float(lit.astype(np.float32).ravel()), diffusion.RingPoints.of(length_mm)).numpy()
 
 
 def test_points_of_the_sheet_lie_on_its_triangles(renderer):
@@ -78,8 +85,8 @@ def test_points_of_the_sheet_lie_on_its_triangles(renderer):
 
 
 def test_even_light_stays_even(renderer):
-    sheet, at, globe, _, radius = grids(renderer, job(region=BARE))
-    out, cells = spread(sheet, np.ones(at.shape[:2]), 0.7), sheet.sent[0].numpy()
+    (sheet, skin), at, (globe, radius), _ = grids(renderer, job(region=BARE))
+    out, cells = spread(sheet, np.ones(at.shape[:2]), 0.7, skin), sheet.cells[0].numpy()
     assert len(cells) > 0.9 * out.size
     assert out[cells] == pytest.approx(1.0, abs=1e-5)
     side = 192
@@ -94,17 +101,17 @@ def lit_share(away: np.ndarray, width: np.ndarray | float) -> np.ndarray:
 
 @pytest.mark.parametrize(("name", "rows", "tolerance"), [("head", 160, 0.03), ("remote", 80, 0.05)])
 def test_shadow_edges_have_their_shape_on_skin_and_globe(renderer, name, rows, tolerance):
-    sheet, at, globe, on_globe, radius = grids(renderer, job(name, region=BARE))
+    (sheet, skin), at, (globe, radius), on_globe = grids(renderer, job(name, region=BARE))
     assert sheet.rows == rows  # in pictures of few pixels per mm the cells are twice as large
     # The edge of a shadow runs up and down the cheek and the lower lid, and up and down the sclera.
     away, along = at[..., 1] - 2.0, np.gradient(at, axis=1)
     level = np.abs(along[..., 1]) / np.maximum(np.linalg.norm(along, axis=-1), 1e-6) > 0.95
     known = np.zeros(away.size, bool)
-    known[sheet.sent[0].numpy()] = True
+    known[sheet.cells[0].numpy()] = True
     near = level & known.reshape(away.shape) & (np.abs(away) < 2.5) & (at[..., 2] < -9.0) & (at[..., 2] > -14.0)
     assert near.sum() > 100
     lit = lit_share(away, np.abs(along[..., 1]))
-    out = spread(sheet, lit, 0.65).reshape(away.shape)[near]
+    out = spread(sheet, lit, 0.65, skin).reshape(away.shape)[near]
     # Six rings of six places are good to 0.017 on a plane; the rows of cells are bent and of unequal width.
     worst = np.abs(out - edge(away[near], 0.65)).max()
     assert worst < tolerance
@@ -145,7 +152,7 @@ def test_shut_lids_transmit_light(renderer):
     assert shown.frame.caches.diffusion is not None
     upper = place.posed.upper_margin
     up = upper[np.argmin(np.abs(upper[:, 1]))]  # where the lids meet before the eye
-    inside = float(shown.frame.caches.diffusion.on_globe(shown.frame, mi.Vector3f(*(float(v) for v in up))).numpy()[0])
+    inside = float(shown.frame.caches.diffusion.at_globe(shown.frame, mi.Vector3f(*(float(v) for v in up))).numpy()[0])
     lamp = shut.lights[0]
     way = lamp.position_mm - up
     outside = lamp.intensity_mw_sr / float(way @ way)  # more than what falls on the slope of the lid

@@ -24,7 +24,7 @@ from ..records.recording import forget, recorded
 from ..scene.background import Background, Obstacle
 from ..scene.head import place_scene
 from ..scene.region import RegionScene
-from ..transport.diffusion import diffused_light
+from ..transport.diffusion import DiffusedLight
 from ..transport.environment import Ambience, Maps, bright_lamps
 from ..transport.fundusirradiance import FundusIrradiance
 from ..transport.globeirradiance import GlobeIrradiance
@@ -141,7 +141,7 @@ class FrameBuilder:
         if job.mesh_edge_mm is not None:
             frame.surfaces = meshed(frame.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
         if lit and structure.scattering and region is not None:
-            frame.caches.diffusion = diffused_light(job, frame, host.lamps, region, host.tissue_cells)
+            frame.caches.diffusion = DiffusedLight.build(frame, job, host.lamps, region, host.tissue_cells)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
             panels = panel_table(job.ambient, job.anchor_mm)

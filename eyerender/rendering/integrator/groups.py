@@ -270,13 +270,13 @@ class _GroupShading:
         if self.soft:
             # What went through the tissue is known, and what remains is the film's highlight.
             tissues = self.frame.caches.diffusion
-            covered, share = ~seen.cornea | (seen.opacity > 0), tissues.globe_sees(self.frame, seen.point)
+            covered, share = ~seen.cornea | (seen.opacity > 0), tissues.lamps_at_globe(self.frame, seen.point)
 
             def shine(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
                 lamp = lights[i]
                 return i + 1, total + lit_by(lamp, mi.Float(0))[1] * share(lamp.number)
 
-            state = (mi.UInt32(0), direct(seen, albedo, tissues.on_globe(self.frame, seen.point), mi.Float(0)))
+            state = (mi.UInt32(0), direct(seen, albedo, tissues.at_globe(self.frame, seen.point), mi.Float(0)))
             labels = ("i", "total")
             return dr.while_loop(state, lambda i, _: covered & (i < lights.count), shine, labels=labels, label="film")[
                 1
@@ -332,7 +332,7 @@ class _GroupShading:
         if soft:
             tissues = self.frame.caches.diffusion
             on_map = self.skin.map_place(kept.face, kept.uv, kept.weight > 0)
-            on_skin, sees = tissues.on_skin(*on_map), tissues.skin_sees(*on_map)
+            on_skin, sees = tissues.at_skin(*on_map), tissues.lamps_at_skin(*on_map)
             inside, matte = direct(view, view.albedo, on_skin, mi.Float(0)), mi.Float(0)
         total += (rest + inside) * kept.weight
         faint = _FAINT * inside

@@ -104,7 +104,14 @@ def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vecto
 
 @syntax
 def irradiance_at(
-    frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float, *, off_globe: mi.Bool, on_sheet: mi.Bool
+    frame: Frame,
+    x: mi.Vector3f,
+    normal: mi.Vector3f,
+    u: mi.Float,
+    v: mi.Float,
+    *,
+    off_globe: mi.Bool,
+    on_sheet: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
     """Irradiance of points in air straight from all lamps.
 

@@ -1,10 +1,10 @@
-"""What the lamps see of an eye region: where nothing but bare skin is in the way, no ray is needed for a shadow.
+"""Shadow maps of an eye region: where a lamp's light is certain to reach the skin, so that no ray is needed.
 
-The view of every lamp, a stereographic map of the directions from its middle, is divided into cells. A cell is marked
-if it may show a hair, an end of the sheet of skin, or a triangle of the sheet that turns its back to any point of the
-lamp. A ray through a cell without marks meets the sheet from its front only. The crossings from the
-front, less those from the back, are at most one, because the sheet is one surface with a hole (see `pixels`). So a point
-point of the sheet in such a cell is the only one there, and the lamp lights it.
+The map of every lamp holds the directions from its middle in stereographic projection, divided into cells. A cell is
+marked if it may show a hair, an end of the sheet of skin, or a triangle of the sheet that turns its back to any point
+of the lamp. A ray through a cell without marks meets the sheet from its front only. The crossings from the front, less
+those from the back, are at most one, because the sheet is one surface with a hole (see `pixels`). So a point of the
+sheet in such a cell is the only one there, and the lamp lights it.
 
 A lamp of radius r is more than its middle. Seen from another of its points, an occluder at the distance a shifts
 against a receiver at the distance b by r (1 / a - 1 / b) at most. The marks are as much wider.

@@ -1,0 +1,201 @@
+"""Grids over skin and globe on the device: where their cells are, and interpolation between them.
+
+The grid over the skin is fixed to the tissue: its rows run around the opening between the lids, and its columns close.
+The grid over the globe is fixed to the head, in Lambert's equal-area projection. `scene.diffusiongrids` chooses the
+cells that matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...arrays import Ints
+from ...region.skin import BANDS, SHEET_ROWS
+from ..records.frame import aligned_copy
+from ..scene.diffusiongrids import SIDE, WIDTH, GlobeCells, SheetCells
+from ..scene.region import SHEET_COLUMNS, SkinGeometry
+
+_FINEST_MM = 0.02  # of a cell; about the corners of the eye they are smaller
+
+
+@dataclass(frozen=True, slots=True)
+class Bilinear:
+    """The four cells of a grid about places, row by row, and the shares of the way across and down between them."""
+
+    numbers: tuple[mi.UInt32, ...]
+    across: mi.Float
+    down: mi.Float
+
+    def interpolate(self, kind: Any, buffer: mi.Float, each: mi.UInt32 | int = 1, which: mi.UInt32 | int = 0) -> Any:
+        """Interpolate the numbers of cells, each of which has so many."""
+        a, b, c, d = (dr.gather(kind, buffer, n * each + which) for n in self.numbers)
+        high, low = a + self.across * (b - a), c + self.across * (d - c)
+        return high + self.down * (low - high)
+
+
+def _between_rows(
+    row: mi.Float, rows: mi.UInt32 | int, columns: mi.UInt32 | int, beside: tuple[mi.UInt32, mi.UInt32], s: mi.Float
+) -> Bilinear:
+    """Find the cells between rows, at a share s of the way from the first to the second of two columns."""
+    v = dr.clip(row, 0, mi.Float(rows) - 1.001)
+    i = mi.UInt32(v)
+    return Bilinear(tuple(p * columns + q for p in (i, i + 1) for q in beside), s, v - mi.Float(i))
+
+
+@dataclass(frozen=True, slots=True)
+class SheetSize:
+    """Numbers of rows and columns of a grid over the skin, on the device; the columns close."""
+
+    rows: mi.UInt32
+    columns: mi.UInt32
+
+    def place(self, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Row and column at coordinates of the map of the skin."""
+        rows, columns = (mi.Float(n) for n in (self.rows, self.columns))
+        return v * ((SHEET_ROWS + BANDS) / SHEET_ROWS) * rows - 0.5, u * columns - 0.5
+
+    def cells(self, row: mi.Float, column: mi.Float, level: int) -> Bilinear:
+        """Cells of the grid reduced by 2^level, about places in units of its finest cells."""
+        rows, columns, scale = self.rows >> level, self.columns >> level, 1 / (1 << level)
+        u = (column + 0.5) * scale - 0.5
+        u = dr.select(u < 0, u + mi.Float(columns), u)
+        j = dr.minimum(mi.UInt32(u), columns - 1)
+        right = dr.select(j + 1 < columns, j + 1, 0)
+        return _between_rows((row + 0.5) * scale - 0.5, rows, columns, (j, right), u - mi.Float(j))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SheetGrid:
+    """The grid over a posed sheet of skin.
+
+    Attributes:
+        rows: number of its rows.
+        columns: number of its columns, which close.
+        size: the same on the device.
+        cells: numbers of its cells that matter, and of the cells about them on the grid reduced by 2 and by 4.
+        edges: row of the sheet's vertices at the edges of the grid's rows.
+        middles: the same in their middles.
+    """
+
+    rows: int
+    columns: int
+    size: SheetSize
+    cells: tuple[mi.UInt32, ...]
+    edges: mi.Float
+    middles: mi.Float
+
+    @classmethod
+    def upload(cls, cells: SheetCells) -> SheetGrid:
+        """Send the cells of a pose to the device."""
+        size = SheetSize(dr.opaque(mi.UInt32, cells.rows), dr.opaque(mi.UInt32, cells.columns))
+        edges, middles = (mi.Float(aligned_copy(at)) for at in (cells.edges, cells.middles))
+        numbers = tuple(_numbers(n) for n in cells.numbers)
+        return cls(rows=cells.rows, columns=cells.columns, size=size, cells=numbers, edges=edges, middles=middles)
+
+    def vertex_row(self, row: mi.UInt32, share: mi.Float) -> mi.Float:
+        """Row of the sheet's vertices at a share of the grid's rows."""
+        a, b = (dr.gather(mi.Float, self.edges, row + k) for k in (0, 1))
+        return a + share * (b - a)
+
+
+@dataclass(frozen=True, slots=True)
+class SheetMetric:
+    """Lengths on a posed sheet of skin, along and across its rows.
+
+    Attributes:
+        size: size of the grid.
+        table: for each row and column of vertices: columns per mm along the row, a, rows per mm across it, size of a
+            cell (mm). A place x mm along and y mm across is y per-mm rows and (x - a rows) per-mm columns away.
+    """
+
+    size: SheetSize
+    table: mi.Float
+
+    @classmethod
+    def measure(cls, grid: SheetGrid, skin: SkinGeometry) -> SheetMetric:
+        """Measure the cells of a grid on a posed surface."""
+        columns, last = SHEET_COLUMNS - 1, mi.UInt32(grid.rows - 1)
+        index = dr.arange(mi.UInt32, grid.rows * columns)
+        i = index // columns
+        j = index - i * columns
+
+        def point(i: mi.UInt32, j: mi.UInt32) -> mi.Vector3f:
+            return skin.sheet_point(dr.gather(mi.Float, grid.middles, i), mi.Float(j))[0]
+
+        before, after = dr.select(j > 0, j - 1, columns - 1), dr.select(j + 1 < columns, j + 1, 0)
+        above, below = dr.maximum(i, 1) - 1, dr.minimum(i + 1, last)
+        along = (point(i, after) - point(i, before)) * (0.5 * columns / mi.Float(grid.size.columns))
+        down = (point(below, j) - point(above, j)) / mi.Float(below - above)
+        width = dr.maximum(dr.norm(along), 1e-6)
+        a = dr.dot(along, down) / width
+        height = dr.maximum(dr.sqrt(dr.maximum(dr.squared_norm(down) - a * a, 0)), _FINEST_MM)
+        width = dr.maximum(width, _FINEST_MM)
+        table = dr.zeros(mi.Float, 4 * grid.rows * columns)
+        dr.scatter(table, mi.Vector4f(dr.rcp(width), a, dr.rcp(height), dr.maximum(width, height)), index)
+        dr.eval(table)
+        return cls(grid.size, table)
+
+    def step(self, row: mi.Float, column: mi.Float, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Go x mm along a row and y mm across: the new row and column, and the size of a cell (mm)."""
+        columns, around = SHEET_COLUMNS - 1, mi.Float(self.size.columns)
+        i = mi.UInt32(row + 0.5)
+        j = mi.UInt32((column + 0.5) * (columns / around) + 0.5)
+        m = dr.gather(mi.Vector4f, self.table, i * columns + dr.select(j < columns, j, 0))
+        down = y * m.z
+        column = column + (x - m.y * down) * m.x
+        column -= dr.floor(column / around) * around
+        return dr.clip(row + down, 0, mi.Float(self.size.rows) - 1), dr.minimum(column, around - 0.51), m.w
+
+
+@dataclass(frozen=True, slots=True)
+class GlobeGrid:
+    """Numbers of cells of the grid over the globe.
+
+    Attributes:
+        between: those between the lids.
+        under: those under the lids whose light gets there.
+        coarse: cells of the grid reduced by 2 that hold the latter.
+        over: the one of these for each of `under`.
+    """
+
+    between: mi.UInt32
+    under: mi.UInt32
+    coarse: mi.UInt32
+    over: mi.UInt32
+
+    @classmethod
+    def upload(cls, cells: GlobeCells) -> GlobeGrid:
+        """Send the cells of a pose to the device."""
+        return cls(*(_numbers(numbers) for numbers in (cells.between, cells.under, cells.coarse, cells.over)))
+
+
+def globe_cells(row: mi.Float, column: mi.Float) -> Bilinear:
+    """Cells of the grid over the globe about places."""
+    u = dr.clip(column, 0, SIDE - 1.001)
+    j = mi.UInt32(u)
+    return _between_rows(row, SIDE, SIDE, (j, j + 1), u - mi.Float(j))
+
+
+def globe_place(n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """Row and column of the grid over the globe in directions (scene's frame) from its centre, of any length."""
+    n = dr.normalize(n)
+    scale = dr.sqrt(2 * dr.rcp(dr.maximum(1 + n.x, 0.1))) * (SIDE / WIDTH)
+    return scale * n.z + 0.5 * (SIDE - 1), scale * n.y + 0.5 * (SIDE - 1)
+
+
+def globe_direction(row: mi.Float, column: mi.Float) -> mi.Vector3f:
+    """Directions (scene's frame) of places of the grid over the globe."""
+    a, b = ((k - 0.5 * (SIDE - 1)) * (WIDTH / SIDE) for k in (column, row))
+    q = a * a + b * b
+    k = dr.sqrt(dr.maximum(1 - 0.25 * q, 0))
+    return mi.Vector3f(1 - 0.5 * q, a * k, b * k)
+
+
+def _numbers(cells: Ints) -> mi.UInt32:
+    """Send numbers of cells to the device, at least one of them."""
+    return mi.UInt32(aligned_copy((cells if cells.size else np.zeros(1)).astype(np.uint32)))
