@@ -6,11 +6,13 @@ Numba compiles a function again when its own file changed, but not when another 
 function. So the machine code is kept in a folder of a name that depends on all files with compiled functions. When such
 a folder is made, those of other versions that nothing has used for thirty days are removed.
 
-Numba compiles one function at a time. So where the extractor's machine code is missing, several processes make it.
+Numba compiles one function at a time in a process. So where the extractor's machine code is missing, several processes
+make it.
 """
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import re
@@ -18,22 +20,25 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import config as numba_config
-from numba.core import event as numba_event
+from numba.core import sigutils
 
 from .storage.cachefolder import cache_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _DIGITS, _UNUSED_S = 16, 30 * 86400.0
 config: Any = numba_config  # it makes its attributes at run time
-event: Any = numba_event
+normalize_signature: Any = sigutils.normalize_signature  # it has no types
 njit: Any = numba.njit  # its types lack some options
 
 
@@ -63,47 +68,80 @@ def used(folder: Path) -> Path:
 
 FOLDER = None if (_place := _folder()) is None else str(used(_place))
 FUNCTIONS: dict[Any, str] = {}  # what `compiled` made, numba's dispatchers, and the types of their arguments
+_CODE: Counter[str] = Counter()  # bytes of bytecode per module
 # Helpers are called by compiled functions only.
 HELPER: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-ABOUT_S = 20  # time that compilation takes on two cores, as people are told
+ABOUT_S = 15  # time that compilation takes on two cores, as people are told
 _MOST_WORKERS = 4
-_WORKER = "EYERENDER_COMPILE_WORKER"  # set in the processes that compile
+_COMPLETE = "complete"  # file in FOLDER: all functions were compiled
+_LOCK = threading.Lock()  # of `ensure_compiled`
 
 
-class _Announcement(numba_event.Listener):
-    """At the first compilation, says so on stderr and has the whole extractor compiled."""
-
-    def __init__(self) -> None:
-        kept = FOLDER is not None and any(Path(FOLDER).glob("pupil_*"))
-        self.said = kept or _WORKER in os.environ
-
-    def on_start(self, event: Any) -> None:
-        """Compile everything, where no earlier process kept anything."""
-        if not self.said and event.data["dispatcher"].py_func.__module__.startswith("eyerender.extraction"):
-            self.said = True
-            print(f"compiling the extractor (once per machine), about {ABOUT_S} s ...", file=sys.stderr)
-            if FOLDER is not None:
-                _compile_in_processes()  # the compilation that starts here goes on, and finds the others' machine code
-
-    def on_end(self, event: object) -> None:
-        """Do nothing."""
+def ensure_compiled() -> None:
+    """Compile the whole extractor in up to four processes, unless its machine code is kept on disk."""
+    with _LOCK:
+        _compile_missing()
 
 
-event.register("numba:compile", _Announcement())
+@cache
+def _compile_missing() -> None:
+    """Announce the compilation on stderr, start the other processes, and compile a share of the functions here.
 
-
-def _compile_in_processes() -> None:
-    """Compile the extractor in as many processes as there are cores, at most four, and wait for them.
-
-    What they could not compile is compiled when it is called.
+    A function that another process failed to compile is compiled when it is called.
     """
+    if FOLDER is not None and Path(FOLDER, _COMPLETE).exists():
+        return
+    print(f"compiling the extractor (once per machine), about {ABOUT_S} s ...", file=sys.stderr)
+    if FOLDER is None:
+        return  # no other process could use the machine code, so each function is compiled when it is called
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)), _WORKER: "1"}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
     null = subprocess.DEVNULL
     with suppress(OSError), tempfile.TemporaryDirectory(prefix="eyerender-compile-") as claims, ExitStack() as workers:
         command = [sys.executable, "-P", "-m", "eyerender.extraction.compile", claims]
-        for _ in range(min(cores, _MOST_WORKERS) if cores > 1 else 0):
-            workers.enter_context(subprocess.Popen(command, env=environment, stdin=null, stdout=null, stderr=null))
+        for k in range(1, min(cores, _MOST_WORKERS)):
+            one = subprocess.Popen([*command, str(k)], env=environment, stdin=null, stdout=null, stderr=null)
+            workers.enter_context(one)  # it waits for the process at the end
+        compile_share(Path(claims), 0)
+        Path(FOLDER, _COMPLETE).touch()
+
+
+def compile_share(claims: Path, worker: int) -> None:
+    """Compile the functions of the extractor's modules, except those of modules that other processes claimed.
+
+    Functions of one package share helpers, which every process compiles for itself. So even workers begin with the
+    modules of glints and odd ones with those of the pupil, the largest first.
+
+    Args:
+        claims: folder in which a process claims a module by making a folder of its name.
+        worker: number of this process.
+    """
+    made = functions()
+    modules = sorted(
+        {one.py_func.__module__ for one in made}, key=lambda one: _CODE[one] if ".pupil." in one else -_CODE[one]
+    )
+    modules.sort(key=lambda one: ".pupil." in one)
+    collecting = gc.isenabled()
+    gc.disable()  # numba makes millions of objects, which the collector would visit again and again
+    try:
+        for module in modules if worker % 2 == 0 else reversed(modules):
+            with suppress(FileExistsError):
+                (claims / module).mkdir()
+                for one in (one for one in made if one.py_func.__module__ == module):
+                    one.compile(argument_types(one))
+    finally:
+        if collecting:
+            gc.enable()
+
+
+def functions() -> list[Any]:
+    """Return the extractor's compiled functions, as numba's dispatchers."""
+    return [one for one in FUNCTIONS if one.py_func.__module__.startswith("eyerender.extraction")]
+
+
+def argument_types(function: Any) -> tuple[Any, ...]:
+    """Return the types that are written beside a compiled function, as in numba's index of machine code."""
+    return tuple(normalize_signature(f"({FUNCTIONS[function]},)")[0])
 
 
 def compiled(types: str = "") -> Callable[[Function], Function]:
@@ -116,6 +154,7 @@ def compiled(types: str = "") -> Callable[[Function], Function]:
     def decorate(function: Function) -> Function:
         made = _dispatcher(function)
         FUNCTIONS[made] = types
+        _CODE[function.__module__] += len(function.__code__.co_code)
         return cast(Function, made)
 
     return decorate
@@ -139,9 +178,14 @@ def _dispatcher(function: Callable[..., Any]) -> Any:
 
 def summing(function: Function) -> Function:
     """Compile a helper whose sums may be taken in any order, so that they use vector instructions."""
-    return cast(Function, njit(fastmath={"reassoc", "contract"}, **HELPER)(function))
+    return _helper(function, fastmath={"reassoc", "contract"})
 
 
 def inlined(function: Function) -> Function:
     """Compile a helper as part of what calls it."""
-    return cast(Function, njit(**HELPER)(function))
+    return _helper(function)
+
+
+def _helper(function: Function, **options: Any) -> Function:
+    _CODE[function.__module__] += len(function.__code__.co_code)
+    return cast(Function, njit(**HELPER, **options)(function))

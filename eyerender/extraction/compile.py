@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numba.core import sigutils
 
 from ..arrays import Bytes
-from ..jit import FUNCTIONS
+from ..jit import compile_share, functions
 from .pipeline import extract
-
-normalize_signature: Any = sigutils.normalize_signature  # it has no types
 
 
 def compile_all() -> None:
@@ -24,27 +19,6 @@ def compile_all() -> None:
     missing = [one.__name__ for one in functions() if not one.signatures]
     if missing:
         raise RuntimeError(f"not compiled: {', '.join(missing)}")
-
-
-def compile_share(claims: Path) -> None:
-    """Compile the functions of modules, the longest first, except those that other processes claimed in a folder."""
-    made = functions()
-    sizes = {one.py_func.__module__: Path(one.py_func.__code__.co_filename).stat().st_size for one in made}
-    for module in sorted(sizes, key=lambda one: -sizes[one]):
-        with suppress(FileExistsError):
-            (claims / module).mkdir()
-            for one in (one for one in made if one.py_func.__module__ == module):
-                one.compile(argument_types(one))
-
-
-def argument_types(function: Any) -> tuple[Any, ...]:
-    """Return the types that are written beside a compiled function, as in numba's index of machine code."""
-    return tuple(normalize_signature(f"({FUNCTIONS[function]},)")[0])
-
-
-def functions() -> list[Any]:
-    """Return the extractor's compiled functions, as numba's dispatchers."""
-    return [one for one in FUNCTIONS if one.py_func.__module__.startswith("eyerender.extraction")]
 
 
 def drawn_eye(*, lid: bool = False, edge: bool = False) -> Bytes:
@@ -68,4 +42,4 @@ def drawn_eye(*, lid: bool = False, edge: bool = False) -> Bytes:
 
 
 if __name__ == "__main__":
-    compile_share(Path(sys.argv[1])) if len(sys.argv) > 1 else compile_all()
+    compile_share(Path(sys.argv[1]), int(sys.argv[2])) if len(sys.argv) > 2 else compile_all()

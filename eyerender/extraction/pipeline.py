@@ -12,6 +12,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..geometry.ellipse import signed_distance
+from ..jit import ensure_compiled
 from .glints.bloomed import bloomed_glints
 from .glints.classification import Eye, classify_spots
 from .glints.deblending import give_edges, split_blends
@@ -61,6 +62,7 @@ def extract(
     Raises:
         InputError: it is not a single-channel image, or it contradicts bit_depth.
     """
+    ensure_compiled()
     settings = settings or ExtractionSettings()
     prepared = prepare(image, bit_depth, gamma)
     shape = np.asarray(image).shape[:2]

@@ -9,7 +9,7 @@ import numpy as np
 
 import make_ideal_images as ideal
 from eyerender.extraction import extract, preprocessing
-from eyerender.extraction.compile import argument_types, compile_all, functions
+from eyerender.extraction.compile import compile_all
 from eyerender.extraction.glints import detection, gaussian_model, prescreening, subtraction
 from eyerender.extraction.pupil import (
     candidates,
@@ -23,7 +23,7 @@ from eyerender.extraction.pupil import (
     refinement,
     search,
 )
-from eyerender.jit import used
+from eyerender.jit import argument_types, functions, used
 from tests.support import extraction_oracles as oracles
 
 CONDITIONS = ("eight-glints", "lid", "jpeg")
