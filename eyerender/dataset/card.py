@@ -13,13 +13,15 @@ _LABELS = """\
 - `records`: the record of the analytic observer: pose, target, apparent pupil (ellipse and boundary points), glints.
 - `labels.pupil`, `labels.iris`: the `amodal` ellipse of the outline without anything in front of the eye, the
   `visible` ellipse with the second moments of the visible pixels, and the visible share of the amodal pixels. The
-  pupil also has the visible arcs of its outline, `visible_arcs_deg`.
+  pupil also has the visible arcs of its outline, `visible_arcs_deg`, and two diameters: `entrance_diameter_mm` as seen
+  on the optic axis through the cornea, and `stop_diameter_mm` of the anatomical pupil.
 - `labels.glints`: for each light the position of the reflection by ray optics (`xy_px`), the energy-weighted position
   in the image (`spot_xy_px`), whether it is visible, the visible share of the lamp's image, and the occluder
   (`hidden_by`).
 - `labels.lid_margins_px`: landmarks along the lid margins, if the scene has lids.
-- `labels.space`: centres of rotation, globe, corneal curvature and pupil, corneal apex, optic axis, line of sight and
-  target, in the world frame and the camera frame (mm; unit vectors).
+- `labels.space`: centres of globe, corneal curvature and pupil, corneal apex, optic axis, line of sight and target, in
+  the world frame and the camera frame (mm; unit vectors). The centres of rotation in azimuth and elevation are fixed in
+  the head; `head` has them without the head position.
 - `labels.pose`: x_world = rotation x_eye + translation. `labels.camera`: K, R, t, distortion (OpenCV). `lights_mm`.
 - `mask_file_name`: {mask}.{more}
 - `parameters`: every drawn value by its path in the spec (`draws`), and the whole scene and eye as JSON text.

@@ -41,6 +41,8 @@ def image_line(
         "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
         "bit_depth": scene.spec.sensor.bit_depth,
         "gamma": scene.spec.sensor.gamma,
+        # Keys of version 4 that no scene fills yet: moments and movements of the frame, and what the eye wears.
+        **dict.fromkeys(("time_s", "event", "rig_pose")),
         # A frame's number is unique in the whole dataset.
         "records": [{**record, "frame": turn.sample * frames + frame}],
         "labels": labels,
@@ -54,6 +56,8 @@ def image_line(
             "attempt": turn.attempt,
             "subject_attempt": turn.subject_attempt,
             "draws": sample.draws,
+            "spectacles": None,
+            "contact_lens": None,
             **scene.person_numbers(side),
             # They are stored as text, because their nested keys may differ between samples, which columns must not.
             "scene_json": json.dumps(sample.scene, sort_keys=True),

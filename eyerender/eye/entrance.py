@@ -26,13 +26,18 @@ _STEPS = 12
 _SETTLED_MM = 1e-10
 
 
-def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS) -> float:
+def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS, distance_mm: float = FAR_MM) -> float:
     """Diameter of the entrance pupil of a single eye, for the circle of equal area.
+
+    Args:
+        eye: the eye.
+        points: number of points of the margin.
+        distance_mm: distance of the observer.
 
     Raises:
         InputError: a ray from the margin does not leave the eye.
     """
-    return _diameter(eye.front, tuple(float(n) for n in eye.front_indices), eye.stop, points)
+    return _diameter(eye.front, tuple(float(n) for n in eye.front_indices), eye.stop, points, distance_mm)
 
 
 @remembered
@@ -90,8 +95,10 @@ def stop_for_entrance(
     raise InputError(f"no stop has an entrance pupil of {entrance_mm:g} mm", path="stop.diameter_mm")
 
 
-def _diameter(front: tuple[Surface, ...], indices: tuple[float, ...], stop: Stop, points: int) -> float:
-    found = apparent_points(front, indices, stop.boundary(points), np.array([FAR_MM, 0.0, 0.0]))
+def _diameter(
+    front: tuple[Surface, ...], indices: tuple[float, ...], stop: Stop, points: int, distance_mm: float = FAR_MM
+) -> float:
+    found = apparent_points(front, indices, stop.boundary(points), np.array([distance_mm, 0.0, 0.0]))
     if (found.status != Status.OK).any():
         raise InputError("a ray from the margin does not leave the eye", path="stop.diameter_mm")
     exits = found.exit_points_mm

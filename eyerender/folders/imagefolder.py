@@ -22,10 +22,11 @@ from ..storage.jsonlines import JsonLines
 from ..versions import package_version
 from .imagefile import read_image
 
-IMAGE_SCHEMA = "eyerender/image/3"
-# Version 2 has no masks of highlights, version 1 neither `gamma` nor the class 4 of masks; they are read wherever
-# version 3 is.
-IMAGE_SCHEMAS = (IMAGE_SCHEMA, "eyerender/image/2", "eyerender/image/1")
+IMAGE_SCHEMA, RENDERED_SCHEMA = "eyerender/image/4", "eyerender/image/3"
+"""Schemas of a line in a dataset, and in a rendered folder, whose lines hold nothing that version 4 added."""
+# Version 3 has no diameters of the pupil, version 2 no masks of highlights, version 1 neither `gamma` nor the class 4
+# of masks; they are read wherever version 4 is.
+IMAGE_SCHEMAS = (IMAGE_SCHEMA, RENDERED_SCHEMA, "eyerender/image/2", "eyerender/image/1")
 DATASET_SCHEMA = "eyerender/dataset/1"
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
 RUN = "run.json"  # in a folder that `generate` fills, from its start
@@ -48,7 +49,10 @@ CONVENTIONS = {
 
 
 # Keys of a line that name files of the folder.
-FILE_KEYS = ("file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name", "highlight_mask_file_name")
+FILE_KEYS = (
+    *("file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name", "highlight_mask_file_name"),
+    "lens_reflections_mask_file_name",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,7 +369,7 @@ def write_dataset(folder: Path, lines: list[dict[str, Any]], *, spec: dict[str, 
     """Write metadata.jsonl and then dataset.json, which marks the folder complete."""
     with open(folder / METADATA, "w", encoding="utf-8") as file:
         for line in lines:
-            file.write(json.dumps({"schema": IMAGE_SCHEMA, **line}, allow_nan=False) + "\n")
+            file.write(json.dumps({"schema": RENDERED_SCHEMA, **line}, allow_nan=False) + "\n")
     dataset = {
         "schema": DATASET_SCHEMA,
         "digest": digest,
@@ -377,7 +381,7 @@ def write_dataset(folder: Path, lines: list[dict[str, Any]], *, spec: dict[str, 
     write_json(folder / DATASET, dataset)
 
 
-RESULTS = 17
+RESULTS = 18
 """Version of what this package computes: records, labels and pixels of the same spec.
 
 A change of the code that changes them raises it. A run that was begun with another version is not resumed.

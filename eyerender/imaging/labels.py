@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from ..arrays import Bools, Bytes, Floats
+from ..arrays import Bools, Bytes, Floats, remembered
+from ..errors import InputError
+from ..eye.entrance import entrance_pupil_mm
 from ..eye.fixation import fixations
 from ..eye.model import EyeModel
 from ..folders.imagefolder import IRIS, PUPIL
@@ -28,6 +30,7 @@ from .capture import EyeImage, eye_motion
 
 _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
+_FAR_MM = 1e9  # an observer from whom the entrance pupil is 3e-9 of its size larger than from infinity
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -98,6 +101,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
             glint | _seen_glint(image, k, seen["glints"][k]["reason"]) for k, glint in enumerate(known["glints"])
         ],
         "lid_margins_px": seen["lid_margins_px"],
+        "lid_opening": None,
         **{key: known[key] for key in ("space", "globe_radius_mm", "pose", "camera", "lights_mm")},
         "failed_paths": int(seen["failed_paths"]),
     }
@@ -107,7 +111,11 @@ def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | E
     """Labels that follow from pose and parameters alone, without an image: a part of `image_labels`."""
     camera = scene.rig.cameras[view.camera]
     return {
-        "pupil": {"amodal": _ellipse_of_record(observations, view.row)},
+        "pupil": {
+            "amodal": _ellipse_of_record(observations, view.row),
+            "entrance_diameter_mm": entrance_diameter_mm(view.eye),
+            "stop_diameter_mm": scene.stop_diameter_mm(EYES[int(observations.index.eye[view.row])]),
+        },
         "iris": {"amodal": iris_outline(scene, view)},
         "glints": _glints(scene, observations, view),
         "space": _space(scene, observations, view, camera),
@@ -119,6 +127,7 @@ def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | E
             "t_mm": camera.t.tolist(),
             "distortion": camera.distortion.tolist(),
             "resolution_px": list(camera.resolution_px),
+            "mirrored": None,
         },
         "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
     }
@@ -225,6 +234,18 @@ def limbus_px(scene: Scene, view: EyeInWindow | EyeImage, count: int) -> tuple[F
     return np.asarray(pixels), reason
 
 
+@remembered
+def entrance_diameter_mm(eye: EyeModel) -> float | None:
+    """Diameter of the entrance pupil, as a distant observer on the optic axis sees it (circle of equal area).
+
+    It is None if a ray from the stop's margin does not leave the eye.
+    """
+    try:
+        return entrance_pupil_mm(eye, distance_mm=_FAR_MM)
+    except InputError:
+        return None
+
+
 def cornea_centre(eye: EyeModel) -> Floats:
     """Centre of curvature of the front cornea at its apex, eye frame, (3,) mm: apex - R axis, R the mean radius."""
     surface = eye.front[0]
@@ -287,24 +308,33 @@ def _share(value: float) -> float | None:
 def _space(
     scene: Scene, observations: Observations, view: EyeInWindow | EyeImage, camera: PinholeCamera
 ) -> dict[str, Any]:
-    """Points (mm) and lines in the world and in the camera's frame."""
+    """Points (mm) and lines in the world and in the camera's frame, and the rotation centres in the head's frame.
+
+    The rotation centres are fixed in the head: where they are in the unrotated eye. (Azimuth turns the eye last, so it
+    carries the eye's elevation axis about the azimuth centre.)
+    """
     eye, M, t, row = view.eye, view.M, view.t, view.row
     index = observations.index
-    point, way = _line_of_sight(scene, observations, view)
+    point, direction = _line_of_sight(scene, observations, view)
     points = {
-        "rotation_centre_mm": eye.rotation.azimuth_centre_mm,
         "globe_centre_mm": eye.sclera.centre_mm,
         "cornea_centre_mm": cornea_centre(eye),
         "cornea_apex_mm": np.zeros(3),
         "pupil_centre_mm": eye.stop.centre_mm,
         "line_of_sight_point_mm": point,
     }
-    ways = {"optic_axis": np.array([1.0, 0, 0]), "line_of_sight": way}
-    world = {k: M @ np.asarray(p) + t for k, p in points.items()} | {k: M @ np.asarray(d) for k, d in ways.items()}
-    seen = {k: camera.R @ v + (camera.t if k in points else 0.0) for k, v in world.items()}
+    directions = {"optic_axis": np.array([1.0, 0, 0]), "line_of_sight": direction}
+    head = {
+        name: index.eye_position_mm[row] + np.asarray(getattr(eye.rotation, name))
+        for name in ("azimuth_centre_mm", "elevation_centre_mm")
+    }
+    world = {k: p + index.head_mm[row] for k, p in head.items()}
+    world |= {k: M @ np.asarray(p) + t for k, p in points.items()} | {k: M @ d for k, d in directions.items()}
+    seen = {k: camera.R @ v + (0.0 if k in directions else camera.t) for k, v in world.items()}
     target = index.target_mm[row]
     there = bool(np.isfinite(target).all())
     return {
+        "head": {k: v.tolist() for k, v in head.items()},
         "world": {k: v.tolist() for k, v in world.items()} | {"target_mm": target.tolist() if there else None},
         "camera": {k: v.tolist() for k, v in seen.items()}
         | {"target_mm": (camera.R @ target + camera.t).tolist() if there else None},

@@ -103,9 +103,11 @@ def test_points_and_lines_hang_together(entries):
         # The paraxial radius from the sag at 0.05 mm: 1e-4 of it.
         near(world["cornea_centre_mm"], apex - radius * axis, 2e-3)
         near(world["pupil_centre_mm"], apex - 3.6 * axis)
-        near(world["rotation_centre_mm"], apex - 13.5 * axis)
-        # E2 turns about one point, which stays where it is in the head.
-        near(world["rotation_centre_mm"], np.array(record["eye_position_mm"]) + record["head_mm"] - [13.5, 0, 0])
+        for name in ("azimuth_centre_mm", "elevation_centre_mm"):
+            near(world[name], apex - 13.5 * axis)
+            # E2 turns about one point, which stays where it is in the head.
+            near(labels["space"]["head"][name], np.array(record["eye_position_mm"]) - [13.5, 0, 0])
+            near(world[name], np.array(record["eye_position_mm"]) + record["head_mm"] - [13.5, 0, 0])
         target = np.array(world["target_mm"])
         near(target, record["target_mm"])
         way = target - world["line_of_sight_point_mm"]

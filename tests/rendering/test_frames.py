@@ -10,7 +10,7 @@ import pytest
 
 from eyerender.cli.main import run
 from eyerender.errors import InputError
-from eyerender.folders.imagefolder import FRAME, IMAGE_SCHEMAS, PUPIL, ImageFolder
+from eyerender.folders.imagefolder import FRAME, IMAGE_SCHEMAS, PUPIL, RENDERED_SCHEMA, ImageFolder
 from eyerender.imaging.capture import make_renderer, noiseless, render_job, render_windows
 from eyerender.imaging.imageobserver import ImageObserver
 from eyerender.imaging.images import auto_exposed, render, render_folder
@@ -124,7 +124,7 @@ def test_a_folder_says_its_classes_and_its_gamma(tmp_path):
     render_folder(given, tmp_path / "out", threads=1)
     folder = ImageFolder.load(tmp_path / "out")
     (entry,) = folder
-    assert (entry.line["schema"], entry.gamma) == (IMAGE_SCHEMAS[0], 2.2)
+    assert (entry.line["schema"], entry.gamma) == (RENDERED_SCHEMA, 2.2)
     mask = entry.mask()
     assert (mask[:12] == FRAME).all()
     assert (mask[-12:] == FRAME).all()
@@ -140,7 +140,7 @@ def test_a_folder_says_its_classes_and_its_gamma(tmp_path):
     del line["gamma"]
     metadata.write_text(json.dumps({**line, "schema": IMAGE_SCHEMAS[-1]}) + "\n")
     assert ImageFolder.load(tmp_path / "out").entries[0].gamma == 1.0
-    for wrong in ({"gamma": "2"}, {"gamma": 0.0}, {"schema": "eyerender/image/4"}):
+    for wrong in ({"gamma": "2"}, {"gamma": 0.0}, {"schema": "eyerender/image/5"}):
         metadata.write_text(json.dumps({**line, **wrong}) + "\n")
         with pytest.raises(InputError, match=next(iter(wrong))):
             ImageFolder.load(tmp_path / "out")

@@ -3,7 +3,7 @@
     NAME.mp4pupil_eli.txt, iris_eli.txt           FRAME;ANGLE;CENTER X;CENTER Y;WIDTH;HEIGHT;   degrees, full axes
     NAME.mp4pupil_lm_2D.txt, iris_lm_2D.txt       FRAME;AVG INACCURACY;X;Y;...;                 eight boundary points
     NAME.mp4lid_lm_2D.txt                         the same, 17 points of the upper, then 17 of the lower lid's margin
-    NAME.mp4gaze_vec.txt                          FRAME;X;Y;Z;       from the rotation centre to the pupil's, camera
+    NAME.mp4gaze_vec.txt                          FRAME;X;Y;Z;       optic axis, unit vector, camera
     NAME.mp4eye_ball.txt                          FRAME;RADIUS;X;Y;Z;                           px, px, px, mm
     NAME.mp4validity_pupil.txt, iris, lid         FRAME;VALIDITY;
     NAME.mp4pupil_seg_2D.mp4, iris_seg_2D.mp4     white where visible
@@ -112,12 +112,11 @@ class _Video:
 def rows_of(item: Item) -> dict[str, list[float]]:
     """Annotations of a frame, without its number."""
     space = item.line["labels"]["space"]["camera"]
-    globe, turn, pupil = (np.array(space[k]) for k in ("globe_centre_mm", "rotation_centre_mm", "pupil_centre_mm"))
-    gaze = (pupil - turn) / np.linalg.norm(pupil - turn)
+    globe = np.array(space["globe_centre_mm"])
     K = np.array(item.line["labels"]["camera"]["K"])
     radius = item.line["labels"]["globe_radius_mm"] * float(np.sqrt(K[0, 0] * K[1, 1])) / float(np.linalg.norm(globe))
     rows: dict[str, list[float]] = {
-        "gaze_vec": gaze.tolist(),
+        "gaze_vec": list(space["optic_axis"]),
         "eye_ball": [radius, *item.pixel_of(globe).tolist(), float(globe[2])],
     }
     lids = item.line["labels"]["lid_margins_px"]
@@ -145,4 +144,4 @@ def _ellipse(ellipse: Ellipse | None) -> list[float]:
 
 
 def _number(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:.6f}"
+    return str(value) if isinstance(value, int) else f"{value:.9f}"  # 1e-7 deg of a unit vector
