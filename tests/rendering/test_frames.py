@@ -11,7 +11,7 @@ import pytest
 from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.folders.imagefolder import FRAME, IMAGE_SCHEMAS, PUPIL, RENDERED_SCHEMA, ImageFolder
-from eyerender.imaging.capture import make_renderer, noiseless, render_job, render_windows
+from eyerender.imaging.capture import noiseless, render_job, render_windows
 from eyerender.imaging.imageobserver import ImageObserver
 from eyerender.imaging.images import auto_exposed, render, render_folder
 from eyerender.rig.surroundings import paint
@@ -21,11 +21,6 @@ from eyerender.scene.spec import SceneSpec
 pytestmark = pytest.mark.render
 # A straight edge that covers the left part of the picture up to 4 px right of its middle.
 EDGE = {"centre": [10.04, 0.0], "half_size": [10.0, 10.0], "power": 50, "edge_px": 2}
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return make_renderer("auto", 1)
 
 
 def scene(poses=((0.0, 0.0),), **fields):

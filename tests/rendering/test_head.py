@@ -16,7 +16,7 @@ from scipy import ndimage
 from eyerender.analytic.observer import trace
 from eyerender.cli.main import run
 from eyerender.errors import InputError
-from eyerender.imaging.capture import make_renderer, render_job, render_windows
+from eyerender.imaging.capture import render_job, render_windows
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.labels import labels_of
@@ -29,11 +29,6 @@ pytestmark = pytest.mark.render
 X_MM, WIDTH_MM, UPPER_MM, LOWER_MM = 2.0, 26.0, 2.2, 4.0
 # A bar further out, before the lower half of the pupil and the way from the first lamp's glint to the camera.
 BAR_MM = ((3.0, -3.0, -1.7), (3.1, 3.0, -0.7))
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return make_renderer("auto", 1)
 
 
 def almond(count: int = 400) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import j1
 
 from eyerender.errors import InputError
-from eyerender.imaging.capture import make_renderer, render_windows
+from eyerender.imaging.capture import render_windows
 from eyerender.rig.defocus import confusion_px, defocused, disc, vignette
 from eyerender.rig.imaging import Lens
 from eyerender.rig.sensor import Sensor
@@ -15,11 +15,6 @@ from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 
 pytestmark = pytest.mark.render
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return make_renderer("auto", 1)
 
 
 def shot(renderer, **more):

@@ -103,7 +103,7 @@ def plain(renderer, monkeypatch):
 
 
 def test_light_between_globe_and_background_against_path(plain, tmp_path):
-    # The bars of the long proofs below. A picture without interreflection is 5 to 6 % darker, so this test would see it.
+    # The bars of the long proofs below. A picture without interreflection is 5 to 6 % darker, which this would see.
     job = job_in(remote(32), "E2", lights=large_lamps(LOW))
     found = against_path(plain, job, tmp_path, 1024)
     assert found.keys() == {"sclera", "other"}

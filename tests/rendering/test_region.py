@@ -20,11 +20,6 @@ from tests.support.labels import labels_of
 pytestmark = pytest.mark.render
 
 
-@pytest.fixture(scope="module")
-def renderer():
-    return make_renderer("auto", 1)
-
-
 def scene(eyes=("right",), poses=((0.0, 0.0),), look=None, region=None, spp=4, interreflection=True):
     return Scene.of(
         SceneSpec.from_mapping(
