@@ -67,7 +67,14 @@ def test_a_record_is_described_once_and_links_lead_to_it(pages):
 def test_every_public_name_has_a_docstring_page(pages):
     texts = (text for name, text in pages.items() if "/api_" in name and not name.endswith("/api_torch"))
     found = references.names_on("".join(texts))
-    assert found == (set(er.__all__) | set(er.gaze.__all__)) - {"gaze", "__version__"}
+    spaces = [er.dataset, er.gaze, er.region, er.rig]
+    assert found == set(er.__all__).union(*(s.__all__ for s in spaces)) - {
+        "dataset",
+        "gaze",
+        "region",
+        "rig",
+        "__version__",
+    }
 
 
 def test_every_command_is_in_the_reference(pages):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import eyerender as er
 from eyerender.cli import main as _commands  # noqa: F401  (registers the commands)
@@ -11,12 +13,15 @@ from eyerender.cli.app import app
 
 # A page of the API: its title, and the beginnings of the modules (below the package) whose names it holds.
 GROUPS = {
-    "api_scenes": ("Scenes, frames and subjects", ("scene", "capture", "images")),
+    "api_scenes": ("Scenes, frames and subjects", ("scene", "imaging.capture", "imaging.images")),
     "api_eyes": ("Eyes and the eye region", ("eye", "region")),
     "api_rigs": ("Rigs: cameras, lights, screens, sensors", ("rig",)),
     "api_observers": ("Observers, observations and comparison", ("",)),
-    "api_datasets": ("Datasets and folders of images", ("dataset", "imagefolder", "benchmark")),
+    "api_datasets": ("Datasets and folders of images", ("dataset", "folders", "benchmark")),
 }
+
+# Pages that end with the names of a namespace which are not among the package's own.
+NAMESPACES = {"api_eyes": "region", "api_rigs": "rig", "api_datasets": "dataset"}
 
 # PyTorch need not be installed where the site is built.
 TORCH = """# Datasets for PyTorch
@@ -50,10 +55,10 @@ def homes() -> dict[str, str]:
     """The page of each public name."""
     found = {}
     for name in er.__all__:
-        if name in ("gaze", "__version__"):
+        if name == "__version__" or isinstance(getattr(er, name), ModuleType):
             continue
-        home = getattr(er, name).__module__.split(".")[1]
-        pages = [page for page, (_, starts) in GROUPS.items() if home in starts]
+        home = getattr(er, name).__module__.removeprefix("eyerender.") + "."
+        pages = [page for page, (_, starts) in GROUPS.items() if any(home.startswith(f"{s}.") for s in starts)]
         found[name] = pages[0] if pages else "api_observers"
     return found
 
@@ -63,18 +68,22 @@ def pages() -> dict[str, str]:
     made = {"commands": commands()}
     where = homes()
     for page, (title, _) in GROUPS.items():
-        made[page] = api_page(title, "eyerender", [name for name, its in where.items() if its == page])
-    made["api_gaze"] = api_page("Gaze estimators", "eyerender.gaze", er.gaze.__all__)
+        text = f"# {title}\n\n" + api_section("eyerender", [name for name, its in where.items() if its == page])
+        if space := NAMESPACES.get(page):
+            more = [name for name in getattr(er, space).__all__ if name not in er.__all__]
+            text += f"\n## Also in `er.{space}`\n\n" + api_section(f"eyerender.{space}", more)
+        made[page] = text
+    made["api_gaze"] = "# Gaze estimators\n\n" + api_section("eyerender.gaze", er.gaze.__all__)
     made["api_torch"] = TORCH
     return made
 
 
-def api_page(title: str, module: str, names: list[str]) -> str:
-    """A page of names of one module: a table of all, then the docstring of each."""
+def api_section(module: str, names: list[str]) -> str:
+    """Names of one module: a table of all, then the docstring of each."""
     table = "\n".join(f"   {name}" for name in names)
-    lines = [f"# {title}", "", "```{eval-rst}", f".. currentmodule:: {module}", "", ".. autosummary::", "", table, ""]
+    lines = ["```{eval-rst}", f".. currentmodule:: {module}", "", ".. autosummary::", "", table, ""]
     for name in names:
-        found = getattr(er.gaze if module.endswith("gaze") else er, name)
+        found = getattr(sys.modules[module], name)
         kind = "class" if isinstance(found, type) else "function"
         if isinstance(found, type) and issubclass(found, Exception):
             kind = "exception"
