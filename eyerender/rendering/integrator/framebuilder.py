@@ -87,7 +87,7 @@ class FrameBuilder:
         self._replaced: deque[Any] = deque(maxlen=_REGIONS)  # subjects whose scenes others took
         self._maps = Maps()
         self.meshes = Meshes()
-        self._exchange = RadiositySolver()
+        self._radiosity = RadiositySolver()
         self._shapes: EyeCache[ReliefShape] = EyeCache()
         self._next: _Next | None = None
 
@@ -154,12 +154,13 @@ class FrameBuilder:
         """Add the light between surfaces, and the grids of the lamps' light that the frame can use."""
         job = host.job
         parts = panel_lamps(job.ambient, job.anchor_mm) + bright_lamps(job.ambient.map, self._maps, job.anchor_mm)
-        read = self._exchange.begun(job, host.lamps, host.places, frame, LampTable.of(parts, job.M, job.t), place)
+        panels = LampTable.of(parts, job.M, job.t)
+        pending = self._radiosity.gather(frame, job, host.lamps, panels, host.patches, place)
         if after is not None:
             self._expect(after)
-        solved = read()
+        gathered = pending.read()
         self._fill_grids(host, frame, place)
-        frame.caches.radiosity = solved()
+        frame.caches.radiosity = pending.solve(gathered)
         if not place.obstructed:
             reach = dr.opaque(mi.Float, min(host.reach_mm, _FARTHEST_MM))
             points = dr.opaque(mi.UInt32, host.lamps.points)

@@ -248,7 +248,7 @@ class _GroupShading:
         seen = on_relief(frame, replace(view, other=mi.Bool(False)))
         inner, missed = irradiance_through_cornea(frame, seen.inner, seen.lit_inside, *group.spot(j))
         albedo = outer_albedo(frame, seen)
-        received = frame.caches.radiosity.globe(frame.point_to_scene(seen.point))
+        received = frame.caches.radiosity.at_globe(frame.point_to_scene(seen.point))
         rest = indirect(frame, seen, d, albedo, inner, received)
         return rest + self.lamps_on_globe(seen, albedo, -frame.vector_to_eye(d), j), missed
 

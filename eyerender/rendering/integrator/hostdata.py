@@ -20,7 +20,7 @@ from ..records.parameters import Parameters
 from ..scene.blur import Blur
 from ..scene.diffusiongrids import DiffusionGrids
 from ..scene.pixels import skin_only_tiles, supersampled_pixels
-from ..transport.patches import GlobePlaces, globe_places
+from ..transport.patches import GlobePatches, globe_patches
 from ..transport.shadowmaps import shadow_map_table
 
 _NO_TILES = frozen([[False]], bool)
@@ -43,7 +43,7 @@ class HostData:
     def made(cls, job: RenderJob, posed: RegionMesh | None) -> HostData:
         """Make all that a picture needs."""
         made = cls(job, posed)
-        _ = made.parameters, made.lamps, made.returned, made.places, made.lid_margins_px
+        _ = made.parameters, made.lamps, made.returned, made.patches, made.lid_margins_px
         if job.mesh_edge_mm is None:
             _ = made.mirror_images
         if made.posed is not None:
@@ -104,9 +104,9 @@ class HostData:
         return MirrorImages.of(self.job, None)
 
     @cached_property
-    def places(self) -> GlobePlaces:
-        """The places on the globe where the light between surfaces is computed."""
-        return globe_places(self.job.globe, self.posed)
+    def patches(self) -> GlobePatches:
+        """The patches of the globe between which light is exchanged."""
+        return globe_patches(self.job.globe, self.posed)
 
     @cached_property
     def tissue_cells(self) -> DiffusionGrids:

@@ -42,17 +42,17 @@ def direct(view: SurfaceInteraction, albedo: mi.Float, outer: mi.Float, shine: m
 
 
 def of_surroundings(frame: Frame, view: SurfaceInteraction, known: mi.Bool) -> mi.Vector4f:
-    """What points of a bare globe and of its surround receive from other surfaces (see `radiosity.RadiosityField`).
+    """What points of a bare globe and of its background receive from other surfaces (see `RadiosityField`).
 
     Obstacles receive nothing. The light from other surfaces on the globe is left out where it is `known`.
     """
     received, nothing = frame.caches.radiosity, mi.Vector4f(0, 1, 0, 0)
 
     def of_plane(x: mi.Vector3f) -> mi.Vector4f:
-        return dr.select(dr.abs(x.x - frame.backdrop_x) < _FLAT_MM, received.surround(x), nothing)
+        return dr.select(dr.abs(x.x - frame.backdrop_x) < _FLAT_MM, received.at_background(x), nothing)
 
     def of_either(x: mi.Vector3f) -> mi.Vector4f:
-        return dr.if_stmt((x,), view.other, of_plane, received.globe)
+        return dr.if_stmt((x,), view.other, of_plane, received.at_globe)
 
     known &= ~view.other
     wanted = view.matte if frame.structure.ambient else view.matte & ~known
@@ -71,7 +71,7 @@ def indirect(
         d: directions of the rays (scene's frame).
         albedo: of what is matte.
         inner: irradiance of the lamps in the plane of the iris.
-        received: what the first surface receives from other surfaces (see `radiosity.RadiosityField`).
+        received: what the first surface receives from other surfaces (see `radiosityfield.RadiosityField`).
     """
     index = frame.inner_index
     rest = off_eye(frame, view, d, albedo, received)
@@ -115,7 +115,7 @@ def _cover(view: SurfaceInteraction) -> mi.Float:
 def _leaving(frame: Frame, pupil: mi.Bool, x: mi.Vector3f, lit: mi.Float) -> mi.Float:
     """Radiosity of points in the plane of the iris that have the irradiance `lit` from the lamps."""
     albedo = dr.if_stmt((x,), ~pupil, lambda x: iris_albedo(frame, x), lambda x: mi.Float(frame.pupil_albedo))
-    return albedo * (lit + frame.caches.radiosity.iris(x))
+    return albedo * (lit + frame.caches.radiosity.at_iris(x))
 
 
 def _mirrored(frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, clear: mi.Float) -> mi.Float:
@@ -153,7 +153,7 @@ def _mirrored(frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, clear: mi.
         seen = dr.if_stmt(
             (start + t * way, seen),
             wet & (way.x < -1e-4) & (t > 0),
-            lambda x, _: received.surround(x).z * dr.inv_pi,
+            lambda x, _: received.at_background(x).z * dr.inv_pi,
             lambda _, seen: seen,
         )
     return dr.select(wet | film, share * seen, 0)

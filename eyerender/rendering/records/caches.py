@@ -20,7 +20,7 @@ class Caches:
         iris: irradiance of the lamps in the plane of the iris (`irisirradiance.IrisIrradiance`).
         relief: relief mapping of the iris in the light of the lamps (`reliefmapping.IrisRelief`).
         fundus: light of the lamps that the fundus returns (`fundusirradiance.FundusIrradiance`).
-        radiosity: irradiance by way of other surfaces (`radiosity.RadiosityField`).
+        radiosity: irradiance by way of other surfaces (`radiosityfield.RadiosityField`).
         globe: irradiance of the lamps on a bare globe and on the plane about it (`globeirradiance.GlobeIrradiance`).
     """
 

@@ -218,7 +218,7 @@ class SkinGeometry:
         faces: four entries for each triangle: its vertices, and 1 unless it is a part inside the sheet of skin.
         vertices: eight numbers for each vertex: place (scene's frame, mm), first coordinate of the map, normal, second
             coordinate of the map.
-        received: four numbers for each vertex: the light of other surfaces, as in `radiosity.RadiosityField`.
+        received: four numbers for each vertex: the light of other surfaces, as in `radiosityfield.RadiosityField`.
         sheet: number of the triangles of the sheet, which come first.
         film: number of the first triangle of the menisci.
         mirror: -1 for a left eye, else 1.

@@ -1,22 +1,22 @@
 """Light inside the anterior chamber: what iris and chamber wall send to each other by way of the cornea.
 
 Light that the iris scatters is mirrored by the cornea (by Fresnel, totally beyond the critical angle) and returns to
-it. The irradiance that this adds varies slowly, so it is computed at a few places: points on rings in the plane of the
+it. The irradiance that this adds varies slowly, so it is computed at a few patches: points on rings in the plane of the
 iris, and points on the wall between this plane and the cornea's rim. From each, rays of a cosine-distributed pattern
 are traced through the exact surfaces:
 
     E_i = E0_i + (1 / K) sum_k [ F_k rho_j E_j + n^2 (1 - F_k) pi L_k ]
 
-with F_k the share that the cornea mirrors, j the place where the mirrored ray arrives, and L_k the radiance that comes
+with F_k the share that the cornea mirrors, j the patch where the mirrored ray arrives, and L_k the radiance that comes
 from outside along the ray that leaves the eye. Both sums depend on the eye alone, and they are linear in its lights.
-For a new pose, one ray is followed outside for each bundle of like rays, from whatever places.
+For a new pose, one ray is followed outside for each bundle of like rays, from whatever patches.
 
 Limbal tissue is translucent. Of the light that falls on it, a share T goes through and leaves its inner side scattered.
 This side is that of the cornea's rim, as far as the rim has turned to sclera (opacity o), and the chamber's wall:
 
     E_i += T sum_s (f_is + w_is) E_s,   f_is = integral over the rim's sector s of o cos_i cos / (pi r^2) dA
 
-with E_s the irradiance of the limbus in sector s from outside, and w_is the share of the wall in the view of place i.
+with E_s the irradiance of the limbus in sector s from outside, and w_is the share of the wall in the view of patch i.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ IRIS_RINGS, TURNS = 16, 16  # points in the plane of the iris, over radius and a
 ROOT_RINGS = 14  # of these on iris and pupil, the others beyond the root
 IRIS = IRIS_RINGS * TURNS
 LEVELS = 2  # of points on the wall
-PLACES = IRIS + TURNS * LEVELS
+PATCHES = IRIS + TURNS * LEVELS
 RAYS = 256  # from each point
 _FAR_MM = 8.0  # distance of what rays that leave the eye meet: so far apart are two rays at an angle of 1
 _WEAK, _FEW = 0.25, 4  # of the rays of which the cornea mirrors less, one of four stands for all
@@ -53,16 +53,16 @@ _WALL_MM = 1.0  # thickness of the sclera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chamber(ArrayValue):
-    """The chamber of one eye, in the eye frame; arrays with PLACES rows list the rings from the middle, then the wall.
+    """The chamber of one eye, in the eye frame; arrays with PATCHES rows list the rings from the middle, then the wall.
 
     Attributes:
         root_mm: radius of the iris' root, between two rings.
         reach_mm: radius of the edge of the last ring.
-        points: (PLACES, 3) places, mm.
-        normals: (PLACES, 3) unit normals into the chamber.
-        valid: (PLACES,) whether a place is in the chamber.
-        exchange: (PLACES, PLACES) share of the radiosity of each place in the irradiance of each other.
-        leaving: (PLACES, RAYS, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none.
+        points: (PATCHES, 3) patches, mm.
+        normals: (PATCHES, 3) unit normals into the chamber.
+        valid: (PATCHES,) whether a patch is in the chamber.
+        exchange: (PATCHES, PATCHES) share of the radiosity of each patch in the irradiance of each other.
+        leaving: (PATCHES, RAYS, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none.
     """
 
     root_mm: float
@@ -96,7 +96,7 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
 
 
 def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
-    """Share (PLACES, TURNS) by which light that comes through each sector of the limbal tissue lights each place.
+    """Share (PATCHES, TURNS) by which light that comes through each sector of the limbal tissue lights each patch.
 
     Args:
         eye: the eye.
@@ -108,7 +108,7 @@ def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
 
 @remembered
 def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
-    """Bundle the rays that leave an eye: those of like origin and direction, from whatever places, are one bundle.
+    """Bundle the rays that leave an eye: those of like origin and direction, from whatever patches, are one bundle.
 
     From the outer iris few rays leave. So none is left out, and one ray of each bundle is followed for all.
 
@@ -117,11 +117,11 @@ def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
         halvings: how often the rays are halved into bundles.
 
     Returns:
-        Origin and direction (bundles, 6) of a ray from the middle of each bundle, and the gain (PLACES, bundles),
-        sparse, by which pi times the radiance along it becomes irradiance of each place.
+        Origin and direction (bundles, 6) of a ray from the middle of each bundle, and the gain (PATCHES, bundles),
+        sparse, by which pi times the radiance along it becomes irradiance of each patch.
     """
-    place, ray = np.nonzero(chamber.leaving[..., 6])
-    rays, count = chamber.leaving[place, ray], 2**halvings
+    patch, ray = np.nonzero(chamber.leaving[..., 6])
+    rays, count = chamber.leaving[patch, ray], 2**halvings
     # Some rays are there twice at first, so that all bundles have the same number.
     full = -(-len(rays) // count) * count
     order = np.arange(full) * len(rays) // full
@@ -142,13 +142,13 @@ def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
     middle = order[np.arange(count), np.argmin(np.einsum("ijk,ijk->jk", off, off), axis=1)]
     bundle = np.empty(len(rays), dtype=int)
     bundle[order] = np.arange(count)[:, None]
-    gain = csr_array((rays[:, 6] / RAYS, (place, bundle)), shape=(PLACES, count))
+    gain = csr_array((rays[:, 6] / RAYS, (patch, bundle)), shape=(PATCHES, count))
     return rays[middle, :6], gain
 
 
 @lru_cache(maxsize=64)
 def _through_limbus(chamber: Chamber, front: Surface, limbus: float, width: float) -> Floats:
-    wall = chamber.exchange[:, IRIS:].reshape(PLACES, TURNS, LEVELS).sum(axis=2)
+    wall = chamber.exchange[:, IRIS:].reshape(PATCHES, TURNS, LEVELS).sum(axis=2)
     if width == 0:
         return frozen(wall)
     rows, fine = 8, 4
@@ -166,7 +166,7 @@ def _through_limbus(chamber: Chamber, front: Surface, limbus: float, width: floa
     here = np.einsum("ijkl,il->ijk", way, chamber.normals)
     there = np.einsum("ijkl,jkl->ijk", way, normal)
     seen = np.maximum(here, 0) * np.maximum(there, 0) / (np.pi * r2 * r2) * area
-    sectors = seen.reshape(PLACES, rows, TURNS, fine).sum(axis=(1, 3))
+    sectors = seen.reshape(PATCHES, rows, TURNS, fine).sum(axis=(1, 3))
     return frozen(wall + np.where(chamber.valid[:, None], sectors, 0))
 
 
@@ -184,8 +184,8 @@ def _in_plane(centre: Floats, normal: Floats, y: Floats, z: Floats) -> Floats:
     return np.stack([x, y, z], axis=-1)
 
 
-def shares(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: float) -> Floats:
-    """Mean albedo of each place, (PLACES,): of pupil (`inside`), iris, and limbal tissue (`beyond` and on the wall)."""
+def patch_albedo(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: float) -> Floats:
+    """Mean albedo (PATCHES,) of the patches: of pupil (`inside`), iris, and limbal tissue (`beyond` and on the wall)."""
     fine = (np.arange(4) + 0.5) / 4
     ring, turn = np.arange(IRIS)[:, None] // TURNS, np.arange(IRIS)[:, None] % TURNS
     part, side = (v.ravel() for v in np.meshgrid(fine, fine))
@@ -258,9 +258,9 @@ def _chamber(
     walls = _walls(front, indices, film, plane, radii[1], sclera, foot)
     reach = walls.rim + walls.slope * max(walls.top - walls.centre[0], 0)
     root = min(radii[0], 0.99 * reach)
-    points, normals, valid = _places(walls, root, reach)
-    exchange = np.zeros((PLACES, PLACES))
-    leaving = np.zeros((PLACES, RAYS, 7))
+    points, normals, valid = _patches(walls, root, reach)
+    exchange = np.zeros((PATCHES, PATCHES))
+    leaving = np.zeros((PATCHES, RAYS, 7))
     rows = np.flatnonzero(valid)
     o, d = _pattern(points[rows], normals[rows])
     row = np.repeat(rows, RAYS)
@@ -285,7 +285,7 @@ def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, 
     return _Walls(front, indices, film, centre, normal, limbus, limbus, top, (wide - limbus) / (top - bottom))
 
 
-def _places(walls: _Walls, root: float, reach: float) -> tuple[Floats, Floats, Bools]:
+def _patches(walls: _Walls, root: float, reach: float) -> tuple[Floats, Floats, Bools]:
     n, c = walls.normal, walls.centre
     ring, turn = np.arange(IRIS) // TURNS, np.arange(IRIS) % TURNS
     radius, angle = _radius(np.asarray(ring + 0.5, dtype=float), root, reach), 2 * np.pi * (turn + 0.5) / TURNS
@@ -466,13 +466,13 @@ def _refracted(d: Floats, n: Floats, eta: float) -> Floats:
 
 
 def _turned(exchange: Floats, valid: Bools) -> Floats:
-    """Exchange (PLACES, PLACES) averaged over neighbouring sectors, because an eye is nearly round."""
-    place = np.arange(PLACES)
-    on_wall = place >= IRIS
-    turn = np.where(on_wall, (place - IRIS) // LEVELS, place % TURNS)
-    total, weight = np.zeros_like(exchange), np.zeros(PLACES)
+    """Exchange (PATCHES, PATCHES) averaged over neighbouring sectors, because an eye is nearly round."""
+    patch = np.arange(PATCHES)
+    on_wall = patch >= IRIS
+    turn = np.where(on_wall, (patch - IRIS) // LEVELS, patch % TURNS)
+    total, weight = np.zeros_like(exchange), np.zeros(PATCHES)
     for shift, share in enumerate(_ALIKE, -(len(_ALIKE) // 2)):
-        moved = place + ((turn + shift) % TURNS - turn) * np.where(on_wall, LEVELS, 1)
+        moved = patch + ((turn + shift) % TURNS - turn) * np.where(on_wall, LEVELS, 1)
         total += share * exchange[np.ix_(moved, moved)]
         weight += share * valid[moved]
     return np.asarray(total * np.where(valid & (weight > 0), 1 / np.maximum(weight, 1), 0)[:, None])
@@ -481,7 +481,7 @@ def _turned(exchange: Floats, valid: Bools) -> Floats:
 def _onto(
     back: Floats, on_wall: Bools, radii: tuple[float, float], points: Floats, valid: Bools
 ) -> list[tuple[Ints, Floats]]:
-    """Places that stand for points of arrival, each with its weight (n,): on the same side of the iris' root."""
+    """Patches that stand for points of arrival, each with its weight (n,): on the same side of the iris' root."""
     turn = np.arctan2(back[:, 2], back[:, 1]) / (2 * np.pi) * TURNS % TURNS
     root2, reach2 = np.square(radii)
     r2 = back[:, 1] ** 2 + back[:, 2] ** 2

@@ -64,7 +64,7 @@ class GlobeIrradiance:
         local = frame.surfaces[0].point_in(x)
         outside = (local.y * local.y + local.z * local.z > dr.square(frame.limbus.radius)) | (normal.x < 0)
         on_globe = _from_lamps(frame, points, x, normal, sphere=mi.Bool(False), cornea=outside)
-        more = frame.caches.radiosity.globe(frame.point_to_scene(x)).x
+        more = frame.caches.radiosity.at_globe(frame.point_to_scene(x)).x
         seen = frame.point_to_eye(mi.Vector3f(frame.backdrop_x, reach * a, reach * b))
         yes, normal = mi.Bool(True), frame.vector_to_eye(mi.Vector3f(1, 0, 0))
         on_plane = _from_lamps(frame, points, seen, normal, sphere=yes, cornea=yes)

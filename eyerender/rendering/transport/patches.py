@@ -1,4 +1,4 @@
-"""Places on skin and globe at which the light between surfaces is computed, and what lies between them."""
+"""Patches of skin, globe and background between which light is exchanged, and interpolation between them (host)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ GLOBE_COLUMNS, GLOBE_ROWS = 40, 12  # between the lids
 MAP_SIDE = 26  # over the front of a bare globe
 WIDEST = 0.55 * np.pi  # polar angle of the edge of that map
 _HALF_MM, _HIGH_MM = 14.0, 8.0  # of the opening of a head mesh, whose margins are unknown
-_FINE_MM, _NEAR_MM = 1.25, 12.0  # distance of places on skin this far from the middle of the fissure, and in proportion
+_FINE_MM, _NEAR_MM = (
+    1.25,
+    12.0,
+)  # distance of patches on skin this far from the middle of the fissure, and in proportion
 _NEIGHBOURS = 12
 _MARGIN_LEVEL = -2  # of the lids' margins: half the distance
 # Across the margins light changes fast: so many times as fast with the height above the globe as along them. They are
@@ -25,15 +28,15 @@ _LID_MM = 4.0  # from the sclera's sphere to the outside of a lid over the corne
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SkinPlaces(ArrayValue):
+class SkinPatches(ArrayValue):
     """Vertices of a region that stand for the skin about them; they move with the tissue.
 
     Attributes:
         vertices: (n,) indices of the vertices.
-        nearest: (all vertices,) place that stands for each vertex.
-        lids: (l,) places on the skin right in front of the globe, whose inner sides close a space about the cornea.
+        nearest: (all vertices,) patch that stands for each vertex.
+        lids: (l,) patches on the skin right in front of the globe, whose inner sides close a space about the cornea.
         behind: (all vertices,) index in `lids` of what stands for the inner side of each; -1 for none.
-        near: (all vertices, k) places about every vertex.
+        near: (all vertices, k) patches about every vertex.
         weight: (all vertices, k) their weights there.
     """
 
@@ -45,8 +48,8 @@ class SkinPlaces(ArrayValue):
     weight: Singles
 
 
-def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
-    """Choose places on a region's mesh: one for each cell of a grid that grows with the distance from the eye.
+def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
+    """Choose patches on a region's mesh: one for each cell of a grid that grows with the distance from the eye.
 
     On the margins of the lids cells are smaller, above all from edge to edge.
 
@@ -82,7 +85,7 @@ def skin_places(mesh: RegionMesh, globe: Globe) -> SkinPlaces:
     lids = np.flatnonzero(over & (out[:, 0] > 0))
     index = np.full(len(chosen), -1)
     index[lids] = np.arange(len(lids))
-    return SkinPlaces(chosen, nearest, lids, index[nearest], near, weight)
+    return SkinPatches(chosen, nearest, lids, index[nearest], near, weight)
 
 
 def _from_globe(globe: Globe, points: Floats) -> Floats:
@@ -97,9 +100,9 @@ def _where(mesh: RegionMesh, globe: Globe) -> Floats:
 
 
 def _spread(normals: Floats, where: Floats, chosen: Ints, size: Floats) -> tuple[Ints, Singles]:
-    """The nearest places at every vertex, and their weights.
+    """The nearest patches at every vertex, and their weights.
 
-    A place has less weight with distance and where the skin faces another way.
+    A patch has less weight with distance and where the skin faces another way.
     """
     k = min(_NEIGHBOURS, len(chosen))
     distance, index = cKDTree(where[chosen]).query(where, k=k)
@@ -111,7 +114,7 @@ def _spread(normals: Floats, where: Floats, chosen: Ints, size: Floats) -> tuple
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GlobePlaces(ArrayValue):
+class GlobePatches(ArrayValue):
     """Points of the globe in the scene's frame, on a grid of `rows` by `columns`.
 
     Between lids the columns have constant y, and the rows divide the opening there. On a bare globe the grid is its
@@ -133,8 +136,8 @@ class GlobePlaces(ArrayValue):
     rows: int
 
 
-def globe_places(globe: Globe, mesh: RegionMesh | None) -> GlobePlaces:
-    """Choose places on a posed globe, between the lids of a region or on the front of the bare globe."""
+def globe_patches(globe: Globe, mesh: RegionMesh | None) -> GlobePatches:
+    """Choose patches on a posed globe, between the lids of a region or on the front of the bare globe."""
     mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
     centre = globe.centre * mirror
     if mesh is None:
@@ -161,7 +164,7 @@ def _opening(globe: Globe, centre: Floats, mesh: RegionMesh) -> tuple[Floats, Fl
     return y, low, np.maximum(high, low + 1e-3)
 
 
-def _front(globe: Globe, centre: Floats, mirror: Floats) -> GlobePlaces:
+def _front(globe: Globe, centre: Floats, mirror: Floats) -> GlobePatches:
     at = np.linspace(-WIDEST, WIDEST, MAP_SIDE)
     a, b = (v.ravel() for v in np.meshgrid(at, at))
     polar = np.minimum(np.hypot(a, b), np.pi - 0.01)
@@ -172,17 +175,17 @@ def _front(globe: Globe, centre: Floats, mirror: Floats) -> GlobePlaces:
 
 def _placed(
     globe: Globe, centre: Floats, mirror: Floats, way: Floats, table: Floats, columns: int, rows: int
-) -> GlobePlaces:
+) -> GlobePatches:
     way = way / np.linalg.norm(way, axis=1, keepdims=True)
     points = centre + globe.radial(way * mirror)[:, None] * way
-    return GlobePlaces(points, way, table, columns, rows)
+    return GlobePatches(points, way, table, columns, rows)
 
 
-RINGS, TURNS = 24, 16  # places on the plane of a surround
+RINGS, TURNS = 24, 16  # patches on the plane of a surround
 PLANE_MM, PLANE_FIRST_MM = 500.0, 1.0
 
 
-def plane_places(globe: Globe, plane_x: float) -> tuple[Floats, float]:
+def plane_patches(globe: Globe, plane_x: float) -> tuple[Floats, float]:
     """Points (RINGS * TURNS, 3) of the plane about a bare globe, and the radius (mm) of the first ring.
 
     Their distances from the globe grow by a constant factor, from `PLANE_FIRST_MM`.
@@ -199,7 +202,7 @@ def plane_places(globe: Globe, plane_x: float) -> tuple[Floats, float]:
 def filled(values: Floats, valid: Bools, rows: int, columns: int, across: tuple[float, float] = (1.0, 1.0)) -> Floats:
     """Values (rows * columns, k) of a grid averaged over valid neighbours; farther ones where none is valid.
 
-    across: weight of each neighbour along columns and along rows, beside 2 for the place itself.
+    across: weight of each neighbour along columns and along rows, beside 2 for the patch itself.
     """
     weight = valid.reshape(rows, columns).astype(float)[..., None]
     total = values.reshape(rows, columns, -1) * weight

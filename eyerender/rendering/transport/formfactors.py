@@ -1,0 +1,233 @@
+"""Form factors between patches, from rays of a cosine-distributed pattern.
+
+From every patch i, K rays find the patches j that it sees. The mean over its rays of the albedo at the points that are
+met, with the losses at the cornea where a ray goes through it, is rho_j F_ij. The rays of the iris are those that leave
+the eye, in bundles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import csr_array
+
+from ...arrays import Floats, Ints, Reals, remembered
+from ..hits.interaction import RegionHit, SurfaceInteraction, appearance, intersect, outer_albedo
+from ..materials.albedo import iris_albedo
+from ..records.frame import Frame
+from .chamber import IRIS_RINGS
+from .chamber import TURNS as IRIS_TURNS
+from .framepatches import RAYS, FramePatches
+from .patches import RINGS, TURNS
+from .patchtables import PatchTables, gather_rows, sequence
+from .radiosityfield import RadiosityField
+
+START_MM = 0.02  # above a surface, where rays begin
+SHUFFLED = 0x9E3779B1
+_TOUCHING_MM = 0.3  # a patch most of whose rays are stopped this near is covered
+
+
+@dataclass(kw_only=True)
+class RayHits:
+    """What the rays of the patches meet, on the device, one number per ray.
+
+    Attributes:
+        target: the patch that is met.
+        weight: share of its irradiance that is sent back.
+        near: whether something is met very close.
+        open: whether nothing is met.
+        sky: irradiance from even light and the soft part of a map, where nothing is met.
+        free: the same as if nothing were met.
+        on_skin: whether the outer side of the sheet of skin is met.
+        point: where (eye frame).
+        normal: unit normal there.
+    """
+
+    target: mi.UInt32
+    weight: mi.Float
+    near: mi.Float
+    open: mi.Bool
+    sky: mi.Float
+    free: mi.Float
+    on_skin: mi.Bool
+    point: mi.Vector3f
+    normal: mi.Vector3f
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PatchRays:
+    """The rays of all patches on the host, one number per ray.
+
+    Attributes:
+        shares: (patches, rays) share of each ray in the mean over a patch's rays, sparse.
+        target: as in `RayHits`.
+        weight: as in `RayHits`.
+        near: as in `RayHits`.
+        sky: as in `RayHits`.
+        free: as in `RayHits`.
+        lit: irradiance straight from the lamps at the very point of the skin that is met, -1 where it is not known.
+        bare: the same if nothing stood in the way, -1 where no skin is met.
+    """
+
+    shares: csr_array
+    target: Ints
+    weight: Reals
+    near: Reals
+    sky: Reals
+    free: Reals
+    lit: Reals
+    bare: Reals
+
+    @classmethod
+    def read(cls, patches: FramePatches, hits: RayHits, lit: mi.Float | None, bare: mi.Float | None) -> PatchRays:
+        """Read what rays have met; `lit` has the rays of globe and chamber alone."""
+        plan, globe = patches.plan, patches.on_globe * RAYS
+        rays = plan.rays + patches.bundles
+        at_hits = np.full(rays, -1.0, np.float32)
+        if lit is not None:
+            found = lit.numpy()
+            at_hits[:globe], at_hits[plan.rays :] = found[:globe], found[globe:]
+        columns = (hits.target, hits.weight, hits.near, hits.sky, hits.free)
+        target, weight, near, sky, free = (column.numpy()[:rays] for column in columns)
+        return cls(
+            shares=_shares(plan.count, patches.interior.gain), target=target, weight=weight, near=near, sky=sky,
+            free=free, lit=at_hits, bare=at_hits if bare is None else bare.numpy()[:rays],
+        )  # fmt: skip
+
+    def mean(self, values: Reals) -> Floats:
+        """Means (patches,) over the rays of each patch."""
+        return np.asarray(self.shares @ values)
+
+    def form_factors(self, stand_in: Ints) -> csr_array:
+        """Form factors times albedo, (patches, patches), between patches and those that are used for the others."""
+        part = self.shares
+        return csr_array(
+            (part.data * self.weight[part.indices], stand_in[self.target][part.indices], part.indptr),
+            shape=(part.shape[0],) * 2,
+        )
+
+    def correction(self, direct: Floats, bare: Floats) -> Floats:
+        """What the lamps' light at the points that are met adds to that of the patches there, `direct`.
+
+        `bare` is the lamps' light on the patches if nothing stood in the way. Where that at the very point is not
+        known, the same share of it arrives there.
+        """
+        if not np.any(self.bare >= 0):
+            return np.zeros(self.shares.shape[0])
+        target = np.minimum(self.target, len(direct) - 1)
+        lit = np.where(self.lit >= 0, self.lit, share_of(direct, bare)[target] * self.bare)
+        return self.mean(self.weight * np.where(self.bare >= 0, lit - direct[target], 0))
+
+
+@remembered
+def _shares(count: Ints, gain: csr_array) -> csr_array:
+    """Shares as in `PatchRays`, from the number of rays of each patch and the gain of those that leave the eye."""
+    ends = np.append(0, np.cumsum(count))
+    return csr_array(
+        (
+            np.append(np.repeat(1 / count, count), gain.data),
+            np.append(np.arange(ends[-1]), ends[-1] + gain.indices),
+            np.append(ends[:-1], ends[-1] + gain.indptr),
+        ),
+        shape=(len(count) + gain.shape[0], ends[-1] + gain.shape[1]),
+    )
+
+
+def share_of(part: Floats, whole: Floats) -> Floats:
+    """Share that a part has of the whole, 1 where there is nothing."""
+    return np.where(whole > 0, part / np.where(whole > 0, whole, 1), 1.0)
+
+
+def trace_rays(frame: Frame, field: RadiosityField, tables: PatchTables, lanes: int) -> RayHits:
+    """Find what the rays of patches meet. The first rays belong to patches outside; there are more lanes than rays."""
+    index, first = dr.arange(mi.UInt32, lanes), tables.rays_outside
+    outside, inside = index < first, (index >= first) & (index < tables.rays)
+    patch = dr.gather(mi.UInt32, tables.of_patch, index, outside)
+    n = gather_rows(tables.outer, 6, patch, outside)
+    normal = mi.Vector3f(*n[3:])
+    o = mi.Vector3f(*n[:3]) + START_MM * normal
+    d = _pattern(normal, index)
+    leaving = gather_rows(tables.leaving, 6, index - first, inside)
+    start, way = mi.Vector3f(*leaving[:3]), mi.Vector3f(*leaving[3:6])
+    o = dr.select(outside, o, frame.point_to_scene(start + 2e-3 * way))
+    d = dr.select(outside, d, frame.vector_to_scene(way))
+    hits = _meet(frame, field, tables, o, d, index)
+    if frame.structure.ambient:
+        hits.free = dr.pi * frame.caches.ambience.soft(d, outside | hits.open)
+    hits.sky = dr.select(hits.open, hits.free, 0)
+    dr.eval(hits)
+    return hits
+
+
+def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
+    """Cosine-distributed directions about normals; rays of a patch have consecutive numbers."""
+    u, v = sequence(ray)
+    s, c = dr.sincos(v * (2 * dr.pi))
+    e1, e2 = mi.coordinate_system(normal)
+    r = dr.sqrt(u)
+    return (r * c) * e1 + (r * s) * e2 + dr.sqrt(1 - u) * normal
+
+
+def _meet(
+    frame: Frame, field: RadiosityField, tables: PatchTables, o: mi.Vector3f, d: mi.Vector3f, index: mi.UInt32
+) -> RayHits:
+    """Find what is met along rays with these numbers; `sky` and `free` are 0."""
+    active = index < tables.rays
+    view, hit = intersect(frame, o, d, active, coherent=False)
+    view = appearance(frame, view, hit, d)
+    # One of the four patches about a point stands for it, each as often as linear interpolation gives it weight.
+    s, t = sequence(index * mi.UInt32(SHUFFLED))
+    at = frame.point_to_scene(view.point)
+    if frame.region is None:
+        other, matte = _patch_on_background(frame, field, tables, view, at, s, t)
+        on_skin = mi.Bool(False)
+    else:
+        other, matte, on_skin = _patch_on_skin(frame, tables, view, hit, d, s)
+    column, row = field.globe_place(at)
+    i, j = mi.UInt32(dr.clip(column + t, 0, field.columns - 1)), mi.UInt32(dr.clip(row + s, 0, field.rows - 1))
+    through = view.cornea & (view.opacity < 0.5)
+    outer = dr.select(view.other, other, j * field.columns + i)
+    target = dr.select(through, tables.outside + _patch_of_iris(field, view, s, t), outer)
+    behind = dr.select(view.pupil, frame.pupil_albedo, iris_albedo(frame, view.inner))
+    inside = view.passed * behind / (frame.inner_index * frame.inner_index)
+    back = dr.select(through, inside, dr.select(view.other & ~matte, 0, outer_albedo(frame, view)))
+    back = dr.select(view.met, back, 0)
+    dark = mi.Float(0) * o.x
+    return RayHits(
+        target=dr.select(back > 0, target, 0), weight=back,
+        near=mi.Float(dr.select(view.met, view.distance, 1e9) < _TOUCHING_MM), open=active & ~view.met, sky=dark,
+        free=dark, on_skin=on_skin, point=view.point, normal=view.normal,
+    )  # fmt: skip
+
+
+def _patch_on_skin(
+    frame: Frame, tables: PatchTables, view: SurfaceInteraction, hit: RegionHit, d: mi.Vector3f, s: mi.Float
+) -> tuple[mi.UInt32, mi.Bool, mi.Bool]:
+    """Patch of a region that is met, whether it sends light back, and whether it is the sheet's outer side."""
+    face = frame.region.face(hit)
+    inner = frame.region.from_behind(face, hit.prim_uv, d, view.other)
+    corner = frame.region.corner(face, hit.prim_uv, s, view.other)
+    which = dr.gather(mi.Int32, tables.stands_for, 2 * corner + dr.select(inner, 1, 0), view.other)
+    matte = view.other & (~inner | (which >= mi.Int32(tables.on_skin)))
+    return tables.on_globe + mi.UInt32(which), matte, view.other & ~inner & frame.region.on_sheet(face)
+
+
+def _patch_on_background(
+    frame: Frame, field: RadiosityField, tables: PatchTables, view: SurfaceInteraction, at: mi.Vector3f,
+    s: mi.Float, t: mi.Float,
+) -> tuple[mi.UInt32, mi.Bool]:  # fmt: skip
+    """Patch of the background that is met at points of the scene's frame, and whether it sends light back."""
+    ring, turn = field.background_place(at)
+    ring, turn = mi.UInt32(dr.clip(ring + s, 0, RINGS - 1)), mi.UInt32(dr.clip(turn + t, 0, TURNS))
+    patch = tables.on_globe + ring * TURNS + dr.select(turn < TURNS, turn, 0)
+    return patch, view.other & (dr.abs(at.x - frame.backdrop_x) < 1e-2)
+
+
+def _patch_of_iris(field: RadiosityField, view: SurfaceInteraction, s: mi.Float, t: mi.Float) -> mi.UInt32:
+    """Patch of the iris that is met, by its number in the chamber."""
+    ring, turn = field.iris_place(view.inner)
+    turn = mi.UInt32(dr.clip(turn + t, 0, IRIS_TURNS))
+    return mi.UInt32(dr.clip(ring + s, 0, IRIS_RINGS - 1)) * IRIS_TURNS + dr.select(turn < IRIS_TURNS, turn, 0)

@@ -1,0 +1,271 @@
+"""The patches of a frame on the host, and what a subject and an eye keep of them.
+
+The patches come in this order: the globe; skin, the inner sides of the lids, or the background; the limbus; the chamber
+behind the cornea. The first three are "outside".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...arrays import Floats, Ints
+from ...eye.model import EyeModel
+from ...geometry.vectors import dots, lengths
+from ...region.globe import Globe
+from ...region.look import Look
+from ..records.eyecache import EyeCache
+from ..records.frame import aligned_copy, upload_array
+from ..records.job import RenderJob
+from ..records.recording import recorded
+from ..scene.region import RegionScene
+from .chamber import TURNS as IRIS_TURNS
+from .chamber import Chamber, bundles, chamber_of, limbus_points, patch_albedo, through_limbus
+from .manifold import CORNEA_MM
+from .patches import (
+    GLOBE_COLUMNS,
+    GLOBE_ROWS,
+    MAP_SIDE,
+    RINGS,
+    TURNS,
+    GlobePatches,
+    SkinPatches,
+    plane_patches,
+    skin_patches,
+)
+
+RAYS = 24  # from each patch on the globe or about it
+_SKIN_RAYS, _INNER_RAYS = 10, 2  # from patches on the skin, and on the lids' inner sides, which lie in the dark
+_HALVINGS = 14, 15  # of the rays that leave the eye into bundles, without and with light from afar
+LANES = 4096  # there are lanes for so many times as many rays, so that recordings serve many subjects
+_CLOSE_MM = 10.5  # from the cornea's centre to skin that it mirrors lamps to
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Interior:
+    """The chamber of an eye, and what does not depend on the eye's pose.
+
+    Attributes:
+        chamber: the chamber.
+        form_factors: shares of the irradiance of its patches by which they light each other.
+        limbus: shares of the irradiance of the limbus' sectors by which they light the patches.
+        rows: on the device, the patches, their normals, and whether they are in the eye.
+        leaving: on the device, a ray for each bundle of those that leave the eye.
+        gain: (patches, bundles) gain with which each bundle lights each patch, sparse.
+    """
+
+    chamber: Chamber
+    form_factors: Floats
+    limbus: Floats
+    rows: mi.Float
+    leaving: mi.Float
+    gain: Any
+
+    @classmethod
+    def of(cls, eye: EyeModel, film_index: float, look: Look, halvings: int) -> Interior:
+        """Compute it for an eye, with its pupil, and a look, with so many halvings of the rays that leave."""
+        chamber = chamber_of(eye, film_index)
+        albedo = patch_albedo(eye, chamber, look.pupil_albedo, look.iris_albedo, look.limbus_albedo)
+        limbus = through_limbus(eye, chamber, look.limbus_width_mm) * look.limbus_transmittance
+        rows = upload_array(np.column_stack([chamber.points, chamber.normals, chamber.valid]))
+        rays, gain = bundles(chamber, halvings)
+        return cls(
+            chamber=chamber, form_factors=chamber.exchange * albedo, limbus=limbus, rows=rows,
+            leaving=upload_array(rays), gain=gain,
+        )  # fmt: skip
+
+
+def round_up(number: int, step: int) -> int:
+    """Round up to a multiple of a step."""
+    return -(-number // step) * step
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RayPlan:
+    """The patches on the skin of a subject, and the rays of all patches outside the eye; the pose does not matter.
+
+    Attributes:
+        skin: the patches, None for a bare eye.
+        count: (patches,) number of rays of each patch outside the chamber.
+        of_patch: on the device, the patch of each ray, of some rays more than there are.
+        stands_for: on the device, the patches that stand for both sides of each vertex.
+        near: on the device, the patches about every vertex: first the first ones of all vertices, then the second ...
+        weight: on the device, their weights there.
+    """
+
+    skin: SkinPatches | None
+    count: Ints
+    of_patch: mi.UInt32
+    stands_for: mi.Int32
+    near: mi.UInt32
+    weight: mi.Float
+
+    @classmethod
+    def of(cls, on_globe: int, others: int, skin: SkinPatches | None) -> RayPlan:
+        """Plan for so many patches on the globe, and so many others before the limbus."""
+        count = np.full(on_globe + others + IRIS_TURNS, RAYS)
+        stands_for, near, weight = mi.Int32(0), mi.UInt32(0), mi.Float(0)
+        if skin is not None:
+            on_skin = len(skin.vertices)
+            count[on_globe : on_globe + others] = _SKIN_RAYS
+            count[on_globe + on_skin : on_globe + others] = _INNER_RAYS
+            table = np.stack([skin.nearest, skin.behind + on_skin], axis=1)
+            stands_for = mi.Int32(aligned_copy(table.astype(np.int32).ravel()))
+            near = mi.UInt32(aligned_copy(skin.near.T.astype(np.uint32).ravel()))
+            weight = upload_array(skin.weight.T.ravel())
+        rays = int(count.sum())
+        of_patch = np.zeros(round_up(rays, LANES), np.uint32)
+        of_patch[:rays] = np.repeat(np.arange(len(count)), count)
+        return cls(
+            skin=skin, count=count, of_patch=mi.UInt32(aligned_copy(of_patch)), stands_for=stands_for, near=near,
+            weight=weight,
+        )  # fmt: skip
+
+    @property
+    def rays(self) -> int:
+        """Number of all rays."""
+        return int(self.count.sum())
+
+    def at_vertices(self, patches: Floats) -> mi.Float:
+        """Interpolate the numbers of patches (n, 4), as in `RadiosityField` with the whole sky last, at the vertices."""
+        assert self.skin is not None
+        vertices, each = self.skin.near.shape
+        count = dr.opaque(mi.UInt32, vertices)
+        return _at_vertices(upload_array(patches), self.near, self.weight, count, vertices, each)
+
+
+@recorded
+def _at_vertices(
+    patches: mi.Float, near: mi.UInt32, weight: mi.Float, count: mi.UInt32, vertices: int, each: int
+) -> mi.Float:
+    """Four numbers of every vertex from those of `each` patches about it."""
+    index = dr.arange(mi.UInt32, vertices)
+    total = mi.Vector4f(0)
+    for k in range(each):
+        patch = dr.gather(mi.UInt32, near, index + k * count)
+        total += dr.gather(mi.Float, weight, index + k * count) * dr.gather(mi.Vector4f, patches, patch)
+    total.y = dr.select(total.w > 0, total.y / total.w, 1)
+    total.w = 0
+    out = dr.zeros(mi.Float, 4 * vertices)
+    dr.scatter(out, total, index)
+    dr.eval(out)
+    return out
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramePatches:
+    """The patches of a frame, on the host.
+
+    Attributes:
+        job: the job.
+        globe: patches of the globe.
+        interior: those of the chamber.
+        plan: the rays.
+        points: (n, 3) patches on skin and lids, or on the background.
+        normals: (n, 3) unit normals there.
+        plane: as in `RadiosityField`.
+    """
+
+    job: RenderJob
+    globe: GlobePatches
+    interior: Interior
+    plan: RayPlan
+    points: Floats
+    normals: Floats
+    plane: tuple[float, float, float]
+
+    @property
+    def on_globe(self) -> int:
+        """Number of patches on the globe."""
+        return len(self.globe.points)
+
+    @property
+    def on_skin(self) -> int:
+        """Number of patches on the outer side of a region's skin."""
+        return 0 if self.plan.skin is None else len(self.plan.skin.vertices)
+
+    @property
+    def outside(self) -> int:
+        """Number of patches outside the chamber; the last ones are on the limbus."""
+        return len(self.globe.points) + len(self.points) + IRIS_TURNS
+
+    @property
+    def bundles(self) -> int:
+        """Number of rays that leave the eye."""
+        return int(self.interior.gain.shape[1])
+
+    @cached_property
+    def near_cornea(self) -> Ints:
+        """Patches on skin and lids, by their numbers there, to which the cornea may mirror lamps."""
+        job = self.job
+        if self.plan.skin is None or not job.interreflection:
+            return np.zeros(0, int)
+        bulge = job.M @ (np.asarray(job.eye.front[0].origin_mm) - [CORNEA_MM, 0, 0]) + (job.t - job.anchor_mm)
+        way = bulge - self.points
+        return np.flatnonzero((lengths(way) < _CLOSE_MM) & (dots(way, self.normals) > -0.5 * CORNEA_MM))
+
+    @property
+    def outer(self) -> Floats:
+        """Points and normals of the patches outside the chamber, (n, 6)."""
+        job = self.job
+        rim, facing = limbus_points(job.eye)
+        points = (self.globe.points, self.points, rim @ job.M.T + (job.t - job.anchor_mm))
+        normals = (self.globe.normals, self.normals, facing @ job.M.T)
+        return np.column_stack([np.concatenate(points), np.concatenate(normals)])
+
+
+class Patches:
+    """Patches of frames; keeps what does not change between frames of a subject."""
+
+    def __init__(self) -> None:
+        self._plans: list[tuple[tuple[Any, ...], Globe, RayPlan]] = []  # of subjects
+        self._bare: RayPlan | None = None
+        self._interiors: EyeCache[Interior] = EyeCache()
+
+    def of(self, job: RenderJob, globe: GlobePatches, region: RegionScene | None) -> FramePatches:
+        """The patches of a job, with those of its globe."""
+        plan = self._plan(region, job.globe)
+        points, normals, plane = _others(job, region, plan.skin)
+        return FramePatches(
+            job=job, globe=globe, interior=self._interior(job), plan=plan, points=points, normals=normals, plane=plane
+        )
+
+    def _interior(self, job: RenderJob) -> Interior:
+        """The chamber of a job's eye; more rays leave it where they look for light."""
+        ambient = job.ambient
+        halvings = _HALVINGS[ambient.map is not None or ambient.irradiance_w_m2 > 0]
+        film, look = job.film_index, job.look
+        return self._interiors.get(job.eye, (film, look, halvings), lambda: Interior.of(job.eye, film, look, halvings))
+
+    def _plan(self, region: RegionScene | None, globe: Globe) -> RayPlan:
+        """Patches and rays, chosen with the eye straight ahead: no earlier pose may change a picture."""
+        if region is None:
+            self._bare = self._bare or RayPlan.of(MAP_SIDE * MAP_SIDE, RINGS * TURNS, None)
+            return self._bare
+        rest = replace(globe, M=np.eye(3), t=np.zeros(3))
+        for known, still, plan in self._plans:
+            if still == rest and known == region.subject:
+                return plan
+        skin = skin_patches(region.at_rest(rest), rest)
+        plan = RayPlan.of(GLOBE_COLUMNS * GLOBE_ROWS, len(skin.vertices) + len(skin.lids), skin)
+        self._plans = [*self._plans[-3:], (region.subject, rest, plan)]
+        return plan
+
+
+def _others(
+    job: RenderJob, region: RegionScene | None, skin: SkinPatches | None
+) -> tuple[Floats, Floats, tuple[float, float, float]]:
+    """Patches that are not on the eye, their normals, and the rings of the background."""
+    if region is not None and skin is not None:
+        vertices, normals = (a[skin.vertices] for a in (region.posed.vertices, region.posed.normals))
+        both = np.concatenate([vertices, vertices[skin.lids]]), np.concatenate([normals, -normals[skin.lids]])
+        return *both, (0.0, 0.0, 1.0)
+    globe = job.globe
+    points, inner = plane_patches(globe, -job.look.backdrop_distance_mm)
+    centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    return points, np.tile([1.0, 0.0, 0.0], (len(points), 1)), (float(centre[1]), float(centre[2]), inner)

@@ -1,0 +1,156 @@
+"""The radiosity field: what the patches receive, as kernels look it up between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...arrays import Floats
+from ..records.frame import upload_array, upload_scalars
+from .chamber import IRIS_RINGS, ROOT_RINGS, Chamber
+from .chamber import TURNS as IRIS_TURNS
+from .patches import (
+    GLOBE_COLUMNS,
+    MAP_SIDE,
+    PLANE_FIRST_MM,
+    PLANE_MM,
+    RINGS,
+    TURNS,
+    WIDEST,
+    GlobePatches,
+)
+
+
+@dataclass(kw_only=True)
+class RadiosityField:
+    """Irradiance of surfaces by way of other surfaces, and the share of open sky.
+
+    The patches of globe and background have four numbers each: irradiance from other surfaces, share of the sky that is
+    open, whole irradiance (what a mirror image of the patch shows), and 0. Without interreflection all of it is dark
+    and open. The numbers of the skin are stored at its vertices (`SkinGeometry.received`).
+
+    Attributes:
+        on: whether surfaces send light to each other.
+        between: whether the grid of patches on the globe lies between lids.
+        columns: of that grid.
+        rows: of that grid.
+        centre: of the globe (scene's frame, mm).
+        first: y (mm) of the first column between lids.
+        per_mm: columns per mm.
+        ends: lower and upper end of each column (mm).
+        root2: squared radius of the root of the iris, mm^2.
+        reach2: squared reach of the chamber, mm^2.
+        plane: y and z of the middle of the background's rings, and the radius of the first (mm).
+        globe: four numbers for each patch of the globe.
+        background: four numbers for each patch of the background's plane.
+        iris: one number for each patch of the iris.
+    """
+
+    on: mi.Bool
+    between: bool
+    columns: int
+    rows: int
+    centre: mi.Vector3f
+    first: mi.Float
+    per_mm: mi.Float
+    ends: mi.Float
+    root2: mi.Float
+    reach2: mi.Float
+    plane: tuple[mi.Float, mi.Float, mi.Float]
+    globe: mi.Float
+    background: mi.Float
+    iris: mi.Float
+
+    @classmethod
+    def dark(cls, on: bool, chamber: Chamber, globe: GlobePatches, plane: tuple[float, float, float]) -> RadiosityField:
+        """Send the patches to the device; they receive nothing.
+
+        Args:
+            on: whether surfaces send light to each other.
+            chamber: the chamber of the eye.
+            globe: the patches of the globe.
+            plane: as the attribute.
+        """
+        rim = [chamber.root_mm**2, chamber.reach_mm**2]
+        n = upload_scalars(np.array([*globe.table[:5], *rim, *plane], dtype=np.float32))
+        none = upload_array(np.zeros(4))
+        return cls(
+            on=dr.opaque(mi.Bool, on), between=globe.columns == GLOBE_COLUMNS, columns=globe.columns, rows=globe.rows,
+            centre=mi.Vector3f(*n[:3]), first=n[3], per_mm=n[4], root2=n[5], reach2=n[6], plane=(n[7], n[8], n[9]),
+            ends=upload_array(globe.table[5:]), globe=none, background=none, iris=none,
+        )  # fmt: skip
+
+    def filled(self, globe: Floats, background: Floats, iris: Floats) -> RadiosityField:
+        """The same patches with the light that they receive."""
+        return replace(self, globe=upload_array(globe), background=upload_array(background), iris=upload_array(iris))
+
+    def at_globe(self, x: mi.Vector3f) -> mi.Vector4f:
+        """Numbers of points of the globe, given in the scene's frame."""
+        beyond = 0.5 if self.between else 0.0  # the last rows are half a row from the lids, where light changes fast
+        return _bilinear(self.globe, *self.globe_place(x), self.columns, self.rows, beyond)
+
+    def globe_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Column and row of points of the globe in the grid of its patches."""
+        if self.between:
+            column = dr.clip((x.y - self.first) * self.per_mm, 0, GLOBE_COLUMNS - 1)
+            i = mi.UInt32(dr.minimum(column, GLOBE_COLUMNS - 1.001))
+            w = column - mi.Float(i)
+            a, b = (dr.gather(mi.Vector2f, self.ends, i + k) for k in (0, 1))
+            low, high = a.x + w * (b.x - a.x), a.y + w * (b.y - a.y)
+            return column, (x.z - low) / (high - low) * self.rows - 0.5
+        r = dr.normalize(x - self.centre)
+        polar = dr.acos(dr.clip(r.x, -1, 1)) / WIDEST
+        inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
+        middle = 0.5 * (MAP_SIDE - 1)
+        return middle * (1 + polar * r.y * inv), middle * (1 + polar * r.z * inv)
+
+    def at_iris(self, x: mi.Vector3f) -> mi.Float:
+        """Irradiance of points in the plane of the iris (eye frame), without the light straight from the lamps."""
+        return _around(self.iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float)
+
+    def iris_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Ring and turn of points in the plane of the iris among the patches of the chamber."""
+        turn = dr.atan2(x.z, x.y) * (IRIS_TURNS * 0.5 * dr.inv_pi) - 0.5
+        r2 = x.y * x.y + x.z * x.z
+        beyond = dr.maximum(r2 - self.root2, 0) * ((IRIS_RINGS - ROOT_RINGS) / (self.reach2 - self.root2))
+        ring = dr.minimum(r2 / self.root2, 1) * ROOT_RINGS + beyond - 0.5
+        return ring, dr.select(turn < 0, turn + IRIS_TURNS, turn)
+
+    def at_background(self, x: mi.Vector3f) -> mi.Vector4f:
+        """Numbers of points of the background's plane, given in the scene's frame."""
+        return _around(self.background, *self.background_place(x), RINGS, TURNS, mi.Vector4f)
+
+    def background_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Ring and turn of points of the background's plane among its patches."""
+        y, z, inner = self.plane
+        dy, dz = x.y - y, x.z - z
+        out = dr.maximum(dr.sqrt(dy * dy + dz * dz) - inner, 0) / PLANE_FIRST_MM
+        ring = dr.log(1 + out) * ((RINGS - 1) / float(np.log1p(PLANE_MM / PLANE_FIRST_MM)))
+        turn = dr.atan2(dz, dy) * (TURNS * 0.5 * dr.inv_pi)
+        return ring, dr.select(turn < 0, turn + TURNS, turn)
+
+
+def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int, beyond: float) -> mi.Vector4f:
+    """Interpolate between columns and rows, and extrapolate by so many rows beyond the last ones."""
+    column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, -beyond, rows - 1.001 + beyond)
+    i, j = mi.UInt32(column), mi.UInt32(dr.clip(row, 0, rows - 1.001))
+    s, t = column - mi.Float(i), row - mi.Float(j)
+    place = j * columns + i
+    a, b, c, d = (dr.gather(mi.Vector4f, buffer, place + k) for k in (0, 1, columns, columns + 1))
+    low, high = a + s * (b - a), c + s * (d - c)
+    return dr.maximum(low + t * (high - low), 0)
+
+
+def _around(buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any) -> Any:
+    """Interpolate between rings and turns; the turns close."""
+    ring, turn = dr.clip(ring, 0, rings - 1.001), dr.clip(turn, 0, turns - 0.001)
+    i, j = mi.UInt32(ring), mi.UInt32(turn)
+    s, t = ring - mi.Float(i), turn - mi.Float(j)
+    after = dr.select(j + 1 < turns, j + 1, 0)
+    a, b, c, d = (dr.gather(kind, buffer, p * turns + q) for p in (i, i + 1) for q in (j, after))
+    near, far = a + t * (b - a), c + t * (d - c)
+    return near + s * (far - near)
