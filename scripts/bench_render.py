@@ -79,9 +79,8 @@ class Bench:
         import mitsuba as mi
 
         from eyerender.arrays import frozen
-        from eyerender.rendering.hits.interaction import first_hit
-        from eyerender.rendering.integrator.film import Pixels
-        from eyerender.rendering.integrator.sampling import camera_ray
+        from eyerender.rendering.hits.primary import first_hit
+        from eyerender.rendering.integrator.sampling import Pixels, camera_ray
         from eyerender.rig.camera import Camera
         from eyerender.rig.light import Lamp
         from tests.support.render_oracles import RINGS_MM

@@ -11,9 +11,10 @@ import numpy as np
 from ..arrays import Bools, Floats, Singles
 from ..folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from .glints.splatting import MirrorImages, Shine
-from .integrator.film import BoundFrame, mean_radiance, start
+from .integrator.film import mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
 from .integrator.hostdata import HostData
+from .integrator.request import BoundFrame
 from .output.labels import PartLabels, highlights, part_labels
 from .output.window import RawFrame, RenderedWindow
 from .records.job import RenderJob

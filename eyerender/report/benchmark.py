@@ -305,8 +305,8 @@ def _glint_table(entries: Sequence[Row]) -> Table:
     return Table(
         header=header,
         rows=rows,
-        caption="Glints: a reported glint matches a true one within 2 px. Errors are in px. Swaps: matches with the wrong"
-        " light, of the matches with a light. A dash means that the extractor does not look for glints.",
+        caption="Glints: a reported glint matches a true one within 2 px. Errors are in px. Swaps: matches with the"
+        " wrong light, of the matches with a light. A dash means that the extractor does not look for glints.",
     )
 
 

@@ -13,6 +13,7 @@ from eyerender.imaging.labels import visible_arcs_deg
 from eyerender.region.anatomy import Region
 from eyerender.rendering.glints.occlusion import glint_reason
 from eyerender.rendering.integrator import film
+from eyerender.rendering.integrator.hostdata import FINE, PLAIN, WET
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.labels import labels_of
@@ -157,9 +158,8 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
     import mitsuba as mi
 
     from eyerender.imaging.capture import render_job
-    from eyerender.rendering.hits.interaction import intersect
-    from eyerender.rendering.integrator.film import Pixels
-    from eyerender.rendering.integrator.sampling import camera_ray
+    from eyerender.rendering.hits.primary import intersect
+    from eyerender.rendering.integrator.sampling import Pixels, camera_ray
 
     s = scene(poses=((9.0, -6.0),), region={"seed": 3})
     focal = 4000 if place[0] > 100 else 600
@@ -172,11 +172,8 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
     camera = s.rig.cameras[0]
     job = replace(render_job(s.frames(), 0), window=(0, 0, *camera.resolution_px))
     shown, _ = renderer.bind(job)
-    tiles, size = shown.host.plain(job.window)
     width, height = job.window[2:]
-    plain = (np.kron(tiles, np.ones((size, size), bool))[:height, :width]).ravel() & (
-        shown.host.fine(job.window)[0] == 0
-    )
+    plain = (shown.host.marks(job.window) & PLAIN) > 0
     assert 0.3 < plain.mean() < 0.95
     u, v = Pixels.of(job.window).at(dr.arange(mi.UInt32, width * height))
     for du, dv in ((-0.45, -0.45), (0.45, -0.1), (0.0, 0.45)):
@@ -249,7 +246,7 @@ def test_hairs_are_sampled_more_finely(renderer, monkeypatch):
     monkeypatch.setattr(film, "_TIMES", 1)
     (plain,) = images(renderer, region=spec, spp=8)
     job = render_job(scene(region=spec).frames(), 0)
-    fine = renderer.bind(job)[0].host.fine(job.window)[0].reshape(few.irradiance.shape) > 0
+    fine = (renderer.bind(job)[0].host.marks(job.window).reshape(few.irradiance.shape) & FINE) > 0
     assert 0.02 < fine.mean() < 0.4
     # Not the standard deviation: a mirror image of the lamp in a drop of water outweighs all hairs.
     error = [np.percentile(np.abs(p.irradiance - many.irradiance)[fine], 90) for p in (few, plain)]
@@ -266,8 +263,8 @@ def test_fine_pixels_are_those_that_hairs_touch(renderer):
     job = render_job(scene(region={}).frames(), 0)
     x0, y0, width, height = job.window
     shown, place = renderer.bind(job)
-    marks = shown.host.fine(job.window)[0].reshape(height, width)
-    fine, wet = marks > 0, (marks & 2) > 0
+    marks = shown.host.marks(job.window).reshape(height, width)
+    fine, wet = (marks & FINE) > 0, (marks & WET) > 0
     row, column = np.mgrid[y0 : y0 + height, x0 : x0 + width].reshape(2, -1)
     hairs = np.zeros(height * width, dtype=bool)
     for k in range(36):
@@ -285,8 +282,8 @@ def test_which_pixels_are_fine_does_not_depend_on_the_window(renderer):
     job = render_job(scene(region={}).frames(), 0)
     x0, y0 = job.window[:2]
     host = renderer.bind(job)[0].host
-    whole = host.fine(job.window)[0].reshape(job.window[:1:-1]) & 3
-    part = host.fine((x0 + 30, y0 + 20, 90, 70))[0].reshape(70, 90) & 3
-    for mark in (1, 2):
+    whole = host.marks(job.window).reshape(job.window[:1:-1]) & (FINE | WET)
+    part = host.marks((x0 + 30, y0 + 20, 90, 70)).reshape(70, 90) & (FINE | WET)
+    for mark in (FINE, WET):
         assert 0 < np.mean((whole & mark) > 0) < 0.4
     assert np.array_equal(part, whole[20:90, 30:120])

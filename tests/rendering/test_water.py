@@ -44,14 +44,14 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.hits.interaction import intersect
-    from eyerender.rendering.hits.meniscus import through_water, wetted
+    from eyerender.rendering.hits.meniscus import through_water, water_hit
+    from eyerender.rendering.hits.primary import intersect
 
     rig = head_rig()
     region = Region.from_mapping({"tears": {"unevenness": 0.0}})
     job = job_of(eye_of("E2"), rig, rig.window(32, 32), (12.0, 0.0), look=PLAIN, region=region)
     shown, place = renderer.bind(job, lit=False)
-    values, skin = shown.frame, shown.frame.region
+    values = shown.frame
     ends, face_ends = place.posed.layout.vertex_ends, place.posed.layout.face_ends
     faces = place.posed.layout.faces[face_ends[-2] :]
     weights = np.random.default_rng(4).dirichlet(np.ones(3), 60000)
@@ -61,9 +61,10 @@ def test_the_globe_is_seen_through_menisci_where_ray_optics_puts_it(renderer):
     d = (x - o) / np.linalg.norm(x - o, axis=-1, keepdims=True)
     rays = mi.Vector3f(*o.tolist()), mi.Vector3f(*d.astype(np.float32).T)
     view, _ = intersect(values, *rays, dr.full(mi.Bool, True, len(d)))
-    film, wet = wetted(skin.water, *rays, view.distance)
+    water = water_hit(values, *rays, view.distance)
+    wet = water.is_valid()
     straight, on_sclera = view.point.numpy().T, (wet & view.sclera).numpy()
-    seen, way = through_water(values, skin, film, wet, view, *rays)
+    seen, way = through_water(values, water, view, *rays)
     found, turned = seen.point.numpy().T, way.numpy().T
     behind = on_sclera & seen.sclera.numpy() & (np.linalg.norm(turned - d, axis=-1) > 1e-4)
     assert behind.sum() > 500

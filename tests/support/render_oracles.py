@@ -205,7 +205,7 @@ def rings(renderer: Any, job: RenderJob) -> dict[str, Any]:
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.hits.interaction import intersect
+    from eyerender.rendering.hits.primary import intersect
     from eyerender.rendering.integrator.sampling import camera_ray
 
     shown, _ = renderer.bind(job, lit=False)

@@ -131,9 +131,8 @@ def depths_mm(renderer: Renderer, job: RenderJob) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
 
-    from eyerender.rendering.hits.interaction import intersect
-    from eyerender.rendering.integrator.film import Pixels
-    from eyerender.rendering.integrator.sampling import camera_ray
+    from eyerender.rendering.hits.primary import intersect
+    from eyerender.rendering.integrator.sampling import Pixels, camera_ray
 
     shown, _ = renderer.bind(job, lit=False)
     _, _, width, height = job.window

@@ -1,7 +1,8 @@
 """The menisci: water between lids and globe, which mirrors the lamps and bends the light behind it.
 
-A camera ray is refracted at the water's surface, n sin(a') = sin(a), and goes on to the globe. There it meets the film
-that lies everywhere, so the rest of its way is that of the ray in air which the globe refracts into the same direction.
+A camera ray is refracted at the water's surface, n sin(a') = sin(a), and goes on to the globe. There it meets the tear
+film that lies everywhere, so the rest of its way is that of the ray in air which the globe refracts into the same
+direction.
 
 The margin below the other edge of the meniscus, where the water is thinnest, is seen without displacement. Water
 shadows nothing.
@@ -9,81 +10,80 @@ shadows nothing.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ...optics.media import TEARS
 from ..records.frame import Frame
-from ..scene.region import SkinGeometry
-from .interaction import SurfaceInteraction, intersect_globe, look_at_skin
+from ..records.recording import syntax
+from .eyeshape import EyeShape
+from .interaction import SurfaceInteraction
+from .primary import RegionHit, region_interaction, segment
 
 _INDEX = float(TEARS.index(850.0))
 _LEAST = 0.1  # cosine below which a ray is not followed
 
 
-def wetted(
-    water: mi.Scene, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float
-) -> tuple[mi.PreliminaryIntersection3f, mi.Bool]:
-    """Hits of camera rays (scene's frame) on menisci in front of what they meet, and whether there are any."""
-    ray = mi.Ray3f(mi.Point3f(o), d)
-    ray.maxt = nearest
-    film = water.ray_intersect_preliminary(ray, coherent=True, active=True)
-    return film, film.is_valid()
+@dataclass(kw_only=True)
+class View:
+    """What a camera ray shows, and its direction in air there (scene's frame)."""
+
+    si: SurfaceInteraction
+    d: mi.Vector3f
 
 
-def on_water(frame: Frame, view: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
-    """The view of camera rays where menisci are in front of it, else `view` itself."""
-    region = frame.region
-    if region is None or region.water is None:
-        return view
-    film, wet = wetted(region.water, o, d, view.distance)
-    water = look_at_skin(frame, region, region.on_water(film), film.prim_uv, d, wet)
-    return SurfaceInteraction(*(dr.select(wet, a, b) for a, b in zip(parts_of(water), parts_of(view), strict=True)))
+def water_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> RegionHit:
+    """Intersect camera rays (scene's frame) with menisci in front of what they meet."""
+    hit = frame.region.water.ray_intersect_preliminary(segment(o, d, nearest), coherent=True, active=True)
+    return RegionHit(t=dr.select(hit.is_valid(), hit.t, dr.inf), face=frame.region.on_water(hit), prim_uv=hit.prim_uv)
 
 
+def on_water(frame: Frame, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
+    """Replace what camera rays meet by menisci where these are in front of it."""
+    if frame.region is None or frame.region.water is None:
+        return si
+    hit = water_hit(frame, o, d, si.distance)
+    wet = hit.is_valid()
+    water = region_interaction(frame, hit.face, hit.prim_uv, d, wet)
+    first: SurfaceInteraction = dr.select(wet, replace(water, level=None), replace(si, level=None))
+    return first
+
+
+@syntax
 def through_water(
-    frame: Frame,
-    skin: SkinGeometry,
-    film: mi.PreliminaryIntersection3f,
-    wet: mi.Bool,
-    view: SurfaceInteraction,
-    o: mi.Vector3f,
-    d: mi.Vector3f,
+    frame: Frame, hit: RegionHit, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f
 ) -> tuple[SurfaceInteraction, mi.Vector3f]:
-    """What rays show of the globe behind a meniscus, where `wet`, and their directions in air before it."""
-    wet &= ~view.other
+    """Bend camera rays at menisci that they hit in front of the globe.
 
-    def bent(d: mi.Vector3f, *parts: Any) -> tuple[Any, ...]:
-        view = SurfaceInteraction(*parts)
-        x = o + film.t * d
-        surface = skin.surface(skin.on_water(film), film.prim_uv, wet)
-        below = frame.vector_to_scene(view.normal)
-        inside, enters = _refracted(d, surface.normal, 1 / _INDEX)
-        cosine = dr.maximum(-dr.dot(inside, below), _LEAST)
-        deep = dr.dot(x - frame.point_to_scene(view.point), below)
-        outside, leaves = _refracted(inside, below, _INDEX)
-        way = dr.select(enters & leaves, outside, d)
-        seen = intersect_globe(frame, x + (deep / cosine) * inside, way)
-        found = enters & leaves & (seen.cornea | seen.sclera)
-        # Below the water nothing mirrors the lamps. The distance is that at which the depth is the one without water.
-        forward = frame.camera.forward
-        dry, distance = mi.Float(0), view.distance * (dr.dot(d, forward) / dr.dot(way, forward))
-        seen = replace(seen, distance=distance)
-        seen, view = (replace(v, gloss=dry, mirrored=dry) for v in (seen, view))
-        return dr.select(found, way, d), *(
-            dr.select(found, a, b) for a, b in zip(parts_of(seen), parts_of(view), strict=True)
-        )
-
-    d, *parts = dr.if_stmt((d, *parts_of(view)), wet, bent, lambda *unchanged: unchanged)
-    return SurfaceInteraction(*parts), d
+    Returns:
+        What they show of the globe, and their directions in air before it.
+    """
+    view = View(si=si, d=mi.Vector3f(d))
+    if dr.hint(hit.is_valid() & ~si.other, exclude=[frame, hit, si, o, d]):
+        view = _bent(frame, hit, view, o, d)
+    return view.si, view.d
 
 
-def parts_of(view: SurfaceInteraction) -> tuple[Any, ...]:
-    """Fields of a view but for the last one, which `intersect_globe` does not set."""
-    return tuple(getattr(view, f.name) for f in fields(SurfaceInteraction) if f.name != "level")
+def _bent(frame: Frame, hit: RegionHit, view: View, o: mi.Vector3f, d: mi.Vector3f) -> View:
+    """Refract rays into the water and out of it; those that find no way keep their direction."""
+    si = view.si
+    x = o + hit.t * d
+    surface = frame.region.surface(hit.face, hit.prim_uv, hit.is_valid() & ~si.other)
+    below = frame.vector_to_scene(si.normal)
+    inside, enters = _refracted(d, surface.normal, 1 / _INDEX)
+    cosine = dr.maximum(-dr.dot(inside, below), _LEAST)
+    deep = dr.dot(x - frame.point_to_scene(si.point), below)
+    outside, leaves = _refracted(inside, below, _INDEX)
+    way = dr.select(enters & leaves, outside, d)
+    seen = EyeShape(frame=frame).ray_intersect(x + (deep / cosine) * inside, way)
+    found = enters & leaves & seen.globe
+    # Below the water nothing mirrors the lamps. The distance is that at which the depth is the one without water.
+    forward, dry = frame.camera.forward, mi.Float(0)
+    seen.distance = si.distance * (dr.dot(d, forward) / dr.dot(way, forward))
+    seen, kept = (replace(s, gloss=dry, mirrored=dry) for s in (seen, si))
+    return View(si=dr.select(found, seen, kept), d=dr.select(found, way, d))
 
 
 def _refracted(d: mi.Vector3f, normal: mi.Vector3f, eta: mi.Float) -> tuple[mi.Vector3f, mi.Bool]:

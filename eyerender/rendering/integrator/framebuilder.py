@@ -32,8 +32,8 @@ from ..transport.irisirradiance import IrisIrradiance
 from ..transport.radiosity import RadiositySolver
 from ..transport.reliefmapping import IrisRelief, ReliefShape, ReliefSize, relief_shape
 from ..transport.shadowmaps import ShadowMaps
-from .film import BoundFrame
 from .hostdata import HostData
+from .request import BoundFrame
 
 _REGIONS, _TEXTURES = 4, 8  # kept
 _REMEMBERED = 32  # subjects; then recordings are made anew, because those of sizes that never come back take 3 MB each

@@ -1,67 +1,235 @@
-"""Groups of a pixel's samples in front of an eye region: what they see of the skin is shaded once for all."""
+"""Stages 2 to 4 before an eye region: merging, shading, and the weighted sum of a group of samples.
+
+A group is a few samples of one pixel. Every sample has a camera ray of its own. What the group hits of the region is
+merged to two surface points, one on the sheet of skin and one before it (hairs, tears); each is the first sample's and
+has the weight of all. They are shaded once. The globe is shaded for every sample.
+
+The groups of a pixel take the lamps in turn, and so do the samples on the globe. A lamp used by c of n counts n / c
+times, so that every lamp has its exact share in every pixel. The sun, whose shadows are dark and sharp, is used by all.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import RegionHit, SurfaceInteraction, behind, intersect_globe, look_at_skin, outer_albedo
-from ..hits.meniscus import parts_of, through_water, wetted
+from ..hits.eyeshape import EyeShape
+from ..hits.interaction import SurfaceInteraction, outer_albedo
+from ..hits.meniscus import View, through_water, water_hit
+from ..hits.primary import RegionHit, behind, region_hit, region_interaction
 from ..materials.gloss import film_normal, glossy_normal
-from ..records.frame import Frame, Lamp
-from ..scene.region import SkinGeometry
+from ..records.frame import Frame, Lamp, Lights, quotient
+from ..records.recording import syntax
 from ..transport.directlight import direct_light, irradiance_through_cornea, lamp_blocked, on_relief
+from .sampling import Samples
 from .shading import direct, indirect, off_eye
+from .visibility import HitTable
 
 _FAINT = 1e-3  # highlights so weak, relative to the other light or to a white surface, need no ray for their shadow
 _LIDS_MM = 18.0  # about the axis of the unrotated eye: the region of the lids, where lashes cast shadows
 
 
-@dataclass(frozen=True, slots=True)
-class Group:
-    """The samples of a lane, numbered from 0 to `count`, and the lamps that they use with their weights.
+@dataclass(kw_only=True)
+class LampShare:
+    """A lamp, and the number of users for which one user's ray to it stands."""
+
+    lamp: Lamp
+    weight: mi.Float
+
+
+@dataclass(kw_only=True)
+class LampTurns:
+    """Lamps that `users`, such as the groups of a pixel, take in turn. The sun, the last lamp, has no turns."""
+
+    lights: Lights
+    users: mi.UInt32
+
+    @property
+    def others(self) -> mi.UInt32:
+        """Number of lamps but the sun. A frame without lamps has a dark one."""
+        return dr.maximum(self.lights.count, 1) - self.lights.suns
+
+    def count(self, user: mi.UInt32) -> mi.UInt32:
+        """Number of lamps that a user has."""
+        several = quotient(self.users + self.others - 1 - user, self.users)
+        return dr.select(self.users < self.others, several, dr.minimum(self.others, 1)) + self.lights.suns
+
+    def share(self, user: mi.UInt32, k: mi.UInt32) -> LampShare:
+        """The k-th lamp of a user."""
+        sun, lamps = k < self.lights.suns, dr.maximum(self.others, 1)
+        which = user - quotient(user, lamps) * lamps + (k - self.lights.suns) * self.users
+        weight = mi.Float(self.users) / mi.Float(dr.maximum(quotient(self.users + lamps - 1 - which, lamps), 1))
+        lamp = self.lights[dr.select(sun, self.lights.count - 1, which)]
+        return LampShare(lamp=lamp, weight=dr.select(sun, 1, weight))
+
+
+@dataclass(kw_only=True)
+class PixelGroup:
+    """A group of samples of a pixel, one per lane; j numbers them from 0 to `count`.
 
     Attributes:
-        count: number of samples.
+        samples: all samples of the pixel.
+        number: number of the group in its pixel.
+        count: number of samples in the group.
+        hits: what they hit of the region.
+        first_hit: index of the first of these hits.
+        plain: whether the pixel shows nothing but the sheet of skin, and there is one hit for the group.
+        wet: whether the pixel may show menisci.
         halved: whether half of the samples that meet the globe are shaded for all of them.
-        ray: origin, direction (scene's frame) and weight of sample j.
-        hit: what sample j hits of the region, from what it meets of the globe alone, its origin and its direction.
-        spot: place of sample j on the lamps' discs, [0, 1)^2.
-        shared_spot: the same for the group. The groups that use a lamp have consecutive places.
-        asked: number of lamps to which sample j sends rays where it meets the globe.
-        lamp: the k-th of these lamps, and its weight.
-        lamps: number of lamps that the whole group uses where it meets the region.
-        shared: the k-th of these lamps, and its weight.
-        fine: whether pairs of samples send rays of their own to the group's first lamp about the lids and on hairs,
-            where lashes cast shadows finer than a pixel.
+        turns: turns of the pixel's groups, for light on the region.
+        sample_turns: turns of the pixel's samples, for light on the globe.
+        own_shadows: whether pairs of samples send rays of their own to the group's first lamp about the lids and on
+            hairs, where lashes cast shadows finer than a pixel.
         sharp: whether every sample does so, and everywhere: the lamp is the sun.
-        plain: whether the samples' pixel shows nothing but the sheet of skin.
-        wet: whether it may show menisci.
-        layered: whether the parts of the sum, and their distances, are wanted one by one.
+        layered: whether the depths of the parts are wanted.
     """
 
+    samples: Samples
+    number: mi.UInt32
     count: mi.UInt32
-    halved: mi.Bool
-    ray: Callable[[mi.UInt32], tuple[mi.Vector3f, mi.Vector3f, mi.Float]]
-    hit: Callable[[mi.UInt32, SurfaceInteraction, mi.Vector3f, mi.Vector3f], RegionHit]
-    spot: Callable[[mi.UInt32], mi.Point2f]
-    shared_spot: mi.Point2f
-    asked: Callable[[mi.UInt32], mi.UInt32]
-    lamp: Callable[[mi.UInt32, mi.UInt32], tuple[Lamp, mi.Float]]
-    lamps: mi.UInt32
-    shared: Callable[[mi.UInt32], tuple[Lamp, mi.Float]]
-    fine: mi.Bool
-    sharp: mi.Bool
+    hits: HitTable
+    first_hit: mi.UInt32
     plain: mi.Bool
     wet: mi.Bool
+    halved: mi.Bool
+    turns: LampTurns
+    sample_turns: LampTurns
+    own_shadows: mi.Bool
+    sharp: mi.Bool
     layered: bool = False
 
+    def in_order(self, i: mi.UInt32) -> mi.UInt32:
+        """The i-th sample to look at: the middle one first, then the others in turn."""
+        middle = self.count >> 1
+        return dr.select(i == 0, middle, dr.select(i <= middle, i - 1, i))
 
-@dataclass(frozen=True, slots=True)
+    def of_pixel(self, j: mi.UInt32) -> mi.UInt32:
+        """Number in its pixel of sample j."""
+        return self.number * self.count + j
+
+    def ray(self, frame: Frame, j: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+        """Origin and direction (scene's frame) of sample j, and its weight, cos^4 of its field angle."""
+        o, d, cosine = self.samples.ray(frame, self.of_pixel(j))
+        return o, d, cosine * cosine
+
+    @syntax
+    def hit(self, frame: Frame, j: mi.UInt32) -> RegionHit:
+        """What sample j hits of the region."""
+        hit = self.hits.at(self.first_hit + dr.select(self.plain, 0, j))
+        # A ray in some ten thousand slips between two triangles, and then it stands for itself alone.
+        if dr.hint(self.plain & ~hit.is_valid(), exclude=[self, frame, j]):
+            hit = region_hit(frame, *self.ray(frame, j)[:2])
+        return hit
+
+    def spot(self, j: mi.UInt32) -> mi.Point2f:
+        """Place of sample j on the lamps' discs, [0, 1)^2."""
+        return self.samples.pair(self.of_pixel(j), 0)
+
+    @property
+    def shared_spot(self) -> mi.Point2f:
+        """The same for the group. The groups that use a lamp have consecutive places."""
+        lamps = dr.maximum(self.turns.others, 1)
+        several = self.turns.users < self.turns.others
+        return self.samples.pair(dr.select(several, self.number, self.number // lamps), 0)
+
+
+@dataclass(kw_only=True)
+class WeightedHit:
+    """A sample's hit on the region, with its weight.
+
+    Attributes:
+        j: number of the sample in its group.
+        hit: where it hits.
+        on_sheet: whether it hits the sheet of skin.
+        weight: of the sample.
+        near: weight times inverse depth (1/mm).
+        own_ray: whether the sample does not rely on the group's ray to the lamp.
+    """
+
+    j: mi.UInt32
+    hit: RegionHit
+    on_sheet: mi.Bool
+    weight: mi.Float
+    near: mi.Float
+    own_ray: mi.Bool
+
+
+@dataclass(kw_only=True)
+class RegionSample:
+    """The surface point that stands for all samples of a group on one kind of surface.
+
+    Attributes:
+        j: number of its sample.
+        face: its triangle.
+        uv: barycentric coordinates there.
+        weight: of the samples.
+        shared: of those that rely on the group's ray to the lamp.
+        clear: of the others that see the lamp.
+        near: sum of weights times inverse depth (1/mm).
+    """
+
+    j: mi.UInt32
+    face: mi.UInt32
+    uv: mi.Point2f
+    weight: mi.Float
+    shared: mi.Float
+    clear: mi.Float
+    near: mi.Float
+
+    @classmethod
+    def none(cls) -> RegionSample:
+        """Return the point of no samples."""
+        j, face, uv = mi.UInt32(0), mi.UInt32(0), mi.Point2f(0)
+        return cls(j=j, face=face, uv=uv, weight=mi.Float(0), shared=mi.Float(0), clear=mi.Float(0), near=mi.Float(0))
+
+    def add(self, met: mi.Bool, sample: WeightedHit, blocked: mi.Bool) -> None:
+        """Add a sample where it has `met` the surface; `blocked` is the result of its own ray to the lamp."""
+        first, weight = met & (self.weight == 0), dr.select(met, sample.weight, 0)
+        self.j = dr.select(first, sample.j, self.j)
+        self.face = dr.select(first, sample.hit.face, self.face)
+        self.uv = dr.select(first, sample.hit.prim_uv, self.uv)
+        self.weight = self.weight + weight
+        self.shared = self.shared + dr.select(sample.own_ray, 0, weight)
+        self.clear = self.clear + dr.select(sample.own_ray & ~blocked, weight, 0)
+        self.near = self.near + dr.select(met, sample.near, 0)
+
+
+@dataclass(kw_only=True)
+class GlobeSamples:
+    """A group's samples on the globe.
+
+    Attributes:
+        lit: radiance times weight of the samples that are shaded.
+        shaded: weight of these.
+        weight: of all samples on the globe.
+        near: sum of weights times inverse depth (1/mm).
+        water: radiance times weight of the menisci before globe and skin.
+        failures: number of failed light paths.
+    """
+
+    lit: mi.Float
+    shaded: mi.Float
+    weight: mi.Float
+    near: mi.Float
+    water: mi.Float
+    failures: mi.UInt32
+
+    @classmethod
+    def none(cls) -> GlobeSamples:
+        """Return the sums of no samples."""
+        lit, shaded, weight, near, water = (mi.Float(0) for _ in range(5))
+        return cls(lit=lit, shaded=shaded, weight=weight, near=near, water=water, failures=mi.UInt32(0))
+
+    @property
+    def radiance(self) -> mi.Float:
+        """Radiance times weight of all samples. The shaded ones stand for the others."""
+        return self.water + self.lit * dr.select(self.shaded > 0, self.weight / self.shaded, 0)
+
+
+@dataclass(kw_only=True)
 class Part:
     """What a group sees of one part of the scene: radiance, weight of the samples, and weight times inverse depth."""
 
@@ -70,351 +238,269 @@ class Part:
     near: mi.Float
 
 
-def shade_group(frame: Frame, group: Group) -> tuple[tuple[Part, ...], mi.Float, mi.UInt32]:
-    """Sum radiance and failed light paths over a group's samples in front of an eye region.
+def shade_group(frame: Frame, group: PixelGroup) -> tuple[mi.Float, mi.UInt32]:
+    """Radiance times weight, summed over a group's samples, and the number of failed light paths."""
+    sheet, before = merge_hits(frame, group)
+    globe = shade_globe(frame, group)
+    radiance = shade_region(frame, group, sheet, globe.radiance, on_sheet=True)
+    return shade_region(frame, group, before, radiance, on_sheet=False), globe.failures
 
-    The parts, from front to back, are what is before the skin, the skin, and the globe. There are none unless the group
-    is layered.
 
-    Every sample has a ray of its own, and the globe is shaded for each, or for half where many are taken because of
-    thin hairs. The region is shaded once for the sheet of skin and once for everything in front of it (hairs,
-    tears), at the first sample that hits it. The result is multiplied by the number of hits on that surface. In a plain
-    pixel the first sample that hits the skin represents the others.
-    """
-    shading = _GroupShading(frame, frame.region, group)
-    no = mi.Bool(False)
-    depths = tuple(mi.Float(0) for _ in range(3)) if group.layered else ()
-    state = (
-        mi.UInt32(0),
-        no,
-        mi.Float(0),
-        GlobeSamples.none(),
-        RegionSample.none(),
-        RegionSample.none(),
-        no,
-        no,
-        mi.UInt32(0),
-        depths,
+def shade_parts(frame: Frame, group: PixelGroup) -> tuple[tuple[Part, Part, Part], mi.UInt32]:
+    """The same of each part, from front to back: what is before the skin, the skin, and the globe."""
+    sheet, before = merge_hits(frame, group)
+    globe = shade_globe(frame, group)
+    front = shade_region(frame, group, before, mi.Float(0), on_sheet=False)
+    skin = shade_region(frame, group, sheet, mi.Float(0), on_sheet=True)
+    parts = (
+        Part(radiance=front, weight=before.weight, near=before.near),
+        Part(radiance=skin, weight=sheet.weight, near=sheet.near),
+        Part(radiance=globe.radiance, weight=globe.weight, near=globe.near),
     )
-    names = ("i", "settled", "total", "globe", "sheet", "before", "known", "blocked", "failures", "depths")
-    i, settled, total, globe, sheet, before, _, _, failures, depths = dr.while_loop(
-        state, shading.goes_on, shading.trace_sample, labels=names, label="group"
-    )
-    total += globe.radiance
-    traced = sheet.weight
-    sheet = shading.with_untraced(sheet, i, settled)
-
-    def with_region(total: mi.Float, kept: RegionSample, on_sheet: bool) -> mi.Float:
-        return dr.if_stmt(
-            (total,), kept.weight > 0, lambda total: shading.add_region(total, kept, on_sheet), lambda total: total
-        )
-
-    if group.layered:
-        near = list(depths)
-        near[1] *= dr.select(traced > 0, sheet.weight / traced, 1)
-        radiance = [shading.add_region(mi.Float(0), before, False), shading.add_region(mi.Float(0), sheet, True)]
-        weights = (before.weight, sheet.weight, globe.weight)
-        parts = tuple(Part(*part) for part in zip((*radiance, total), weights, near, strict=True))
-        return parts, total, failures
-    return (), with_region(with_region(total, sheet, True), before, False), failures
+    return parts, globe.failures
 
 
-@dataclass(frozen=True, slots=True)
-class _GroupShading:
-    """Steps of `shade_group` for one frame."""
+# Stage 2: merging
 
-    frame: Frame
-    skin: SkinGeometry
-    group: Group
 
-    @property
-    def soft(self) -> bool:
-        """Whether light spreads inside skin and sclera."""
-        return self.frame.structure.scattering
-
-    def number(self, i: mi.UInt32) -> mi.UInt32:
-        """Index of the i-th sample to trace: the middle one first, then the others in turn."""
-        middle = self.group.count >> 1
-        return dr.select(i == 0, middle, dr.select(i <= middle, i - 1, i))
-
-    def lamp_point(self, lamp: Lamp, j: mi.UInt32) -> mi.Vector3f:
-        """Point of sample j on a lamp."""
-        u, v = self.group.spot(j)
-        return lamp.point(u, *dr.sincos(v * (2 * dr.pi)))
-
-    def goes_on(self, i: mi.UInt32, settled: mi.Bool, *_: object) -> mi.Bool:
-        """Whether samples are left to trace."""
-        return (i < self.group.count) & ~settled
-
-    def trace_sample(
-        self,
-        i: mi.UInt32,
-        settled: mi.Bool,
-        total: mi.Float,
-        globe: GlobeSamples,
-        sheet: RegionSample,
-        before: RegionSample,
-        known: mi.Bool,
-        blocked: mi.Bool,
-        failures: mi.UInt32,
-        depths: tuple[mi.Float, ...],
-    ) -> tuple[
-        mi.UInt32,
-        mi.Bool,
-        mi.Float,
-        GlobeSamples,
-        RegionSample,
-        RegionSample,
-        mi.Bool,
-        mi.Bool,
-        mi.UInt32,
-        tuple[mi.Float, ...],
-    ]:
-        """Trace one sample: shade the globe if the sample hits it, else keep the hit on the region.
-
-        `known` says whether the previous sample has sent its own ray to the lamp, `blocked` whether that ray met
-        anything.
-        """
-        frame, group, skin = self.frame, self.group, self.skin
-        j = self.number(i)
-        o, d, weight = group.ray(j)
-
-        view = intersect_globe(frame, o, d)
-        hit = group.hit(j, view, o, d)
-        view, face = behind(view, hit, mi.Bool(True)), hit.face
-        at = o + hit.t * d
-        on_sheet = skin.on_sheet(face)
-        if skin.water is not None:
-            total, d, *parts = dr.if_stmt(
-                (total, d, *parts_of(view)),
-                group.wet,
-                lambda total, d, *parts: self.past_water(total, d, SurfaceInteraction(*parts), o, j, weight),
-                lambda *unchanged: unchanged,
-            )
-            view = SurfaceInteraction(*parts)
-        if group.layered:
-            # Before the branches below: Dr.Jit would reuse their values outside of them.
-            add = weight * view.nearness(frame, d)
-            seen = (view.other & ~on_sheet, view.other & on_sheet, view.cornea | view.sclera)
-            depths = tuple(n + dr.select(there, add, 0) for n, there in zip(depths, seen, strict=True))
-
-        def shade(lit: mi.Float, shaded: mi.Float, failures: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.UInt32]:
-            radiance, missed = self.globe_radiance(view, d, j)
-            return lit + radiance * weight, shaded + weight, failures + missed
-
-        on_globe = view.cornea | view.sclera
-        # Of any four samples the two in the middle: of twelve, these are a lattice about the pixel's centre.
-        in_turn = ~group.halved | (((j + 1) & 2) > 0) | (globe.shaded == 0)
-        lit, shaded, failures = dr.if_stmt(
-            (globe.lit, globe.shaded, failures), on_globe & in_turn, shade, lambda *unchanged: unchanged
-        )
-        globe = GlobeSamples(lit, shaded, globe.weight + dr.select(on_globe, weight, 0))
-        alone = view.other & group.fine
-        if self.soft:
-            alone &= ~on_sheet
-        else:
-            alone &= ~on_sheet | group.sharp | (at.y * at.y + at.z * at.z < _LIDS_MM * _LIDS_MM)
-
+@syntax
+def merge_hits(frame: Frame, group: PixelGroup) -> tuple[RegionSample, RegionSample]:
+    """Merge a group's hits to a point on the sheet of skin and a point before it."""
+    sheet, before = RegionSample.none(), RegionSample.none()
+    i, asked, blocked = mi.UInt32(0), mi.Bool(False), mi.Bool(False)
+    while dr.hint(i < group.count, label="merge", exclude=[frame, group]):
+        sample = _weighted_hit(frame, group, group.in_order(i))
         # Two samples share one ray, unless the shadows are sharp.
-        known &= ((i & 1) == 1) & ~group.sharp
-        asked = alone & ~known
-
-        def own_ray(_: mi.Bool) -> mi.Bool:
-            source = self.lamp_point(group.shared(mi.UInt32(0))[0], j)
-            return self.skin_blocked(group.shared(mi.UInt32(0))[0], source, frame.point_to_eye(at), on_sheet, asked)
-
-        blocked = dr.if_stmt((blocked,), asked, own_ray, lambda blocked: blocked)
-        known |= asked
-        sheet = sheet.with_(view.other & on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
-        before = before.with_(view.other & ~on_sheet, j, face, hit.prim_uv, weight, alone, blocked)
-        settled = group.plain & view.other & on_sheet & ~alone
-        return i + 1, settled, total, globe, sheet, before, known, blocked, failures, depths
-
-    def past_water(
-        self, total: mi.Float, d: mi.Vector3f, view: SurfaceInteraction, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
-    ) -> tuple[Any, ...]:
-        """Add what menisci mirror to `total`; the direction in air, and the parts of the view, of what is behind."""
-        frame, skin, no = self.frame, self.skin, mi.Bool(False)
-        film, wet = wetted(skin.water, o, d, view.distance)
-        # Mirror images of lamps in water are smaller than a pixel, so no sample stands for others.
-        drop = RegionSample.none().with_(wet, j, skin.on_water(film), film.prim_uv, weight, no, no)
-        total = dr.if_stmt((total,), wet, lambda total: self.add_region(total, drop, False), lambda total: total)
-        view, d = through_water(frame, skin, film, wet, view, o, d)
-        return total, d, *parts_of(view)
-
-    def globe_radiance(self, view: SurfaceInteraction, d: mi.Vector3f, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
-        """Radiance of the globe along sample j's ray, and failed light paths."""
-        frame, group = self.frame, self.group
-        seen = on_relief(frame, replace(view, other=mi.Bool(False)))
-        inner, missed = irradiance_through_cornea(frame, seen.inner, seen.lit_inside, *group.spot(j))
-        albedo = outer_albedo(frame, seen)
-        received = frame.caches.radiosity.at_globe(frame.point_to_scene(seen.point))
-        rest = indirect(frame, seen, d, albedo, inner, received)
-        return rest + self.lamps_on_globe(seen, albedo, -frame.vector_to_eye(d), j), missed
-
-    def lamps_on_globe(self, seen: SurfaceInteraction, albedo: mi.Float, back: mi.Vector3f, j: mi.UInt32) -> mi.Float:
-        """Radiance of the matte globe at sample j: the light of all lamps, less what is kept from it.
-
-        The samples of a pixel share the rays to the lamps. So only shadows that end within the pixel are noisy.
-        """
-        frame, lights, group = self.frame, self.frame.lights, self.group
-
-        mirror = (film_normal(seen.normal), back)
-        u, v = group.spot(j)
-        turn = dr.sincos(v * (2 * dr.pi))
-
-        def lit_by(lamp: Lamp, matte: mi.Float) -> tuple[mi.Vector3f, mi.Float]:
-            source = lamp.point(u, *turn)
-            return source, direct(seen, matte, *direct_light(lamp, source, seen, mirror))
-
-        if self.soft:
-            # What went through the tissue is known, and what remains is the film's highlight.
-            tissues = self.frame.caches.diffusion
-            covered, share = ~seen.cornea | (seen.opacity > 0), tissues.lamps_at_globe(self.frame, seen.point)
-
-            def shine(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-                lamp = lights[i]
-                return i + 1, total + lit_by(lamp, mi.Float(0))[1] * share(lamp.number)
-
-            state = (mi.UInt32(0), direct(seen, albedo, tissues.at_globe(self.frame, seen.point), mi.Float(0)))
-            labels = ("i", "total")
-            return dr.while_loop(state, lambda i, _: covered & (i < lights.count), shine, labels=labels, label="film")[
-                1
-            ]
-
-        def add(i: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            return i + 1, total + lit_by(lights[i], albedo)[1]
-
-        state = (mi.UInt32(0), mi.Float(0))
-        _, total = dr.while_loop(state, lambda i, _: i < lights.count, add, labels=("i", "total"), label="all lamps")
-
-        def subtract(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            lamp, share = group.lamp(j, k)
-            source, lit = lit_by(lamp, albedo)
-            barred = lamp_blocked(frame, seen.point, source, False, ~seen.cornea, lit > 0)
-            return k + 1, total - dr.select(barred, lit * share, 0)
-
-        state, asked = (mi.UInt32(0), total), group.asked(j)
-        _, total = dr.while_loop(state, lambda k, _: k < asked, subtract, labels=("k", "total"), label="shadows")
-        return total
-
-    def with_untraced(self, sheet: RegionSample, i: mi.UInt32, settled: mi.Bool) -> RegionSample:
-        """Add to the skin's hit the weights of the samples from the i-th on, which a plain pixel left untraced."""
-
-        def more(i: mi.UInt32, *_: object) -> mi.Bool:
-            return settled & (i < self.group.count)
-
-        def add(i: mi.UInt32, weight: mi.Float, shared: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-            rest = self.group.ray(self.number(i))[2]
-            return i + 1, weight + rest, shared + rest
-
-        state = (i, sheet.weight, sheet.shared)
-        _, weight, shared = dr.while_loop(state, more, add, labels=("i", "weight", "shared"), label="settled")
-        return replace(sheet, weight=weight, shared=shared)
-
-    def skin_blocked(
-        self, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, asked: mi.Bool
-    ) -> mi.Bool:
-        """Whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
-        frame, views = self.frame, self.frame.caches.shadow_maps
-        # Where the lamp's own view shows bare skin alone, only the globe may be in the way.
-        clear = views.at(lamp.number, frame.point_to_scene(x), asked & on_sheet)
-        return lamp_blocked(frame, x, source, True, True, asked & ~clear)
-
-    def add_region(self, total: mi.Float, kept: RegionSample, on_sheet: bool) -> mi.Float:
-        """Add to `total` the radiance of a kept hit on the region, from the lamps that the group uses."""
-        frame, group = self.frame, self.group
-        _, d, _ = group.ray(kept.j)
-        view = look_at_skin(frame, self.skin, kept.face, kept.uv, d, kept.weight > 0)
-        rest = off_eye(frame, view, d, view.albedo, view.received)
-        inside, matte, sees = mi.Float(0), view.albedo, None
-        soft = self.soft and on_sheet
-        if soft:
-            tissues = self.frame.caches.diffusion
-            on_map = self.skin.map_place(kept.face, kept.uv, kept.weight > 0)
-            on_skin, sees = tissues.at_skin(*on_map), tissues.lamps_at_skin(*on_map)
-            inside, matte = direct(view, view.albedo, on_skin, mi.Float(0)), mi.Float(0)
-        total += (rest + inside) * kept.weight
-        faint = _FAINT * inside
-        mirror = (glossy_normal(view.normal, view.gloss), -frame.vector_to_eye(d))
-        turn = dr.sincos(group.shared_spot.y * (2 * dr.pi))
-
-        def more(k: mi.UInt32, *_: object) -> mi.Bool:
-            return k < group.lamps
-
-        def lamp_light(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            lamp, share = group.shared(k)
-            source = lamp.point(group.shared_spot.x, *turn)
-            outer, shine = direct_light(lamp, source, view, mirror)
-            lit = direct(view, matte, outer, shine) * share
-            if sees is not None:
-                return k + 1, total + lit * kept.weight * sees(lamp.number)
-            first = group.fine & (k == 0)
-            shared = dr.select(first, kept.shared, kept.weight)
-            asked = (shared > 0) & (lit > faint) & (lit > _FAINT * dr.inv_pi * share * outer)
-            blocked = self.skin_blocked(lamp, source, view.point, on_sheet, asked)
-            return k + 1, total + lit * (dr.select(first, kept.clear, 0) + dr.select(blocked, 0, shared))
-
-        return dr.while_loop((mi.UInt32(0), total), more, lamp_light, labels=("k", "total"), label="its lamps")[1]
+        asked &= ((i & 1) == 1) & ~group.sharp
+        asks = sample.own_ray & ~asked
+        if dr.hint(asks, exclude=[frame, group, sample, asks]):
+            blocked = _own_shadow(frame, group, sample, asks)
+        asked |= asks
+        sheet.add(sample.hit.is_valid() & sample.on_sheet, sample, blocked)
+        before.add(sample.hit.is_valid() & ~sample.on_sheet, sample, blocked)
+        i += 1
+    return sheet, before
 
 
-@dataclass
-class GlobeSamples:
-    """A group's samples on the globe: radiance times weight of the shaded ones, their weight, and that of all."""
-
-    lit: mi.Float = None
-    shaded: mi.Float = None
-    weight: mi.Float = None
-
-    @classmethod
-    def none(cls) -> GlobeSamples:
-        """Return the sums of no samples."""
-        return cls(mi.Float(0), mi.Float(0), mi.Float(0))
-
-    @property
-    def radiance(self) -> mi.Float:
-        """Radiance of all these samples, of which the shaded ones stand for the others."""
-        return self.lit * dr.select(self.shaded > 0, self.weight / self.shaded, 0)
+def _weighted_hit(frame: Frame, group: PixelGroup, j: mi.UInt32) -> WeightedHit:
+    """Read sample j's hit, and decide whether its shadow needs a ray of its own."""
+    hit, (o, d, weight), near = group.hit(frame, j), group.ray(frame, j), mi.Float(0)
+    x, on_sheet = o + hit.t * d, frame.region.on_sheet(hit.face)
+    own_ray = hit.is_valid() & group.own_shadows
+    if frame.structure.scattering:
+        own_ray &= ~on_sheet
+    else:
+        own_ray &= ~on_sheet | group.sharp | (x.y * x.y + x.z * x.z < _LIDS_MM * _LIDS_MM)
+    if group.layered:
+        along = group.ray(frame, dr.select(group.plain, group.in_order(mi.UInt32(0)), j))[1]
+        near = weight * dr.rcp(dr.maximum(hit.t * dr.dot(along, frame.camera.forward), 1e-3))
+    return WeightedHit(j=j, hit=hit, on_sheet=on_sheet, weight=weight, near=near, own_ray=own_ray)
 
 
-@dataclass
-class RegionSample:
-    """The hit that represents all samples of a group on one kind of surface.
+def _own_shadow(frame: Frame, group: PixelGroup, sample: WeightedHit, active: mi.Bool) -> mi.Bool:
+    """Whether the group's first lamp is blocked from a sample's own hit."""
+    lamp, spot = group.turns.share(group.number, mi.UInt32(0)).lamp, group.spot(sample.j)
+    source = lamp.point(spot.x, *dr.sincos(spot.y * (2 * dr.pi)))
+    o, d, _ = group.ray(frame, sample.j)
+    x = frame.point_to_eye(o + sample.hit.t * d)
+    return _blocked_from_region(frame, lamp, source, x, sample.on_sheet, active)
 
-    It holds the sample's number and two weights: that of the samples without a ray of their own to the lamp (`shared`),
-    and that of the other samples that see the lamp (`clear`).
+
+def _blocked_from_region(
+    frame: Frame, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, active: mi.Bool
+) -> mi.Bool:
+    """Whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
+    # Where the lamp's shadow map shows bare skin alone, only the globe may be in the way.
+    clear = frame.caches.shadow_maps.at(lamp.number, frame.point_to_scene(x), active & on_sheet)
+    return lamp_blocked(frame, x, source, True, True, active & ~clear)
+
+
+# Stage 3: shading of the globe, and of menisci before it
+
+
+@syntax
+def shade_globe(frame: Frame, group: PixelGroup) -> GlobeSamples:
+    """Shade a group's samples on the globe."""
+    globe, i = GlobeSamples.none(), mi.UInt32(0)
+    while dr.hint(i < group.count, label="globe", exclude=[frame, group]):
+        j = group.in_order(i)
+        hit = group.hit(frame, j)
+        if dr.hint(~hit.is_valid() | group.wet, exclude=[frame, group, j, hit]):
+            _add_globe_sample(frame, group, globe, j, hit)
+        i += 1
+    return globe
+
+
+@syntax
+def _add_globe_sample(frame: Frame, group: PixelGroup, globe: GlobeSamples, j: mi.UInt32, hit: RegionHit) -> None:
+    """Add what sample j shows of the globe and of menisci."""
+    o, d, weight = group.ray(frame, j)
+    view = View(si=behind(EyeShape(frame=frame).ray_intersect(o, d), hit, mi.Bool(True)), d=mi.Vector3f(d))
+    if dr.hint(group.wet, exclude=[frame, group, o, j, weight]):
+        _look_through_water(frame, group, globe, view, o, j, weight)
+    on_globe = view.si.globe
+    if group.layered:
+        # Before the branch below: Dr.Jit would reuse its values outside of it.
+        globe.near = globe.near + dr.select(on_globe, weight * view.si.nearness(frame, view.d), 0)
+    # Of any four samples the two in the middle: of twelve, these are a lattice about the pixel's centre.
+    in_turn = ~group.halved | (((j + 1) & 2) > 0) | (globe.shaded == 0)
+    if dr.hint(on_globe & in_turn, exclude=[frame, group, view, j, weight]):
+        radiance, failures = _globe_radiance(frame, group, view, j)
+        globe.lit = globe.lit + radiance * weight
+        globe.shaded = globe.shaded + weight
+        globe.failures = globe.failures + failures
+    globe.weight = globe.weight + dr.select(on_globe, weight, 0)
+
+
+def _look_through_water(
+    frame: Frame, group: PixelGroup, globe: GlobeSamples, view: View, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
+) -> None:
+    """Add what menisci mirror along sample j's ray, and change the view to what is behind them."""
+    if frame.region.water is None:
+        return
+    hit = water_hit(frame, o, view.d, view.si.distance)
+    no = mi.Bool(False)
+    sample = WeightedHit(j=j, hit=hit, on_sheet=no, weight=weight, near=mi.Float(0), own_ray=no)
+    # Mirror images of lamps in water are smaller than a pixel, so no sample stands for others.
+    drop = RegionSample.none()
+    drop.add(hit.is_valid(), sample, no)
+    globe.water = shade_region(frame, group, drop, globe.water, on_sheet=False)
+    view.si, view.d = through_water(frame, hit, view.si, o, view.d)
+
+
+def _globe_radiance(frame: Frame, group: PixelGroup, view: View, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
+    """Radiance of the globe along sample j's ray, and failed light paths."""
+    si = on_relief(frame, replace(view.si, other=mi.Bool(False)))
+    inner, failures = irradiance_through_cornea(frame, si.inner, si.lit_inside, *group.spot(j))
+    albedo = outer_albedo(frame, si)
+    received = frame.caches.radiosity.at_globe(frame.point_to_scene(si.point))
+    radiance = indirect(frame, si, view.d, albedo, inner, received)
+    lit = _LitPoint(
+        si=si, normal=film_normal(si.normal), to_camera=-frame.vector_to_eye(view.d), spot=group.spot(j)
+    )  # fmt: skip
+    if frame.structure.scattering:
+        return radiance + _highlights_of_globe(frame, lit, albedo), failures
+    return radiance + _lamps_on_globe(frame, group, lit, albedo, j), failures
+
+
+@dataclass(kw_only=True)
+class _LitPoint:
+    """A surface point in the light of lamps (eye frame).
+
+    Attributes:
+        si: the point.
+        normal: normal of the film that mirrors.
+        to_camera: unit direction of the viewer.
+        spot: place on the lamps' discs, [0, 1)^2.
     """
 
-    j: mi.UInt32 = None
-    face: mi.UInt32 = None
-    uv: mi.Point2f = None
-    weight: mi.Float = None
-    shared: mi.Float = None
-    clear: mi.Float = None
+    si: SurfaceInteraction
+    normal: mi.Vector3f
+    to_camera: mi.Vector3f
+    spot: mi.Point2f
 
-    @classmethod
-    def none(cls) -> RegionSample:
-        """Return an empty hit."""
-        return cls(mi.UInt32(0), mi.UInt32(0), mi.Point2f(0), mi.Float(0), mi.Float(0), mi.Float(0))
+    def source(self, lamp: Lamp) -> mi.Vector3f:
+        """Point of a lamp."""
+        return lamp.point(self.spot.x, *dr.sincos(self.spot.y * (2 * dr.pi)))
 
-    def with_(
-        self,
-        met: mi.Bool,
-        j: mi.UInt32,
-        face: mi.UInt32,
-        uv: mi.Point2f,
-        weight: mi.Float,
-        alone: mi.Bool,
-        blocked: mi.Bool,
-    ) -> RegionSample:
-        """Add sample `j` where it has `met` the surface; the first sample stands for all."""
-        taken = met & (self.weight == 0)
-        weight = dr.select(met, weight, 0)
-        return RegionSample(
-            dr.select(taken, j, self.j),
-            dr.select(taken, face, self.face),
-            dr.select(taken, uv, self.uv),
-            self.weight + weight,
-            self.shared + dr.select(alone, 0, weight),
-            self.clear + dr.select(alone & ~blocked, weight, 0),
-        )
+    def radiance(self, lamp: Lamp, albedo: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Radiance towards the viewer when nothing is in the lamp's way, and the irradiance (mW/mm^2)."""
+        irradiance, shine = direct_light(lamp, self.source(lamp), self.si, (self.normal, self.to_camera))
+        return direct(self.si, albedo, irradiance, shine), irradiance
+
+
+@syntax
+def _highlights_of_globe(frame: Frame, lit: _LitPoint, albedo: mi.Float) -> mi.Float:
+    """Radiance of the globe where light spreads inside: that light is known, and the tear film's highlight remains."""
+    tissues, si = frame.caches.diffusion, lit.si
+    covered, share = ~si.cornea | (si.opacity > 0), tissues.lamps_at_globe(frame, si.point)
+    total = direct(si, albedo, tissues.at_globe(frame, si.point), mi.Float(0))
+    i = mi.UInt32(0)
+    while dr.hint(covered & (i < frame.lights.count), label="film", exclude=[frame, lit, covered, share]):
+        lamp = frame.lights[i]
+        total += lit.radiance(lamp, mi.Float(0))[0] * share(lamp.number)
+        i += 1
+    return total
+
+
+@syntax
+def _lamps_on_globe(frame: Frame, group: PixelGroup, lit: _LitPoint, albedo: mi.Float, j: mi.UInt32) -> mi.Float:
+    """Radiance of the matte globe at sample j: the light of all lamps, less what is kept from it.
+
+    The samples of a pixel share the rays to the lamps. So only shadows that end within the pixel are noisy.
+    """
+    total, i = mi.Float(0), mi.UInt32(0)
+    while dr.hint(i < frame.lights.count, label="all lamps", exclude=[frame, lit, albedo]):
+        total += lit.radiance(frame.lights[i], albedo)[0]
+        i += 1
+    user, k, si = group.of_pixel(j), mi.UInt32(0), lit.si
+    rays = group.sample_turns.count(user)
+    while dr.hint(k < rays, label="shadows", exclude=[frame, group, lit, albedo, user, si, rays]):
+        share = group.sample_turns.share(user, k)
+        radiance, _ = lit.radiance(share.lamp, albedo)
+        blocked = lamp_blocked(frame, si.point, lit.source(share.lamp), False, ~si.cornea, radiance > 0)
+        total -= dr.select(blocked, radiance * share.weight, 0)
+        k += 1
+    return total
+
+
+# Stage 4: shading of the merged points of the region
+
+
+@syntax
+def shade_region(frame: Frame, group: PixelGroup, point: RegionSample, total: mi.Float, *, on_sheet: bool) -> mi.Float:
+    """Add to `total` the radiance of a merged point times its weight."""
+    if dr.hint(point.weight > 0, exclude=[frame, group, point, on_sheet]):
+        total = _add_region(frame, group, point, total, on_sheet)
+    return total
+
+
+def _add_region(frame: Frame, group: PixelGroup, point: RegionSample, total: mi.Float, on_sheet: bool) -> mi.Float:
+    """Add the light of other surfaces and of the lamps that the group uses."""
+    _, d, _ = group.ray(frame, point.j)
+    si = region_interaction(frame, point.face, point.uv, d, point.weight > 0)
+    radiance = off_eye(frame, si, d, si.albedo, si.received)
+    lit = _LitPoint(
+        si=si, normal=glossy_normal(si.normal, si.gloss), to_camera=-frame.vector_to_eye(d), spot=group.shared_spot
+    )  # fmt: skip
+    if not (on_sheet and frame.structure.scattering):
+        return _lamps_on_region(frame, group, point, lit, total + radiance * point.weight, on_sheet)
+    tissues, on_map = frame.caches.diffusion, frame.region.map_place(point.face, point.uv, point.weight > 0)
+    radiance += direct(si, si.albedo, tissues.at_skin(*on_map), mi.Float(0))
+    return _highlights_of_skin(group, point, lit, total + radiance * point.weight, tissues.lamps_at_skin(*on_map))
+
+
+@syntax
+def _highlights_of_skin(
+    group: PixelGroup, point: RegionSample, lit: _LitPoint, total: mi.Float, share_of: Callable[[mi.UInt32], mi.Float]
+) -> mi.Float:
+    """Add the highlights of skin in which light spreads; `share_of` a lamp reaches it."""
+    k = mi.UInt32(0)
+    lamps = group.turns.count(group.number)
+    while dr.hint(k < lamps, label="highlights", exclude=[group, point, lit, share_of, lamps]):
+        share = group.turns.share(group.number, k)
+        radiance, _ = lit.radiance(share.lamp, mi.Float(0))
+        total += radiance * share.weight * point.weight * share_of(share.lamp.number)
+        k += 1
+    return total
+
+
+@syntax
+def _lamps_on_region(
+    frame: Frame, group: PixelGroup, point: RegionSample, lit: _LitPoint, total: mi.Float, on_sheet: bool
+) -> mi.Float:
+    """Add the light of lamps on a matte surface with highlights, with their shadows."""
+    k = mi.UInt32(0)
+    lamps = group.turns.count(group.number)
+    while dr.hint(k < lamps, label="its lamps", exclude=[frame, group, point, lit, on_sheet, lamps]):
+        share = group.turns.share(group.number, k)
+        radiance, irradiance = lit.radiance(share.lamp, lit.si.albedo)
+        radiance *= share.weight
+        first = group.own_shadows & (k == 0)
+        shared = dr.select(first, point.shared, point.weight)
+        asked = (shared > 0) & (radiance > 0) & (radiance > _FAINT * dr.inv_pi * share.weight * irradiance)
+        source = lit.source(share.lamp)
+        blocked = _blocked_from_region(frame, share.lamp, source, lit.si.point, on_sheet, asked)
+        total += radiance * (dr.select(first, point.clear, 0) + dr.select(blocked, 0, shared))
+        k += 1
+    return total

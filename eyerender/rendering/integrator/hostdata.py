@@ -1,4 +1,4 @@
-"""What NumPy alone makes of a job: nothing here asks the device, so a second thread can do it beside the tracing."""
+"""Host-side precomputation for a job: nothing here asks the device, so a second thread may do it during the tracing."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Bools, Ints, Singles, frozen
+from ...arrays import Singles
 from ...eye.fundus import FundusLight
 from ...region.mesh import RegionMesh
 from ...rig.camera import Window
 from ..glints.occlusion import lid_margins_px
 from ..glints.splatting import MirrorImages
-from ..records.frame import aligned_copy
 from ..records.job import LampTable, RenderJob, parameters_of, returned_light, sun_lamps
 from ..records.parameters import Parameters
 from ..scene.blur import Blur
@@ -23,11 +22,11 @@ from ..scene.pixels import skin_only_tiles, supersampled_pixels
 from ..transport.patches import GlobePatches, globe_patches
 from ..transport.shadowmaps import shadow_map_table
 
-_NO_TILES = frozen([[False]], bool)
+FINE, WET, PLAIN = 1, 2, 4  # classes of pixels
 
 
 class HostData:
-    """What NumPy alone makes of a job. Every part is made when it is first asked for, or all by `made`.
+    """Host-side precomputation for a job. Every part is made when it is first asked for, or all by `made`.
 
     Args:
         job: the job.
@@ -36,8 +35,7 @@ class HostData:
 
     def __init__(self, job: RenderJob, posed: RegionMesh | None) -> None:
         self.job, self.posed = job, posed
-        self._tiles: dict[Window, tuple[Bools, int]] = {}
-        self._fine: dict[Window, tuple[NDArray[np.uint32], Ints]] = {}
+        self._marks: dict[Window, NDArray[np.uint8]] = {}
 
     @classmethod
     def made(cls, job: RenderJob, posed: RegionMesh | None) -> HostData:
@@ -47,8 +45,7 @@ class HostData:
         if job.mesh_edge_mm is None:
             _ = made.mirror_images
         if made.posed is not None:
-            made.plain(made.blur.window)
-            made.fine(made.blur.window)
+            made.marks(made.blur.window)
             _ = made.views
             if job.look.scattering is not None:
                 _ = made.tissue_cells
@@ -119,27 +116,18 @@ class HostData:
         """Landmarks along the lids, where there are any."""
         return None if self.posed is None else lid_margins_px(self.posed, self.job.camera, self.job.anchor_mm)
 
-    def plain(self, window: Window) -> tuple[Bools, int]:
-        """Which tiles of a window show nothing but skin and thin hairs, and their size (px)."""
-        if window not in self._tiles:
-            posed, job = self.posed, self.job
-            nothing = _NO_TILES, max(window[2:])
-            self._tiles[window] = (
-                nothing if posed is None else skin_only_tiles(posed, job.camera, job.anchor_mm, window)
-            )
-        return self._tiles[window]
+    def marks(self, window: Window) -> NDArray[np.uint8]:
+        """Classes of a window's pixels, row by row: sums of `FINE`, `WET` and `PLAIN`.
 
-    def fine(self, window: Window) -> tuple[NDArray[np.uint32], Ints]:
-        """Pixels of a window that may show menisci or thin hairs, in the order of its rows.
-
-        Returns:
-            For each pixel of the window 1 if it may show either, plus 2 if it may show menisci, plus 4 k if it is the
-            k-th of those that may show either; and the indices of these.
+        A pixel is `FINE` if thin hairs or menisci may show in it, `WET` if menisci may, and `PLAIN` if nothing but the
+        sheet of skin does.
         """
-        if window not in self._fine:
-            fine, wet = supersampled_pixels(self.posed, self.job.camera, self.job.anchor_mm, window)
-            chosen = np.flatnonzero(fine)
-            marks = aligned_copy((fine + 2 * wet).astype(np.uint32).ravel())
-            marks[chosen] |= 4 * np.arange(1, len(chosen) + 1, dtype=np.uint32)
-            self._fine[window] = marks, chosen
-        return self._fine[window]
+        if window not in self._marks:
+            camera, anchor = self.job.camera, self.job.anchor_mm
+            fine, wet = supersampled_pixels(self.posed, camera, anchor, window)
+            plain = np.zeros_like(fine)
+            if self.posed is not None:
+                tiles, size = skin_only_tiles(self.posed, camera, anchor, window)
+                plain = tiles.repeat(size, 0).repeat(size, 1)[: window[3], : window[2]] & ~fine
+            self._marks[window] = (fine * FINE + wet * WET + plain * PLAIN).astype(np.uint8).ravel()
+        return self._marks[window]

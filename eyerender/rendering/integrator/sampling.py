@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...rig.camera import Window
 from ..records.frame import Frame
 
 _PHI = 1.324717957244746
@@ -50,51 +51,98 @@ def lattice_generator(count: int) -> int:
     return found
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(kw_only=True)
+class Pixels:
+    """The pixels of a window, row by row: its first pixel on the sensor, and its width."""
+
+    corner: tuple[mi.Int32, mi.Int32]
+    width: mi.UInt32
+
+    @classmethod
+    def of(cls, window: Window) -> Pixels:
+        """Upload the place of a window."""
+        corner = dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])
+        return cls(corner=corner, width=dr.opaque(mi.UInt32, window[2]))
+
+    def at(self, pixel: mi.UInt32) -> tuple[mi.Int32, mi.Int32]:
+        """Full-sensor coordinates, as signed integers, of pixels."""
+        row = pixel // self.width
+        return mi.Int32(pixel - row * self.width) + self.corner[0], mi.Int32(row) + self.corner[1]
+
+
+@dataclass(kw_only=True)
 class Pattern:
     """The samples of all pixels of a frame: numbers and steps of two lattices, and keys of the further numbers.
 
     A step is the lattice's generator over its number, in units of 2^-32, so that wrapping takes the place of a
     remainder: processors divide whole numbers one by one.
+
+    Attributes:
+        usual: number and step of the usual lattice.
+        fine: those of the lattice of supersampled pixels.
+        keys: of the further numbers.
     """
 
-    lattices: tuple[tuple[mi.UInt32, mi.UInt32], tuple[mi.UInt32, mi.UInt32]]
+    usual: tuple[mi.UInt32, mi.UInt32]
+    fine: tuple[mi.UInt32, mi.UInt32]
     keys: tuple[mi.UInt32, ...]
 
     @classmethod
     def of(cls, count: int, seed: int, *, times: int = 1) -> Pattern:
-        """Make the pattern of `count` samples, `times` as many in fine pixels, for a seed."""
-        few, many = (
+        """Make the pattern of `count` samples, `times` as many in supersampled pixels, for a seed."""
+        usual, fine = (
             (dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, -(-(lattice_generator(n) << 32) // n) & 0xFFFFFFFF))
             for n in (count, count * times)
         )
         keys = (np.random.SeedSequence([seed, call]).generate_state(1)[0] for call in range(_CALLS))
-        return cls((few, many), tuple(dr.opaque(mi.UInt32, int(key)) for key in keys))
+        return cls(usual=usual, fine=fine, keys=tuple(dr.opaque(mi.UInt32, int(key)) for key in keys))
 
 
+@dataclass(kw_only=True)
 class Samples:
-    """The `count` samples of the pixels of a frame, for lanes with a place on the sensor (`pixel`)."""
+    """The samples of pixels, one pixel per lane. They are the same in every window.
 
-    def __init__(self, pixel: mi.UInt32, pattern: Pattern, fine: mi.Bool | bool = False) -> None:
-        self.pixel, self._keys = pixel, pattern.keys
-        # Where `fine`, a pixel has more samples.
-        (few, one), (many, other) = pattern.lattices
-        self.count, self._step = dr.select(fine, many, few), dr.select(fine, other, one)
+    Attributes:
+        u: column of the pixel on the sensor.
+        v: its row.
+        count: number of samples.
+        step: of the lattice, as in `Pattern`.
+        keys: as in `Pattern`.
+    """
+
+    u: mi.Int32
+    v: mi.Int32
+    count: mi.UInt32
+    step: mi.UInt32
+    keys: tuple[mi.UInt32, ...]
+
+    @classmethod
+    def of(cls, u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = False) -> Samples:
+        """The samples of pixels (u, v), which are supersampled where `fine`."""
+        (few, one), (many, other) = pattern.usual, pattern.fine
+        return cls(u=u, v=v, count=dr.select(fine, many, few), step=dr.select(fine, other, one), keys=pattern.keys)
 
     def in_pixel(self, k: mi.UInt32) -> mi.Point2f:
         """Place of sample `k` in the pixel, [0, 1)^2."""
         scale = dr.rcp(mi.Float(self.count))
-        return mi.Point2f((mi.Float(k) + 0.5) * scale, mi.Float((k * self._step) >> 8) * 2.0**-24 + 0.5 * scale)
+        return mi.Point2f((mi.Float(k) + 0.5) * scale, mi.Float((k * self.step) >> 8) * 2.0**-24 + 0.5 * scale)
 
     def pair(self, k: mi.UInt32, call: int) -> mi.Point2f:
         """Two further numbers of sample `k`, [0, 1)^2: each call of a pixel has its own shift."""
         tea: Any = mi.sample_tea_32
+        pixel = (self.u & mi.UInt32(0xFFFF)) | (self.v << mi.UInt32(16))
         return mi.Point2f(
             *(
                 mi.Float((shift + k * mi.UInt32(alpha)) >> 8) * (2.0**-24)
-                for shift, alpha in zip(tea(self.pixel, self._keys[call]), _ALPHA, strict=True)
+                for shift, alpha in zip(tea(pixel, self.keys[call]), _ALPHA, strict=True)
             )
         )
+
+    def ray(self, frame: Frame, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+        """Camera ray of sample `k` (scene's frame): origin, unit direction, squared cosine to the camera's axis."""
+        place = self.in_pixel(k)
+        o, d, cosine = camera_ray(frame, mi.Float(self.u) + (place.x - 0.5), mi.Float(self.v) + (place.y - 0.5))
+        return o, d, cosine * cosine
 
 
 def camera_ray(frame: Frame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:

@@ -2,8 +2,8 @@
 
     L = (1 - F) / n^2 * albedo / pi * sum_l I_l (1 - F_l) cos(theta) / J_l
 
-from the iris, which every lamp lights through all refracting surfaces (`lighting`). Sclera and surround are matte and
-lit directly.
+from the iris, which every lamp lights through all refracting surfaces (`directlight`). Sclera and background are matte
+and lit directly.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import EPSILON_MM, SurfaceInteraction, first_hit, outer_albedo
+from ..hits.interaction import EPSILON_MM, SurfaceInteraction, outer_albedo
+from ..hits.primary import first_hit
 from ..materials.albedo import iris_albedo, stop_coordinates
 from ..materials.gloss import film_normal, film_reflectance
 from ..records.frame import Frame
+from ..records.recording import syntax
 from ..transport.directlight import lamp_light, on_relief
 
-_FLAT_MM = 1e-2  # from the plane of a surround
+_FLAT_MM = 1e-2  # from the plane of the background
 
 
 def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.UInt32]:
@@ -25,135 +27,139 @@ def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float
 
     u, v: place on each lamp's disc, [0, 1).
     """
-    view = on_relief(frame, first_hit(frame, o, d, mi.Bool(True)))
+    si = on_relief(frame, first_hit(frame, o, d, mi.Bool(True)))
     known, outer_known = mi.Bool(False), mi.Float(0)
     if frame.caches.globe is not None:
-        outer_known, known = frame.caches.globe.at(frame, view)
-    outer, inner, failures = lamp_light(frame, view, u, v, known)
-    albedo = outer_albedo(frame, view)
-    received = of_surroundings(frame, view, known)
-    seen = indirect(frame, view, d, albedo, inner, received) + direct(view, albedo, outer + outer_known, mi.Float(0))
-    return seen, failures
+        outer_known, known = frame.caches.globe.at(frame, si)
+    outer, inner, failures = lamp_light(frame, si, u, v, known)
+    albedo = outer_albedo(frame, si)
+    received = of_surroundings(frame, si, known)
+    rest = indirect(frame, si, d, albedo, inner, received)
+    return rest + direct(si, albedo, outer + outer_known, mi.Float(0)), failures
 
 
-def direct(view: SurfaceInteraction, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
+def direct(si: SurfaceInteraction, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
     """Radiance of matte surfaces lit by the lamps: from their irradiance, and from their sheen."""
-    return dr.select(view.met, _cover(view) * (albedo * outer * dr.inv_pi + shine), 0)
+    return dr.select(si.met, si.cover * (albedo * outer * dr.inv_pi + shine), 0)
 
 
-def of_surroundings(frame: Frame, view: SurfaceInteraction, known: mi.Bool) -> mi.Vector4f:
-    """What points of a bare globe and of its background receive from other surfaces (see `RadiosityField`).
+@syntax
+def of_surroundings(frame: Frame, si: SurfaceInteraction, known: mi.Bool) -> mi.Vector4f:
+    """Light that a bare globe and its background receive from other surfaces (see `radiosityfield.RadiosityField`).
 
     Obstacles receive nothing. The light from other surfaces on the globe is left out where it is `known`.
     """
-    received, nothing = frame.caches.radiosity, mi.Vector4f(0, 1, 0, 0)
+    known = known & ~si.other
+    wanted = si.matte if frame.structure.ambient else si.matte & ~known
+    received, x = mi.Vector4f(0, 1, 0, 0), frame.point_to_scene(si.point)
+    if dr.hint(wanted, exclude=[frame, si, x]):
+        received = _from_other_surfaces(frame, si.other, x)
+    return mi.Vector4f(dr.select(known, 0, received.x), received.y, received.z, received.w)
 
-    def of_plane(x: mi.Vector3f) -> mi.Vector4f:
-        return dr.select(dr.abs(x.x - frame.backdrop_x) < _FLAT_MM, received.at_background(x), nothing)
 
-    def of_either(x: mi.Vector3f) -> mi.Vector4f:
-        return dr.if_stmt((x,), view.other, of_plane, received.at_globe)
-
-    known &= ~view.other
-    wanted = view.matte if frame.structure.ambient else view.matte & ~known
-    found = dr.if_stmt((frame.point_to_scene(view.point),), wanted, of_either, lambda x: nothing)
-    return mi.Vector4f(dr.select(known, 0, found.x), found.y, found.z, found.w)
+@syntax
+def _from_other_surfaces(frame: Frame, other: mi.Bool, x: mi.Vector3f) -> mi.Vector4f:
+    """The same for points x (scene's frame) of the globe, or of something `other`."""
+    radiosity = frame.caches.radiosity
+    if dr.hint(other, exclude=[frame, radiosity, x]):
+        on_plane = dr.abs(x.x - frame.backdrop_x) < _FLAT_MM
+        received = dr.select(on_plane, radiosity.at_background(x), mi.Vector4f(0, 1, 0, 0))
+    else:
+        received = radiosity.at_globe(x)
+    return received
 
 
 def indirect(
-    frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float, received: mi.Vector4f
+    frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float, received: mi.Vector4f
 ) -> mi.Float:
     """Radiance other than `direct`.
 
     Args:
         frame: the frame.
-        view: what is seen.
+        si: the surface that is seen, and the iris behind it.
         d: directions of the rays (scene's frame).
         albedo: of what is matte.
         inner: irradiance of the lamps in the plane of the iris.
-        received: what the first surface receives from other surfaces (see `radiosityfield.RadiosityField`).
+        received: light of other surfaces on the first surface (see `radiosityfield.RadiosityField`).
     """
-    index = frame.inner_index
-    rest = off_eye(frame, view, d, albedo, received)
+    rest = off_eye(frame, si, d, albedo, received)
     if not frame.structure.ambient:
-        rest += _mirrored(frame, view, d, 1 - _cover(view))
-    leaving = (
-        dr.if_stmt(
-            (view.inner, inner),
-            view.lit_inside,
-            lambda x, lit: _leaving(frame, view.pupil, x, lit),
-            lambda x, lit: mi.Float(0),
-        )
-        * dr.inv_pi
-        / (index * index)
-    )
+        rest += _mirrored(frame, si, d)
+    leaving = _radiosity_of_iris(frame, si, inner) * dr.inv_pi / (frame.inner_index * frame.inner_index)
     if frame.caches.fundus is not None:
-        seen = view.cornea & view.pupil
-        leaving += dr.select(seen, frame.caches.fundus.at(*stop_coordinates(frame, view.inner), seen), 0)
-    rest += dr.select(view.cornea, (1 - view.opacity) * view.passed * leaving, 0)
-    return dr.select(view.met, rest, 0)
+        seen = si.cornea & si.pupil
+        leaving += dr.select(seen, frame.caches.fundus.at(*stop_coordinates(frame, si.inner), seen), 0)
+    rest += dr.select(si.cornea, (1 - si.opacity) * si.passed * leaving, 0)
+    return dr.select(si.met, rest, 0)
 
 
-def off_eye(
-    frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, received: mi.Vector4f
-) -> mi.Float:
-    """The same of what is not the clear cornea; see `indirect`."""
+def off_eye(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, received: mi.Vector4f) -> mi.Float:
+    """Radiance as of `indirect` of what is not the clear cornea."""
     even, mirrored = received.x, mi.Float(0)
     if frame.structure.ambient:
-        facing = view.normal if view.level is None else view.level
-        x, normal = frame.point_to_scene(view.point), frame.vector_to_scene(facing)
+        facing = si.normal if si.level is None else si.level
+        x, normal = frame.point_to_scene(si.point), frame.vector_to_scene(facing)
         even += received.y * frame.caches.ambience.irradiance(x, normal)
-        mirrored = _mirrored(frame, view, d, 1 - _cover(view))
-    return dr.select(view.met, _cover(view) * albedo * even * dr.inv_pi + mirrored, 0)
+        mirrored = _mirrored(frame, si, d)
+    return dr.select(si.met, si.cover * albedo * even * dr.inv_pi + mirrored, 0)
 
 
-def _cover(view: SurfaceInteraction) -> mi.Float:
-    """Share of the first surface that is matte."""
-    return dr.select(view.cornea, view.opacity, 1)
+@syntax
+def _radiosity_of_iris(frame: Frame, si: SurfaceInteraction, lit: mi.Float) -> mi.Float:
+    """Radiosity in the plane of the iris, which has the irradiance `lit` from the lamps."""
+    radiosity = mi.Float(0)
+    if dr.hint(si.lit_inside, exclude=[frame, si, lit]):
+        albedo = mi.Float(frame.pupil_albedo)
+        if dr.hint(~si.pupil, exclude=[frame, si]):
+            albedo = iris_albedo(frame, si.inner)
+        radiosity = albedo * (lit + frame.caches.radiosity.at_iris(si.inner))
+    return radiosity
 
 
-def _leaving(frame: Frame, pupil: mi.Bool, x: mi.Vector3f, lit: mi.Float) -> mi.Float:
-    """Radiosity of points in the plane of the iris that have the irradiance `lit` from the lamps."""
-    albedo = dr.if_stmt((x,), ~pupil, lambda x: iris_albedo(frame, x), lambda x: mi.Float(frame.pupil_albedo))
-    return albedo * (lit + frame.caches.radiosity.at_iris(x))
-
-
-def _mirrored(frame: Frame, view: SurfaceInteraction, d: mi.Vector3f, clear: mi.Float) -> mi.Float:
+def _mirrored(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f) -> mi.Float:
     """Radiance that wet surfaces mirror to the camera, but for that of the lamps.
 
-    The front cornea, where it is `clear`, mirrors the ambient light and the surfaces about it. The film of tears
+    The front cornea, where it is clear, mirrors the ambient light and the surfaces about it. The film of tears
     elsewhere mirrors the ambient light.
     """
-    received = frame.caches.radiosity
-    normal, share = view.normal, view.mirrored * clear
-    seen, wet = mi.Float(0), view.cornea & (clear > 0)
-    film = mi.Bool(False)
+    clear = 1 - si.cover
+    normal, share, wet, film = si.normal, si.mirrored * clear, si.cornea & (clear > 0), mi.Bool(False)
     if frame.structure.ambient and frame.structure.region:
-        film = ~view.cornea & view.met & (view.gloss > 0.5)
-        normal = dr.select(film, film_normal(view.normal), view.normal)
+        film = ~si.cornea & si.met & (si.gloss > 0.5)
+        normal = dr.select(film, film_normal(si.normal), si.normal)
         cosine = -dr.dot(normal, frame.vector_to_eye(d))
-        share = dr.select(film, film_reflectance(cosine, view.gloss), share)
+        share = dr.select(film, film_reflectance(cosine, si.gloss), share)
     normal = frame.vector_to_scene(normal)
     way = d - 2 * dr.dot(d, normal) * normal
-    start = frame.point_to_scene(view.point) + EPSILON_MM * normal
+    start = frame.point_to_scene(si.point) + EPSILON_MM * normal
+    seen = mi.Float(0)
     if frame.structure.ambient:
         seen = frame.ambient_irradiance * dr.inv_pi + frame.caches.ambience.radiance(start, way, wet | film)
     else:
-        wet &= received.on
-    if frame.structure.obstacles:
-        hit = frame.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
-        barred = hit.is_valid()
-        surface = mi.Float(0)
-        if frame.region is not None:
-            skin = frame.region.surface(frame.region.face(hit), hit.prim_uv, barred & wet)
-            surface = dr.select(wet, skin.albedo * skin.received.z * dr.inv_pi, 0)
-        seen = dr.select(barred, surface, seen)
-    else:
-        t = (frame.backdrop_x - start.x) / dr.select(way.x < -1e-4, way.x, -1)
-        seen = dr.if_stmt(
-            (start + t * way, seen),
-            wet & (way.x < -1e-4) & (t > 0),
-            lambda x, _: received.at_background(x).z * dr.inv_pi,
-            lambda _, seen: seen,
-        )
-    return dr.select(wet | film, share * seen, 0)
+        wet &= frame.caches.radiosity.on
+    mirror = _mirror_of_scene if frame.structure.obstacles else _mirror_of_plane
+    return dr.select(wet | film, share * mirror(frame, start, way, wet, film, seen), 0)
+
+
+def _mirror_of_scene(
+    frame: Frame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
+) -> mi.Float:
+    """Radiance of the skin that the cornea mirrors; `seen` where a ray meets nothing."""
+    hit = frame.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
+    surface, met = mi.Float(0), hit.is_valid()
+    if frame.region is not None:
+        skin = frame.region.surface(frame.region.face(hit), hit.prim_uv, met & wet)
+        surface = dr.select(wet, skin.albedo * skin.received.z * dr.inv_pi, 0)
+    return dr.select(met, surface, seen)
+
+
+@syntax
+def _mirror_of_plane(
+    frame: Frame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
+) -> mi.Float:
+    """Radiance of the background's plane that the cornea mirrors; `seen` where a ray does not meet it."""
+    t = (frame.backdrop_x - start.x) / dr.select(way.x < -1e-4, way.x, -1)
+    x = start + t * way
+    if dr.hint(wet & (way.x < -1e-4) & (t > 0), exclude=[frame, x]):
+        seen = frame.caches.radiosity.at_background(x).z * dr.inv_pi
+    return seen

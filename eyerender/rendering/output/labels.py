@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,13 +12,15 @@ import numpy as np
 from ...arrays import ArrayValue, Bools, Bytes, frozen, sealed
 from ...folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ...rig.camera import Window
-from ..hits.interaction import SurfaceInteraction, first_hit, hidden, intersect_globe, outer_albedo
+from ..hits.eyeshape import EyeShape
+from ..hits.interaction import SurfaceInteraction, outer_albedo
 from ..hits.meniscus import on_water
-from ..integrator.film import BoundFrame, Pixels
-from ..integrator.sampling import camera_ray
+from ..hits.primary import first_hit, hidden
+from ..integrator.request import BoundFrame
+from ..integrator.sampling import Pixels, camera_ray
 from ..materials.gloss import glossy_normal
 from ..records.frame import Frame
-from ..records.recording import recorded
+from ..records.recording import recorded, syntax
 from ..transport.directlight import direct_light, lamp_blocked
 
 _HIGHLIGHT = 0.5  # of the scattered light
@@ -60,14 +61,14 @@ def part_labels(shown: BoundFrame, window: Window) -> Callable[[], PartLabels]:
 
 @recorded
 def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8]:
-    """What the centres of pixels show, with and without occluders."""
+    """Parts that the centres of pixels show, with and without occluders."""
     u, v = pixels.at(dr.arange(mi.UInt32, count))
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
-    alone = intersect_globe(frame, o, d)
-    clear = alone.cornea & (alone.opacity < 0.5)
-    inside = dr.select(alone.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
-    amodal = dr.select(clear, inside, dr.select(alone.cornea | alone.sclera, mi.UInt8(SCLERA), mi.UInt8(BACKGROUND)))
-    part = dr.select(hidden(frame, alone, o, d), mi.UInt8(BACKGROUND), amodal)
+    eye = EyeShape(frame=frame).ray_intersect(o, d)
+    clear = eye.cornea & (eye.opacity < 0.5)
+    inside = dr.select(eye.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
+    amodal = dr.select(clear, inside, dr.select(eye.globe, mi.UInt8(SCLERA), mi.UInt8(BACKGROUND)))
+    part = dr.select(hidden(frame, eye, o, d), mi.UInt8(BACKGROUND), amodal)
     dr.eval(amodal, part)
     return part, amodal
 
@@ -78,39 +79,40 @@ def highlights(shown: BoundFrame, window: Window) -> Bools:
     Both are light of the lamps alone, with its shadows. Lens and sensor do not matter, nor do glints of the cornea.
     Pixels that show mostly cornea are not marked. Without an eye region nothing but the cornea mirrors lamps.
     """
-    frame, lights = shown.frame, shown.frame.lights
-    mirrored = scattered = beside = 0.0
-    for i in range(_ACROSS * _ACROSS if frame.structure.region else 0):
-        place = ((i % _ACROSS + 0.5) / _ACROSS - 0.5, (i // _ACROSS + 0.5) / _ACROSS - 0.5)
-        o, d = _rays(shown, window, *(dr.opaque(mi.Float, c) for c in place))
-        view = first_hit(frame, o, d, mi.Bool(True))
-        albedo = outer_albedo(frame, view)  # of what is below the water
-        view = on_water(frame, view, o, d)
-        mirror = (glossy_normal(view.normal, view.gloss), -frame.vector_to_eye(d))
-
-        def add(
-            k: mi.UInt32, shine: mi.Float, even: mi.Float, view: SurfaceInteraction = view, mirror: Any = mirror
-        ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-            lamp = lights[k]
-            received, sheen = direct_light(lamp, lamp.position, view, mirror)
-            barred = lamp_blocked(frame, view.point, lamp.position, view.other, ~view.cornea, received > 0)
-            return k + 1, shine + dr.select(barred, 0, sheen), even + dr.select(barred, 0, received)
-
-        state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
-        _, shine, even = dr.while_loop(state, lambda k, *_: k < lights.count, add, label="highlights")
-        matte = albedo * even * dr.inv_pi
-        there = view.other | view.sclera
-        shine, matte, share = (dr.select(there, x, 0) for x in (shine, matte, mi.Float(1 / _ACROSS**2)))
+    mirrored = scattered = beside = np.zeros(window[2] * window[3], np.float32)
+    for i in range(_ACROSS * _ACROSS if shown.frame.structure.region else 0):
+        right, down = ((k + 0.5) / _ACROSS - 0.5 for k in (i % _ACROSS, i // _ACROSS))
+        shine, matte, share = _lamps_at(shown.frame, window, right, down)
         dr.eval(shine, matte, share)
-        mirrored, scattered = mirrored + shine.numpy(), scattered + matte.numpy()
-        beside = beside + share.numpy()
-    marked = (np.asarray(mirrored) > _HIGHLIGHT * np.asarray(scattered)) & (np.asarray(beside) > 0.5)
-    marked = np.broadcast_to(marked, window[2] * window[3])
+        mirrored, scattered, beside = mirrored + shine.numpy(), scattered + matte.numpy(), beside + share.numpy()
+    marked = (mirrored > _HIGHLIGHT * scattered) & (beside > 0.5)
     return frozen(marked.reshape(window[3], window[2]), np.bool_)
 
 
-def _rays(shown: BoundFrame, window: Window, right: mi.Float, down: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Camera rays through places beside the centres of a window's pixels (px)."""
+def _lamps_at(frame: Frame, window: Window, right: float, down: float) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Mirrored and scattered radiance of lamps at places (px) beside a window's pixel centres; share of the pixel."""
     u, v = Pixels.of(window).at(dr.arange(mi.UInt32, window[2] * window[3]))
-    o, d, _ = camera_ray(shown.frame, mi.Float(u) + right, mi.Float(v) + down)
-    return o, d
+    right_of, below = (dr.opaque(mi.Float, x) for x in (right, down))
+    o, d, _ = camera_ray(frame, mi.Float(u) + right_of, mi.Float(v) + below)
+    si = first_hit(frame, o, d, mi.Bool(True))
+    albedo = outer_albedo(frame, si)  # of what is below the water
+    si = on_water(frame, si, o, d)
+    shine, irradiance = _shine(frame, si, (glossy_normal(si.normal, si.gloss), -frame.vector_to_eye(d)))
+    there = si.other | si.sclera
+    values = (shine, albedo * irradiance * dr.inv_pi, mi.Float(1 / _ACROSS**2))
+    shine, matte, share = (dr.select(there, x, 0) for x in values)
+    return shine, matte, share
+
+
+@syntax
+def _shine(frame: Frame, si: SurfaceInteraction, mirror: tuple[mi.Vector3f, mi.Vector3f]) -> tuple[mi.Float, mi.Float]:
+    """Radiance that points mirror of all lamps, and irradiance; `mirror` as of `direct_light`."""
+    shine, irradiance, k = mi.Float(0), mi.Float(0), mi.UInt32(0)
+    while dr.hint(k < frame.lights.count, label="highlights", exclude=[frame, si, mirror]):
+        lamp = frame.lights[k]
+        received, sheen = direct_light(lamp, lamp.position, si, mirror)
+        blocked = lamp_blocked(frame, si.point, lamp.position, si.other, ~si.cornea, received > 0)
+        shine += dr.select(blocked, 0, sheen)
+        irradiance += dr.select(blocked, 0, received)
+        k += 1
+    return shine, irradiance

@@ -31,7 +31,7 @@ from .parameters import (
     packed,
     rebuilt,
 )
-from .recording import recorded
+from .recording import recorded, syntax
 from .surfaces import Surface
 
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
@@ -222,22 +222,18 @@ class PupilBoundary:
         table[: len(waves)] = waves
         return cls(count=dr.opaque(mi.UInt32, len(waves)), waves=mi.Float(aligned_copy(table.ravel())))
 
+    @syntax
     def radius(self, x: mi.Float, y: mi.Float) -> mi.Float:
         """Radius r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
         inv = dr.rsqrt(dr.maximum(x * x + y * y, 1e-12))
         c, s = x * inv, y * inv
-
-        def more(k: mi.UInt32, *_: object) -> mi.Bool:
-            return k > 0
-
-        def body(k: mi.UInt32, re: mi.Float, im: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-            k = k - 1
-            re = re + dr.gather(mi.Float, self.waves, 2 * k)
-            im = im + dr.gather(mi.Float, self.waves, 2 * k + 1)
-            return k, re * c - im * s, re * s + im * c
-
-        state = (mi.UInt32(self.count), mi.Float(0), mi.Float(0))
-        return 1 + dr.while_loop(state, more, body, labels=("k", "re", "im"), label="margin")[1]
+        k, re, im = mi.UInt32(self.count), mi.Float(0), mi.Float(0)
+        while dr.hint(k > 0, label="margin", exclude=[self, c, s]):
+            k -= 1
+            a = re + dr.gather(mi.Float, self.waves, 2 * k)
+            b = im + dr.gather(mi.Float, self.waves, 2 * k + 1)
+            re, im = a * c - b * s, a * s + b * c
+        return 1 + re
 
 
 @dataclass(kw_only=True)
@@ -266,10 +262,13 @@ class Lights:
     def __getitem__(self, i: mi.UInt32) -> Lamp:
         # Four numbers are gathered at once.
         a, b, c = (dr.gather(mi.Vector4f, self.rows, i * (_LIGHT_ROW // 4) + k) for k in range(3))
-        return Lamp(mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(a.w, b.x, b.y), b.z, b.w, c.x, c.y, i)
+        return Lamp(
+            position=mi.Vector3f(a.x, a.y, a.z), axis=mi.Vector3f(a.w, b.x, b.y), radius=b.z, intensity=b.w,
+            exponent=c.x, inner_radius=c.y, number=i,
+        )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(kw_only=True)
 class Lamp:
     """One LED on the device: I(w) = intensity * max(0, cos)^exponent, from an annulus of points across its axis."""
 
@@ -293,14 +292,12 @@ class Lamp:
         turn = (mi.Float(k) + 0.5) * (0.5 * dr.pi)
         return self.point(dr.select(count > 1, 0.5, 0), *dr.sincos(turn))
 
+    @syntax
     def radiant_intensity(self, direction: mi.Vector3f) -> mi.Float:
         """Radiant intensity (mW/sr) into a unit direction that leaves the lamp."""
-        c = dr.dot(direction, self.axis)
+        c, m = dr.dot(direction, self.axis), self.exponent
+        lobe = dr.maximum(c, 0)
         # A Lambertian lamp, the usual one, needs no power function.
-        lobe = dr.if_stmt(
-            (c, self.exponent),
-            self.exponent != 1,
-            lambda c, m: dr.select(m == 0, 1, dr.select(c > 0, dr.power(dr.maximum(c, 1e-6), m), 0)),
-            lambda c, m: dr.maximum(c, 0),
-        )
+        if dr.hint(m != 1, exclude=[c, m]):
+            lobe = dr.select(m == 0, 1, dr.select(c > 0, dr.power(dr.maximum(c, 1e-6), m), 0))
         return self.intensity * lobe

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..hits.interaction import EPSILON_MM, SurfaceInteraction, intersect_sphere
+from ..hits.eyeshape import EyeShape
+from ..hits.interaction import EPSILON_MM, SurfaceInteraction
+from ..hits.primary import ray_blocked, segment
 from ..materials.albedo import opacity
 from ..materials.gloss import sheen
 from ..records.frame import ALL, BITS, Frame, Lamp
@@ -26,17 +28,18 @@ def lamp_blocked(
     d = lamp - x
     distance = dr.norm(d)
     d /= distance
-    blocked = _globe_blocks(frame, x, d, distance, mi.Bool(sphere), mi.Bool(cornea))
+    blocked = _eye_blocks(frame, x, d, distance, mi.Bool(sphere), mi.Bool(cornea))
     if not frame.structure.obstacles:
         return blocked | (frame.point_to_scene(lamp).x < frame.backdrop_x)
-    return _scene_blocks(frame, x, d, distance, blocked, active)
+    start, way = frame.point_to_scene(x + EPSILON_MM * d), frame.vector_to_scene(d)
+    return blocked | ray_blocked(frame.scene, segment(start, way, distance * (1 - 1e-4)), active & ~blocked)
 
 
 @syntax
-def _globe_blocks(
+def _eye_blocks(
     frame: Frame, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
 ) -> mi.Bool:
-    """Whether the globe blocks the way from points (eye frame) in unit directions."""
+    """Whether the eye blocks rays from points x along d (see `EyeShape.ray_test`), which most pass at a distance."""
     r = x - frame.sclera.centre
     along = dr.dot(r, d)
     reach = frame.globe_reach
@@ -46,28 +49,8 @@ def _globe_blocks(
     ahead, away2 = dr.dot(way, d), dr.squared_norm(way)
     near &= sphere | ((away2 - ahead * ahead < bulge2) & ((ahead > 0) | (away2 < bulge2)))
     blocked = mi.Bool(False)
-    if dr.hint(near & (sphere | cornea), exclude=[frame]):
-        t, met = intersect_sphere(r, d, frame.sclera.radius)
-        blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
-        front = frame.surfaces[0]
-        o, way_in = front.point_in(x), front.vector_in(d)
-        t, met = front.hit(o, way_in)
-        y = o + t * way_in
-        rho2 = y.y * y.y + y.z * y.z
-        met &= (rho2 < frame.limbus.radius * frame.limbus.radius) & (y.x > frame.limbus.floor)
-        blocked |= met & cornea & (t > EPSILON_MM) & (t < distance)
-    return blocked
-
-
-@syntax
-def _scene_blocks(
-    frame: Frame, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, blocked: mi.Bool, active: mi.Bool
-) -> mi.Bool:
-    """Whether points (eye frame) are `blocked`, or something of the scene blocks the way in unit directions."""
-    ray = mi.Ray3f(mi.Point3f(frame.point_to_scene(x + EPSILON_MM * d)), frame.vector_to_scene(d))
-    ray.maxt = distance * (1 - 1e-4)
-    if dr.hint(active & ~blocked, exclude=[frame, ray]):
-        blocked |= frame.scene.ray_test(ray, coherent=True, active=True)
+    if dr.hint(near & (sphere | cornea), exclude=[frame, x, d, distance, sphere, cornea]):
+        blocked = EyeShape(frame=frame).ray_test(x, d, distance, sphere, cornea)
     return blocked
 
 

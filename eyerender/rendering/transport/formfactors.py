@@ -15,7 +15,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from ...arrays import Floats, Ints, Reals, remembered
-from ..hits.interaction import RegionHit, SurfaceInteraction, appearance, intersect, outer_albedo
+from ..hits.interaction import SurfaceInteraction, outer_albedo
+from ..hits.primary import RegionHit, appearance, intersect
 from ..materials.albedo import iris_albedo
 from ..records.frame import Frame
 from .chamber import IRIS_RINGS

@@ -1,0 +1,199 @@
+"""The eye as a shape: hits of rays on its exact surfaces, and the way behind the cornea to the plane of the iris.
+
+The methods have the names and tasks of those of Mitsuba's shapes. So a shape that is written in Python, where Mitsuba
+allows one, can call them and take its place in the scene among the meshes. Until then `primary` compares its hits with
+those of the scene, and `directlight` its shadows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..materials.albedo import opacity, stop_coordinates
+from ..records.frame import Frame
+from ..records.recording import syntax
+from .interaction import EPSILON_MM, WET, SurfaceInteraction
+
+_NEAR_MM = 20.0
+_FAR = float(np.finfo(np.float32).max)
+
+
+@dataclass(kw_only=True)
+class EyeHit:
+    """Preliminary hit of a ray on the eye; what lies behind the surface is not computed yet.
+
+    Attributes:
+        t: distance, without bound where the ray misses.
+        cornea: whether the ray enters through the clear part of the cornea.
+        sclera: whether it meets the sclera.
+        to_cornea: distance to the cornea from the start next to the eye.
+        to_sclera: distance to the sclera from there.
+        facing: unit normal of the cornea, in its own frame.
+    """
+
+    t: mi.Float
+    cornea: mi.Bool
+    sclera: mi.Bool
+    to_cornea: mi.Float
+    to_sclera: mi.Float
+    facing: mi.Vector3f
+
+
+@dataclass(kw_only=True)
+class IrisView:
+    """What the cornea mirrors and lets pass, and where the refracted ray meets the plane of the iris."""
+
+    normal: mi.Vector3f
+    mirrored: mi.Float
+    passed: mi.Float
+    inner: mi.Vector3f
+    slant: mi.Vector3f
+    pupil: mi.Bool
+
+
+@dataclass(kw_only=True)
+class EyeShape:
+    """The cornea and the sclera of a frame as one shape."""
+
+    frame: Frame
+
+    def ray_intersect_preliminary(self, o: mi.Vector3f, d: mi.Vector3f) -> EyeHit:
+        """Intersect rays (scene's frame) with the eye, as if it stood alone."""
+        frame = self.frame
+        t0, oe, de = self._start(o, d)
+        front = frame.surfaces[0]
+        ol, dl = front.point_in(oe), front.vector_in(de)
+        tc, on_cornea, facing = front.meet(ol, dl)
+        yl = ol + tc * dl
+        on_cornea &= (_from_axis(yl) < frame.limbus.radius) & (yl.x > frame.limbus.floor)
+        ts, on_sclera = intersect_sphere(oe - frame.sclera.centre, de, frame.sclera.radius)
+        # The sphere's front is behind the cornea, so a ray that meets the sphere first has met no clear cornea. This
+        # avoids cracks, even where the rim of a tilted or toric cornea is no circle of the sphere.
+        on_cornea &= ~on_sclera | (tc < ts)
+        on_sclera &= ~on_cornea
+        t = t0 + dr.select(on_cornea, tc, ts)
+        on_cornea &= t > EPSILON_MM
+        on_sclera &= t > EPSILON_MM
+        t = dr.select(on_cornea | on_sclera, t, _FAR)
+        return EyeHit(t=t, cornea=on_cornea, sclera=on_sclera, to_cornea=tc, to_sclera=ts, facing=facing)
+
+    def compute_surface_interaction(self, o: mi.Vector3f, d: mi.Vector3f, hit: EyeHit) -> SurfaceInteraction:
+        """Compute what rays (scene's frame) meet on the eye and behind its cornea."""
+        frame, front = self.frame, self.frame.surfaces[0]
+        _, oe, de = self._start(o, d)
+        dl = front.vector_in(de)
+        xc, xs = oe + hit.to_cornea * de, oe + hit.to_sclera * de
+        iris = self._iris_view(hit, xc, dl)
+        return SurfaceInteraction(
+            cornea=hit.cornea,
+            sclera=hit.sclera,
+            other=mi.Bool(False),
+            distance=hit.t,
+            point=dr.select(hit.cornea, xc, xs),
+            normal=dr.normalize(dr.select(hit.cornea, iris.normal, xs - frame.sclera.centre)),
+            opacity=dr.select(hit.cornea, opacity(frame, _from_axis(front.point_in(oe) + hit.to_cornea * dl)), 1),
+            mirrored=iris.mirrored,
+            passed=iris.passed,
+            inner=iris.inner,
+            slant=iris.slant,
+            pupil=iris.pupil,
+            albedo=mi.Float(0),
+            gloss=mi.Float(WET),
+            received=mi.Vector4f(0),
+        )
+
+    def ray_intersect(self, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
+        """Compute what rays (scene's frame) meet of the eye, as if it stood alone."""
+        return self.compute_surface_interaction(o, d, self.ray_intersect_preliminary(o, d))
+
+    def ray_test(self, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool) -> mi.Bool:
+        """Whether the eye blocks rays from points x along d (eye frame) within a distance.
+
+        `sphere` and `cornea` mark the rays that the globe's sphere and the cornea's bulge can block.
+        """
+        frame = self.frame
+        t, met = intersect_sphere(x - frame.sclera.centre, d, frame.sclera.radius)
+        blocked = met & sphere & (t > EPSILON_MM) & (t < distance)
+        front = frame.surfaces[0]
+        o, dl = front.point_in(x), front.vector_in(d)
+        t, met = front.hit(o, dl)
+        y = o + t * dl
+        rho2 = y.y * y.y + y.z * y.z
+        met &= (rho2 < frame.limbus.radius * frame.limbus.radius) & (y.x > frame.limbus.floor)
+        return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
+
+    def _start(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f, mi.Vector3f]:
+        """Distance to a point next to the eye, where rays must start in single precision; it and d in the eye frame."""
+        t0 = -dr.dot(o, d) - _NEAR_MM
+        return t0, self.frame.point_to_eye(o + t0 * d), self.frame.vector_to_eye(d)
+
+    @syntax
+    def _iris_view(self, hit: EyeHit, x: mi.Vector3f, dl: mi.Vector3f) -> IrisView:
+        """Follow rays that meet the cornea in x (eye frame) along dl (the cornea's frame) to the plane of the iris."""
+        nothing = mi.Vector3f(0)
+        iris = IrisView(
+            normal=nothing, mirrored=mi.Float(0), passed=mi.Float(0), inner=nothing, slant=nothing, pupil=mi.Bool(False)
+        )
+        if dr.hint(hit.cornea, exclude=[self, hit, x, dl]):
+            iris = _refracted(self.frame, hit.facing, x, dl)
+        return iris
+
+
+def _refracted(frame: Frame, normal: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3f) -> IrisView:
+    """Refract rays at the cornea, whose normal and ray direction dl are given in its own frame, x in the eye frame."""
+    front = frame.surfaces[0]
+    c = -dr.dot(normal, dl)
+    c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
+    mirrored = front.mirrored(c, c2)
+    passed = 1 - mirrored
+    w = front.vector_out(front.eta * dl + (front.eta * c - c2) * normal)
+    inside = mi.Vector3f(x)
+    reached = mi.Bool(True)
+    for surface in frame.surfaces[1:]:
+        inside, w, share, ok = surface.refract(inside, w)
+        passed *= share
+        reached &= ok
+    n = frame.stop.normal
+    down = dr.dot(w, n)
+    s = dr.dot(frame.stop.centre - inside, n) / down
+    inner = dr.select(s > 0, inside + s * w, _beyond_root(frame, inside))
+    pu, pv = stop_coordinates(frame, inner)
+    margin = frame.boundary.radius(pu, pv)
+    return IrisView(
+        normal=front.vector_out(normal),
+        mirrored=mirrored,
+        passed=dr.select(reached, passed, 0),
+        # A ray that finds no way may have no place at all, and nothing may be computed from that.
+        inner=dr.select(reached, inner, frame.stop.centre),
+        slant=dr.select(reached & (down < -0.05), w / down - n, 0),
+        pupil=reached & (pu * pu + pv * pv < margin * margin),
+    )
+
+
+def _beyond_root(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
+    """Places in the plane of the iris, just beyond its root, that stand for points behind the plane.
+
+    Where a shallow chamber's cornea ends behind the plane, a real iris bends back to its root. It is lit there about as
+    at the end of the flat one.
+    """
+    n, centre = frame.stop.normal, frame.stop.centre
+    scale = (frame.iris.root_radius + EPSILON_MM) * dr.rsqrt(dr.maximum(x.y * x.y + x.z * x.z, 1e-12))
+    y, z = x.y * scale, x.z * scale
+    return mi.Vector3f(centre.x - (n.y * (y - centre.y) + n.z * (z - centre.z)) / n.x, y, z)
+
+
+def _from_axis(x: mi.Vector3f) -> mi.Float:
+    """Distance from the axis of the surface in whose frame points are given."""
+    return dr.sqrt(x.y * x.y + x.z * x.z)
+
+
+def intersect_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Bool]:
+    """Distance to the near side of a sphere about the origin, and whether it is met from outside."""
+    b, c = dr.dot(o, d), dr.squared_norm(o) - radius * radius
+    disc = b * b - c
+    q = dr.sqrt(dr.maximum(disc, 0)) - b
+    return c / q, (disc > 0) & (q > 0) & (c > 0)

@@ -1,0 +1,174 @@
+"""Camera rays: the nearer of the hits on the eye and on the rest of the scene, and the surface there.
+
+The eye is met in closed form (`EyeShape`), and everything else by Embree or OptiX.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import drjit as dr
+import mitsuba as mi
+
+from ..records.frame import Frame
+from ..records.recording import syntax
+from ..scene.background import HALF_MM
+from .eyeshape import EyeShape
+from .interaction import WET, SurfaceInteraction
+
+
+@dataclass(kw_only=True)
+class RegionHit:
+    """Hit on a triangle (`face`) of an eye region, infinitely far where there is none."""
+
+    t: mi.Float
+    face: mi.UInt32
+    prim_uv: mi.Point2f
+
+    def is_valid(self) -> mi.Bool:
+        """Whether anything is hit."""
+        return self.t < dr.inf
+
+
+@dataclass(kw_only=True)
+class PlaneHit:
+    """Hit on the plane of the background in closed form, as on its first triangle, extended."""
+
+    t: mi.Float
+    prim_index: mi.UInt32
+    prim_uv: mi.Point2f
+
+    @classmethod
+    def of(cls, plane_x: mi.Float, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> PlaneHit:
+        """Hit of a ray nearer than a distance on the plane x = `plane_x`, which reaches as far as its triangles."""
+        t = (plane_x - o.x) / d.x
+        y, z = o.y + t * d.y, o.z + t * d.z
+        met = (t > 0) & (t < nearest) & (dr.maximum(dr.abs(y), dr.abs(z)) < HALF_MM)
+        uv = mi.Point2f((y - z) / (2 * HALF_MM), (z + HALF_MM) / (2 * HALF_MM))
+        return cls(t=dr.select(met, t, dr.inf), prim_index=mi.UInt32(0), prim_uv=uv)
+
+    def is_valid(self) -> mi.Bool:
+        """Whether the plane is hit."""
+        return self.t < dr.inf
+
+
+Hit: TypeAlias = "mi.PreliminaryIntersection3f | PlaneHit"
+
+
+def first_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> SurfaceInteraction:
+    """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris."""
+    si, hit = intersect(frame, o, d, active)
+    return appearance(frame, si, hit, d)
+
+
+def intersect(
+    frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True
+) -> tuple[SurfaceInteraction, Hit]:
+    """Trace rays (scene's frame); the surface of what is not the eye is not evaluated yet (see `appearance`).
+
+    coherent: whether neighbouring rays are alike, as those of a camera.
+    """
+    eye = EyeShape(frame=frame).ray_intersect(o, d)
+    hit: Hit
+    if frame.structure.obstacles:
+        hit = frame.scene.ray_intersect_preliminary(segment(o, d, eye.distance), coherent=coherent, active=active)
+    else:
+        hit = PlaneHit.of(frame.backdrop_x, o, d, eye.distance)
+    return behind(eye, hit, active), hit
+
+
+def behind(eye: SurfaceInteraction, hit: Hit | RegionHit, active: mi.Bool) -> SurfaceInteraction:
+    """Keep what rays meet of the eye where nothing is hit in front of it."""
+    other, clear = hit.is_valid() & active, ~hit.is_valid() & active
+    distance = dr.select(other, hit.t, eye.distance)
+    return replace(eye, cornea=eye.cornea & clear, sclera=eye.sclera & clear, other=other, distance=distance)
+
+
+def appearance(frame: Frame, si: SurfaceInteraction, hit: Hit, d: mi.Vector3f) -> SurfaceInteraction:
+    """Add the surface of what is not the eye to the result of `intersect` along d."""
+    region, background = frame.region, frame.background
+    if region is not None:
+        there = region_interaction(frame, region.face(hit), hit.prim_uv, d, si.other)
+    else:
+        matte = background.surface(hit.prim_index, hit.prim_uv, si.other)
+        there = replace(_matte(frame, matte.point, matte.normal, d, si.other), albedo=matte.albedo)
+    return replace(
+        si,
+        point=dr.select(si.other, there.point, si.point),
+        normal=dr.select(si.other, there.normal, si.normal),
+        albedo=there.albedo,
+        gloss=dr.select(si.other, there.gloss, si.gloss),
+        received=there.received,
+    )
+
+
+def region_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> RegionHit:
+    """Intersect camera rays (scene's frame) with an eye region in front of the globe."""
+    reach = EyeShape(frame=frame).ray_intersect_preliminary(o, d).t
+    hit = frame.scene.ray_intersect_preliminary(segment(o, d, reach), coherent=True, active=True)
+    t = dr.select(hit.is_valid(), hit.t, dr.inf)
+    return RegionHit(t=t, face=frame.region.face(hit), prim_uv=hit.prim_uv)
+
+
+def hidden(frame: Frame, eye: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
+    """Whether anything of the scene is in front of the globe where the rays of `EyeShape` meet it."""
+    if not frame.structure.obstacles:
+        return eye.globe & PlaneHit.of(frame.backdrop_x, o, d, eye.distance).is_valid()
+    return ray_blocked(frame.scene, segment(o, d, eye.distance), eye.globe)
+
+
+@syntax
+def ray_blocked(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+    """Whether anything of a scene blocks rays; packets without active rays are skipped."""
+    found = mi.Bool(False)
+    if dr.hint(active, exclude=[scene, ray]):
+        found = scene.ray_test(ray, coherent=True, active=True)
+    return found
+
+
+def segment(o: mi.Vector3f, d: mi.Vector3f, length: mi.Float) -> mi.Ray3f:
+    """Rays that end after a length, such as at the globe: what is behind it does not matter."""
+    ray = mi.Ray3f(mi.Point3f(o), d)
+    ray.maxt = length
+    return ray
+
+
+def region_interaction(
+    frame: Frame, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool
+) -> SurfaceInteraction:
+    """Compute what rays along d (scene's frame) meet on triangles of an eye region."""
+    skin = frame.region.surface(face, uv, active)
+    si = _matte(frame, skin.point, skin.normal, d, active)
+    level = _facing(frame, skin.smooth, d) if frame.structure.scattering else None
+    return replace(si, albedo=skin.albedo, gloss=skin.gloss, received=skin.received, level=level)
+
+
+def _matte(
+    frame: Frame, point: mi.Vector3f, normal: mi.Vector3f, d: mi.Vector3f, active: mi.Bool
+) -> SurfaceInteraction:
+    """Interaction with matte points of the scene; normals are turned to the viewer."""
+    no, nothing = mi.Bool(False), mi.Float(0)
+    return SurfaceInteraction(
+        cornea=no,
+        sclera=no,
+        other=active,
+        distance=nothing,
+        point=frame.point_to_eye(point),
+        normal=_facing(frame, normal, d),
+        opacity=mi.Float(1),
+        mirrored=nothing,
+        passed=nothing,
+        inner=mi.Vector3f(0),
+        slant=mi.Vector3f(0),
+        pupil=no,
+        albedo=nothing,
+        gloss=mi.Float(WET),
+        received=mi.Vector4f(0),
+    )
+
+
+def _facing(frame: Frame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
+    """Normals (eye frame) turned to the viewer; normals and rays are given in the scene's frame."""
+    normal = frame.vector_to_eye(normal)
+    return dr.normalize(dr.select(dr.dot(normal, frame.vector_to_eye(d)) > 0, -normal, normal))
