@@ -185,7 +185,7 @@ def _in_plane(centre: Floats, normal: Floats, y: Floats, z: Floats) -> Floats:
 
 
 def patch_albedo(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: float) -> Floats:
-    """Mean albedo (PATCHES,) of the patches: of pupil (`inside`), iris, and limbal tissue (`beyond` and on the wall)."""
+    """Mean albedo (PATCHES,) of patches: of pupil (`inside`), iris, and limbal tissue (`beyond` and on the wall)."""
     fine = (np.arange(4) + 0.5) / 4
     ring, turn = np.arange(IRIS)[:, None] // TURNS, np.arange(IRIS)[:, None] % TURNS
     part, side = (v.ravel() for v in np.meshgrid(fine, fine))
