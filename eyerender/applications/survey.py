@@ -92,15 +92,42 @@ class Result:
         }  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurveySize:
+    """What a survey draws.
+
+    Attributes:
+        seed: seed of the draw.
+        count: number of people in the statistics and in the table.
+        check: number of people whose eyes are built, to see what physics refuses.
+        faces: number of people whose eyes are rendered; 0 for none.
+        spp: samples per pixel of the faces.
+    """
+
+    seed: int = 0
+    count: int = 10_000
+    check: int = 200
+    faces: int = 16
+    spp: int = 16
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range, by the names of the command's options."""
+        for name, low, high in (
+            ("count", 2, 10**7),
+            ("check", 1, 10**5),
+            ("faces", 0, MOST_FACES),
+            ("spp", 1, 65536),
+            ("seed", 0, 2**63 - 1),
+        ):
+            if not low <= (value := getattr(self, name)) <= high:
+                raise InputError(f"must be {low} to {high}, not {value}", source=f"--{name}")
+
+
 def run_survey(
     population: PopulationSpec,
     output: str | Path,
+    size: SurveySize = SurveySize(),
     *,
-    seed: int = 0,
-    count: int = 10_000,
-    check: int = 200,
-    faces: int = 16,
-    spp: int = 16,
     backend: BackendChoice = "auto",
     threads: int | None = None,
     overwrite: bool = False,
@@ -111,34 +138,24 @@ def run_survey(
     Args:
         population: the people.
         output: the folder.
-        seed: seed of the draw.
-        count: number of people in the statistics and in the table.
-        check: number of people whose eyes are built, to see what physics refuses.
-        faces: number of people whose eyes are rendered; 0 for none.
-        spp: samples per pixel of the faces.
+        size: how many people, and the seed.
         backend: the render backend.
         threads: total number of processor threads; by default all.
         overwrite: replace the contents of the folder.
         progress: called with (steps done, steps in all, what).
 
     Raises:
-        InputError: a number is out of range, or the folder is not empty.
+        InputError: the folder is not empty.
     """
-    for name, value, low, high in (
-        ("--count", count, 2, 10**7),
-        ("--check", check, 1, 10**5),
-        ("--faces", faces, 0, MOST_FACES),
-    ):
-        if not low <= value <= high:
-            raise InputError(f"must be {low} to {high}, not {value}", source=name)
+    seed, count = size.seed, size.count
     with staged(output, overwrite=overwrite) as folder:
         _write_csv(folder / CSV, population, count, seed)
         found = Result(
-            population, seed, survey(population, count, seed), refusals(population, check, seed, progress=progress)
+            population, seed, survey(population, count, seed), refusals(population, size.check, seed, progress=progress)
         )
         sheet = None
-        if faces:
-            tiles = list(_faces(population, seed, faces, spp=spp, backend=backend, threads=threads, progress=progress))
+        if size.faces:
+            tiles = list(_faces(population, size, backend=backend, threads=threads, progress=progress))
             sheet = contact_sheet(tiles)
             sheet.save(folder / FACES)
         data = found.to_mapping()
@@ -182,21 +199,19 @@ def face_scene(subject: Subject, spp: int = 16) -> Scene:
 
 def _faces(
     population: PopulationSpec,
-    seed: int,
-    count: int,
+    size: SurveySize,
     *,
-    spp: int,
     backend: BackendChoice,
     threads: int | None,
     progress: Progress | None,
 ) -> Iterator[tuple[Any, str]]:
     renderer = make_renderer(backend, threads)
     subject, done = 0, 0
-    while done < count:
-        person = population.person(subject, seed)
+    while done < size.faces:
+        person = population.person(subject, size.seed)
         subject += 1
         try:
-            scene = face_scene(Subject.of(person), spp)
+            scene = face_scene(Subject.of(person), size.spp)
         except InputError:
             continue  # physics refuses this person
         shots = list(render_windows(scene.frames(), renderer=renderer))
@@ -210,7 +225,7 @@ def _faces(
         yield eight_bit(both, 2.0**scene.spec.sensor.bit_depth - 1), text
         done += 1
         if progress is not None:
-            progress(done, count, "faces")
+            progress(done, size.faces, "faces")
 
 
 def page_of(found: Result, sheet: Image.Image | None) -> Page:
@@ -243,7 +258,7 @@ def page_of(found: Result, sheet: Image.Image | None) -> Page:
             "deviations, and all others by less."
         )
     rows = [(reason, str(number)) for reason, number in sorted(r.reasons.items(), key=lambda item: -item[1])]
-    tables = [PageTable(("reason", "eyes"), rows, wide=(0,))] if rows else []
+    tables = [PageTable(header=("reason", "eyes"), rows=rows, wide=(0,))] if rows else []
     sections.append(Section("What physics refuses", refused, [], tables))
     sections.append(Section("Sources", [_MARKS], [], [_sources(table, found.population)]))
     lead = table.presets[found.population.preset].description.capitalize() + "."
@@ -317,7 +332,7 @@ def _quantities(s: Survey, table: Table) -> PageTable:
     ]  # fmt: skip
     header = ("quantity", "mean, table", "mean, drawn", "SD, table", "SD, drawn", "off by (standard errors)", "marks")
     caption = "Means and standard deviations, with standard errors; of the eyes, the right ones."
-    return PageTable(header, rows, caption, (6,))
+    return PageTable(header=header, rows=rows, caption=caption, wide=(6,))
 
 
 def _off(m: Moments) -> str:
@@ -332,7 +347,7 @@ def _correlations(s: Survey) -> PageTable:
     ]  # fmt: skip
     header = ("pair", "source", "joint distribution", "drawn", "off by (standard errors)", "where from")
     caption = "The source's value may be of residuals; the others are of the quantities."
-    return PageTable(header, rows, caption, (5,))
+    return PageTable(header=header, rows=rows, caption=caption, wide=(5,))
 
 
 def _sources(table: Table, population: PopulationSpec) -> PageTable:
@@ -346,7 +361,8 @@ def _sources(table: Table, population: PopulationSpec) -> PageTable:
             told = table.presets[population.preset].sources
         rows += [(name, source.what, source.mark, source.text) for source in told]
     rows += [(name, "value", constant.mark, constant.text) for name, constant in table.constants.items()]
-    return PageTable(("quantity", "what", "mark", "source"), rows, "Every number and its source", (3,), folded=True)
+    header = ("quantity", "what", "mark", "source")
+    return PageTable(header=header, rows=rows, caption="Every number and its source", wide=(3,), folded=True)
 
 
 def _marks(table: Table, name: str) -> str:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import Floats
 from ..errors import InputError
@@ -105,7 +104,7 @@ def _load_own(folder: Path) -> list[LabelledImage]:
     out = []
     for name, path, pupil in own_labels(folder):
         image, depth, _ = read_any_image(path)
-        out.append(_without_rig(name, path, depth, image, pupil))
+        out.append(_without_rig(name, path, (depth, image.shape), pupil))
     if not out:
         raise InputError("holds no labelled images", source=str(folder))
     return out
@@ -114,8 +113,7 @@ def _load_own(folder: Path) -> list[LabelledImage]:
 def _without_rig(
     name: str,
     path: Path,
-    bit_depth: int,
-    image: NDArray[Any],
+    stored: tuple[int, tuple[int, ...]],
     pupil: Ellipse | None,
     *,
     visible: float | None = None,
@@ -123,8 +121,9 @@ def _without_rig(
     polarity: str = "auto",
     known: Mapping[str, float] | None = None,
 ) -> LabelledImage:
-    """An image of which no camera or lights are known."""
-    size, outline = (image.shape[1], image.shape[0]), np.zeros((0, 2)) if pupil is None else pupil.points(120)
+    """An image, with `stored` bit depth and shape, of which no camera or lights are known."""
+    bit_depth, (height, width) = stored
+    size, outline = (width, height), np.zeros((0, 2)) if pupil is None else pupil.points(120)
     hints = {"polarity": polarity, "gamma": 1.0, "radius_px": None, "rig": None}
     factors = _ellipse_factors(pupil, visible)
     return LabelledImage(name, path, bit_depth, size, pupil, outline, visible, glints, hints, known or {}, factors)
@@ -280,4 +279,4 @@ def _ideal(path: Path, name: str, record: Mapping[str, Any], said: Mapping[str, 
     known = {"noise_dn": float(said["noise_dn"]), "blur_px": float(said["blur_px"]), "step_dn": float(said["step_dn"])}
     glints = tuple(TrueGlint(int(g["light"]), tuple(g["xy_px"])) for g in record["glints"] if g["status"] == "ok")
     more: dict[str, Any] = {"visible": visible, "glints": glints, "polarity": said["polarity"], "known": known}
-    return _without_rig(name, path, int(said["bit_depth"]), image, pupil, **more)
+    return _without_rig(name, path, (int(said["bit_depth"]), image.shape), pupil, **more)

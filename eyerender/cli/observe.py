@@ -95,7 +95,7 @@ def extract(
     """
     from ..extraction.video import is_video
     from ..imaging.imageobserver import ImageObserver
-    from ..imaging.videoobserver import observe_video
+    from ..imaging.videoobserver import VideoOutput, observe_video
     from ..scene import load_scene
     from ..storage.files import make_folder, refuse_special, written
 
@@ -116,10 +116,8 @@ def extract(
         if len(images) > 1:
             raise InputError("give one video at a time", source=str(images[1]))
         with progress("extracting") as steps:
-            result = observe_video(
-                images[0], observer, scene=loaded, eyes=eyes, output=output, overlay=overlay, record=record,
-                progress=steps, warn=heed,
-            )  # fmt: skip
+            files = VideoOutput(output, overlay, record)
+            result = observe_video(images[0], observer, files, scene=loaded, eyes=eyes, progress=steps, warn=heed)
         emit(result.to_mapping(), result.to_text(), json, heed)
         return 0
     if overlay is not None:

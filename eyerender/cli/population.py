@@ -43,13 +43,10 @@ def population(
         spp: Samples per pixel of the faces.
         seed: The seed of the draw.
     """
-    from ..applications.survey import REPORT, Population, run_survey
+    from ..applications.survey import REPORT, Population, SurveySize, run_survey
     from ..spec import read_yaml
 
-    if not 1 <= spp <= 65536:
-        raise InputError(f"must be 1 to 65536, not {spp}", source="--spp")
-    if not 0 <= seed < 2**63:
-        raise InputError(f"must be 0 to 2^63 - 1, not {seed}", source="--seed")
+    size = SurveySize(seed=seed, count=count, check=check, faces=faces, spp=spp)
     if preset.endswith((".yaml", ".yml")):
         data = read_yaml(preset)
         people = Population.from_mapping(data.get("population", data), source=preset)
@@ -59,19 +56,7 @@ def population(
         except InputError as error:
             raise InputError(error.reason, source="PRESET") from None
     with progress("drawing") as steps:
-        found = run_survey(
-            people,
-            output,
-            seed=seed,
-            count=count,
-            check=check,
-            faces=faces,
-            spp=spp,
-            backend=backend,
-            threads=threads,
-            overwrite=overwrite,
-            progress=steps,
-        )
+        found = run_survey(people, output, size, backend=backend, threads=threads, overwrite=overwrite, progress=steps)
     emit(found, f"{_text(found)}\n\nreport: {output / REPORT}", json)
     return 0
 

@@ -43,15 +43,29 @@ class VideoSummary:
         return f"{self.source}: {self.frames} frames, pupil found in {self.found} of {self.pupils}{where}"
 
 
+@dataclass(frozen=True, slots=True)
+class VideoOutput:
+    """Files that an observed video gives.
+
+    Attributes:
+        records: one JSON object per line: the record, and the frame's `time_s` (null where the video has no times) and
+            the pupil's `confidence`.
+        overlay: video of what was found (.mp4, .avi or .mkv).
+        version: version of the records.
+    """
+
+    records: Path | None = None
+    overlay: Path | None = None
+    version: int = RECORD
+
+
 def observe_video(
     path: Path,
     observer: ImageObserver,
+    output: VideoOutput = VideoOutput(),
     *,
     scene: Scene | None = None,
     eyes: int = 1,
-    output: Path | None = None,
-    overlay: Path | None = None,
-    record: int = RECORD,
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> VideoSummary:
@@ -60,29 +74,26 @@ def observe_video(
     Args:
         path: the video.
         observer: with its settings and gamma.
+        output: files to write.
         scene: the scene whose rig took the video.
         eyes: 1, or 2 for frames with both eyes, as in `ImageObserver.observe_files`.
-        output: file for the records, one JSON object per line: the record, and the frame's `time_s` (null where the
-            video has no times) and the pupil's `confidence`.
-        overlay: video of what was found (.mp4, .avi or .mkv).
-        record: version of the records.
         progress: called after each frame.
         warn: receives a warning if frames have colour.
     """
     reader = VideoReader(path)
     count = pupils = ok = coloured = 0
     with ExitStack() as stack:
-        file = None if output is None else stack.enter_context(written(output, sync=False))
+        file = None if output.records is None else stack.enter_context(written(output.records, sync=False))
         writer: VideoWriter | None = None
         for frame, found in follow(reader, gamma=observer.gamma, settings=observer.settings, eyes=eyes):
-            if overlay is not None:
+            if output.overlay is not None:
                 if writer is None:
                     height, width = frame.image.shape
-                    writer = stack.enter_context(VideoWriter(overlay, width, height, reader.frames_per_s))
+                    writer = stack.enter_context(VideoWriter(output.overlay, width, height, reader.frames_per_s))
                 writer.add(drawn(frame.image, found, 255.0))
             seen = observer.observe_found(found, frame.number, frame.image.shape, scene=scene, source=str(path))
             if file is not None:
-                for line, one in zip(seen.records(record), found, strict=True):
+                for line, one in zip(seen.records(output.version), found, strict=True):
                     file.write(_line(line, frame.time_s, one))
             count, pupils, coloured = count + 1, pupils + len(found), coloured + frame.colour
             ok += sum(one.pupil.ok for one in found)
@@ -91,7 +102,11 @@ def observe_video(
     if coloured and warn is not None:
         warn([colour_warning(coloured, "frames")])
     return VideoSummary(
-        source=str(path), frames=count, pupils=pupils, found=ok, records=None if output is None else str(output)
+        source=str(path),
+        frames=count,
+        pupils=pupils,
+        found=ok,
+        records=None if output.records is None else str(output.records),
     )
 
 
