@@ -11,6 +11,8 @@ import pytest
 
 from tests.support.paths import SCRIPTS
 
+pytestmark = pytest.mark.packaging
+
 
 @pytest.fixture
 def bench(monkeypatch):

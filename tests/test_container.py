@@ -17,7 +17,7 @@ from tests.support.paths import ROOT
 
 DOCKERFILE = ROOT / "containers" / "Dockerfile"
 
-pytestmark = pytest.mark.skipif(not DOCKERFILE.is_file(), reason="not a checkout")
+pytestmark = [pytest.mark.skipif(not DOCKERFILE.is_file(), reason="not a checkout"), pytest.mark.packaging]
 
 
 def locked() -> dict[str, str]:

@@ -12,6 +12,8 @@ import pytest
 
 import eyerender
 
+pytestmark = pytest.mark.packaging
+
 PACKAGE = Path(eyerender.__file__).resolve().parent
 PROJECT = PACKAGE.parent / "pyproject.toml"
 # Distributions whose module has another name.

@@ -21,7 +21,10 @@ from eyerender.geometry.ellipse import Ellipse, signed_distance
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="tells peaks of memory in /proc only")
+pytestmark = [
+    pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="tells peaks of memory in /proc only"),
+    pytest.mark.packaging,
+]
 WIDTH, HEIGHT = 96, 72
 SCENE = {
     "format": 1,

@@ -35,6 +35,8 @@ CONFTEST = """
 from pathlib import Path
 from tests.support.quick import Quick, Recorder, listed
 
+pytestmark = pytest.mark.packaging
+
 LIST = Path("list.txt")
 
 def pytest_configure(config):

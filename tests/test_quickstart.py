@@ -131,6 +131,7 @@ def test_report_is_self_contained_and_shows_every_image(folder):
     assert f"{data['gaze']['image']['mean_deg']:.3f}°" in text
 
 
+@pytest.mark.packaging
 def test_python_twin_prints_the_same_numbers(folder, tmp_path):
     script = ROOT / "scripts" / "quickstart.py"
     if not script.is_file():

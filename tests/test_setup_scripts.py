@@ -26,7 +26,10 @@ SCRIPTS = (
     ".ci/run",
 )
 
-pytestmark = pytest.mark.skipif(not (ROOT / "scripts" / "_setup.sh").is_file(), reason="not a checkout")
+pytestmark = [
+    pytest.mark.skipif(not (ROOT / "scripts" / "_setup.sh").is_file(), reason="not a checkout"),
+    pytest.mark.packaging,
+]
 
 
 @pytest.fixture

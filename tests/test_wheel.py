@@ -18,6 +18,8 @@ import pytest
 import eyerender
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.packaging
+
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):

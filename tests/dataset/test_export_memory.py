@@ -14,7 +14,7 @@ from eyerender.dataset.shard import sum_of
 from eyerender.errors import InputError
 from tests.support.fabricated import SHARD, fabricate, peak_bytes
 
-pytestmark = pytest.mark.render
+pytestmark = [pytest.mark.render, pytest.mark.packaging]
 BAR_BYTES, ROWS = 300 * 2**20, 200_000  # what so many images may take above the base process
 
 # Python's own count, so that some hundred images show what many would take. The first export loads modules.

@@ -30,6 +30,7 @@ from tests.support.dataset_specs import mapping, tree
 from tests.support.failing_disk import Disk, Name
 
 pytestmark = [
+    pytest.mark.packaging,
     pytest.mark.render,
     pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="asks the kernel for a handle's path"),
 ]

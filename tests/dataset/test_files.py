@@ -246,7 +246,7 @@ def test_a_sample_written_as_a_scene_renders_the_datasets_image(made, tmp_path, 
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("name", ["rooms/day.npy", "heads/bar.json"])
+@pytest.mark.parametrize("name", ["rooms/day.npy", pytest.param("heads/bar.json", marks=pytest.mark.slow)])
 def test_a_run_is_not_gone_on_with_when_a_file_has_changed(made, tmp_path, capsys, monkeypatch, name):
     spec, folder = tmp_path / "spec", tmp_path / "out"
     shutil.copytree(made / "spec", spec)

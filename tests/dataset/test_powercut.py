@@ -15,6 +15,7 @@ from tests.support.dataset_specs import make, plan, tree, write
 from tests.support.powercut import Disk, record
 
 pytestmark = [
+    pytest.mark.packaging,
     pytest.mark.render,
     pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="asks the kernel for a handle's path"),
 ]

@@ -126,7 +126,7 @@ def test_the_shift_is_seen_in_the_picture():
 
 @pytest.mark.parametrize("model", ["E1", "E2", "E3", "E4", "E5"])
 def test_every_model_takes_every_size(model):
-    for seed in range(10):
+    for seed in range(4):
         for diameter in (2.0, 8.0):
             eye = scene_with({"seed": seed}, diameter, model=model).eye("right")
             assert np.ptp(radii_mm(eye.stop)) > 0.01 * diameter / 2

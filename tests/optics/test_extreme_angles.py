@@ -84,6 +84,7 @@ def check(biconics, seed, corneas, count=200):
     return refused
 
 
+@pytest.mark.slow
 def test_no_ray_through_two_biconics_and_a_conic_is_missed():
     """Without the search from the object's side, some of these are missed."""
     assert check(2, seed=5, corneas=2) > 10

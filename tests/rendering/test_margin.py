@@ -48,7 +48,7 @@ def test_the_waves_on_the_device_are_the_radius_of_the_stop(renderer, side):
 
 
 @pytest.mark.parametrize("rig_name", RIGS)
-@pytest.mark.parametrize(("model", "side"), [("E2", "left"), ("E4", "right")])
+@pytest.mark.parametrize(("model", "side"), [pytest.param("E2", "left", marks=pytest.mark.slow), ("E4", "right")])
 def test_the_rendered_edge_is_the_analytic_outline(renderer, model, side, rig_name):
     # As for ellipses: a black and a grey pupil, whose quotient is the iris' share of each pixel.
     rig, eye = RIGS[rig_name](), eye_with(CONTOUR, model, side)

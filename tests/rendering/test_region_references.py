@@ -26,10 +26,10 @@ def test_the_picture_is_that_of_the_version(renderer, references, name):
 @pytest.mark.parametrize(
     ("name", "changed"),
     [
-        ("open", {"skin": {"albedo": 0.55 * 1.02}}),  # 2 %
+        pytest.param("open", {"skin": {"albedo": 0.55 * 1.02}}, marks=pytest.mark.slow),  # 2 %
         ("open", {"fissure": {"upper_mm": 3.8}}),  # 0.1 mm
-        ("shut", {"skin": {"albedo": 0.55 * 1.02}}),
-        ("near", {"fissure": {"lower_mm": 5.3}}),
+        pytest.param("shut", {"skin": {"albedo": 0.55 * 1.02}}, marks=pytest.mark.slow),
+        pytest.param("near", {"fissure": {"lower_mm": 5.3}}, marks=pytest.mark.slow),
     ],
     ids=["albedo-open", "upper-open", "albedo-shut", "lower-near"],
 )
