@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from ..arrays import Singles
 from ..errors import InputError
-from ..jit import compiled
 from .buffers import image_buffer
 from .statistics import median, quantile
 
@@ -180,17 +179,11 @@ def estimate_noise(linear: Image) -> float:
     return 0.7413 * median(difference if moving > 0.6 * difference.size else difference[difference > 0.0])
 
 
-@compiled("f4[:,::1], i8")
 def _differences(linear: Image, step: int) -> Image:
     """|I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1)| of every `step`-th pixel of every `step`-th row, in one row."""
-    rows, columns = (linear.shape[0] - 2) // step + 1, (linear.shape[1] - 2) // step + 1
-    out = np.empty(rows * columns, dtype=np.float32)
-    for k in range(rows):
-        above, below = linear[k * step], linear[k * step + 1]
-        for m in range(columns):
-            i = m * step
-            out[k * columns + m] = abs(above[i] - above[i + 1] - below[i] + below[i + 1])
-    return out
+    a, b = linear[:-1:step, :-1:step], linear[:-1:step, 1::step]
+    c, d = linear[1::step, :-1:step], linear[1::step, 1::step]
+    return as_image(np.abs(a - b - c + d).ravel())
 
 
 def invert(prepared: Prepared) -> Prepared:

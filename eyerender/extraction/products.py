@@ -1,8 +1,15 @@
-"""Sums of products, which normal equations are made of, and their solution."""
+"""Sums of products, which normal equations are made of, their solution, and other loops of compiled functions.
+
+numba takes several times as long to compile NumPy's expressions of whole arrays as it takes for these loops.
+"""
 
 from __future__ import annotations
 
-from ..arrays import Floats
+import math
+
+import numpy as np
+
+from ..arrays import Bools, Floats
 from ..jit import inlined, summing
 
 
@@ -33,6 +40,41 @@ def solve(matrix: Floats, right: Floats) -> None:
         for j in range(k + 1, right.size):
             right[k] -= matrix[k, j] * right[j]
         right[k] /= matrix[k, k]
+
+
+@inlined
+def largest_size(values: Floats) -> float:
+    """Largest absolute value of (n,) values; 0 for none, NaN if one is NaN."""
+    out = 0.0
+    for i in range(values.size):
+        size = abs(values[i])
+        out = size if size > out or math.isnan(size) else out
+        if math.isnan(out):
+            break
+    return out
+
+
+@inlined
+def selected_rows(values: Floats, which: Bools) -> Floats:
+    """Return the rows (m, k) of values (n, k) for which `which` (n,) holds."""
+    out, count = np.empty(values.shape), 0
+    for i in range(values.shape[0]):
+        if which[i]:
+            for j in range(values.shape[1]):
+                out[count, j] = values[i, j]
+            count += 1
+    return out[:count]
+
+
+@inlined
+def selected(values: Floats, which: Bools) -> Floats:
+    """Return the values (m,) of (n,) for which `which` (n,) holds."""
+    out, count = np.empty(values.size), 0
+    for i in range(values.size):
+        if which[i]:
+            out[count] = values[i]
+            count += 1
+    return out[:count]
 
 
 @inlined

@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 import make_ideal_images as ideal
-from eyerender.extraction import extract, preprocessing
+from eyerender.extraction import extract
 from eyerender.extraction.compile import compile_all
 from eyerender.extraction.glints import detection, gaussian_model, prescreening, subtraction
 from eyerender.extraction.pupil import (
@@ -20,15 +20,14 @@ from eyerender.extraction.pupil import (
     least_squares,
     occlusion,
     outline,
+    places,
     refinement,
-    search,
 )
 from eyerender.jit import argument_types, functions, used
 from tests.support import extraction_oracles as oracles
 
 CONDITIONS = ("eight-glints", "lid", "jpeg")
 COMPARED = [
-    (preprocessing, "_differences"),
     (candidates, "_ring_levels"),
     (candidates, "_levels_about"),
     (candidates, "_interior"),
@@ -39,15 +38,16 @@ COMPARED = [
     (consensus, "_settled"),
     (covariance, "_edge_sums"),
     (covariance, "_along_outline"),
-    (search, "_overlap"),
     (outline, "_along"),
     (edge_model, "_levels"),
     (least_squares, "_pixel_sums"),
     (refinement, "_band"),
+    (places, "sectors_at"),
+    (occlusion, "_look"),
+    (occlusion, "_displacements"),
     (occlusion, "_visible"),
     (detection, "_maxima"),
     (detection, "_widths"),
-    (detection, "_compact"),
     (detection, "_parted"),
     (detection, "_above_ring"),
     (prescreening, "_bells"),

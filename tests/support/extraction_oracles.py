@@ -29,10 +29,9 @@ from eyerender.extraction.glints.prescreening import (
     NARROWEST_PX,
 )  # fmt: skip
 from eyerender.extraction.glints.windows import Windows
-from eyerender.extraction.preprocessing import DN, Image, as_image
+from eyerender.extraction.preprocessing import DN, Image
 from eyerender.extraction.pupil import places
 from eyerender.extraction.pupil.candidates import ANGLES
-from eyerender.extraction.pupil.consensus import UNEVEN
 from eyerender.extraction.pupil.covariance import GROUPS, SHAPE, distance_slopes, reshaped
 from eyerender.extraction.pupil.edge_model import EdgeModel, longest_gap
 from eyerender.extraction.pupil.edges import WEAK
@@ -41,9 +40,8 @@ from eyerender.extraction.pupil.occlusion import FARTHEST, LINEAR, OUTLIER
 from eyerender.extraction.pupil.outline import DARK, SHADED
 from eyerender.extraction.pupil.places import SECTORS
 from eyerender.extraction.statistics import median, quantile
-from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct, iou, points_on_ellipse, signed_distance
+from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct, points_on_ellipse, signed_distance
 
-_COS, _SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.arange(12) * (np.pi / 6.0))
 _RING_STEPS = np.repeat((0.1, 0.5, 0.9), 24)
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
@@ -158,10 +156,10 @@ class Profile:
         )
 
 
-def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats, steps: int) -> Indices:
+def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats) -> Indices:
     """Sector (n,) of each pixel (x, y) near an ellipse (cx, cy, a, b, angle)."""
     about = Ellipse.of(ellipse)
-    return sector_of(Place.of(about, x, y, steps))
+    return sector_of(Place.of(about, x, y, 3))
 
 
 def sector_of(place: Place) -> Indices:
@@ -284,10 +282,10 @@ def _pixel_sums(
     )
 
 
-def _edge_sums(ellipse: tuple[float, ...], points: Floats) -> tuple[Floats, Floats, Floats, Indices]:
-    """The sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle)."""
+def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Indices]:
+    """The sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle) and points (x, y)."""
     about = Ellipse.of(ellipse)
-    place = Place.of(about, points[:, 0], points[:, 1])
+    place = Place.of(about, x, y)
     slopes = distance_slopes(about, place)
     group = sector_of(place) // (SECTORS // GROUPS)
 
@@ -579,14 +577,14 @@ def levels_beside(
 
 
 def _along(
-    ellipse: tuple[float, ...], points: Floats, others: Floats, linear: Image, corner: tuple[int, int], patch: Image,
+    ellipse: tuple[float, ...], held: Bools, others: Floats, linear: Image, corner: tuple[int, int], patch: Image,
     away: tuple[float, float], levels: tuple[float, float],
 ) -> tuple[int, int, int, int, int, int]:  # fmt: skip
     """Look along an ellipse (cx, cy, a, b, angle).
 
     Args:
         ellipse: the ellipse.
-        points: (n, 2) edge points that it fits.
+        held: (SECTORS,) sectors with edge points that it fits.
         others: (m, 2) the other edge points.
         linear: the image, DN.
         corner: column and row of the part of it that is replaced.
@@ -599,8 +597,6 @@ def _along(
         points whose outside is shaded, and whose inside is not dark; those without points that have an edge on a bright
         inside. What is dark there is told by the median step of the sectors with points.
     """
-    held = np.zeros(SECTORS, dtype=bool)
-    held[sectors_at(ellipse, points[:, 0], points[:, 1], 3)] = True
     inside, outside = (levels_beside(ellipse, side * away[0], linear, corner, patch) for side in (-1.0, 1.0))
     step = median((outside - inside)[held]) if held.any() else 0.0
     pale = inside > levels[0] + DARK * step
@@ -618,8 +614,8 @@ def _along(
 def _band(
     linear: Image, masked: Bools, corner: tuple[int, int], ellipse: tuple[float, ...],
     outer: tuple[float, float], inner: tuple[float, float],
-) -> tuple[Floats, Floats, Floats, Indices]:  # fmt: skip
-    """Pixels (x, y, level, sector) of a part of an image between two ellipses of these semi-axes about another one."""
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+    """Pixels (x, y, level) of a part of an image between two ellipses of these semi-axes about another one."""
     cx, cy, _, _, angle = ellipse
     dx = np.arange(corner[0], corner[0] + linear.shape[1])[None, :] - cx
     dy = np.arange(corner[1], corner[1] + linear.shape[0])[:, None] - cy
@@ -628,15 +624,14 @@ def _band(
     out2, in2 = ((p / axes[0]) ** 2 + (q / axes[1]) ** 2 for axes in (outer, inner))
     row, column = np.nonzero((out2 < 1.0) & (in2 > 1.0) & ~masked)
     x, y = (column + corner[0]).astype(np.float64), (row + corner[1]).astype(np.float64)
-    return x, y, linear[row, column].astype(np.float64), sectors_at(ellipse, x, y, 3)
+    return x, y, linear[row, column].astype(np.float64)
 
 
 def _visible(
-    x: Floats, y: Floats, level: Floats, use: Bools, seen: Bools, sectors: Bools, numbers: Floats, displaced: Floats,
-    noise_dn: float,
-) -> tuple[Bools, Bools, float, Floats, Indices]:  # fmt: skip
-    """Compute the parts of `Visible`."""
-    bins, residual, whole, weight = _displacements(x, y, level, use, numbers, displaced)
+    bins: Indices, found: tuple[Floats, ...], use: Bools, seen: Bools, sectors: Bools, noise_dn: float, uneven_px: float
+) -> tuple[Bools, Bools, float, Floats]:
+    """Compute the parts of `Visible`, but the sectors of the pixels, from what `_displacements` found."""
+    residual, whole, weight = found
     told = seen & (weight > 0.1 * float(weight.max(initial=0.0)))
     by_noise = noise_dn**2 / np.maximum(weight, 1e-9)
     uneven2 = 0.0
@@ -650,27 +645,34 @@ def _visible(
     outliers = np.bincount(bins, weights=~new_use, minlength=SECTORS) / total
     usual = max(median(mean_square[seen]), 1.0)
     explained = (mean_square < np.where(sectors, 5.0, 2.5) * usual) & (outliers < np.where(sectors, 0.25, 0.1))
-    radius = math.sqrt(numbers[2] * numbers[3])
-    likely2 = np.where(sectors, max(uneven2, (UNEVEN * radius) ** 2), uneven2) + by_noise
+    likely2 = np.where(sectors, max(uneven2, uneven_px**2), uneven2) + by_noise
     explained &= np.abs(whole) < FARTHEST * np.sqrt(likely2)
     likely = np.where(explained, whole * uneven2 / (uneven2 + by_noise), 0.0)
-    return new_use, explained, math.sqrt(uneven2), likely, bins
+    return new_use, explained, math.sqrt(uneven2), likely
+
+
+def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
+    """Sector of each pixel (n,), and its distance, curvature, inner level and step (4, n)."""
+    model = EdgeModel.of(numbers)
+    place = Place.of(model.ellipse, x, y, steps=3)
+    inner = inner_level(model, place)
+    step = model.outer @ harmonics(place.cos_u, place.sin_u, (model.outer.size - 1) // 2) - inner
+    return sector_of(place), np.stack([place.distance, place.curvature, inner, step])
 
 
 def _displacements(
-    x: Floats, y: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
-) -> tuple[Indices, Floats, Floats, Floats]:
-    """Find the displacement of every sector that its pixels show.
+    bins: Indices, look: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Find the displacement of every sector that its pixels show, from what `_look` returns.
 
     Returns:
-        The sector of each pixel (n,), its residual (n,), the displacements (SECTORS,) and their weights (SECTORS,).
+        The residual of each pixel (n,), the displacements (SECTORS,) and their weights (SECTORS,).
     """
-    model = EdgeModel.of(numbers)
-    place = Place.of(model.ellipse, x, y, steps=3)
-    bins, whole = sector_of(place), displaced
+    model, (distance, curvature, inner, step), whole = EdgeModel.of(numbers), look, displaced
     for _ in range(2):  # the levels are not linear in a displacement as large as the blur
-        expected, slope = level_and_slope(model, replace(place, distance=place.distance + whole[bins]))
-        residual = level - expected
+        profile = Profile.of(distance + whole[bins], curvature, model.sigma_px, model.kurtosis)
+        residual = level - (inner + step * profile.edge + model.slope * profile.ramp)
+        slope = step * profile.edge_by_distance + model.slope * profile.ramp_by_distance
         counted = slope * use
         weight = np.bincount(bins, weights=counted * slope, minlength=SECTORS).astype(np.float64)
         further = np.bincount(bins, weights=counted * residual, minlength=SECTORS) / np.maximum(weight, 1e-9)
@@ -678,12 +680,7 @@ def _displacements(
         whole = whole + further
         if float(np.abs(further).max()) < LINEAR * model.sigma_px:
             break
-    return bins, residual - slope * further[bins], whole, weight
-
-
-def _overlap(first: tuple[float, ...], second: tuple[float, ...]) -> float:
-    """Intersection over union of two ellipses (cx, cy, a, b, angle), to about 0.001."""
-    return iou(Ellipse.of(first), Ellipse.of(second), nodes=128)
+    return residual - slope * further[bins], whole, weight
 
 
 def _sampled(smooth: Image, xy: Floats, x: Floats, y: Floats) -> Singles:
@@ -718,17 +715,6 @@ def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
     brightest = level[told, np.rint(0.9 * (count[told] - 1)).astype(np.intp)]
     out[told] = smooth[xy[told, 1].astype(np.intp), xy[told, 0].astype(np.intp)] - brightest
     return out
-
-
-def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
-    """Whether the level falls by at least a third of the height in 9 of 12 directions, 2.5 sigma from the peak.
-
-    This rejects strips of sclera and the corners between lid and iris. A glint beside another one or on an edge passes.
-    """
-    reach = (2.5 * width + 1.5)[:, None]
-    top = np.take(smooth, (xy[:, 1] * smooth.shape[1] + xy[:, 0]).astype(np.intp))
-    fallen = top[:, None] - _sampled(smooth, xy, reach * _COS, reach * _SIN) > 0.33 * height[:, None]
-    return np.asarray(fallen.sum(axis=1) >= 9)
 
 
 def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> Indices:
@@ -1015,10 +1001,3 @@ def pixel_profile(x: Floats, centre: float, sigma: float) -> Floats:
     scale = math.sqrt(0.5) / sigma
     low = (x - 0.5 - centre) * scale
     return np.asarray(sigma * _ROOT_HALF_PI * (erf(low + scale) - erf(low)))
-
-
-def _differences(linear: Image, step: int) -> Image:
-    """|I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1)| of every `step`-th pixel of every `step`-th row, in one row."""
-    a, b = linear[:-1:step, :-1:step], linear[:-1:step, 1::step]
-    c, d = linear[1::step, :-1:step], linear[1::step, 1::step]
-    return as_image(np.abs(a - b - c + d).ravel())

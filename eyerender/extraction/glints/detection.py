@@ -26,6 +26,7 @@ MOST_PEAKS = 80  # maxima that are examined, brightest first
 # Directions of the sample points of a ring: three circles, each turned against the previous one.
 _RING_ANGLE = (np.arange(72) % 24 + np.repeat((0.0, 1.0 / 3.0, 2.0 / 3.0), 24)) * (np.pi / 12.0)
 _RING_COS, _RING_SIN = np.cos(_RING_ANGLE), np.sin(_RING_ANGLE)
+_COMPASS_COS, _COMPASS_SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.arange(12) * (np.pi / 6.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +128,9 @@ def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
 
     Skin, lashes and the gaps between lashes have many peaks, with equally bright ones beside them.
     """
-    out, level, disc = np.full(width.size, np.inf), np.empty(72), 2.5 * width + 1.0
+    out, level, disc = np.empty(width.size), np.empty(72), np.empty(width.size)
+    for k in range(width.size):
+        disc[k] = 2.5 * width[k] + 1.0
     for k in range(width.size):
         inner, outer, ring, count = 2.2 * width[k] + 1.0, 3.5 * width[k] + 2.0, 0, 0
         for i in range(72):
@@ -138,9 +141,9 @@ def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
                 if _is_free(xy, disc, outer, k, x, y):
                     level[count] = _level(smooth, x, y)
                     count += 1
+        out[k] = math.inf
         if count > 0.25 * ring:
-            rank = int(np.rint(0.9 * (count - 1)))
-            brightest = select(level[:count], rank)
+            brightest = select(level[:count], int(np.rint(0.9 * (count - 1))))
             out[k] = smooth[int(xy[k, 1]), int(xy[k, 0])] - brightest
     return out
 
@@ -155,21 +158,17 @@ def optics_sigma(blur_px: float) -> float:
     return math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0))
 
 
-@compiled("f4[:,::1], f8[:,::1], f8[::1], f8[::1]")
 def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
     """Whether the level falls by at least a third of the height in 9 of 12 directions, 2.5 sigma from the peak.
 
     This rejects strips of sclera and the corners between lid and iris. A glint beside another one or on an edge passes.
     """
-    out = np.empty(width.size, dtype=np.bool_)
-    for k in range(width.size):
-        reach, fallen = 2.5 * width[k] + 1.5, 0
-        top = smooth[int(xy[k, 1]), int(xy[k, 0])]
-        for i in range(12):
-            x, y = reach * math.cos(i * (math.pi / 6.0)), reach * math.sin(i * (math.pi / 6.0))
-            fallen += top - _level(smooth, xy[k, 0] + x, xy[k, 1] + y) > 0.33 * height[k]
-        out[k] = fallen >= 9
-    return out
+    reach = (2.5 * width + 1.5)[:, None]
+    column = np.rint(np.clip(xy[:, :1] + reach * _COMPASS_COS, 0.0, smooth.shape[1] - 1.0)).astype(np.intp)
+    row = np.rint(np.clip(xy[:, 1:] + reach * _COMPASS_SIN, 0.0, smooth.shape[0] - 1.0)).astype(np.intp)
+    top = smooth[xy[:, 1].astype(np.intp), xy[:, 0].astype(np.intp)]
+    fallen = top[:, None] - smooth[row, column] > 0.33 * height[:, None]
+    return np.asarray(fallen.sum(axis=1) >= 9)
 
 
 @compiled("f4[:,::1], f8[:,::1], i8, f8")

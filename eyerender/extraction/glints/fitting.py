@@ -216,11 +216,12 @@ def _reported(
     n, k = theta.shape
     covariance, moments, level, misfit = np.empty((n, 2, 2)), np.zeros((n, 2, 2)), np.empty(n), np.empty(n)
     for s in range(n):
-        own, pull, matrix = theta[s], 0.0, gram[s, :k, :k].copy()
+        own, pull, matrix = theta[s], 0.0, np.empty((k, k))
         for j in range(k):
-            matrix[j, j] += 1e-9
             for m in range(k):
+                matrix[j, m] = gram[s, j, m]
                 pull += own[j] * penalty[j, m] * own[m]
+            matrix[j, j] += 1e-9
         cost = max(gram[s, k, k] - pull, 0.0)
         # A misfit beyond the noise counts as more noise.
         scale = max(cost / max(used[s] - k, 1.0), 1.0)

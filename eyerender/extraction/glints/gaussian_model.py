@@ -15,7 +15,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices
 from ...jit import compiled, inlined
-from ..products import add_products, copy, solve
+from ..products import add_products, copy, largest_size, solve
 from .windows import WINDOWS, SpotPixels, Windows, light_of_others, profile
 
 PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; with an edge also h, p, o
@@ -174,7 +174,8 @@ def _gram(
     gram, used = np.zeros((n, k + 1, k + 1)), np.empty(n)
     for i in range(clip.size):
         if clip[i] and rows[k, i] <= 0.0:
-            rows[:, i] = 0.0
+            for j in range(k + 1):
+                rows[j, i] = 0.0
     for s in range(n):
         used[s] = first[s + 1] - first[s]
         for i in range(first[s], min(first[s + 1], clip.size)):
@@ -198,8 +199,10 @@ def _gram(
 def _step(gram: Floats, damping: float, theta: Floats, bounds: Floats, step: Floats, trial: Floats) -> float:
     """Write the damped step (K,) of a spot and where it leads (K,), both limited; return the gain that it promises."""
     k, gain = theta.size, 0.0
-    matrix = gram[:k, :k].copy()
+    matrix = np.empty((k, k))
     for j in range(k):
+        for m in range(k):
+            matrix[j, m] = gram[j, m]
         matrix[j, j] = matrix[j, j] * (1.0 + damping) + 1e-9
         step[j] = gram[j, k]
     solve(matrix, step)
@@ -214,7 +217,7 @@ def _step(gram: Floats, damping: float, theta: Floats, bounds: Floats, step: Flo
 def _finish(step: Floats, trial: Floats, theta: Floats) -> None:
     """Take the last steps (n, K) of spots, unless they are large."""
     for s in range(theta.shape[0]):
-        if np.abs(step[s]).max() < 1.0:
+        if largest_size(step[s]) < 1.0:
             copy(trial[s], theta[s])
 
 
@@ -301,11 +304,13 @@ def _descended(
         The parts of `Descent`.
     """
     first, (n, k) = windows[0], theta.shape
-    rest, theta, start = rest.copy(), theta.copy(), theta[:, :2].copy()
-    middle, cost = start.copy(), np.full(n, np.inf)
+    rest, start, theta = rest.copy(), theta, theta.copy()
+    middle, cost = theta.copy(), np.empty(n)
     rows = _spot_rows(windows, theta, rest, blur_px)
     gram, used = _gram(first, clip, rows, theta, noise, penalty)
-    damping, step, trial = np.full(n, 1e-2), np.empty((n, k)), np.empty((n, k))
+    damping, step, trial = np.empty(n), np.empty((n, k)), np.empty((n, k))
+    for s in range(n):
+        cost[s], damping[s] = math.inf, 1e-2
     over, stalled, better = np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     held, shared = light_of_others(windows, theta, pairs, rest.size), pairs.shape[0] > 0
     enough = SMALL_GAIN[1] if shared else SMALL_GAIN[0]

@@ -90,7 +90,9 @@ def _elongation(pixels: Floats, tall: float) -> float:
 
     Only the part above a third of the height counts.
     """
-    top, total, x, y, xx, xy, yy = pixels[:, 2].max() - 0.65 * tall, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    top, total, x, y, xx, xy, yy = -math.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(pixels.shape[0]):
+        top = max(top, pixels[i, 2] - 0.65 * tall)
     for i in range(pixels.shape[0]):
         dx, dy, weight = pixels[i, 0], pixels[i, 1], max(pixels[i, 2] - top, 0.0)
         total, x, y = total + weight, x + weight * dx, y + weight * dy
@@ -119,7 +121,9 @@ def _is_bell(pixels: Floats, sigma: float, tall: float, noise_dn: float) -> bool
         for m in range(j + 1):
             matrix[j, m] = matrix[m, j] = gram[j, m]
         matrix[j, j] += 1e-6  # it keeps the matrix regular where half of the pixels belong to another spot
-    found = gram[7, :7].copy()
+    found = np.empty(7)
+    for j in range(7):
+        found[j] = gram[7, j]
     solve(matrix, found)
     cost = 0.0
     for i in range(n):
@@ -138,13 +142,12 @@ def _bells(
     linear: Image, xy: Floats, width: Floats, height: Floats, noise_dn: float, clip_dn: float, index: Indices
 ) -> Bools:
     """Judge the spots with these indices (m,) (see `bell_shaped`)."""
-    out = np.ones(index.size, dtype=np.bool_)
+    out = np.empty(index.size, dtype=np.bool_)
     for m in range(index.size):
         k = index[m]
         sigma = max(width[k], NARROWEST_PX)
         reach = 2.2 * sigma + 1.0
         pixels = np.empty(((2 * math.ceil(reach) + 1) ** 2, 3))
         count = _patch(linear, xy, k, reach, clip_dn, pixels)
-        if count >= 12:
-            out[m] = _is_bell(pixels[:count], sigma, height[k], noise_dn)
+        out[m] = count < 12 or _is_bell(pixels[:count], sigma, height[k], noise_dn)
     return out

@@ -89,10 +89,12 @@ def _subtracted(linear: Image, spots: Floats, radius: Floats, limit: float) -> t
     height, width = linear.shape
     out, bright = linear.copy(), np.zeros(linear.shape, dtype=np.bool_)
     for k in range(radius.size):
-        cx, cy, wide, high, amplitude = spots[k]
+        cx, cy, wide, high, amplitude = spots[k, 0], spots[k, 1], spots[k, 2], spots[k, 3], spots[k, 4]
         x0, x1 = max(0, math.floor(cx - radius[k])), min(width, math.ceil(cx + radius[k]) + 1)
         y0, y1 = max(0, math.floor(cy - radius[k])), min(height, math.ceil(cy + radius[k]) + 1)
-        across = np.array([amplitude * profile(x - 0.5 - cx, wide)[1] for x in range(x0, x1)])
+        across = np.empty(max(x1 - x0, 0))
+        for x in range(x0, x1):
+            across[x - x0] = amplitude * profile(x - 0.5 - cx, wide)[1]
         for y in range(y0, y1):
             along = profile(y - 0.5 - cy, high)[1]
             for x in range(x0, x1):

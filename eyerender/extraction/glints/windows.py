@@ -175,7 +175,7 @@ def _windows(linear: Image, start: Floats, centre: Floats, radius: Floats) -> tu
     for k in range(n):
         size += (2 * math.ceil(radius[k] + 0.5) + 1) ** 2
     first, spot = np.zeros(n + 1, dtype=np.int64), np.empty(size, dtype=np.int64)
-    plane, data, count = np.empty((3, size)), np.empty(size), 0
+    across, along, data, count = np.empty(size), np.empty(size), np.empty(size), 0
     for k in range(n):
         half = math.ceil(radius[k] + 0.5)
         off_x, off_y, square = centre[k, 0] - start[k, 0], centre[k, 1] - start[k, 1], radius[k] ** 2
@@ -185,11 +185,13 @@ def _windows(linear: Image, start: Floats, centre: Floats, radius: Floats) -> tu
                 if (off_y + dy) ** 2 + (off_x + dx) ** 2 > square:
                     continue
                 if 0 <= x < linear.shape[1] and 0 <= y < linear.shape[0]:
-                    spot[count], plane[1, count], plane[2, count], data[count] = k, dx, dy, linear[y, x]
+                    spot[count], across[count], along[count], data[count] = k, dx, dy, linear[y, x]
                     count += 1
         first[k + 1] = count
-    plane[0] = 1.0
-    return first, spot[:count].copy(), plane[:, :count].copy(), data[:count].copy()
+    plane = np.empty((3, count))
+    for i in range(count):
+        plane[0, i], plane[1, i], plane[2, i] = 1.0, across[i], along[i]
+    return first, spot[:count].copy(), plane, data[:count].copy()
 
 
 def shining_pairs(pixels: SpotPixels, theta: Floats, pairs: Bools, noise_dn: float) -> Indices:

@@ -17,8 +17,10 @@ def direct_fits(points: Floats) -> Floats:
 
     Source: Halir and Flusser (1998), for points that an affine map has made round.
     """
-    out = np.full((points.shape[0], 5), np.nan)
+    out = np.empty((points.shape[0], 5))
     for m in range(points.shape[0]):
+        for j in range(5):
+            out[m, j] = math.nan
         _direct_fit(points[m], out[m])
     return out
 

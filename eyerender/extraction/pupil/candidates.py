@@ -191,34 +191,49 @@ def _best_blobs(blobs: Floats, levels: Floats, noise: float) -> Floats:
     Returns:
         Ellipse (x, y, a, b, angle), level inside, step and score of each, (k, 8).
     """
-    n = blobs.shape[0]
-    score, kept, count = np.empty(n), np.empty(MOST_BLOBS, dtype=np.int64), 0
-    for i in range(n):
-        typical, spread = levels[i, 1], levels[i, 4]
-        strength = max(typical, 0.0) / (max(typical, 0.0) + 8.0 * noise + 4.0)
-        uniform = 1.0 / (1.0 + (spread / max(typical, 1e-6)) ** 2)
-        score[i] = levels[i, 2] ** 2 * strength * uniform * min(blobs[i, 5], 1.0) ** 2
-    for i in _descending(score):
-        new = levels[i, 1] >= max(2.5 * noise, 0.5) and levels[i, 2] >= 0.3
-        for k in range(count):
-            new = new and not _same(blobs[i], blobs[kept[k]])
-        if new:
-            kept[count] = i
-            count += 1
-        if count == MOST_BLOBS:
-            break
-    kept = kept[:count]
-    final = score[kept]
+    score = np.empty(blobs.shape[0])
+    for i in range(score.size):
+        score[i] = _score(levels[i], blobs[i, 5], noise)
+    kept = _different(blobs, levels, score, noise)
+    count, final = kept.size, np.empty(kept.size)
+    for k in range(count):
+        final[k] = score[kept[k]]
     for k in range(count):
         for m in range(count):
             # The iris contains the pupil, so a blob that contains a darker enclosed blob is not the pupil.
             if _inside(blobs[kept[m]], blobs[kept[k]]) and _core(levels[kept[m]], levels[kept[k]], noise):
                 final[k] = min(final[k], 0.5 * final[m])
     out = np.empty((count, 8))
-    for row, k in enumerate(_descending(final)):
+    order = _descending(final)
+    for row in range(count):
+        k = order[row]
         copy(blobs[kept[k], :5], out[row])
         out[row, 5], out[row, 6], out[row, 7] = levels[kept[k], 0], levels[kept[k], 1], final[k]
     return out
+
+
+@inlined
+def _score(levels: Floats, filled: float, noise: float) -> float:
+    """Score of a blob, from its levels (5,) as of `_ring_levels` and the share of its ellipse that it fills."""
+    typical, spread = levels[1], levels[4]
+    strength = max(typical, 0.0) / (max(typical, 0.0) + 8.0 * noise + 4.0)
+    uniform = 1.0 / (1.0 + (spread / max(typical, 1e-6)) ** 2)
+    return levels[2] ** 2 * strength * uniform * min(filled, 1.0) ** 2
+
+
+@inlined
+def _different(blobs: Floats, levels: Floats, score: Floats, noise: float) -> Indices:
+    """Indices (k,) of different blobs that stand out, at most MOST_BLOBS, by score."""
+    kept, count, order = np.empty(MOST_BLOBS, dtype=np.int64), 0, _descending(score)
+    for place in range(order.size):
+        i = order[place]
+        new = levels[i, 1] >= max(2.5 * noise, 0.5) and levels[i, 2] >= 0.3
+        for k in range(count):
+            new = new and not _same(blobs[i], blobs[kept[k]])
+        if new and count < MOST_BLOBS:
+            kept[count] = i
+            count += 1
+    return kept[:count]
 
 
 @inlined
@@ -258,9 +273,28 @@ def _ring_levels(small: Image, blobs: Floats, noise: float) -> Floats:
         _levels_along(small, ellipse, 1.5, 0, within, step)
         typical = quantile_of(step, 0.5)
         out[k, 0], out[k, 1], out[k, 3] = quantile_of(within.ravel(), 0.5), typical, quantile_of(within[0], 0.5)
-        out[k, 2] = np.mean(step > max(0.35 * typical, 2.0 * noise))
-        out[k, 4] = np.std(within)
+        out[k, 2], out[k, 4] = _share_above(step, max(0.35 * typical, 2.0 * noise)), _deviation(within.ravel())
     return out
+
+
+@inlined
+def _share_above(values: Floats, limit: float) -> float:
+    """Share of values (n,) above a limit."""
+    count = 0
+    for i in range(values.size):
+        count += values[i] > limit
+    return count / values.size
+
+
+@inlined
+def _deviation(values: Floats) -> float:
+    """Standard deviation of values (n,)."""
+    mean = square = 0.0
+    for i in range(values.size):
+        mean += values[i] / values.size
+    for i in range(values.size):
+        square += (values[i] - mean) * (values[i] - mean) / values.size
+    return math.sqrt(square)
 
 
 @inlined

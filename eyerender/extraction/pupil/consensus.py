@@ -11,6 +11,7 @@ import numpy as np
 from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse
 from ...jit import compiled, inlined
+from ..products import selected, selected_rows
 from ..settings import Shape
 from ..statistics import quantile_of
 from .algebraic import direct_fits, taubin_fit
@@ -137,7 +138,7 @@ def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) ->
     """
     out = np.zeros(fits.shape[0])
     for m in range(fits.shape[0]):
-        cx, cy, a, b, angle = fits[m]
+        cx, cy, a, b, angle = fits[m, 0], fits[m, 1], fits[m, 2], fits[m, 3], fits[m, 4]
         cos, sin = math.cos(angle), math.sin(angle)
         total = 0.0
         for i in range(points.shape[0]):
@@ -216,11 +217,11 @@ def _settled(
         for i in range(n):
             same = same and chosen[i] == inliers[i]
             inliers[i] = chosen[i]
-        if not taubin_fit(moved[inliers], ellipse):
+        if not taubin_fit(selected_rows(moved, inliers), ellipse):
             return -1, ellipse, inliers, moved, nothing
         if same:
             break
-    return count, ellipse, inliers, moved, _seen(ellipse, moved[inliers])
+    return count, ellipse, inliers, moved, _seen(ellipse, selected_rows(moved, inliers))
 
 
 @inlined
@@ -242,8 +243,11 @@ def _select(
         chosen[i] = abs(distance[i]) < reach and nx * normals[i, 0] + ny * normals[i, 1] > 0.9
         count += chosen[i]
     if clipped and count >= 8:
-        some = distance[chosen]
-        limit = max(3.5 * 1.4826 * quantile_of(np.abs(some - quantile_of(some, 0.5)), 0.5), 0.1)
+        some = selected(distance, chosen)
+        middle = quantile_of(some, 0.5)
+        for i in range(some.size):
+            some[i] = abs(some[i] - middle)
+        limit = max(3.5 * 1.4826 * quantile_of(some, 0.5), 0.1)
         count = 0
         for i in range(n):
             chosen[i] = chosen[i] and abs(distance[i]) < limit

@@ -76,7 +76,7 @@ class EdgeSums:
     @staticmethod
     def of(ellipse: Ellipse, points: Floats) -> EdgeSums:
         """Sum over points (n, 2)."""
-        return EdgeSums(*_edge_sums(ellipse.numbers(), points))
+        return EdgeSums(*_edge_sums(ellipse.numbers(), points[:, 0].copy(), points[:, 1].copy()))
 
 
 @inlined
@@ -86,15 +86,15 @@ def slopes_at(cos: float, sin: float, c: float, s: float, nx: float, ny: float, 
     row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
 
 
-@compiled("UniTuple(f8, 5), f8[:,::1]")
-def _edge_sums(ellipse: tuple[float, ...], points: Floats) -> tuple[Floats, Floats, Floats, Indices]:
-    """The sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle)."""
+@compiled("UniTuple(f8, 5), f8[::1], f8[::1]")
+def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Indices]:
+    """The sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle) and points (x, y)."""
     cos, sin = math.cos(ellipse[4]), math.sin(ellipse[4])
     matrix, scores, slopes = np.zeros((SHAPE, SHAPE)), np.zeros((SHAPE, GROUPS)), np.zeros((SHAPE, GROUPS))
-    number, row, place, flat = np.zeros(GROUPS, dtype=np.int64), np.empty(SHAPE), np.empty(8 * BLOCK), points.T.copy()
-    for start in range(0, points.shape[0], BLOCK):
-        count = min(BLOCK, points.shape[0] - start)
-        places(ellipse, flat[0], flat[1], start, count, place)
+    number, row, place = np.zeros(GROUPS, dtype=np.int64), np.empty(SHAPE), np.empty(8 * BLOCK)
+    for start in range(0, x.size, BLOCK):
+        count = min(BLOCK, x.size - start)
+        places(ellipse, x, y, start, count, place)
         for i in range(count):
             slopes_at(cos, sin, place[COS_T + i], place[SIN_T + i], place[NX + i], place[NY + i], row)
             k = sector_at(place[COS_U + i], place[SIN_U + i]) * GROUPS // SECTORS

@@ -140,7 +140,8 @@ def turn_harmonics(place: Floats, count: int, basis: Floats) -> None:
 @inlined
 def outer_levels(place: Floats, count: int, outer: Floats, basis: Floats, out: Floats) -> None:
     """Write the outer levels of `count` pixels: the Fourier series `outer` at their places."""
-    out[:count], basis[:count], basis[BLOCK : BLOCK + count] = outer[0], 1.0, 0.0
+    for i in range(count):
+        out[i], basis[i], basis[BLOCK + i] = outer[0], 1.0, 0.0
     for j in range(1, outer.size, 2):
         turn_harmonics(place, count, basis)
         for i in range(count):
@@ -151,7 +152,7 @@ def outer_levels(place: Floats, count: int, outer: Floats, basis: Floats, out: F
 def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
     """Levels (n,) of the model of these numbers; `displaced` is empty for an exact ellipse."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
-    inner_dn, slope, _, lean_x, lean_y = numbers[6:11]
+    inner_dn, slope, lean_x, lean_y = numbers[6], numbers[7], numbers[9], numbers[10]
     place, edge, basis = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(2 * BLOCK)
     out, outer, n = np.empty(x.size), np.empty(BLOCK), displaced.size
     for start in range(0, x.size, BLOCK):

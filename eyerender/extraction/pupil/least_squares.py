@@ -14,7 +14,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices
 from ...jit import compiled, inlined, summing
-from ..products import add_products, solve
+from ..products import add_products, largest_size, solve
 from .covariance import SHAPE
 from .edge_model import (
     BY_DISTANCE,
@@ -41,7 +41,9 @@ STILL_PX = 1.5e-2  # a fit ends with a step smaller than this
 
 
 _Sums = tuple[Floats, float, Floats, Floats, Floats, Floats]  # the parts of `Sums`
+_Normal = tuple[Floats, Floats, float, Floats, Floats]  # those of `Normal`, but `across`
 _SUMS = "Tuple((f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[::1], f8[::1]))"  # for `compiled`
+_NORMAL = "Tuple((f8[:,::1], f8[::1], f8, f8[::1], f8[::1]))"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +117,9 @@ class Prior:
 
     def of_all(self, size: int) -> Floats:
         """Weight (size,) of every parameter except the displacements."""
-        return _held(size, self.weights)
+        out = np.zeros(size)
+        out[7], out[8], out[9:11], out[FIXED:] = self.weights
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,10 +170,9 @@ def _rows(
         steep: (BLOCK,) receives the derivatives by the distance.
     """
     cos, sin = math.cos(numbers[4]), math.sin(numbers[4])
-    inner_dn, slope, _, lean_x, lean_y = numbers[6:11]
-    outer = numbers[11:]
-    residual[:count], basis[:count], basis[BLOCK : BLOCK + count] = outer[0], 1.0, 0.0
+    inner_dn, slope, lean_x, lean_y, outer = numbers[6], numbers[7], numbers[9], numbers[10], numbers[11:]
     for i in range(count):
+        residual[i], basis[i], basis[BLOCK + i] = outer[0], 1.0, 0.0
         rows[11 * BLOCK + i] = edge[i]
     for j in range(1, outer.size, 2):
         turn_harmonics(place, count, basis)
@@ -272,7 +275,7 @@ class Normal:
 
 
 @compiled(f"{_SUMS}, f8[::1], f8")
-def _eliminated(sums: _Sums, displaced: Floats, displacement: float) -> tuple[Floats, Floats, float, Floats, Floats]:
+def _eliminated(sums: _Sums, displaced: Floats, displacement: float) -> _Normal:
     """Compute the parts of `Normal`, but `across`, from those of `Sums` and the prior's weight (see `Prior`)."""
     matrix, cost, pull, across, along, square = sums
     size, sectors = across.shape
@@ -306,20 +309,34 @@ class Solution:
 
 
 def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
-    """Fit the model with at most `steps` Gauss-Newton steps; displaced (k,) is the start of the displacements."""
+    """Fit the model with at most `steps` Gauss-Newton steps with Levenberg's damping.
+
+    The cost is sum r^2 plus the priors' part. displaced (k,) is the start of the displacements.
+    """
+    numbers = model.numbers()
+    held, damping = prior.of_all(numbers.size), 1e-4
     about = (pixels.x, pixels.y, pixels.level, pixels.index)
-    numbers, displaced, sums = _gauss_newton(
-        *about, model.numbers(), displaced, prior.weights, prior.displacement, steps
-    )
+    sums = _pixel_sums(*about, numbers, displaced)
+    normal = _eliminated(sums, displaced, prior.displacement)
+    cost = normal[2] + float(held @ numbers**2)
+    for _ in range(steps):
+        trial, trial_displaced, largest, widened = _trial(normal, sums[3], held, numbers, displaced, damping)
+        if largest < STILL_PX and widened < 10.0 * STILL_PX and damping < 1e-3:
+            # Another step would be several times smaller, and so small a step hardly changes a sum.
+            numbers, displaced = trial, trial_displaced
+            break
+        trial_sums = _pixel_sums(*about, trial, trial_displaced)
+        trial_normal = _eliminated(trial_sums, trial_displaced, prior.displacement)
+        trial_cost = trial_normal[2] + float(held @ trial**2)
+        if trial_cost <= cost:
+            gained, cost = cost - trial_cost, trial_cost
+            numbers, displaced, sums, normal = trial, trial_displaced, trial_sums, trial_normal
+            damping *= 0.1
+            if gained < 1e-7 * cost:
+                break
+        else:
+            damping = min(max(damping * 30.0, 1e-3), 1e6)
     return Solution(EdgeModel.of(numbers), displaced, Sums(*sums))
-
-
-@compiled("i8, f8[::1]")
-def _held(size: int, weights: Floats) -> Floats:
-    """Weight (size,) of the square of every parameter, by those of the priors (4,)."""
-    out = np.zeros(size)
-    out[7], out[8], out[9:11], out[FIXED:] = weights[0], weights[1], weights[2], weights[3]
-    return out
 
 
 @inlined
@@ -336,13 +353,17 @@ def _step(matrix: Floats, vector: Floats, held: Floats, numbers: Floats, damping
             scaled[j, m] /= scale[j] * scale[m]
         scaled[j, j] += damping
     solve(scaled, right)
-    return right / scale
+    for j in range(size):
+        right[j] /= scale[j]
+    return right
 
 
 @inlined
 def _moved(numbers: Floats, step: Floats) -> Floats:
     """Apply a step of the parameters to the numbers of a model; the shape matrix's eigenvectors give the new axes."""
-    out = numbers + step
+    out = numbers.copy()
+    for j in range(out.size):
+        out[j] += step[j]
     a, b, mixed = out[2], out[3], step[4]
     mean, apart = 0.5 * (a + b), math.sqrt(0.25 * (a - b) ** 2 + mixed * mixed)
     out[2], out[3] = max(mean + apart, 0.5), max(mean - apart, 0.5)
@@ -352,58 +373,33 @@ def _moved(numbers: Floats, step: Floats) -> Floats:
     return out
 
 
-@compiled("f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8, i8")
-def _gauss_newton(
-    x: Floats, y: Floats, level: Floats, index: Indices, numbers: Floats, displaced: Floats,
-    weights: Floats, displacement: float, steps: int,
-) -> tuple[Floats, Floats, tuple[Floats, float, Floats, Floats, Floats, Floats]]:  # fmt: skip
-    """Take Gauss-Newton steps with Levenberg's damping; the cost is sum r^2 plus the priors' part.
+@compiled(f"{_NORMAL}, f8[:,::1], f8[::1], f8[::1], f8[::1], f8")
+def _trial(
+    normal: _Normal, across: Floats, held: Floats, numbers: Floats, displaced: Floats, damping: float
+) -> tuple[Floats, Floats, float, float]:
+    """Take one damped step of at most 3 px.
 
     Args:
-        x: (n,) px, like the next three one of `Pixels`.
-        y: (n,) px.
-        level: (n,) DN.
-        index: (n,) sectors.
-        numbers: the start of the model (see `EdgeModel.numbers`).
-        displaced: (k,) the start of the sectors' displacements.
-        weights: (4,) of `Prior`.
-        displacement: of `Prior`.
-        steps: how many at most.
+        normal: what `_eliminated` returns.
+        across: of `Sums`.
+        held: (p,) weights of the priors.
+        numbers: (p,) the model (see `EdgeModel.numbers`).
+        displaced: (k,) displacements of the sectors.
+        damping: added to the diagonal of the scaled normal matrix.
 
     Returns:
-        The numbers, the displacements, and the parts of `Sums`.
+        The numbers and displacements that it leads to, its largest change of the shape, and that of sigma, px.
     """
-    sums = _pixel_sums(x, y, level, index, numbers, displaced)
-    matrix, vector, cost, along, inverse = _eliminated(sums, displaced, displacement)
-    held, damping = _held(numbers.size, weights), 1e-4
-    for j in range(held.size):
-        cost += held[j] * numbers[j] ** 2
-    for _ in range(steps):
-        step = _step(matrix, vector, held, numbers, damping)
-        largest = np.abs(step[:SHAPE]).max()
-        if largest > 3.0:
-            step *= 3.0 / largest
-        trial, trial_displaced = _moved(numbers, step), displaced.copy()
-        for k in range(along.size):
-            further = along[k]
-            for j in range(step.size):
-                further -= step[j] * sums[3][j, k]
-            trial_displaced[k] += further * inverse[k]
-        if largest < STILL_PX and abs(step[SHAPE]) < 10.0 * STILL_PX and damping < 1e-3:
-            # Another step would be several times smaller, and so small a step hardly changes a sum.
-            return trial, trial_displaced, sums
-        trial_sums = _pixel_sums(x, y, level, index, trial, trial_displaced)
-        reduced = _eliminated(trial_sums, trial_displaced, displacement)
-        trial_cost = reduced[2]
-        for j in range(held.size):
-            trial_cost += held[j] * trial[j] ** 2
-        if trial_cost <= cost:
-            gained, cost = cost - trial_cost, trial_cost
-            numbers, displaced, sums = trial, trial_displaced, trial_sums
-            matrix, vector, _, along, inverse = reduced
-            damping *= 0.1
-            if gained < 1e-7 * cost:
-                break
-        else:
-            damping = min(max(damping * 30.0, 1e-3), 1e6)
-    return numbers, displaced, sums
+    matrix, vector, _, along, inverse = normal
+    step = _step(matrix, vector, held, numbers, damping)
+    largest = largest_size(step[:SHAPE])
+    if largest > 3.0:
+        for j in range(step.size):
+            step[j] *= 3.0 / largest
+    moved = displaced.copy()
+    for k in range(along.size):
+        further = along[k]
+        for j in range(step.size):
+            further -= step[j] * across[j, k]
+        moved[k] += further * inverse[k]
+    return _moved(numbers, step), moved, largest, abs(step[SHAPE])

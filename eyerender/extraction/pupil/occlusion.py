@@ -9,6 +9,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices
 from ...jit import compiled, inlined
+from ..products import largest_size, selected
 from ..statistics import quantile_of
 from .consensus import UNEVEN
 from .edge_model import BY_DISTANCE, RAMP, RAMP_BY_DISTANCE, EdgeModel, outer_levels, profiles
@@ -67,10 +68,14 @@ def visible_part(
         sectors: (SECTORS,) sectors with edge points.
         noise_dn: standard deviation of a pixel's noise.
     """
-    return Visible(*_visible(x, y, level, use, seen, sectors, model.numbers(), displaced, noise_dn))
+    numbers = model.numbers()
+    bins, look = _look(x, y, numbers)
+    found = _displacements(bins, look, level, use, numbers, displaced)
+    uneven_px = UNEVEN * math.sqrt(numbers[2] * numbers[3])
+    return Visible(*_visible(bins, found, use, seen, sectors, noise_dn, uneven_px), bins)
 
 
-@inlined
+@compiled("f8[::1], f8[::1], f8[::1]")
 def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
     """Sector of each pixel (n,), and its distance, curvature, inner level and step (4, n)."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
@@ -90,20 +95,27 @@ def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
 
 
 @inlined
+def _clear(values: Floats) -> None:
+    """Set values (n,) to 0."""
+    for k in range(values.size):
+        values[k] = 0.0
+
+
+@compiled("i8[::1], f8[:,::1], f8[::1], b1[::1], f8[::1], f8[::1]")
 def _displacements(
-    x: Floats, y: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
-) -> tuple[Indices, Floats, Floats, Floats]:
-    """Find the displacement of every sector that its pixels show.
+    bins: Indices, look: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Find the displacement of every sector that its pixels show, from what `_look` returns.
 
     Returns:
-        The sector of each pixel (n,), its residual (n,), the displacements (SECTORS,) and their weights (SECTORS,).
+        The residual of each pixel (n,), the displacements (SECTORS,) and their weights (SECTORS,).
     """
-    bins, look = _look(x, y, numbers)
-    sigma, slope, n = numbers[5], numbers[7], x.size
+    sigma, slope, n = numbers[5], numbers[7], bins.size
     place, edge, residual, steep = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(n), np.empty(n)
     whole, weight, further = displaced.copy(), np.empty(SECTORS), np.empty(SECTORS)
     for _ in range(2):  # the levels are not linear in a displacement as large as the blur
-        weight[:], further[:] = 0.0, 0.0
+        _clear(weight)
+        _clear(further)
         for start in range(0, n, BLOCK):
             count = min(BLOCK, n - start)
             for i in range(count):
@@ -127,13 +139,13 @@ def _displacements(
             break
     for i in range(n):
         residual[i] -= steep[i] * further[bins[i]]
-    return bins, residual, whole, weight
+    return residual, whole, weight
 
 
 @inlined
 def _uneven2(seen: Bools, whole: Floats, weight: Floats, by_noise: Floats) -> float:
     """Variance of the displacements of the sectors that are seen and told by their pixels, beyond noise."""
-    least, n = 0.1 * weight.max(), 0
+    least, n = 0.1 * largest_size(weight), 0
     size, noise = np.empty(SECTORS), np.empty(SECTORS)
     for k in range(SECTORS):
         if seen[k] and weight[k] > least:
@@ -144,40 +156,42 @@ def _uneven2(seen: Bools, whole: Floats, weight: Floats, by_noise: Floats) -> fl
     return max((1.4826 * quantile_of(size[:n], 0.5)) ** 2 - 1.3 * quantile_of(noise[:n], 0.5), 0.0)
 
 
-@compiled("f8[::1], f8[::1], f8[::1], b1[::1], b1[::1], b1[::1], f8[::1], f8[::1], f8")
+@compiled("i8[::1], UniTuple(f8[::1], 3), b1[::1], b1[::1], b1[::1], f8, f8")
 def _visible(
-    x: Floats, y: Floats, level: Floats, use: Bools, seen: Bools, sectors: Bools, numbers: Floats, displaced: Floats,
-    noise_dn: float,
-) -> tuple[Bools, Bools, float, Floats, Indices]:  # fmt: skip
-    """Compute the parts of `Visible`."""
-    bins, residual, whole, weight = _displacements(x, y, level, use, numbers, displaced)
-    by_noise = noise_dn**2 / np.maximum(weight, 1e-9)
+    bins: Indices, found: tuple[Floats, ...], use: Bools, seen: Bools, sectors: Bools, noise_dn: float, uneven_px: float
+) -> tuple[Bools, Bools, float, Floats]:
+    """Compute the parts of `Visible`, but the sectors of the pixels, from what `_displacements` found."""
+    residual, whole, weight = found
+    by_noise = np.empty(SECTORS)
+    for k in range(SECTORS):
+        by_noise[k] = noise_dn * noise_dn / max(weight[k], 1e-9)
     uneven2 = _uneven2(seen, whole, weight, by_noise)
-    some, n = np.empty(x.size), 0
-    for i in range(x.size):
+    some, n = np.empty(bins.size), 0
+    for i in range(bins.size):
         if use[i] and seen[bins[i]]:
             some[n] = abs(residual[i])
             n += 1
     scale = max(1.4826 * quantile_of(some[:n], 0.5), noise_dn, 1e-3)
-    new_use = np.abs(residual) < OUTLIER * scale
-    total, square, outliers = np.zeros(SECTORS), np.zeros(SECTORS), np.zeros(SECTORS)
-    for i in range(x.size):
+    new_use, total = np.empty(bins.size, dtype=np.bool_), np.zeros(SECTORS)
+    square, outliers = np.zeros(SECTORS), np.zeros(SECTORS)
+    for i in range(bins.size):
         k = bins[i]
+        new_use[i] = abs(residual[i]) < OUTLIER * scale
         total[k] += 1.0
         square[k] += min((residual[i] / scale) ** 2, OUTLIER**2)
         outliers[k] += not new_use[i]
-    total = np.maximum(total, 1.0)
-    square, outliers = square / total, outliers / total
-    usual = max(quantile_of(square[seen], 0.5), 1.0)
-    explained, likely = np.empty(SECTORS, dtype=np.bool_), np.zeros(SECTORS)
-    uneven = (UNEVEN * math.sqrt(numbers[2] * numbers[3])) ** 2
     for k in range(SECTORS):
-        often, rarely, far2 = (5.0, 0.25, max(uneven2, uneven)) if sectors[k] else (2.5, 0.1, uneven2)
+        square[k] /= max(total[k], 1.0)
+        outliers[k] /= max(total[k], 1.0)
+    usual = max(quantile_of(selected(square, seen), 0.5), 1.0)
+    explained, likely = np.empty(SECTORS, dtype=np.bool_), np.zeros(SECTORS)
+    for k in range(SECTORS):
+        often, rarely, far2 = (5.0, 0.25, max(uneven2, uneven_px * uneven_px)) if sectors[k] else (2.5, 0.1, uneven2)
         explained[k] = square[k] < often * usual and outliers[k] < rarely
         explained[k] = explained[k] and abs(whole[k]) < FARTHEST * math.sqrt(far2 + by_noise[k])
         if explained[k]:
             likely[k] = whole[k] * uneven2 / (uneven2 + by_noise[k])
-    return new_use, explained, math.sqrt(uneven2), likely, bins
+    return new_use, explained, math.sqrt(uneven2), likely
 
 
 def clear_of_lids(seen: Bools, model: EdgeModel) -> Bools:

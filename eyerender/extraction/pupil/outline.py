@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...arrays import Floats
+from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse
 from ...jit import compiled
 from ..preprocessing import Image
@@ -51,8 +51,9 @@ def outline_of(found: Found, ellipse: Ellipse) -> Outline:
     patch = NO_PATCH if cleared.patch is None else cleared.patch
     others = edges.points_px[~boundary.inliers]
     levels = (candidate.inside_dn, candidate.inside_dn + DARK * candidate.step_dn)
+    held = holding(about, boundary.points_px)
     hollow, beyond, within, *own = _along(
-        about, boundary.points_px, others, cleared.linear, cleared.corner, patch, (away, max(CLEAR * b, 1.0)), levels
+        about, held, others, cleared.linear, cleared.corner, patch, (away, max(CLEAR * b, 1.0)), levels
     )
     points, (shaded, pale, mirrored) = max(boundary.points_px.shape[0], 1), own
     return Outline(
@@ -66,17 +67,17 @@ def outline_of(found: Found, ellipse: Ellipse) -> Outline:
 
 
 @compiled(
-    "UniTuple(f8, 5), f8[:,::1], f8[:,::1], f4[:,::1], UniTuple(i8, 2), f4[:,::1], UniTuple(f8, 2), UniTuple(f8, 2)"
+    "UniTuple(f8, 5), b1[::1], f8[:,::1], f4[:,::1], UniTuple(i8, 2), f4[:,::1], UniTuple(f8, 2), UniTuple(f8, 2)"
 )
 def _along(
-    ellipse: tuple[float, ...], points: Floats, others: Floats, linear: Image, corner: tuple[int, int], patch: Image,
+    ellipse: tuple[float, ...], held: Bools, others: Floats, linear: Image, corner: tuple[int, int], patch: Image,
     away: tuple[float, float], levels: tuple[float, float],
 ) -> tuple[int, int, int, int, int, int]:  # fmt: skip
     """Look along an ellipse (cx, cy, a, b, angle).
 
     Args:
         ellipse: the ellipse.
-        points: (n, 2) edge points that it fits.
+        held: (SECTORS,) sectors with edge points that it fits.
         others: (m, 2) the other edge points.
         linear: the image, DN.
         corner: column and row of the part of it that is replaced.
@@ -89,10 +90,15 @@ def _along(
         points whose outside is shaded, and whose inside is not dark; those without points that have an edge on a bright
         inside. What is dark there is told by the median step of the sectors with points.
     """
-    held, (pupil, dark) = holding(ellipse, points), levels
+    pupil, dark = levels
     inside = levels_beside(ellipse, -away[0], linear, corner, patch)
     outside = levels_beside(ellipse, away[0], linear, corner, patch)
-    step = quantile_of((outside - inside)[held].astype(np.float64), 0.5) if held.any() else 0.0
+    steps, n = np.empty(SECTORS), 0
+    for k in range(SECTORS):
+        if held[k]:
+            steps[n] = outside[k] - inside[k]
+            n += 1
+    step = quantile_of(steps[:n], 0.5) if n else 0.0
     hollow = beyond = within = shaded = pale = mirrored = 0
     for k in range(SECTORS):
         bright = inside[k] > pupil + DARK * step

@@ -99,7 +99,7 @@ def sector_at(c: float, s: float) -> int:
     return 24 + k if s >= 0.0 else 23 - k
 
 
-@inlined
+@compiled("UniTuple(f8, 5), f8[::1], f8[::1]")
 def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats) -> Indices:
     """Sector (n,) of each point (x, y) near an ellipse (cx, cy, a, b, angle)."""
     out, place = np.empty(x.size, dtype=np.int64), np.empty(8 * BLOCK)
@@ -111,12 +111,10 @@ def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats) -> Indices:
     return out
 
 
-@compiled("UniTuple(f8, 5), f8[:,::1]")
 def holding(ellipse: tuple[float, ...], points: Floats) -> Bools:
     """Whether each sector (SECTORS,) of an ellipse (cx, cy, a, b, angle) holds one of the points (n, 2)."""
-    flat, out = points.T.copy(), np.zeros(SECTORS, dtype=np.bool_)
-    for k in sectors_at(ellipse, flat[0], flat[1]):
-        out[k] = True
+    out = np.zeros(SECTORS, dtype=bool)
+    out[sectors_at(ellipse, points[:, 0].copy(), points[:, 1].copy())] = True
     return out
 
 

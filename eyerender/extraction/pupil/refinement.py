@@ -202,15 +202,16 @@ def _near_boundary(
     inward, outward = min(4.0 * sigma + 1.0, 0.8 * b), min(reach_out * sigma + 1.0, OUTWARD_PX)
     # Inside the larger concentric ellipse and outside the smaller one: a cheap cover of the band.
     outer, inner = (a + outward, b + outward), (max(a - inward, 0.5), max(b - inward, 0.5))
-    return _band(part.linear, masked, part.corner, ellipse.numbers(), outer, inner)
+    x, y, level = _band(part.linear, masked, part.corner, ellipse.numbers(), outer, inner)
+    return x, y, level, sectors_at(ellipse.numbers(), x, y)
 
 
 @compiled("f4[:,::1], b1[:,::1], UniTuple(i8, 2), UniTuple(f8, 5), UniTuple(f8, 2), UniTuple(f8, 2)")
 def _band(
     linear: Image, masked: Bools, corner: tuple[int, int], ellipse: tuple[float, ...],
     outer: tuple[float, float], inner: tuple[float, float],
-) -> tuple[Floats, Floats, Floats, Indices]:  # fmt: skip
-    """Pixels (x, y, level, sector) of a part of an image between two ellipses of these semi-axes about another one."""
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+    """Pixels (x, y, level) of a part of an image between two ellipses of these semi-axes about another one."""
     cx, cy, _, _, angle = ellipse
     cos, sin, reach = math.cos(angle), math.sin(angle), outer[0] + 2.0
     left, top = corner
@@ -227,8 +228,7 @@ def _band(
             if (p / inner[0]) ** 2 + (q / inner[1]) ** 2 > 1.0:
                 x[n], y[n], level[n] = column, row, linear[row - top, column - left]
                 n += 1
-    x, y = x[:n].copy(), y[:n].copy()
-    return x, y, level[:n].copy(), sectors_at(ellipse, x, y)
+    return x[:n].copy(), y[:n].copy(), level[:n].copy()
 
 
 def _padded(outer: Floats, order: int) -> Floats:

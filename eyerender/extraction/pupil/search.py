@@ -16,7 +16,6 @@ import numpy as np
 
 from ...arrays import Bools
 from ...geometry.ellipse import Ellipse, iou
-from ...jit import compiled, inlined
 from ..preprocessing import Prepared, as_image
 from ..result import Goodness, PupilResult
 from ..settings import Shape
@@ -107,35 +106,6 @@ class Found:
         inside = self.interior
         limit = max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
         return inside.darker_dn if abs(inside.darker_dn) > limit else 0.0
-
-
-@inlined
-def _chord(ellipse: tuple[float, ...], y: float) -> tuple[float, float]:
-    """Ends of the horizontal chord of an ellipse at a height."""
-    cx, cy, a, b, angle = ellipse
-    cos, sin, dy = math.cos(angle), math.sin(angle), y - cy
-    square, mixed = (cos / a) ** 2 + (sin / b) ** 2, cos * sin * (1.0 / (a * a) - 1.0 / (b * b)) * dy
-    root = math.sqrt(max(mixed * mixed - square * (((sin / a) ** 2 + (cos / b) ** 2) * dy * dy - 1.0), 0.0))
-    return cx - (mixed + root) / square, cx - (mixed - root) / square
-
-
-@compiled("UniTuple(f8, 5), UniTuple(f8, 5)")
-def _overlap(first: tuple[float, ...], second: tuple[float, ...]) -> float:
-    """Intersection over union of two ellipses (cx, cy, a, b, angle), to about 0.001."""
-    nodes = 128
-    high_1 = math.sqrt((first[2] * math.sin(first[4])) ** 2 + (first[3] * math.cos(first[4])) ** 2)
-    high_2 = math.sqrt((second[2] * math.sin(second[4])) ** 2 + (second[3] * math.cos(second[4])) ** 2)
-    low, high = max(first[1] - high_1, second[1] - high_2), min(first[1] + high_1, second[1] + high_2)
-    if low >= high:
-        return 0.0
-    common = 0.0
-    for k in range(nodes):
-        t = (k + 0.5) * (math.pi / nodes) - 0.5 * math.pi
-        y = 0.5 * (low + high) + 0.5 * (high - low) * math.sin(t)
-        (left_1, right_1), (left_2, right_2) = _chord(first, y), _chord(second, y)
-        common += max(min(right_1, right_2) - max(left_1, left_2), 0.0) * math.cos(t)
-    common *= 0.5 * (high - low) * math.pi / nodes
-    return common / (math.pi * (first[2] * first[3] + second[2] * second[3]) - common)
 
 
 def search(work: Prepared, shape: Shape, prior: Ellipse | None = None) -> Found | PupilResult:
@@ -333,7 +303,7 @@ def boundary_about(work: Prepared, candidate: Candidate, shape: Shape) -> Found 
     boundary = fit_boundary(edges, candidate, shape, expected)
     if isinstance(boundary, str):
         return boundary
-    if candidate.rough and _overlap(candidate.ellipse.numbers(), boundary.ellipse.numbers()) < ROUGH:
+    if candidate.rough and iou(candidate.ellipse, boundary.ellipse, nodes=128) < ROUGH:
         near = candidate_at(work, boundary.ellipse)
         again = None if near is None else boundary_about(work, near, shape)
         if isinstance(again, Found):
