@@ -97,19 +97,20 @@ def observe(task: Task, folder: Path) -> Observed:
     for late, found in search.hypotheses(prepared, Shape.of(rough, prepared.linear.shape)):
         if isinstance(found, str):
             continue
-        out.fast.append(features(found.boundary.ellipse, found.goodness))
+        scored = scoring.score(found)
+        out.fast.append(features(found.boundary.ellipse, scored.goodness))
         out.right.append(truth is not None and iou(found.boundary.ellipse, truth) > 0.9)
         out.away.append(_away(found.boundary.ellipse, found.boundary.covariance, truth))
         out.late.append(late or found.core_dn > 0.0)
         out.core.append(found.core_dn > 0.0)
-        boundaries.append(found)
+        boundaries.append(scored)
     # Those that may be chosen.
     order = sorted(range(len(boundaries)), key=lambda i: -boundaries[i].confidence)
     for i in order[:REFINED_OF_IMAGE]:
-        fit = pixel_fit(prepared, boundaries[i], rough)
+        fit = pixel_fit(prepared, boundaries[i].candidate, rough)
         if fit is not None:
             out.refined.append(i)
-            out.pixel.append(features(fit.ellipse, goodness_of(boundaries[i], fit)))
+            out.pixel.append(features(fit.ellipse, goodness_of(boundaries[i].candidate, fit)))
             out.right_refined.append(truth is not None and iou(fit.ellipse, truth) > 0.9)
             out.away_refined.append(_away(fit.ellipse, fit.covariance, truth))
     return out

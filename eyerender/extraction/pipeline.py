@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -22,14 +21,15 @@ from .glints.fitting import fit_spots
 from .glints.gaussian_model import Limits
 from .glints.subtraction import affected_pixels, part_about, subtract_spots, well_fitted
 from .glints.windows import window_radius
-from .preprocessing import DN, Part, Prepared, invert, prepare
+from .preprocessing import DN, Part, Prepared, prepare
+from .pupil.boundary import PupilCandidate
 from .pupil.consensus import median_off
 from .pupil.covariance import boundary_deviation
 from .pupil.edge_model import EdgeModel
 from .pupil.glare import NO_PATCH, levels_beside
 from .pupil.refinement import LID, PixelFit, refine
-from .pupil.scoring import pupil_of
-from .pupil.search import SURE, Found, search
+from .pupil.scoring import ScoredCandidate, pupil_of
+from .pupil.search import SURE, find_pupil
 from .result import Extraction, PupilResult
 from .settings import ExtractionSettings, Shape
 from .statistics import median
@@ -70,53 +70,26 @@ def extract(
     if isinstance(prepared, str):
         return Extraction(PupilResult.missing("input", prepared), (), (), 0.0, size)
     limits = Shape.of(settings, size)
-    found = _searched(prepared, limits, settings.polarity, prior)
+    found = find_pupil(prepared, limits, settings.polarity, prior)
     if isinstance(found, PupilResult):
         return Extraction(found, (), (), prepared.noise_dn / DN, size)
     return explained(prepared, found, settings)
 
 
-def _searched(
-    prepared: Prepared, limits: Shape, polarity: Literal["auto", "dark", "bright"], prior: PupilResult | None
-) -> Found | PupilResult:
-    """Find the boundary of a dark pupil; if its middle is bright, it may be an iris with a bright pupil in it."""
-    before = None if prior is None else prior.ellipse
-    if prior is not None and prior.bright and polarity == "auto":
-        found = search(invert(prepared), limits, before)
-        if isinstance(found, Found) and found.confidence >= SURE:
-            return found
-    if polarity == "bright":
-        return search(invert(prepared), limits, before)
-    dark = search(prepared, limits, before)
-    if polarity == "dark" or not isinstance(dark, Found) or dark.core_dn >= 0.0:
-        return dark
-    bright = search(invert(prepared), limits, before)
-    if isinstance(bright, Found) and bright.confidence >= SURE and _holds(dark, bright):
-        return bright
-    return dark
-
-
-def _holds(outer: Found, inner: Found) -> bool:
-    """Whether a boundary lies inside a larger one."""
-    apart = float(np.hypot(*(outer.boundary.ellipse.centre_px - inner.boundary.ellipse.centre_px)))
-    smaller = inner.boundary.ellipse.area_px2 < outer.boundary.ellipse.area_px2
-    return smaller and apart < float(outer.boundary.ellipse.semi_axes_px[1])
-
-
-def explained(prepared: Prepared, found: Found, settings: ExtractionSettings) -> Extraction:
+def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionSettings) -> Extraction:
     """Complete a boundary to a result: the pupil, with the glints around it."""
     size = (int(prepared.linear.shape[0]), int(prepared.linear.shape[1]))
-    noise = prepared.noise_dn / DN
+    noise, found = prepared.noise_dn / DN, scored.candidate
     model = found.model
     refined = settings.method == "refined"
-    pupil = pupil_of(found, None, settings)
+    pupil = pupil_of(scored, None, settings)
     if not refined and not pupil.ok:
         return Extraction(pupil, (), (), noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     spots, fit = _fit_spots(prepared, found, spots)
     if refined:
         pixels, fit = _refined(prepared, found, spots, fit)
-        by_pixels = None if pixels is None else pupil_of(found, pixels, settings)
+        by_pixels = None if pixels is None else pupil_of(scored, pixels, settings)
         if pixels is not None and by_pixels is not None and _better(by_pixels, pupil):
             model, pupil = pixels.model, by_pixels
     if not pupil.ok:
@@ -148,41 +121,43 @@ def _deviation(pupil: PupilResult) -> float:
     return boundary_deviation(pupil.ellipse, pupil.covariance)
 
 
-def _iris_level(prepared: Prepared, found: Found, model: EdgeModel) -> float:
+def _iris_level(prepared: Prepared, found: PupilCandidate, model: EdgeModel) -> float:
     """Level just outside the seen parts of the boundary, in the image as it is."""
     away = 1.5 * model.sigma_px + 1.0
     levels = levels_beside(model.ellipse.numbers(), away, prepared.linear, (0, 0), NO_PATCH)
     return median(levels[found.sectors])
 
 
-def pixel_fit(prepared: Prepared, found: Found, settings: ExtractionSettings) -> PixelFit | None:
+def pixel_fit(prepared: Prepared, found: PupilCandidate, settings: ExtractionSettings) -> PixelFit | None:
     """Fit the pixel model to a boundary; None where it contradicts the edges."""
     model = found.model
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     return _refined(prepared, found, *_fit_spots(prepared, found, spots))[0]
 
 
-def _refined(prepared: Prepared, found: Found, spots: Spots, fit: SpotFit) -> tuple[PixelFit | None, SpotFit]:
+def _refined(prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotFit) -> tuple[PixelFit | None, SpotFit]:
     """Fit the pixel model to the image without the spots.
 
     Returns:
         The fit, None where it contradicts the edges, and the spots.
     """
     part = part_about(found.image.linear, found.boundary.ellipse)
-    cleared = _cleared(prepared, part, found, spots, fit)
-    first = _boundary_fit(found, cleared)
+    cleaned = _without_spots(prepared, part, found, spots, fit)
+    first = _boundary_fit(found, cleaned)
     on_boundary = None if first is None else _on_boundary(spots, fit, first.model)
     if first is None or on_boundary is None:
         return first, fit
     # A spot and the boundary below it were each fitted with a rough estimate of the other.
     fit = _fitted_again(prepared, found, spots, fit, on_boundary, first.model)
-    again = _cleared(prepared, part, found, spots, fit)
-    if cv2.norm(again[0].linear, cleared[0].linear, cv2.NORM_INF) < SAME_LIGHT * prepared.noise_dn:
+    again = _without_spots(prepared, part, found, spots, fit)
+    if cv2.norm(again[0].linear, cleaned[0].linear, cv2.NORM_INF) < SAME_LIGHT * prepared.noise_dn:
         return first, fit
     return _boundary_fit(found, again, first) or first, fit
 
 
-def _cleared(prepared: Prepared, part: Part, found: Found, spots: Spots, fit: SpotFit) -> tuple[Part, Bools]:
+def _without_spots(
+    prepared: Prepared, part: Part, found: PupilCandidate, spots: Spots, fit: SpotFit
+) -> tuple[Part, Bools]:
     """A part of the image without the light of well-fitted spots, and mask of the pixels that other spots affect."""
     if found.image.inverted:
         upright = part_about(prepared.linear, found.boundary.ellipse)
@@ -192,10 +167,12 @@ def _cleared(prepared: Prepared, part: Part, found: Found, spots: Spots, fit: Sp
     return dark, bright | affected_pixels(prepared, part, spots, ~known)
 
 
-def _boundary_fit(found: Found, cleared: tuple[Part, Bools], before: PixelFit | None = None) -> PixelFit | None:
+def _boundary_fit(
+    found: PupilCandidate, cleaned: tuple[Part, Bools], before: PixelFit | None = None
+) -> PixelFit | None:
     try:
         scatter = found.boundary.residual_px
-        fit = refine(cleared[0], found.model, found.sectors, cleared[1], found.image.noise_dn, scatter, before)
+        fit = refine(cleaned[0], found.model, found.sectors, cleaned[1], found.image.noise_dn, scatter, before)
     except np.linalg.LinAlgError:  # the pixels do not determine the parameters
         return None
     return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
@@ -209,7 +186,7 @@ def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> Bools | None:
 
 
 def _fitted_again(
-    prepared: Prepared, found: Found, spots: Spots, fit: SpotFit, on_boundary: Bools, model: EdgeModel
+    prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotFit, on_boundary: Bools, model: EdgeModel
 ) -> SpotFit:
     """Fit the spots on the boundary again with the refined boundary, and use these fits where they are no worse."""
     part = part_about(prepared.linear, found.boundary.ellipse)
@@ -225,7 +202,7 @@ def _fitted_again(
     return joined([fit, again]).taken(index)
 
 
-def _agrees(fit: PixelFit, found: Found) -> bool:
+def _agrees(fit: PixelFit, found: PupilCandidate) -> bool:
     """Whether the refined boundary agrees with the edges. Noise and texture may move it, but no more."""
     boundary = found.boundary
     points = found.edges.points_px[boundary.inliers]
@@ -233,7 +210,7 @@ def _agrees(fit: PixelFit, found: Found) -> bool:
     return off < max(2.5 * boundary.residual_px, 0.3)
 
 
-def _fit_spots(prepared: Prepared, found: Found, spots: Spots) -> tuple[Spots, SpotFit]:
+def _fit_spots(prepared: Prepared, found: PupilCandidate, spots: Spots) -> tuple[Spots, SpotFit]:
     """Fit the spots on top of the boundary from the edges.
 
     Blends are replaced by the spots into which they split.

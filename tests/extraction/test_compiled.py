@@ -50,7 +50,7 @@ COMPARED = [
     (detection, "_widths"),
     (detection, "_parted"),
     (detection, "_above_ring"),
-    (prescreening, "_bells"),
+    (prescreening, "_gaussian_like"),
     (gaussian_model, "_spot_rows"),
     (subtraction, "_subtracted"),
 ]

@@ -7,7 +7,7 @@ import pytest
 
 import make_ideal_images as ideal
 from eyerender.extraction import FAST, REFINED, extract
-from eyerender.extraction.glints.prescreening import bell_shaped
+from eyerender.extraction.glints.prescreening import gaussian_like
 from eyerender.geometry.ellipse import Ellipse, iou
 
 
@@ -52,26 +52,26 @@ def _spots(rng: np.random.Generator, sigma: float, height: float, noise: float) 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.5, 3.0])
 @pytest.mark.parametrize("guess", [0.8, 1.25])
-def test_glints_are_bell_shaped(sigma, guess):
+def test_glints_are_gaussian_like(sigma, guess):
     # Widths are guessed from the area above half height, good to some 20 %.
     image, places = _spots(np.random.default_rng(5), sigma, 100.0, 2.0)
     width, height = np.full(7, guess * sigma), np.full(7, 95.0)
-    assert bell_shaped(image, places, width, height, 2.0, 250.0).all()
+    assert gaussian_like(image, places, width, height, 2.0, 250.0).all()
 
 
-def test_grains_of_skin_are_not_bell_shaped():
+def test_grains_of_skin_are_not_gaussian_like():
     # The tops of correlated noise, with widths larger than its own grain, as detection sees them.
     rng = np.random.default_rng(6)
     image = (60.0 + rng.normal(0.0, 15.0, (60, 300))).astype(np.float32)
     places = np.stack([np.arange(30, 300, 40), np.full(7, 30)], axis=-1).astype(float)
-    assert not bell_shaped(image, places, np.full(7, 2.5), np.full(7, 40.0), 1.0, 250.0).any()
+    assert not gaussian_like(image, places, np.full(7, 2.5), np.full(7, 40.0), 1.0, 250.0).any()
 
 
 def test_clipped_spots_are_not_judged():
     image, places = _spots(np.random.default_rng(7), 2.0, 600.0, 2.0)
     # Two spots run into each other, and all that is left of the tops is a plateau.
     image = np.minimum(np.maximum(image, np.roll(image, 3, axis=1)), np.float32(255.0))
-    assert bell_shaped(image, places, np.full(7, 4.0), np.full(7, 215.0), 2.0, 250.0).all()
+    assert gaussian_like(image, places, np.full(7, 4.0), np.full(7, 215.0), 2.0, 250.0).all()
 
 
 def test_a_highlight_of_bright_skin_is_no_glint():

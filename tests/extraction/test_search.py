@@ -9,7 +9,7 @@ import numpy as np
 
 import make_ideal_images as ideal
 from eyerender.extraction import FAST, extract
-from eyerender.extraction.pupil.glare import without_glare
+from eyerender.extraction.pupil.glare import inpaint_glints
 from eyerender.geometry.ellipse import Ellipse, iou
 
 
@@ -30,15 +30,15 @@ def test_the_level_around_glints_takes_their_place():
     drawing = ideal.draw("ring-light", 20_401)
     truth, linear = _truth(drawing), drawing.image.astype(np.float32)
     whole = (slice(0, linear.shape[1]), slice(0, linear.shape[0]))
-    cleared, mask = without_glare(linear, truth, 20.0, 55.0, 2.0).cut(*whole)
+    inpainted, mask = inpaint_glints(linear, truth, 20.0, 55.0, 2.0).cut(*whole)
     assert mask is not None
     for glint in drawing.label["glints"]:
         x, y = (round(v) for v in glint["xy_px"])
         assert mask[y, x]
-        assert cleared[y, x] < 100.0 < linear[y, x]
-    np.testing.assert_array_equal(cleared[~mask], linear[~mask])
+        assert inpainted[y, x] < 100.0 < linear[y, x]
+    np.testing.assert_array_equal(inpainted[~mask], linear[~mask])
     plain = np.minimum(linear, 80.0)
-    assert not without_glare(plain, truth, 20.0, 55.0, 2.0).cut(*whole)[1].any()
+    assert not inpaint_glints(plain, truth, 20.0, 55.0, 2.0).cut(*whole)[1].any()
 
 
 def test_small_pupils():

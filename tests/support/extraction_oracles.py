@@ -772,10 +772,10 @@ def _widths(smooth: Image, opened: Image, xy: Floats, height: Floats, size: int)
     return np.clip(sharp, 0.5, MAX_SIGMA_PX)
 
 
-def _bells(
+def _gaussian_like(
     linear: Image, xy: Floats, width: Floats, height: Floats, noise_dn: float, clip_dn: float, index: Indices
 ) -> Bools:
-    """Judge the spots with these indices (m,) (see `bell_shaped`)."""
+    """Judge the spots with these indices (m,) (see `gaussian_like`)."""
     out = np.ones(index.size, dtype=bool)
     sigma, tall = np.maximum(width[index], NARROWEST_PX), height[index]  # a narrower one is mostly its pixel
     reach = 2.2 * sigma + 1.0

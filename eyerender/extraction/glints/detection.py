@@ -14,7 +14,7 @@ from ...jit import compiled, inlined
 from ..preprocessing import Image, Prepared, as_image
 from ..settings import ExtractionSettings
 from ..statistics import select
-from .prescreening import bell_shaped
+from .prescreening import gaussian_like
 
 SMOOTH_PX = 0.7  # standard deviation of the Gaussian that smooths the image first
 MAX_SIGMA_PX = 8.0  # widest spot
@@ -96,7 +96,7 @@ def detect_spots(
     alone = _above_ring(smooth, xy, width) > RING_SHARE * height
     bell = alone.copy()
     corner = np.array([x0, y0])
-    bell[alone] = bell_shaped(linear, xy + corner, width, height, prepared.noise_dn, prepared.clip_dn, alone)
+    bell[alone] = gaussian_like(linear, xy + corner, width, height, prepared.noise_dn, prepared.clip_dn, alone)
     patches = np.concatenate([patches, xy[~bell]])[: settings.max_glints]
     clutter = alone & ~bell
     return Spots(

@@ -23,7 +23,7 @@ PIXEL = 1.0 / 12.0  # variance of a pixel, px^2
 LONGEST = 2.5  # largest elongation of the bright patch; glints, and two that touch, reach 2.0
 
 
-def bell_shaped(
+def gaussian_like(
     linear: Image,
     xy: Floats,
     width: Floats,
@@ -52,7 +52,7 @@ def bell_shaped(
         which: (n,) spots to judge; None for all. The others only occupy their pixels.
     """
     index = np.arange(width.size) if which is None else np.flatnonzero(which)
-    return _bells(linear, xy, width, height, noise_dn, clip_dn, index)
+    return _gaussian_like(linear, xy, width, height, noise_dn, clip_dn, index)
 
 
 @inlined
@@ -138,10 +138,10 @@ def _is_bell(pixels: Floats, sigma: float, tall: float, noise_dn: float) -> bool
 
 
 @compiled("f4[:,::1], f8[:,::1], f8[::1], f8[::1], f8, f8, i8[::1]")
-def _bells(
+def _gaussian_like(
     linear: Image, xy: Floats, width: Floats, height: Floats, noise_dn: float, clip_dn: float, index: Indices
 ) -> Bools:
-    """Judge the spots with these indices (m,) (see `bell_shaped`)."""
+    """Judge the spots with these indices (m,) (see `gaussian_like`)."""
     out = np.empty(index.size, dtype=np.bool_)
     for m in range(index.size):
         k = index[m]

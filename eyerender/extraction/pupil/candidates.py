@@ -20,7 +20,7 @@ from ..preprocessing import Image, Prepared, as_image
 from ..products import copy
 from ..settings import Shape
 from ..statistics import quantile_of
-from .glare import Cleared, around
+from .glare import Inpainted, around
 
 LEVELS = 20  # thresholds at even grey levels
 # A blob that fills less than this share of its convex hull has notches, as reflections at the boundary make them. The
@@ -368,15 +368,15 @@ class Interior:
     spread_dn: float
 
 
-def inspect_interior(cleared: Cleared, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
+def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
     """Statistics of the pixels inside an ellipse, up to where the blur of the boundary begins.
 
     The interior of a pupil is even. An iris has the pupil in its middle, and other objects have structure. Pixels that
     glints covered do not count. Medians and quartiles are used because of fainter reflections.
     """
     a, b = ellipse.semi_axes_px.tolist()
-    columns, rows = around(ellipse, a, cleared.linear.shape)
-    crop, hidden = cleared.cut(columns, rows)
+    columns, rows = around(ellipse, a, inpainted.linear.shape)
+    crop, hidden = inpainted.cut(columns, rows)
     (cx, cy) = ellipse.centre_px.tolist()
     end = min(0.85, 1.0 - 2.5 * blur_px / b)
     every = max(1, int(a / INSIDE_PX))
@@ -429,11 +429,11 @@ def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float
     return quantile_of(ring[:n_ring], 0.5) - quantile_of(core[:n_core], 0.5), n_core, n_ring, spread
 
 
-def find_inside(prepared: Prepared, cleared: Cleared, ellipse: Ellipse, shape: Shape) -> list[Candidate]:
+def find_inside(prepared: Prepared, inpainted: Inpainted, ellipse: Ellipse, shape: Shape) -> list[Candidate]:
     """Candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
     a, b = ellipse.semi_axes_px.tolist()
-    columns, rows = around(ellipse, a, cleared.linear.shape)
-    crop, _ = cleared.cut(columns, rows)
+    columns, rows = around(ellipse, a, inpainted.linear.shape)
+    crop, _ = inpainted.cut(columns, rows)
     sigma = float(np.clip(0.08 * b, 1.0, 4.0))
     smooth = as_image(cv2.GaussianBlur(cv2.medianBlur(crop, 5), (0, 0), sigma))
     noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * sigma)

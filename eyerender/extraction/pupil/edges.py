@@ -14,7 +14,7 @@ from ...jit import compiled, inlined
 from ..preprocessing import Image, as_image
 from ..statistics import median, quantile_of
 from .candidates import Candidate
-from .glare import Cleared, around
+from .glare import Inpainted, around
 
 # Levels at an edge of the pupil, in steps above the pupil's: the highest one behind it, and the highest one close
 # ahead. Texture and shading of an iris stay below. Skin and sclera are brighter by two steps and more.
@@ -60,7 +60,7 @@ class EdgePoints:
 
 
 def find_edges(
-    cleared: Cleared,
+    inpainted: Inpainted,
     candidate: Candidate,
     noise_dn: float,
     filter_px: float,
@@ -77,7 +77,7 @@ def find_edges(
     of three magnitudes. It is exact for a Gaussian-blurred straight edge. Source: Devernay (1995), with the logarithm.
 
     Args:
-        cleared: the image; no edge point is taken beside the glints in it.
+        inpainted: the image; no edge point is taken beside the glints in it.
         candidate: the dark blob.
         noise_dn: standard deviation of a pixel's noise.
         filter_px: sigma of the derivative filter.
@@ -85,9 +85,9 @@ def find_edges(
     """
     ellipse = candidate.ellipse
     b = float(ellipse.semi_axes_px[1])
-    columns, rows = around(ellipse, float(ellipse.semi_axes_px[0]) * (1.0 + band) + 8.0, cleared.linear.shape)
+    columns, rows = around(ellipse, float(ellipse.semi_axes_px[0]) * (1.0 + band) + 8.0, inpainted.linear.shape)
     x0, y0 = columns.start, rows.start
-    crop, hidden = cleared.cut(columns, rows)
+    crop, hidden = inpainted.cut(columns, rows)
     sigma = filter_px
     gx, gy = _gradient(crop, sigma)
     magnitude = as_image(cv2.magnitude(gx, gy))
@@ -95,7 +95,7 @@ def find_edges(
     floor = 3.5 * noise_dn / (2.0 * math.sqrt(2.0 * math.pi) * sigma**2)
     beside = 2 * math.ceil(sigma) + 1
     covered = hidden.view(np.uint8)
-    if cleared.patch is not None:
+    if inpainted.patch is not None:
         covered = np.asarray(cv2.dilate(covered, np.ones((beside, beside), np.uint8)), dtype=np.uint8)
     cx, cy = ellipse.centre_px.tolist()
     about = (cx - x0, cy - y0, *ellipse.semi_axes_px.tolist(), ellipse.angle_rad)

@@ -30,7 +30,7 @@ _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * FLANK_PX + 1, 2 * FLAN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cleared:
+class Inpainted:
     """An image in which glints near a candidate are replaced by the level around them.
 
     Attributes:
@@ -60,16 +60,16 @@ class Cleared:
             crop[to], hidden[to] = self.patch[part], self.mask[part]
         return crop, hidden
 
-    def doubled(self, linear: Image) -> Cleared:
+    def doubled(self, linear: Image) -> Inpainted:
         """The same at twice the scale, of the image `linear` at that scale."""
         if self.patch is None or self.mask is None:
-            return Cleared(linear)
+            return Inpainted(linear)
         size = (2 * self.patch.shape[1], 2 * self.patch.shape[0])
         mask = cv2.resize(self.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
         patch = as_image(cv2.resize(self.patch, size))
         x, y = 2 * self.corner[0], 2 * self.corner[1]
         patch[~mask] = linear[y : y + size[1], x : x + size[0]][~mask]
-        return Cleared(linear, (x, y), patch, mask)
+        return Inpainted(linear, (x, y), patch, mask)
 
 
 @inlined
@@ -114,7 +114,7 @@ def around(ellipse: Ellipse, reach: float, shape: tuple[int, ...]) -> tuple[slic
     return slice(x0, max(x0, x1)), slice(y0, max(y0, y1))
 
 
-def without_glare(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: float, noise_dn: float) -> Cleared:
+def inpaint_glints(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: float, noise_dn: float) -> Inpainted:
     """Replace glints near an ellipse by the level around them.
 
     Args:
@@ -129,7 +129,7 @@ def without_glare(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: fl
     crop = np.ascontiguousarray(linear[rows, columns])
     bright = inside_dn + (1.0 + ABOVE_IRIS) * step_dn + NOISE * noise_dn
     if crop.shape[0] < 4 or crop.shape[1] < 4 or not crop.max() > bright:
-        return Cleared(linear)
+        return Inpainted(linear)
     # Half resolution is enough for the level around glints.
     half = as_image(cv2.resize(crop, (crop.shape[1] // 2, crop.shape[0] // 2), interpolation=cv2.INTER_AREA))
     side = 2 * math.ceil(max(11.0, b) / 4.0) + 1
@@ -138,6 +138,6 @@ def without_glare(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: fl
     by = STANDS_OUT * step_dn + NOISE * noise_dn
     glint = ((crop > bright) & (crop - level > by)).astype(np.uint8)
     if not np.count_nonzero(glint):
-        return Cleared(linear)
+        return Inpainted(linear)
     wide = cv2.dilate(glint, _DISC).view(bool)
-    return Cleared(linear, (columns.start, rows.start), np.where(wide, level, crop), wide)
+    return Inpainted(linear, (columns.start, rows.start), np.where(wide, level, crop), wide)

@@ -8,7 +8,6 @@ edge points beyond it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +16,9 @@ from ...geometry.ellipse import Ellipse
 from ...jit import compiled
 from ..preprocessing import Image
 from ..statistics import quantile_of
+from .boundary import PupilCandidate
 from .glare import NO_PATCH, levels_beside
 from .places import SECTORS, holding, relative_to
-
-if TYPE_CHECKING:
-    from .search import Found
 
 DARK = 0.35  # of the step: a lower level is the pupil's
 CLEAR = 0.15  # of b: edge points farther from the ellipse are not its own
@@ -42,18 +39,18 @@ class Outline:
     mirrored: float
 
 
-def outline_of(found: Found, ellipse: Ellipse) -> Outline:
+def outline_of(found: PupilCandidate, ellipse: Ellipse) -> Outline:
     """Look along an ellipse about a candidate."""
-    boundary, candidate, edges, cleared = found.boundary, found.candidate, found.edges, found.cleared
+    boundary, candidate, edges, inpainted = found.boundary, found.candidate, found.edges, found.inpainted
     b = float(ellipse.semi_axes_px[1])
     about = ellipse.numbers()
     away = min(1.5 * found.model.sigma_px + 1.0, 0.4 * b)
-    patch = NO_PATCH if cleared.patch is None else cleared.patch
+    patch = NO_PATCH if inpainted.patch is None else inpainted.patch
     others = edges.points_px[~boundary.inliers]
     levels = (candidate.inside_dn, candidate.inside_dn + DARK * candidate.step_dn)
     held = holding(about, boundary.points_px)
     hollow, beyond, within, *own = _along(
-        about, held, others, cleared.linear, cleared.corner, patch, (away, max(CLEAR * b, 1.0)), levels
+        about, held, others, inpainted.linear, inpainted.corner, patch, (away, max(CLEAR * b, 1.0)), levels
     )
     points, (shaded, pale, mirrored) = max(boundary.points_px.shape[0], 1), own
     return Outline(

@@ -17,8 +17,9 @@ each other condition, and 80 without an eye.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from ...status import Status
 from ..preprocessing import DN
 from ..result import Goodness, PupilResult
 from ..settings import ExtractionSettings
+from .boundary import PupilCandidate
 from .covariance import boundary_deviation, leverage
 from .outline import outline_of
 from .refinement import PixelFit
@@ -35,9 +37,6 @@ from .refinement import PixelFit
 FAST: Literal["fast"] = "fast"
 REFINED: Literal["refined"] = "refined"
 SCALES = (-2.0, 6.0)  # limits of the logarithm of the covariance's factor
-
-if TYPE_CHECKING:
-    from .search import Found
 
 FEATURES = (
     "support", "gap", "explained", "ln contrast to noise", "ln contrast", "ln boundary sd / b", "ln residual / b",
@@ -115,7 +114,25 @@ def covariance_scale(ellipse: Ellipse, goodness: Goodness, method: Literal["fast
     return math.exp(min(max(float((row @ weights)[0]), SCALES[0]), SCALES[1]))
 
 
-def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredCandidate:
+    """A candidate, how well its boundary explains the image, and the probability that it is the pupil.
+
+    Both are from the edges alone.
+    """
+
+    candidate: PupilCandidate
+    goodness: Goodness
+    confidence: float
+
+
+def score(candidate: PupilCandidate) -> ScoredCandidate:
+    """Score a candidate by its edges alone."""
+    goodness = goodness_of(candidate, None)
+    return ScoredCandidate(candidate, goodness, confidence(candidate.boundary.ellipse, goodness, FAST))
+
+
+def goodness_of(found: PupilCandidate, fit: PixelFit | None) -> Goodness:
     """How well a boundary explains the image, from its edges or the pixel model."""
     boundary, image = found.boundary, found.image
     about = outline_of(found, boundary.ellipse if fit is None else fit.ellipse)
@@ -137,7 +154,7 @@ def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:
         spread=inside.spread_dn / model.step_dn,
         boundary_sd_px=boundary_deviation(ellipse, covariance),
         uneven_px=0.0 if fit is None else fit.uneven_px,
-        leverage=leverage(boundary.ellipse, boundary.sums) if fit is None else found.goodness.leverage,
+        leverage=leverage(boundary.ellipse, boundary.sums),
         refined=fit is not None,
         open=about.open,
         beyond=about.beyond,
@@ -148,11 +165,12 @@ def goodness_of(found: Found, fit: PixelFit | None) -> Goodness:
     )
 
 
-def pupil_of(found: Found, fit: PixelFit | None, settings: ExtractionSettings) -> PupilResult:
+def pupil_of(scored: ScoredCandidate, fit: PixelFit | None, settings: ExtractionSettings) -> PupilResult:
     """Make the pupil of a boundary, from its edges or the pixel model; missing where it is too unlikely to be right."""
+    found = scored.candidate
     ellipse = found.boundary.ellipse if fit is None else fit.ellipse
-    goodness = found.goodness if fit is None else goodness_of(found, fit)
-    sure = found.confidence if fit is None else confidence(ellipse, goodness, "refined")
+    goodness = scored.goodness if fit is None else goodness_of(found, fit)
+    sure = scored.confidence if fit is None else confidence(ellipse, goodness, REFINED)
     if sure < settings.min_confidence:
         return PupilResult.missing("fit", f"the ellipse found is the pupil with a probability of only {sure:.2f}")
     covariance, method = (found.boundary.covariance, FAST) if fit is None else (fit.covariance, REFINED)

@@ -1,0 +1,136 @@
+"""The pupil boundary about one dark blob: glints inpainted, edges found, and an ellipse fitted to them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ...arrays import Bools
+from ...geometry.ellipse import Ellipse, iou
+from ..preprocessing import Prepared
+from ..settings import Shape
+from .candidates import Candidate, Interior, candidate_at, inspect_interior
+from .consensus import BoundaryFit, fit_boundary
+from .edge_model import EdgeModel
+from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
+from .glare import Inpainted, inpaint_glints
+from .places import holding
+
+ROUGH = 0.8  # overlap with its boundary below which a rough candidate's edges are found again, about the boundary
+_TWICE = np.array([2.0, 2.0, 2.0, 2.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PupilCandidate:
+    """A dark blob, the edge points around it, and the boundary through them; derived values are computed on demand.
+
+    `inpainted` is the image without glints near the blob.
+    """
+
+    image: Prepared
+    inpainted: Inpainted
+    candidate: Candidate
+    edges: EdgePoints
+    boundary: BoundaryFit
+
+    @cached_property
+    def model(self) -> EdgeModel:
+        """Pixel model, as far as the edges determine it."""
+        candidate = self.candidate
+        sigma = math.sqrt(max(self.edges.sigma_px**2 - self.edges.filter_px**2, 0.25))
+        outer = np.array([candidate.inside_dn + candidate.step_dn])
+        return EdgeModel(ellipse=self.boundary.ellipse, inner_dn=candidate.inside_dn, outer=outer, sigma_px=sigma)
+
+    @cached_property
+    def interior(self) -> Interior:
+        """Statistics of the pixels inside the boundary."""
+        return self.inside(self.boundary.ellipse, self.model.sigma_px)
+
+    def inside(self, ellipse: Ellipse, blur_px: float) -> Interior:
+        """Statistics of the pixels inside an ellipse about the blob."""
+        return inspect_interior(self.inpainted, ellipse, blur_px, self.image.noise_dn)
+
+    @cached_property
+    def sectors(self) -> Bools:
+        """Sectors (SECTORS,) with an edge point, and gaps of up to two sectors between them."""
+        hit = holding(self.boundary.ellipse.numbers(), self.edges.points_px[self.boundary.inliers])
+        grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
+        return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
+
+    @property
+    def reach_px(self) -> float:
+        """Side of the square of pixels about the blob in which edges were looked for."""
+        return 2.8 * float(self.candidate.ellipse.semi_axes_px[0]) + 16.0
+
+    @property
+    def core_dn(self) -> float:
+        """How much darker the middle is than the outer part, 0 where that is not significant.
+
+        It is positive inside the outline of an iris, and negative if the pupil in it is bright.
+        """
+        inside = self.interior
+        limit = max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
+        return inside.darker_dn if abs(inside.darker_dn) > limit else 0.0
+
+    def doubled(self, work: Prepared) -> PupilCandidate:
+        """The same in the pixels of an image of twice the scale."""
+        edges, boundary = self.edges, self.boundary
+        return PupilCandidate(
+            image=work,
+            inpainted=self.inpainted.doubled(work.linear),
+            candidate=replace(self.candidate, ellipse=_doubled(self.candidate.ellipse)),
+            edges=replace(
+                edges,
+                points_px=2.0 * edges.points_px + 0.5,
+                sigma_px=2.0 * edges.sigma_px,
+                filter_px=2.0 * edges.filter_px,
+            ),
+            boundary=replace(
+                boundary,
+                ellipse=_doubled(boundary.ellipse),
+                points_px=2.0 * boundary.points_px + 0.5,
+                residual_px=2.0 * boundary.residual_px,
+                covariance=boundary.covariance * np.outer(_TWICE, _TWICE),
+            ),
+        )
+
+
+def _doubled(ellipse: Ellipse) -> Ellipse:
+    return Ellipse(2.0 * ellipse.centre_px + 0.5, 2.0 * ellipse.semi_axes_px, ellipse.angle_rad)
+
+
+def find_boundary(work: Prepared, candidate: Candidate, shape: Shape) -> PupilCandidate | str:
+    """Find the boundary around a dark blob, or give the reason why there is none.
+
+    If the blob is rough and its boundary differs, the edges are found again about that boundary.
+    """
+    found = _find_boundary(work, candidate, shape)
+    if isinstance(found, str) or not candidate.rough:
+        return found
+    if iou(candidate.ellipse, found.boundary.ellipse, nodes=128) >= ROUGH:
+        return found
+    near = candidate_at(work, found.boundary.ellipse)
+    again = found if near is None else _find_boundary(work, near, shape)
+    return found if isinstance(again, str) else again
+
+
+def _find_boundary(work: Prepared, candidate: Candidate, shape: Shape) -> PupilCandidate | str:
+    inpainted = Inpainted(work.linear)
+    if not work.inverted:
+        about = (candidate.ellipse, candidate.inside_dn, candidate.step_dn)
+        inpainted = inpaint_glints(work.linear, *about, work.noise_dn)
+    b = float(candidate.ellipse.semi_axes_px[1])
+    sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
+    edges = find_edges(inpainted, candidate, work.noise_dn, sigma, band=0.4)
+    blur = math.sqrt(max(edges.sigma_px**2 - sigma**2, 0.0))
+    if blur > 1.7 * sigma:  # a filter much sharper than the image only adds noise
+        sigma = min(blur, max(1.0, 0.2 * b))
+        edges = find_edges(inpainted, candidate, work.noise_dn, sigma, band=0.4)
+    expected = edge_noise_px(candidate.step_dn, noise_dn=work.noise_dn, sigma_filter=sigma, sigma_total=edges.sigma_px)
+    boundary = fit_boundary(edges, candidate, shape, expected)
+    if isinstance(boundary, str):
+        return boundary
+    return PupilCandidate(image=work, inpainted=inpainted, candidate=candidate, edges=edges, boundary=boundary)
