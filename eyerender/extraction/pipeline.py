@@ -68,12 +68,17 @@ def extract(
     shape = np.asarray(image).shape[:2]
     size = (int(shape[0]), int(shape[1]))
     if isinstance(prepared, str):
-        return Extraction(PupilResult.missing("input", prepared), (), (), 0.0, size)
+        return _nothing(PupilResult.missing("input", prepared), 0.0, size)
     limits = Shape.of(settings, size)
     found = find_pupil(prepared, limits, settings.polarity, prior)
     if isinstance(found, PupilResult):
-        return Extraction(found, (), (), prepared.noise_dn / DN, size)
+        return _nothing(found, prepared.noise_dn / DN, size)
     return explained(prepared, found, settings)
+
+
+def _nothing(pupil: PupilResult, noise: float, shape: tuple[int, int]) -> Extraction:
+    """Report a pupil that is missing, without glints."""
+    return Extraction(pupil=pupil, glints=(), rejected=(), noise=noise, shape=shape)
 
 
 def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionSettings) -> Extraction:
@@ -84,7 +89,7 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
     refined = settings.method == "refined"
     pupil = pupil_of(scored, None, settings)
     if not refined and not pupil.ok:
-        return Extraction(pupil, (), (), noise, size)
+        return _nothing(pupil, noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     spots, fit = _fit_spots(prepared, found, spots)
     if refined:
@@ -93,13 +98,14 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
         if pixels is not None and by_pixels is not None and _better(by_pixels, pupil):
             model, pupil = pixels.model, by_pixels
     if not pupil.ok:
-        return Extraction(pupil, (), (), noise, size)
+        return _nothing(pupil, noise, size)
     large = bloomed_glints(prepared, model.ellipse, abs(model.step_dn))
     iris, step = _iris_level(prepared, found, model), model.step_dn
     inside = iris + step if found.image.inverted else iris - step
-    eye = Eye(model.ellipse, model.sigma_px, inside, iris, found.boundary.support)
+    support = found.boundary.support
+    eye = Eye(ellipse=model.ellipse, blur_px=model.sigma_px, pupil_dn=inside, iris_dn=iris, support=support)
     accepted, rejected = classify_spots(spots, fit, eye, settings, large)
-    return Extraction(pupil, accepted, rejected, noise, size)
+    return Extraction(pupil=pupil, glints=accepted, rejected=rejected, noise=noise, shape=size)
 
 
 def _better(pixels: PupilResult, edges: PupilResult) -> bool:
@@ -222,7 +228,8 @@ def _fit_spots(prepared: Prepared, found: PupilCandidate, spots: Spots) -> tuple
     fitted = fit_spots(prepared.linear, known, *starts, limits)
     fit = give_edges(fitted, model.sigma_px, broad, limits)
     starts, fit = split_blends(prepared.linear, known, starts, fit, broad, limits)
-    return Spots(*starts, spots.patches_px, spots.clutter), fit
+    xy, width, height = starts
+    return replace(spots, xy_px=xy, width_px=width, height_dn=height), fit
 
 
 def _background(work: Prepared, model: EdgeModel) -> Callable[[Floats, Floats], Floats]:

@@ -14,7 +14,7 @@ from ..status import Status
 Stage = Literal["input", "coarse search", "edges", "fit", "refinement"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Goodness:
     """How well the ellipse explains the image.
 
@@ -130,7 +130,7 @@ class GlintResult:
         return self.status == Status.OK
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Extraction:
     """Everything that was found in one image; coordinates are relative to it, pixel centres at integers.
 

@@ -53,7 +53,7 @@ SECOND = np.array([0.85, 3.32, 3.7, -3.44, 0.798])
 _PIXEL = 1.0 / 12.0  # variance of a pixel; without it a spot of one row of pixels would be a line
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Eye:
     """What spots are judged by.
 

@@ -29,7 +29,7 @@ _RING_COS, _RING_SIN = np.cos(_RING_ANGLE), np.sin(_RING_ANGLE)
 _COMPASS_COS, _COMPASS_SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.arange(12) * (np.pi / 6.0))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Spots:
     """Detected spots.
 
@@ -100,9 +100,12 @@ def detect_spots(
     patches = np.concatenate([patches, xy[~bell]])[: settings.max_glints]
     clutter = alone & ~bell
     return Spots(
-        xy[bell] + corner, width[bell], height[bell], patches + corner,
-        (xy[clutter] + corner, width[clutter], height[clutter]),
-    )  # fmt: skip
+        xy_px=xy[bell] + corner,
+        width_px=width[bell],
+        height_dn=height[bell],
+        patches_px=patches + corner,
+        clutter=(xy[clutter] + corner, width[clutter], height[clutter]),
+    )
 
 
 @inlined
@@ -201,8 +204,8 @@ def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> Indices:
 
 
 def _no_spots() -> Spots:
-    none = (np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    return Spots(*none, np.zeros((0, 2)), none)
+    places, none = np.zeros((0, 2)), np.zeros(0)
+    return Spots(xy_px=places, width_px=none, height_dn=none, patches_px=places, clutter=(places, none, none))
 
 
 def _opening(half: Image, size: int) -> Image:

@@ -277,14 +277,14 @@ def descend(
     """
     edge = blur_px is not None
     clip = pixels.clip if pixels.clipped else pixels.clip[:0]
-    about = (limits.noise_dn, prior(limits, edge), 1.0 if blur_px is None else blur_px, steps, _BOUNDS[edge])
+    about = ((limits.noise_dn, 1.0 if blur_px is None else blur_px), (prior(limits, edge), _BOUNDS[edge]), steps)
     return Descent(*_descended(pixels.windows, np.ascontiguousarray(theta), rest, clip, pairs, *about))
 
 
-@compiled(f"{WINDOWS}, f8[:,::1], f8[::1], b1[::1], i8[:,::1], f8, f8[:,::1], f8, i8, f8[:,::1]")
+@compiled(f"{WINDOWS}, f8[:,::1], f8[::1], b1[::1], i8[:,::1], UniTuple(f8, 2), UniTuple(f8[:,::1], 2), i8")
 def _descended(
     windows: Windows, theta: Floats, rest: Floats, clip: Bools, pairs: Indices,
-    noise: float, penalty: Floats, blur_px: float, steps: int, bounds: Floats,
+    optics: tuple[float, float], limits: tuple[Floats, Floats], steps: int,
 ) -> tuple[Floats, Floats, Floats, Bools, Floats, Bools]:  # fmt: skip
     """Take the steps of `descend`.
 
@@ -294,16 +294,14 @@ def _descended(
         rest: (P,) image minus what is not fitted.
         clip: (P,) clipped pixels; none if no pixel is.
         pairs: (m, 2) the spots of a window, and those that shine into it.
-        noise: standard deviation of a pixel's noise, DN.
-        penalty: (K, K) normal matrix of the priors.
-        blur_px: blur of the edges.
+        optics: standard deviation of a pixel's noise, DN, and blur of the edges, px.
+        limits: normal matrix (K, K) of the priors; (3, K) least and most of the parameters, and their largest steps.
         steps: how many at most.
-        bounds: (3, K) least and most of the parameters, and their largest steps.
 
     Returns:
         The parts of `Descent`.
     """
-    first, (n, k) = windows[0], theta.shape
+    first, (n, k), (noise, blur_px), (penalty, bounds) = windows[0], theta.shape, optics, limits
     rest, start, theta = rest.copy(), theta, theta.copy()
     middle, cost = theta.copy(), np.empty(n)
     rows = _spot_rows(windows, theta, rest, blur_px)

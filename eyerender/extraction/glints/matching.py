@@ -8,7 +8,7 @@ The glints are matched to it with shift and scale free within plausible limits. 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ ROTATION_TO_PUPIL_MM = 10.4
 ROTATION_TO_CORNEA_MM = 5.7
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Assignment:
     """Which light each glint belongs to.
 
@@ -164,8 +164,7 @@ def assign_lights(
     lights = np.asarray(predicted_px, dtype=np.float64).reshape(-1, 2)
     m, count = glints.shape[0], lights.shape[0]
     if m == 0 or count == 0:
-        reason = "the rig has no lights" if m else None
-        return Assignment(np.full(m, -1), (reason,) * m, np.zeros(m), np.zeros(2), 1.0)
+        return _unassigned(m, "the rig has no lights" if m else None)
     middle = lights.mean(axis=0)
     reach = tolerance_px + slack * np.hypot(*(lights - middle).T)
     found: list[tuple[float, tuple[int, ...], Floats, float]] = []
@@ -185,17 +184,24 @@ def assign_lights(
     merit, names, shift, scale = found[0]
     if float(np.hypot(*shift)) > 4.0 * shift_sd_px:
         why = f"the glints lie {np.hypot(*shift):.0f} px from where the lights' reflections are expected"
-        return Assignment(np.full(m, -1), (why,) * m, np.zeros(m), shift, scale)
+        return replace(_unassigned(m, why), shift_px=shift, scale=scale)
     rival = next((item for item in found[1:] if _contradicts(item[1], names)), None)
     if rival is not None and merit - rival[0] < 0.25:
         why = "two arrangements of the lights fit equally well"
-        return Assignment(np.full(m, -1), (why,) * m, np.zeros(m), shift, scale)
+        return replace(_unassigned(m, why), shift_px=shift, scale=scale)
     light = np.array(names, dtype=np.intp)
     residual = np.zeros(m)
     placed = light >= 0
     residual[placed] = np.hypot(*(glints[placed] - _placed(lights[light[placed]], middle, shift, scale)).T)
     stray = "no light's reflection is expected there: off the sclera, a lid or spectacles"
-    return Assignment(light, tuple(None if ok else stray for ok in placed), residual, shift, scale)
+    reasons = tuple(None if ok else stray for ok in placed)
+    return Assignment(light=light, reasons=reasons, residual_px=residual, shift_px=shift, scale=scale)
+
+
+def _unassigned(count: int, reason: str | None) -> Assignment:
+    """Leave all glints without a light, for one reason."""
+    light, residual = np.full(count, -1), np.zeros(count)
+    return Assignment(light=light, reasons=(reason,) * count, residual_px=residual, shift_px=np.zeros(2), scale=1.0)
 
 
 def identify(

@@ -39,7 +39,7 @@ SPOT_PX = 5.0  # radius of the glints that are removed first
 MOST_CONTOURS = 5000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Candidate:
     """A dark blob.
 
@@ -179,7 +179,12 @@ def _blob_ellipse(m: dict[str, float], least: float, most: float, shape: Shape) 
 def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -> list[Candidate]:
     best = _best_blobs(blobs, _ring_levels(small, blobs, noise), noise)[:most]
     return [
-        Candidate(Ellipse((row[:2] + 0.5) * factor - 0.5, row[2:4] * factor, angle), inside, step, score)
+        Candidate(
+            ellipse=Ellipse((row[:2] + 0.5) * factor - 0.5, row[2:4] * factor, angle),
+            inside_dn=inside,
+            step_dn=step,
+            score=score,
+        )
         for row, (angle, inside, step, score) in zip(best, best[:, 4:].tolist(), strict=True)
     ]
 
@@ -332,7 +337,7 @@ def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
     """Make a candidate of a known place, with the levels of the image there; None where it is no darker inside."""
     about = ellipse.numbers()
     inside, step = _levels_about(prepared.linear, about)
-    return Candidate(ellipse, inside, step) if step > prepared.noise_dn else None
+    return Candidate(ellipse=ellipse, inside_dn=inside, step_dn=step) if step > prepared.noise_dn else None
 
 
 @compiled("f4[:,::1], UniTuple(f8, 5)")

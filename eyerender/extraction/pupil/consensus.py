@@ -28,7 +28,7 @@ CUT = 0.08  # share of the outline in a gap that is more than a glint's: a lid, 
 ALL_AGREE = 0.85  # share of the highest support; the root mean square distance is then at most 0.39 of the tolerance
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BoundaryFit:
     """The ellipse through the edge points, corrected for curvature.
 
@@ -182,7 +182,16 @@ def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float)
     if gap > CUT:
         held = holding(ellipse.numbers(), kept)
         ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, held, residual))
-    return BoundaryFit(ellipse, inliers, kept, support, gap, residual, sums, to_axes(covariance, ellipse))
+    return BoundaryFit(
+        ellipse=ellipse,
+        inliers=inliers,
+        points_px=kept,
+        support=support,
+        gap=gap,
+        residual_px=residual,
+        sums=sums,
+        covariance=to_axes(covariance, ellipse),
+    )
 
 
 @compiled("f8[:,::1], f8[:,::1], f8[::1], f8, f8")
@@ -210,7 +219,9 @@ def _settled(
     distance, chosen, inliers = np.empty(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     for turn in range(5):
         reach = 2.0 * tolerance if turn == 0 else tolerance
-        count = _select(points, normals, ellipse, sigma_px, reach, turn >= 1, moved, distance, chosen)
+        count = _select(points, normals, ellipse, sigma_px, reach, moved, distance, chosen)
+        if turn >= 1 and count >= 8:
+            count = _drop_outliers(distance, chosen)
         if count < 8:
             return count, ellipse, chosen, moved, nothing
         same = turn > 1
@@ -226,13 +237,13 @@ def _settled(
 
 @inlined
 def _select(
-    points: Floats, normals: Floats, start: Floats, sigma_px: float, reach: float, clipped: bool,
+    points: Floats, normals: Floats, start: Floats, sigma_px: float, reach: float,
     moved: Floats, distance: Floats, chosen: Bools,
 ) -> int:  # fmt: skip
     """Move points by the curvature shift and choose those near an ellipse; returns how many were chosen.
 
-    The arguments are those of `_settled`, the largest distance of a point, whether outliers are clipped, and what
-    receives the points as moved (n, 2), their distances (n,) and whether they are chosen (n,).
+    The arguments are those of `_settled`, the largest distance of a point, and what receives the points as moved
+    (n, 2), their distances (n,) and whether they are chosen (n,).
     """
     ellipse, n, count = (start[0], start[1], start[2], start[3], start[4]), points.shape[0], 0
     for i in range(n):
@@ -242,16 +253,20 @@ def _select(
         distance[i] = away + shift
         chosen[i] = abs(distance[i]) < reach and nx * normals[i, 0] + ny * normals[i, 1] > 0.9
         count += chosen[i]
-    if clipped and count >= 8:
-        some = selected(distance, chosen)
-        middle = quantile_of(some, 0.5)
-        for i in range(some.size):
-            some[i] = abs(some[i] - middle)
-        limit = max(3.5 * 1.4826 * quantile_of(some, 0.5), 0.1)
-        count = 0
-        for i in range(n):
-            chosen[i] = chosen[i] and abs(distance[i]) < limit
-            count += chosen[i]
+    return count
+
+
+@inlined
+def _drop_outliers(distance: Floats, chosen: Bools) -> int:
+    """Choose fewer points (n,): those whose distance is near the median; returns how many."""
+    some = selected(distance, chosen)
+    middle = quantile_of(some, 0.5)
+    for i in range(some.size):
+        some[i] = abs(some[i] - middle)
+    limit, count = max(3.5 * 1.4826 * quantile_of(some, 0.5), 0.1), 0
+    for i in range(distance.size):
+        chosen[i] = chosen[i] and abs(distance[i]) < limit
+        count += chosen[i]
     return count
 
 

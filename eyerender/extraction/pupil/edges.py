@@ -30,7 +30,7 @@ MIRRORED = 0.7
 WEAK = 0.2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EdgePoints:
     """Edge points along a boundary.
 
@@ -111,12 +111,12 @@ def find_edges(
     if keep.sum() >= 8:
         spread = math.sqrt(median(widths[keep]))
     return EdgePoints(
-        points[keep] + np.array([x0, y0]),
-        normals[keep],
-        (row, column),
-        keep,
-        min(max(spread, sigma), 8.0),
-        sigma,
+        points_px=points[keep] + np.array([x0, y0]),
+        normals=normals[keep],
+        ridge=(row, column),
+        kept=keep,
+        sigma_px=min(max(spread, sigma), 8.0),
+        filter_px=sigma,
     )
 
 

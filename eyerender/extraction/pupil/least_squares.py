@@ -47,6 +47,16 @@ _NORMAL = "Tuple((f8[:,::1], f8[::1], f8, f8[::1], f8[::1]))"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Band:
+    """Pixels near the boundary: their places x (n,) and y (n,), px, levels (n,), DN, and sectors (n,)."""
+
+    x: Floats
+    y: Floats
+    level: Floats
+    sector: Indices
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Pixels:
     """Pixels near the boundary, in the order of their sectors.
 
@@ -65,9 +75,9 @@ class Pixels:
     sector: Indices
 
     @staticmethod
-    def of(x: Floats, y: Floats, level: Floats, sector: Indices, use: Bools, seen: Bools) -> Pixels:
+    def of(band: Band, use: Bools, seen: Bools) -> Pixels:
         """Choose the pixels (n,) in `use` whose sector is one of those `seen` (SECTORS,)."""
-        return Pixels(*_grouped(x, y, level, sector, use, seen))
+        return Pixels(*_grouped(band.x, band.y, band.level, band.sector, use, seen))
 
 
 @compiled("f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], b1[::1]")
@@ -152,8 +162,7 @@ class Sums:
 
 @inlined
 def _rows(
-    place: Floats, edge: Floats, level: Floats, start: int, count: int, numbers: Floats,
-    basis: Floats, rows: Floats, residual: Floats, steep: Floats,
+    place: Floats, edge: Floats, level: Floats, start: int, count: int, numbers: Floats, out: tuple[Floats, ...]
 ) -> None:  # fmt: skip
     """Write the derivatives of the level by the parameters, the residuals, and the derivatives by the distance.
 
@@ -164,11 +173,10 @@ def _rows(
         start: first pixel of the block.
         count: number of pixels in it.
         numbers: (p,) the model (see `EdgeModel.numbers`).
-        basis: (2 BLOCK,) scratch memory for the harmonics.
-        rows: (p BLOCK,) receives the derivatives, parameter after parameter in the order of `numbers`.
-        residual: (BLOCK,) receives the residuals.
-        steep: (BLOCK,) receives the derivatives by the distance.
+        out: receives the derivatives (p BLOCK,), parameter after parameter in the order of `numbers`, the residuals
+            (BLOCK,) and the derivatives by the distance (BLOCK,). It ends with scratch memory (2 BLOCK,).
     """
+    rows, residual, steep, basis = out
     cos, sin = math.cos(numbers[4]), math.sin(numbers[4])
     inner_dn, slope, lean_x, lean_y, outer = numbers[6], numbers[7], numbers[9], numbers[10], numbers[11:]
     for i in range(count):
@@ -228,7 +236,7 @@ def _pixel_sums(
         for i in range(count):
             place[i] += displaced[index[start + i]]
         profiles(place, count, numbers[5], numbers[8], edge)
-        _rows(place, edge, level, start, count, numbers, basis, flat, residual, steep)
+        _rows(place, edge, level, start, count, numbers, (flat, residual, steep, basis))
         add_products(rows, 0, count, matrix)
         begin = 0
         while begin < count:  # the pixels of a sector follow each other

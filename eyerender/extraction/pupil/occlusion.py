@@ -13,6 +13,7 @@ from ..products import largest_size, selected
 from ..statistics import quantile_of
 from .consensus import UNEVEN
 from .edge_model import BY_DISTANCE, RAMP, RAMP_BY_DISTANCE, EdgeModel, outer_levels, profiles
+from .least_squares import Band
 from .places import BLOCK, COS_U, CURVATURE, SECTORS, SIN_U, places, sector_at
 
 OUTLIER = 5.0  # pixels with a larger residual, in standard deviations, are left out
@@ -40,15 +41,7 @@ class Visible:
 
 
 def visible_part(
-    model: EdgeModel,
-    displaced: Floats,
-    x: Floats,
-    y: Floats,
-    level: Floats,
-    use: Bools,
-    seen: Bools,
-    sectors: Bools,
-    noise_dn: float,
+    model: EdgeModel, displaced: Floats, band: Band, use: Bools, seen: Bools, sectors: Bools, noise_dn: float
 ) -> Visible:
     """Decide which pixels and sectors of the boundary the model explains.
 
@@ -60,17 +53,15 @@ def visible_part(
     Args:
         model: the fitted model.
         displaced: (SECTORS,) displacements that the fit found, px inward.
-        x: (n,) px.
-        y: (n,) px.
-        level: (n,) grey levels.
+        band: n pixels.
         use: (n,) pixels that the fit used.
         seen: (SECTORS,) sectors that the fit used.
         sectors: (SECTORS,) sectors with edge points.
         noise_dn: standard deviation of a pixel's noise.
     """
     numbers = model.numbers()
-    bins, look = _look(x, y, numbers)
-    found = _displacements(bins, look, level, use, numbers, displaced)
+    bins, look = _look(band.x, band.y, numbers)
+    found = _displacements(bins, look, band.level, use, numbers, displaced)
     uneven_px = UNEVEN * math.sqrt(numbers[2] * numbers[3])
     return Visible(*_visible(bins, found, use, seen, sectors, noise_dn, uneven_px), bins)
 

@@ -22,12 +22,11 @@ from .places import SECTORS, holding, relative_to
 
 DARK = 0.35  # of the step: a lower level is the pupil's
 CLEAR = 0.15  # of b: edge points farther from the ellipse are not its own
-SHADED = (
-    0.6  # of the median step at the ellipse's own points: the level of a shadow or a reflection outside it is lower
-)
+# Of the median step at the ellipse's own points: the level of a shadow or a reflection outside it is lower.
+SHADED = 0.6
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Outline:
     """Shares of the outline and numbers of edge points, as `Goodness` describes them."""
 

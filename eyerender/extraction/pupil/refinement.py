@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
+from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse
 from ...jit import compiled
 from ..preprocessing import Image, Part
 from .algebraic import direct_fits
 from .covariance import SHAPE, distance_slopes, hidden_part, sector_excess, to_axes, towards_round
 from .edge_model import EdgeModel, longest_gap
-from .least_squares import FIXED, Normal, Pixels, Prior, Solution, Sums, fitted
+from .least_squares import FIXED, Band, Normal, Pixels, Prior, Solution, Sums, fitted
 from .occlusion import clear_of_lids, visible_part
 from .places import SECTORS, Place, sectors_at
 
@@ -39,7 +39,7 @@ OUTWARD_PX = 8.0
 TURNS, PATIENCE = (4, 2, 1), 2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Ended:
     """The end of a fit: its pixels, solution and prior, the sectors that it explains, and how far its band reaches."""
 
@@ -66,7 +66,7 @@ class _Ended:
         return float(sums.cost / freedom)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PixelFit:
     """The result of a refinement.
 
@@ -148,14 +148,14 @@ def _fitted(
     """
     model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before[0]
     prior = Prior.of(start, noise_dn, 0.0 if before is None else before[1])
-    x, y, level, bins = _near_boundary(part, model, masked, outward)
-    use = np.ones(x.size, dtype=bool)
+    band = _near_boundary(part, model, masked, outward)
+    use = np.ones(band.x.size, dtype=bool)
     # A lid must not decide the order of the outer level.
     seen = clear_of_lids(sectors, start) if before is None else before[2]
     allowed = sectors | (longest_gap(sectors) < LID)
     displaced = np.zeros(SECTORS) if model.displaced is None else model.displaced.copy()
     for turn in range(turns):
-        pixels = Pixels.of(x, y, level, bins, use, seen)
+        pixels = Pixels.of(band, use, seen)
         if pixels.x.size < 60:
             return "too few pixels on the boundary are free of glints and lids"
         begun = displaced[pixels.sector]
@@ -164,7 +164,7 @@ def _fitted(
         if not _sane(model, start):
             return "the pixel model's fit ran away from the edges"
         displaced[pixels.sector] = found.displaced
-        visible = visible_part(model, displaced, x, y, level, use, seen, sectors, noise_dn)
+        visible = visible_part(model, displaced, band, use, seen, sectors, noise_dn)
         new_seen = clear_of_lids(visible.explained & allowed, model)
         same = bool((visible.use == use).all() and (new_seen == seen).all())
         same &= abs(visible.uneven_px - prior.uneven_px) < max(0.2 * prior.uneven_px, 0.01)
@@ -178,10 +178,10 @@ def _fitted(
         texture = found.sums.cost > UNEXPLAINED * noise_dn**2 * pixels.x.size or _rough(model, visible.uneven_px)
         if same or turn + 1 == turns or (outward == WIDE and before is None and turn + 1 >= PATIENCE and texture):
             break
-        use, seen, displaced, bins = visible.use, new_seen, visible.displaced, visible.bins
+        use, seen, displaced, band = visible.use, new_seen, visible.displaced, replace(band, sector=visible.bins)
         if seen.sum() < 0.15 * SECTORS:
             return "too little of the boundary fits the pixel model"
-    return _Ended(pixels, found, prior, new_seen, outward)
+    return _Ended(pixels=pixels, found=found, prior=prior, seen=new_seen, outward=outward)
 
 
 def _rough(model: EdgeModel, uneven_px: float) -> bool:
@@ -189,10 +189,8 @@ def _rough(model: EdgeModel, uneven_px: float) -> bool:
     return uneven_px > ROUGH * math.sqrt(float(model.ellipse.semi_axes_px.prod()))
 
 
-def _near_boundary(
-    part: Part, model: EdgeModel, masked: Bools, reach_out: float
-) -> tuple[Floats, Floats, Floats, Indices]:
-    """Pixels near the boundary, as (x, y, level, sector).
+def _near_boundary(part: Part, model: EdgeModel, masked: Bools, reach_out: float) -> Band:
+    """Find the pixels near the boundary.
 
     The band reaches 4 sigma + 1 px inside the boundary and `reach_out` sigma + 1 px outside it, but not beyond
     OUTWARD_PX.
@@ -203,7 +201,7 @@ def _near_boundary(
     # Inside the larger concentric ellipse and outside the smaller one: a cheap cover of the band.
     outer, inner = (a + outward, b + outward), (max(a - inward, 0.5), max(b - inward, 0.5))
     x, y, level = _band(part.linear, masked, part.corner, ellipse.numbers(), outer, inner)
-    return x, y, level, sectors_at(ellipse.numbers(), x, y)
+    return Band(x, y, level, sectors_at(ellipse.numbers(), x, y))
 
 
 @compiled("f4[:,::1], b1[:,::1], UniTuple(i8, 2), UniTuple(f8, 5), UniTuple(f8, 2), UniTuple(f8, 2)")
@@ -289,15 +287,15 @@ def _report(ended: _Ended, noise_dn: float, scatter_px: float) -> PixelFit:
     if not seen.all():
         ellipse, covariance = towards_round(ellipse, covariance + hidden_part(ellipse, seen, scatter_px))
     return PixelFit(
-        model,
-        ellipse,
-        to_axes(covariance, ellipse),
-        variance / noise_dn**2,
-        math.sqrt(variance),
-        count,
-        seen,
-        prior.uneven_px,
-        ended.outward,
+        model=model,
+        ellipse=ellipse,
+        covariance=to_axes(covariance, ellipse),
+        reduced_chi2=variance / noise_dn**2,
+        residual_dn=math.sqrt(variance),
+        pixels=count,
+        sectors=seen,
+        uneven_px=prior.uneven_px,
+        outward=ended.outward,
     )
 
 
