@@ -26,13 +26,26 @@ def test_a_refused_outline_is_searched_again(seed, settings):
     assert iou(found.ellipse, _truth(drawing)) > 0.9
 
 
-@pytest.mark.parametrize("seed", [13, 26, 30, 102, 120, 136, 158, 193, 237, 260])
-def test_a_later_look_does_not_take_the_iris(seed):
-    # Faint pupils in irises that stand out: what a second look reports is the pupil, and nothing reported is the iris.
-    drawing = ideal.draw("mixed", seed)
-    found, truth = extract(drawing.image).pupil, _truth(drawing)
-    assert found.confidence < 0.8 or iou(found.ellipse, truth) > 0.9
-    assert not found.ok or np.prod(found.ellipse.semi_axes_px) < 1.5 * np.prod(truth.semi_axes_px)
+# Pupils that hardly differ from irises that stand out of the sclera.
+FAINT = ideal.Condition(
+    size=(320, 240), semi_axis=(13, 30), noise=(2, 8), blur=(0.7, 3.0), pupil_level=(20, 45), step=(12, 25),
+    texture=(0, 6), glints="scatter", glint_peak=240.0, glint_sigma=(0.8, 2.0),
+)  # fmt: skip
+
+
+def test_faint_pupils_are_found_and_their_irises_are_not_taken_for_them():
+    right, irises = 0, []
+    for seed in range(20_500, 20_524):
+        drawing = ideal.draw(FAINT, seed)
+        found, truth = extract(drawing.image).pupil, _truth(drawing)
+        right += found.ok and iou(found.ellipse, truth) > 0.9
+        if found.ok and found.ellipse.area_px2 > 2.0 * truth.area_px2:  # irises have 5.8 times the area
+            irises.append(found.confidence)
+    # Of 60 other images 57 are right and 3 are irises. With these shares, 19 or fewer right ones, or 5 or more irises,
+    # would have a probability below 1 %.
+    assert right >= 20
+    assert len(irises) <= 4
+    assert all(confidence < 0.95 for confidence in irises)
 
 
 def test_no_later_look_finds_a_pupil_where_no_eye_is():
