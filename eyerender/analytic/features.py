@@ -21,9 +21,10 @@ from ..eye.pose import Poses, rigid_motion
 from ..geometry.ellipse import fit_ellipse_direct
 from ..geometry.surfaces import Xyz
 from ..observation import MAX_BOUNDARY_POINTS, MAX_POINTS
-from ..rig.camera import PinholeCamera, distort
+from ..rig.camera import PinholeCamera
 from ..status import Status
 from .rays import glint_exits, pupil_exits
+from .view_kernels import project_all, see_all
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -112,12 +113,12 @@ def features(
     position = np.broadcast_to(np.asarray(position_mm, dtype=np.float64), (len(which), 3))
     lights = np.asarray(lights_mm, dtype=np.float64).reshape(-1, 3)
     n, m, p = len(which), len(lights), len(purkinje)
-    points, anatomical = np.full((n, boundary_points, 2), np.nan), np.full((n, 2), np.nan)
-    point_status = np.zeros((n, boundary_points), dtype=np.int8)
-    point_residual = np.full((n, boundary_points), np.nan)
-    ellipse, in_image = np.full((n, 6), np.nan), np.zeros((n, boundary_points), dtype=bool)
-    glints, glint_residual = np.full((n, m, p, 2), np.nan), np.full((n, m, p), np.nan)
-    glint_status, glint_in_image = np.zeros((n, m, p), dtype=np.int8), np.zeros((n, m, p), dtype=bool)
+    k = boundary_points
+    points, anatomical, ellipse = np.empty((n, k, 2)), np.empty((n, 2)), np.empty((n, 6))
+    point_status, point_residual = np.empty((n, k), dtype=np.int8), np.empty((n, k))
+    in_image = np.empty((n, k), dtype=bool)
+    glints, glint_residual = np.empty((n, m, p, 2)), np.empty((n, m, p))
+    glint_status, glint_in_image = np.empty((n, m, p), dtype=np.int8), np.empty((n, m, p), dtype=bool)
     for group, rows in groups(eyes, which):
         for number in np.unique(cams[rows]):
             camera = cameras[number]
@@ -194,10 +195,8 @@ class _View:
     def of(cls, eye: EyeModel, poses: Poses, position_mm: Floats, camera: PinholeCamera) -> _View:
         turn, shift = rigid_motion(poses, eye)
         whole = shift + position_mm
-        rotation = np.asarray(camera.R) @ turn
-        translation = whole @ np.asarray(camera.R).T + camera.t
-        # The nodal point in the eye frame: R^T (0 - t).
-        at = -np.einsum("nij,ni->jn", rotation, translation)
+        rotation, translation, at = np.empty(turn.shape), np.empty(shift.shape), np.empty(shift.shape[::-1])
+        see_all(turn, whole, np.array(camera.R), np.array(camera.t), rotation, translation, at)
         return cls(rotation, translation, (at[0], at[1], at[2]), (turn, whole), camera)
 
     def rows(self, part: slice) -> _View:
@@ -220,17 +219,11 @@ class _View:
 
     def project(self, points: Xyz, status: Statuses) -> tuple[Floats, Statuses]:
         """Project points of the eye frame to pixels (n, k, 2); NaN where the status says there is none."""
-        r, t = self.rotation[:, :, :, None], self.translation[:, :, None]
-        x, y, z = points
-        depth = r[:, 2, 0] * x + r[:, 2, 1] * y + r[:, 2, 2] * z + t[:, 2]
-        status = np.where((status == Status.OK) & ~(depth > 0.0), np.int8(Status.BEHIND_CAMERA), status)
-        inverse = 1.0 / np.where(status == Status.OK, depth, np.nan)
-        u = (r[:, 0, 0] * x + r[:, 0, 1] * y + r[:, 0, 2] * z + t[:, 0]) * inverse
-        v = (r[:, 1, 0] * x + r[:, 1, 1] * y + r[:, 1, 2] * z + t[:, 1]) * inverse
-        camera = self.camera
-        if np.any(camera.distortion):
-            u, v = distort(u, v, camera.distortion)
-        pixels = np.empty((*u.shape, 2))
-        pixels[..., 0] = camera.K[0, 0] * u + camera.K[0, 2]
-        pixels[..., 1] = camera.K[1, 1] * v + camera.K[1, 2]
-        return pixels, status
+        camera, found = self.camera, np.array(status, dtype=np.int8)
+        plain = not np.any(camera.distortion)
+        scale = (camera.K[0, 0], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2]) if plain else (1.0, 0.0, 1.0, 0.0)
+        seen = np.empty((*found.shape, 2))
+        x, y, z = (np.ascontiguousarray(axis) for axis in points)
+        ends = np.array(scale), int(Status.BEHIND_CAMERA)
+        project_all(self.rotation, self.translation, x, y, z, found, *ends, seen)
+        return seen if plain else camera.pixels_of(seen[..., 0], seen[..., 1]), found

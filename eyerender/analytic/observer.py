@@ -56,15 +56,16 @@ class AnalyticObserver:
         """
         frames = frames.seen_by(rig)
         scene, index, pose = frames.scene, frames.index, frames.pose
-        has = scene.eye("right").purkinje_orders
+        eyes, which = scene.eyes_of(index)
+        has = eyes[0].purkinje_orders
         if not set(purkinje) <= set(has):
             raise InputError(
                 f"must be among {', '.join(map(str, has))}: {scene.eye_spec.name} has no other Purkinje images",
                 path="purkinje",
             )
         seen = features(
-            [scene.eye(side) for side in EYES],
-            index.eye,
+            eyes,
+            which,
             Poses(pose.azimuth_rad, pose.elevation_rad, pose.torsion_rad),
             index.eye_position_mm + index.head_mm,
             scene.rig.cameras,

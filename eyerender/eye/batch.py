@@ -18,10 +18,8 @@ Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str]
 _NUMBERS = tuple(f.name for f in fields(EyeModel) if f.name not in ("name", "side", "wavelength_nm", "back_passing"))
 _RECORDS = (LineOfSight, RotationCentres, Sphere, Stop)
 
-CHUNK_POINTS = 12000
-"""Points refracted at once: fewer leave the time to the interpreter, more leave the cache (measured: 8,000 to
-20,000).
-"""
+CHUNK_POINTS = 30000
+"""Points refracted at once: fewer leave the time to the interpreter, more leave the cache."""
 FEW_EYES = 4
 """Up to so many different eyes are traced one after the other with plain numbers; more are stacked."""
 

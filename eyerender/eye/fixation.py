@@ -33,7 +33,8 @@ from ..status import Status
 from .batch import CHUNK_POINTS, chunks, groups
 from .landmarks import path_to_retina
 from .model import EyeModel
-from .pose import Poses, Turning, into_eye, split
+from .pose import Poses, Turning, centres_of, into_eye, split
+from .pose_kernels import SETTLED_MM, turn_all
 
 LineOfSightKind = Literal["chief_ray", "entrance_window"]
 
@@ -122,12 +123,11 @@ def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKi
 
 
 def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
-    """Turn the fixed line p + s u through the target.
-
-    The equations are e1.(q - p) = e2.(q - p) = 0, where q is the target as the turned eye sees it.
-    """
+    """Turn the fixed line p + s u through the target."""
     point, direction = eye.chief_ray.point_mm, eye.chief_ray.direction
-    azimuth, elevation, miss, ahead = _turn_line(eye, components(target_mm), split(point), split(direction))
+    lines, out = np.array(np.atleast_2d(np.concatenate([point, direction], axis=-1))), np.empty((len(target_mm), 4))
+    turn_all(centres_of(eye), lines, np.array(target_mm), _START_RAD, out)
+    azimuth, elevation, miss, ahead = (np.array(column) for column in out.T)
     status = _status(target_mm, azimuth=azimuth, elevation=elevation, residual=miss)
     status[(status == Status.OK) & ~(ahead > 0.0)] = Status.TARGET_TOO_NEAR
     poses = Poses.listing(azimuth, elevation)
@@ -138,68 +138,6 @@ def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
         np.broadcast_to(point, target_mm.shape),
         np.broadcast_to(direction, target_mm.shape),
     )
-
-
-def _turn_line(eye: EyeModel, target: Xyz, point: Xyz, direction: Xyz) -> tuple[Floats, Floats, Floats, Floats]:
-    """Turn the line by Newton with Listing's law: azimuth, elevation, the target's distance from and along the line."""
-    e1, e2 = _tangents(direction)
-    centre = eye.rotation.azimuth_centre_mm
-    x, y = target[0] - centre[..., 0], target[1] - centre[..., 1]
-    z = target[2] - eye.rotation.elevation_centre_mm[..., 2]
-    azimuth = np.arctan2(y, x) - np.arctan2(direction[1], direction[0])
-    elevation = np.arctan2(z, np.hypot(x, y)) - np.arctan2(direction[2], np.hypot(direction[0], direction[1]))
-    azimuth, elevation = np.clip(azimuth, -_START_RAD, _START_RAD), np.clip(elevation, -_START_RAD, _START_RAD)
-    for step in range(_STEPS):
-        seen, by_azimuth, by_elevation = _seen(eye, target, azimuth, elevation)
-        gap = (seen[0] - point[0], seen[1] - point[1], seen[2] - point[2])
-        r1, r2 = dot(e1, gap), dot(e2, gap)
-        if step and not np.max(np.abs(r1) + np.abs(r2)) > _SETTLED_MM:
-            break
-        a, b = dot(e1, by_azimuth), dot(e1, by_elevation)
-        c, d = dot(e2, by_azimuth), dot(e2, by_elevation)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1.0 / (a * d - b * c)
-            turn, lift = (d * r1 - b * r2) * scale, (a * r2 - c * r1) * scale
-        # Far from the solution a full step can leave the hemisphere in which Listing's law is defined.
-        turn, lift = np.clip(np.nan_to_num(turn), -0.5, 0.5), np.clip(np.nan_to_num(lift), -0.5, 0.5)
-        azimuth, elevation = azimuth - turn, elevation - lift
-        if max(np.max(np.abs(turn)), np.max(np.abs(lift))) < 1e-9:
-            # Newton converges quadratically, so the remaining error is below rounding. It is measured here.
-            seen, _, _ = _seen(eye, target, azimuth, elevation)
-            gap = (seen[0] - point[0], seen[1] - point[1], seen[2] - point[2])
-            r1, r2 = dot(e1, gap), dot(e2, gap)
-            break
-    return azimuth, elevation, np.hypot(r1, r2), dot(direction, gap)
-
-
-def _seen(eye: EyeModel, target: Xyz, azimuth: Floats, elevation: Floats) -> tuple[Xyz, Xyz, Xyz]:
-    """The target in the frame of the turned eye, with its derivatives by azimuth and elevation.
-
-    Listing's torsion is included.
-    """
-    r = eye.rotation
-    ca, ce, ct = (split(c) for c in (r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm))
-    cos_a, sin_a, cos_e, sin_e = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
-    whole = 1.0 + cos_a * cos_e
-    sin_t = -sin_a * sin_e / whole
-    cos_t = np.sqrt(np.maximum(1.0 - sin_t * sin_t, 1e-300))
-    tau_a = -sin_e * (cos_a + cos_e) / (whole * whole * cos_t)
-    tau_e = -sin_a * (cos_e + cos_a) / (whole * whole * cos_t)
-    # Rz(-az) about ca, and its derivative (y, -x, 0).
-    x, y = target[0] - ca[0], target[1] - ca[1]
-    x, y = cos_a * x + sin_a * y, cos_a * y - sin_a * x
-    ax, ay = y, -x
-    # Ry(el) about ce, and its derivative (z, 0, -x).
-    x, y, z = x + (ca[0] - ce[0]), y + (ca[1] - ct[1]), target[2] - ce[2]
-    x, z = cos_e * x + sin_e * z, cos_e * z - sin_e * x
-    ax, az = cos_e * ax, -sin_e * ax
-    ex, ez = z, -x
-    # Rx(-tau) about ct, and its derivative (0, z, -y).
-    x, z = x + ce[0], z + (ce[2] - ct[2])
-    y, z = cos_t * y + sin_t * z, cos_t * z - sin_t * y
-    by_a = (ax, cos_t * ay + sin_t * az + tau_a * z, cos_t * az - sin_t * ay - tau_a * y)
-    by_e = (ex, sin_t * ez + tau_e * z, cos_t * ez - tau_e * y)
-    return (x, y + ct[1], z + ct[2]), by_a, by_e
 
 
 def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
@@ -217,7 +155,7 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
         axis=-1,
     )
     for _ in range(_STEPS):
-        if not np.max(np.abs(miss), where=(ok & ~lost)[:, None], initial=0.0) > _SETTLED_MM:
+        if not np.max(np.abs(miss), where=(ok & ~lost)[:, None], initial=0.0) > SETTLED_MM:
             break
         sound = np.abs(np.linalg.det(slope)) > 1e-12
         safe = np.where(sound[:, None, None], slope, np.eye(2))
@@ -308,9 +246,8 @@ def _tangents(direction: Xyz) -> tuple[Xyz, Xyz]:
     return e1, (-z * e1[1], z * e1[0], x * e1[1] - y * e1[0])
 
 
-_SETTLED_MM = 1e-11
 _ON_AXIS_RAD = 5e-5
 _ON_AXIS_MM = 1e-3
 """A mean ray this close to the optic axis, in direction and in place, runs along it."""
 _NUDGE_RAD = 1e-5
-_START_RAD = np.radians(85.0)
+_START_RAD = float(np.radians(85.0))

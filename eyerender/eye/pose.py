@@ -19,8 +19,9 @@ import numpy.typing as npt
 
 from ..arrays import ArrayValue, Floats
 from ..geometry.surfaces import Xyz
-from ..geometry.transforms import read_only, rotation_x, rotation_y, rotation_z
+from ..geometry.transforms import read_only
 from .model import EyeModel
+from .pose_kernels import move_all
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,13 +70,17 @@ def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
     Returns:
         M (n, 3, 3) and t (n, 3).
     """
-    centres = eye.rotation
-    azimuth, elevation = rotation_z(poses.azimuth_rad), rotation_y(-poses.elevation_rad)
-    torsion = rotation_x(poses.torsion_rad)
-    shift = _about(torsion, centres.torsion_centre_mm)
-    shift = _apply(elevation, shift) + _about(elevation, centres.elevation_centre_mm)
-    shift = _apply(azimuth, shift) + _about(azimuth, centres.azimuth_centre_mm)
-    return np.asarray(azimuth @ elevation @ torsion), shift
+    angles = np.stack([poses.azimuth_rad, poses.elevation_rad, poses.torsion_rad], axis=-1).reshape(-1, 3)
+    turn, shift = np.empty((len(angles), 3, 3)), np.empty((len(angles), 3))
+    move_all(np.array(angles, dtype=np.float64), centres_of(eye), turn, shift)
+    return turn, shift
+
+
+def centres_of(eye: EyeModel) -> Floats:
+    """Centres of azimuth, elevation and torsion, (1, 9), or (n, 9) for a batch."""
+    r = eye.rotation
+    centres = np.concatenate([r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm], axis=-1)
+    return np.array(np.atleast_2d(centres))
 
 
 class Turning(NamedTuple):
@@ -112,12 +117,3 @@ def into_eye(turning: Turning, eye: EyeModel, point: Xyz) -> Xyz:
 def split(vector: Floats) -> Xyz:
     """Components of vectors (..., 3), as views."""
     return vector[..., 0], vector[..., 1], vector[..., 2]
-
-
-def _apply(matrix: Floats, vector: Floats) -> Floats:
-    return np.asarray((matrix @ vector[..., None])[..., 0])
-
-
-def _about(matrix: Floats, centre: Floats) -> Floats:
-    """Translation c - R c of a rotation about the point c."""
-    return np.asarray(centre - _apply(matrix, centre))

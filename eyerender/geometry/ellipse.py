@@ -21,9 +21,6 @@ from numpy.typing import ArrayLike
 from ..arrays import Bools, Floats
 from ..errors import InputError
 
-# Number of points in one chunk. Its temporaries (about 20 arrays) then stay in a core's second-level cache.
-_CHUNK_POINTS = 16384
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipse:
@@ -169,145 +166,16 @@ def fit_ellipse_direct(points: ArrayLike) -> EllipseFit:
     Raises:
         InputError: the shape is wrong.
     """
+    from .ellipse_kernels import fit_all  # which loads numba
+
     array = np.asarray(points, dtype=np.float64)
     if array.ndim < 2 or array.shape[-1] != 2 or array.shape[-2] < 5:
         raise InputError(f"points must have the shape (..., k >= 5, 2), not {array.shape}")
     lead, count = array.shape[:-2], array.shape[-2]
-    flat = array.reshape(-1, count, 2)
-    out = np.empty((flat.shape[0], 6))
-    step = max(1, _CHUNK_POINTS // count)
-    with np.errstate(all="ignore"):
-        for start in range(0, flat.shape[0], step):
-            out[start : start + step] = _fit_chunk(flat[start : start + step])
+    out = np.empty((math.prod(lead), 6))
+    fit_all(np.array(array.reshape(-1, count, 2)), out)
     out = out.reshape(*lead, 6)
     return EllipseFit(out[..., 0:2], out[..., 2:4], out[..., 4], out[..., 5])
-
-
-def _fit_chunk(points: Floats) -> Floats:
-    """Fit (n, k, 2) points; rows (n, 6) of cx, cy, a, b, angle, residual."""
-    x = np.ascontiguousarray(points[..., 0])
-    y = np.ascontiguousarray(points[..., 1])
-    mean_x, mean_y = x.mean(axis=1), y.mean(axis=1)
-    x -= mean_x[:, None]
-    y -= mean_y[:, None]
-    k = x.shape[1]
-    sxx, sxy, syy = _dot(x, x) / k, _dot(x, y) / k, _dot(y, y) / k
-    # Cholesky factor L of the covariance: (x, y) = L (u, v).
-    l11 = np.sqrt(sxx)
-    l21 = sxy / l11
-    l22 = np.sqrt(syy - l21 * l21)
-    # The points are collinear to rounding error: the smaller spread is lost in the last digits of the larger one.
-    flat = ~(l22 * l11 > 1e-10 * (sxx + syy))
-    u = x / l11[:, None]
-    v = (y - l21[:, None] * u) / l22[:, None]
-
-    uu, vv = u * u, v * v
-    p, q, r = uu + vv - 2.0, uu - vv, 2.0 * u * v
-    linear = []
-    for basis in (p, q, r):
-        along_u, along_v = _dot(basis, u) / k, _dot(basis, v) / k
-        basis -= along_u[:, None] * u
-        basis -= along_v[:, None] * v
-        linear.append((along_u, along_v))
-    m = (_dot(p, p) / k, _dot(p, q) / k, _dot(p, r) / k, _dot(q, q) / k, _dot(q, r) / k, _dot(r, r) / k)
-    wp, wq, wr = _positive_eigenvector(m)
-
-    # F(u, v) = wp (u^2 + v^2 - 2) + wq (u^2 - v^2) + wr 2 u v - (d u + e v); quadratic part [[A, H], [H, C]].
-    a2, h2, c2 = wp + wq, wr, wp - wq
-    d = wp * linear[0][0] + wq * linear[1][0] + wr * linear[2][0]
-    e = wp * linear[0][1] + wq * linear[1][1] + wr * linear[2][1]
-    det = a2 * c2 - h2 * h2
-    cu, cv = 0.5 * (c2 * d - h2 * e) / det, 0.5 * (a2 * e - h2 * d) / det
-    level = 2.0 * wp + 0.5 * (d * cu + e * cv)  # F = quadratic(u - cu) - level
-
-    residual = _sampson_rms((p, q, r), (wp, wq, wr), (a2, h2, c2), (d, e), (u, v), (l11, l21, l22))
-    # Back to pixels: the quadratic form Q becomes L^-T Q L^-1; the centre c becomes L c + mean.
-    centre_x = l11 * cu + mean_x
-    centre_y = l21 * cu + l22 * cv + mean_y
-    # Inverse of Q/level is the form's covariance-like matrix P = level Q^-1; L P L^T has the semi-axes squared.
-    scale = level / det
-    p11, p12, p22 = scale * c2, -scale * h2, scale * a2
-    g11 = l11 * l11 * p11
-    g12 = l11 * (l21 * p11 + l22 * p12)
-    g22 = l21 * l21 * p11 + 2.0 * l21 * l22 * p12 + l22 * l22 * p22
-    semi_a, semi_b, angle = _axes_from_shape_matrix(g11, g12, g22)
-    rows = np.stack([centre_x, centre_y, semi_a, semi_b, angle, residual], axis=-1)
-    bad = flat | ~np.isfinite(rows).all(axis=1) | ~(semi_b > 0.0)
-    rows[bad] = np.nan
-    rows[bad, 5] = np.inf
-    return rows
-
-
-def _dot(first: Floats, second: Floats) -> Floats:
-    product: Floats = np.einsum("nk,nk->n", first, second)
-    return product
-
-
-def _positive_eigenvector(m: tuple[Floats, ...]) -> tuple[Floats, Floats, Floats]:
-    """Eigenvector w of M w = lambda diag(1, -1, -1) w for the largest lambda; M symmetric (pp, pq, pr, qq, qr, rr)."""
-    pp, pq, pr, qq, qr, rr = m
-    # Eigenvalues of diag(1, -1, -1) M, whose characteristic polynomial is x^3 - t x^2 + s x - det = 0.
-    t = pp - qq - rr
-    s = pq * pq + pr * pr - pp * (qq + rr) + qq * rr - qr * qr
-    det = pp * (qq * rr - qr * qr) - pq * (pq * rr - qr * pr) + pr * (pq * qr - qq * pr)
-    # All three roots are real because M is positive semi-definite. Viete's trigonometric form gives the largest.
-    third = t / 3.0
-    spread = np.sqrt(np.maximum(third * third - s / 3.0, 0.0))
-    half = third * third * third - 0.5 * third * s + 0.5 * det
-    cosine = np.clip(half / np.maximum(spread * spread * spread, 1e-300), -1.0, 1.0)
-    value = third + 2.0 * spread * np.cos(np.arccos(cosine) / 3.0)
-    w = _null_vector(m, value)
-    for _ in range(2):
-        # The error of the Rayleigh quotient is the square of the vector's error, so it removes the cancellation in the
-        # cubic.
-        wp, wq, wr = w
-        energy = pp * wp * wp + qq * wq * wq + rr * wr * wr + 2.0 * (pq * wp * wq + pr * wp * wr + qr * wq * wr)
-        value = energy / (wp * wp - wq * wq - wr * wr)
-        w = _null_vector(m, value)
-    return w
-
-
-def _null_vector(m: tuple[Floats, ...], value: Floats) -> tuple[Floats, Floats, Floats]:
-    """Null vector of M - value diag(1, -1, -1), normalised to w_p > 0.
-
-    It is the first column of the adjugate: an ellipse has w_p^2 > w_q^2 + w_r^2, so no other column is longer.
-    """
-    _, pq, pr, qq, qr, rr = m
-    d, f = qq + value, rr + value
-    wp, wq, wr = d * f - qr * qr, pr * qr - pq * f, pq * qr - pr * d
-    norm = np.copysign(np.sqrt(wp * wp + wq * wq + wr * wr), wp)
-    return wp / norm, wq / norm, wr / norm
-
-
-def _sampson_rms(
-    basis: tuple[Floats, Floats, Floats],
-    w: tuple[Floats, Floats, Floats],
-    quadratic: tuple[Floats, Floats, Floats],
-    linear: tuple[Floats, Floats],
-    uv: tuple[Floats, Floats],
-    factor: tuple[Floats, Floats, Floats],
-) -> Floats:
-    """Root mean square sqrt(mean(F^2 / |grad F|^2)), px; L^-T takes the gradient back to pixels."""
-    a2, h2, c2 = (term[:, None] for term in quadratic)
-    d, e = (term[:, None] for term in linear)
-    u, v = uv
-    l11, l21, l22 = (term[:, None] for term in factor)
-    value = w[0][:, None] * basis[0] + w[1][:, None] * basis[1] + w[2][:, None] * basis[2]
-    gu = 2.0 * (a2 * u + h2 * v) - d
-    gv = (2.0 * (h2 * u + c2 * v) - e) / l22
-    gx = (gu - l21 * gv) / l11
-    rms: Floats = np.sqrt((value * value / (gx * gx + gv * gv)).mean(axis=1))
-    return rms
-
-
-def _axes_from_shape_matrix(g11: Floats, g12: Floats, g22: Floats) -> tuple[Floats, Floats, Floats]:
-    """Semi-axes and angle of {x : x^T G^-1 x = 1}: roots of G's eigenvalues, and its first eigenvector."""
-    mean, half = 0.5 * (g11 + g22), 0.5 * (g11 - g22)
-    radius = np.hypot(half, g12)
-    major = mean + radius
-    # This is det / major because mean - radius cancels for a thin ellipse.
-    minor = (g11 * g22 - g12 * g12) / major
-    return np.sqrt(major), np.sqrt(minor), wrap_angle(0.5 * np.arctan2(g12, half))
 
 
 def points_on_ellipse(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: ArrayLike, count: int) -> Floats:

@@ -1,147 +1,185 @@
-"""Surfaces as graphs x = h(y, z) over one plane, with first and second derivatives."""
+"""Surfaces as graphs x = h(y, z) over one plane, as numbers for compiled code (`graph_kernels`)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import FloatLike, Floats
-from .surfaces import Surface, fit
-from .surfaces_graph import GraphSurface, Jet
+from ..arrays import Floats, Ints, remembered
+from .biconic_kernels import Jet
+from .graph_kernels import (
+    APEX,
+    AXIS,
+    COLUMNS,
+    GRID,
+    LEAN,
+    LINEAR,
+    NUMERATOR,
+    ORIGIN,
+    ROOT,
+    SHAPE,
+    SMOOTH,
+    TURN,
+    X0,
+    ZERNIKE,
+    heights,
+    jets,
+)
+from .surfaces import Surface
+from .surfaces_biconic import Biconic
+from .surfaces_graph import GraphSurface
+from .surfaces_measured import GridSurface, Measured, ZernikeSurface
 from .surfaces_quadric import Quadric
 
-
-class Graph(Protocol):
-    """A surface over the (y, z) plane of a working frame."""
-
-    def height(self, y: Floats, z: Floats) -> Floats:
-        """Height h(y, z)."""
-
-    def jet(self, y: Floats, z: Floats) -> Jet:
-        """Height h with its first and second derivatives."""
+_AXES = 1e-15
 
 
-class AxialGraph(NamedTuple):
-    """y^2 + z^2 + p x^2 + 2 b x + c = 0 on the sheet where p x + b > 0; u = p x + b = sqrt(b^2 - p (y^2 + z^2 + c))."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Graphs:
+    """Surfaces over the (y, z) plane of a working frame, p_eye = rotation p + origin_mm.
 
-    p: FloatLike
-    b: FloatLike
-    c: FloatLike
-    ndim: int
+    Attributes:
+        kinds: (s,) kinds of the surfaces.
+        numbers: (1 or n, s, columns), one row per eye of a batch.
+        table: coefficients of measured surfaces.
+        origin_mm: (3,) or (n, 3).
+        rotation: (3, 3) or (n, 3, 3).
+    """
 
-    def height(self, y: Floats, z: Floats) -> Floats:
-        """Height h(y, z) = -r / (b + sqrt(b^2 - p r)), r = y^2 + z^2 + c."""
-        b = fit(self.b, self.ndim)
-        rest = y * y + z * z + fit(self.c, self.ndim)
-        return np.asarray(-rest / (b + np.sqrt(b * b - fit(self.p, self.ndim) * rest)))
+    kinds: Ints
+    numbers: Floats
+    table: Floats
+    origin_mm: Floats
+    rotation: Floats
 
-    def jet(self, y: Floats, z: Floats) -> Jet:
-        """Height h with its first and second derivatives."""
-        p, b = fit(self.p, self.ndim), fit(self.b, self.ndim)
-        rest = y * y + z * z + fit(self.c, self.ndim)
-        u = np.sqrt(b * b - p * rest)
-        x = rest / (-b - u)
-        inverse = -1.0 / u
-        hy, hz = y * inverse, z * inverse
-        lean = p * inverse
-        ty = lean * hy
-        return Jet(x, hy, hz, ty * hy + inverse, ty * hz, lean * (hz * hz) + inverse)
+    @property
+    def plain(self) -> bool:
+        """Whether the working frame is the eye's."""
+        return not np.any(self.origin_mm) and bool(np.all(self.rotation == np.eye(3)))
 
+    def jets(self, y: Floats, z: Floats) -> list[Jet]:
+        """Heights and derivatives of the surfaces of the first eye at places (k,)."""
+        out = np.empty((len(self.kinds), 6, len(y)))
+        jets(self.kinds, self.numbers, self.table, np.array(y, dtype=float), np.array(z, dtype=float), out)
+        return [Jet(*rows) for rows in out]
 
-class QuadricGraph(NamedTuple):
-    """Any quadric: A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 on the sheet where g_x > 0."""
-
-    coefficients: tuple[FloatLike, ...]
-    ndim: int
-
-    def height(self, y: Floats, z: Floats) -> Floats:
-        """Height h(y, z), the root of the quadric on the sheet."""
-        return self._root(y, z)[0]
-
-    def jet(self, y: Floats, z: Floats) -> Jet:
-        """Height h with its first and second derivatives."""
-        xx, yy, zz, xy, xz, yz, _, by, bz, _ = (fit(v, self.ndim) for v in self.coefficients)
-        x, u = self._root(y, z)
-        inverse = -1.0 / u
-        hy = (xy * x + yy * y + yz * z + by) * inverse
-        hz = (xz * x + yz * y + zz * z + bz) * inverse
-        ay, az = xx * hy + xy, xx * hz + xz
-        return Jet(
-            x,
-            hy,
-            hz,
-            (ay * hy + xy * hy + yy) * inverse,
-            (ay * hz + xz * hy + yz) * inverse,
-            (az * hz + xz * hz + zz) * inverse,
-        )
-
-    def _root(self, y: Floats, z: Floats) -> tuple[Floats, Floats]:
-        xx, yy, zz, xy, xz, yz, bx, by, bz, c = (fit(v, self.ndim) for v in self.coefficients)
-        half = xy * y + xz * z + bx
-        rest = y * (yy * y + 2.0 * (yz * z + by)) + z * (zz * z + 2.0 * bz) + c
-        u = np.sqrt(half * half - xx * rest)
-        return np.asarray(-rest / (half + u)), u
+    def heights(self, y: Floats, z: Floats) -> Floats:
+        """Heights (s, k) of the surfaces of the first eye at places (k,); NaN where they do not reach."""
+        out = np.empty((len(self.kinds), len(y)))
+        heights(self.kinds, self.numbers, self.table, np.array(y, dtype=float), np.array(z, dtype=float), out)
+        return out
 
 
-class SheetGraph(NamedTuple):
-    """A graph surface in a frame with its own axes; `offset` (..., 3) is its origin there."""
-
-    surface: GraphSurface
-    offset: Floats
-
-    def height(self, y: Floats, z: Floats) -> Floats:
-        """Height h(y, z), the sag of the surface."""
-        x, y, z = self._moved(y, z)
-        return np.asarray(self.surface.local_sag(y, z) + x)
-
-    def jet(self, y: Floats, z: Floats) -> Jet:
-        """Height h with its first and second derivatives."""
-        x, y, z = self._moved(y, z)
-        jet = self.surface.jet(y, z)
-        return jet._replace(x=jet.x + x)
-
-    def _moved(self, y: Floats, z: Floats) -> tuple[FloatLike, Floats, Floats]:
-        if not self.offset.any():
-            return 0.0, y, z
-        dx, dy, dz = (fit(self.offset[..., i], y.ndim) for i in range(3))
-        return dx, y - dy, z - dz
+@remembered
+def graphs_of(*surfaces: Surface) -> Graphs | None:
+    """Express surfaces as graphs over one plane, as `express` does, once for the same objects."""
+    return express(*surfaces)
 
 
-def graphs_of(surfaces: Sequence[Surface], ndim: int) -> tuple[list[Graph], Floats, Floats] | None:
+def express(*surfaces: Surface) -> Graphs | None:
     """Express surfaces as graphs over one plane.
 
-    The working frame is the eye's, or that of the first surface that is a graph of its own frame. Another one must have
-    parallel axes.
-
-    Args:
-        surfaces: what to express.
-        ndim: number of axes of the arrays that the graphs will receive.
+    The working frame is the eye's where all surfaces that are graphs of a frame have the eye's x axis; else it is that
+    of the first of them, and the x axes of the others must be parallel to it.
 
     Returns:
-        (graphs, origin, rotation) of the working frame, or None where the surfaces have no common frame.
+        None where the surfaces have no common plane.
     """
     frame = next((surface for surface in surfaces if isinstance(surface, GraphSurface)), None)
     first = surfaces[0]
-    origin = np.zeros_like(first.origin_mm) if frame is None else frame.origin_mm
-    rotation = np.broadcast_to(np.eye(3), first.rotation.shape) if frame is None else frame.rotation
-    graphs: list[Graph] = []
-    for surface in surfaces:
-        if isinstance(surface, GraphSurface):
-            if not np.array_equal(surface.rotation, rotation):
+    origin, rotation = np.zeros_like(first.origin_mm), np.broadcast_to(np.eye(3), first.rotation.shape)
+    if frame is not None and not _turned_about_x(frame.rotation):
+        origin, rotation = frame.origin_mm, frame.rotation
+    rows, kinds, table = 1 if first.origin_mm.ndim == 1 else len(first.origin_mm), [], [np.zeros(1)]
+    numbers = np.zeros((rows, len(surfaces), COLUMNS))
+    back = np.swapaxes(rotation, -1, -2)
+    for s, surface in enumerate(surfaces):
+        row, turn = numbers[:, s], back @ surface.rotation
+        place = (back @ (surface.origin_mm - origin)[..., None])[..., 0]
+        row[:, ORIGIN : ORIGIN + 3], row[:, AXIS : AXIS + 3] = place, turn[..., :, 0]
+        row[:, X0] = place[..., 0]
+        if isinstance(surface, Quadric):
+            # From a point beside its own origin, so that no digits cancel.
+            seen = surface.seen_from(origin + rotation[..., :, 0] * place[..., :1], rotation)
+            if not np.all(seen.rotation[..., 0, 0] > 0.5):
                 return None
-            offset = (np.swapaxes(rotation, -1, -2) @ (surface.origin_mm - origin)[..., None])[..., 0]
-            graphs.append(SheetGraph(surface, offset))
-        elif isinstance(surface, Quadric):
-            moved = surface if frame is None else surface.seen_from(origin, rotation)
-            if not np.all(moved.rotation[..., 0, 0] > 0.5):
-                return None
-            p, b, c = moved.axial_coefficients or (None, None, None)
-            if p is not None and b is not None and c is not None:
-                graphs.append(AxialGraph(p, b, c, ndim))
-            else:
-                graphs.append(QuadricGraph(moved.coefficients, ndim))
+            _write_quadric(row, seen)
+            apex = place + turn[..., :, 0] * surface.sag(0.0, 0.0)[..., None]
+            row[:, APEX : APEX + 2] = apex[..., 1:]
+            kinds.append(SMOOTH)
+        elif isinstance(surface, GraphSurface) and _turned_about_x(turn):
+            row[:, TURN], row[:, TURN + 1] = turn[..., 1, 1], turn[..., 2, 1]
+            row[:, APEX : APEX + 2] = place[..., 1:]
+            kinds.append(_write_sheet(row, surface, table))
         else:
             return None
-    return graphs, origin, rotation
+    whole = np.concatenate(table)
+    return Graphs(
+        kinds=np.array(kinds, dtype=np.int64), numbers=numbers, table=whole, origin_mm=origin, rotation=rotation
+    )
+
+
+def _turned_about_x(rotation: Floats) -> bool:
+    """Whether rotations (..., 3, 3) leave the x axis where it is."""
+    return bool(np.all(np.abs(rotation[..., 1:, 0]) <= _AXES)) and bool(np.all(rotation[..., 0, 0] > 0.0))
+
+
+def _write_quadric(row: Floats, quadric: Quadric) -> None:
+    """Write a quadric, A_xx x^2 + 2 h x + N = 0 with R = h^2 - A_xx N, to its columns (n, columns)."""
+    xx, yy, zz, xy, xz, yz, bx, by, bz, c = quadric.coefficients
+    numerator = np.broadcast_arrays(c, 2.0 * by, 2.0 * bz, yy, 2.0 * yz, zz)
+    square = (bx * bx, 2.0 * bx * xy, 2.0 * bx * xz, xy * xy, 2.0 * xy * xz, xz * xz)
+    for k, (n, h) in enumerate(zip(numerator, square, strict=True)):
+        row[:, NUMERATOR + k], row[:, ROOT + k] = n, h - xx * n
+    for k, h in enumerate((bx, xy, xz)):
+        row[:, LINEAR + k] = h
+
+
+def _write_sheet(row: Floats, surface: GraphSurface, table: list[Floats]) -> int:
+    """Write the columns (n, columns) of a graph of its own frame, extend the table, and return its kind."""
+    if isinstance(surface, Biconic):
+        _write_biconic(row, surface.radii_mm, surface.conic_constants, row[:, TURN : TURN + 2])
+        return SMOOTH
+    assert isinstance(surface, Measured)
+    outer, window = surface.outer, surface.window_mm
+    c, s = np.cos(outer[..., 4]), np.sin(outer[..., 4])
+    turn = np.stack([row[:, TURN] * c - row[:, TURN + 1] * s, row[:, TURN + 1] * c + row[:, TURN] * s], axis=-1)
+    _write_biconic(row, outer[..., :2], outer[..., 2:4], turn)
+    lean_y, lean_z = outer[..., 6], outer[..., 7]
+    row[:, LEAN] = row[:, TURN] * lean_y - row[:, TURN + 1] * lean_z
+    row[:, LEAN + 1] = row[:, TURN + 1] * lean_y + row[:, TURN] * lean_z
+    row[:, X0] += outer[..., 5] - row[:, LEAN] * row[:, ORIGIN + 1] - row[:, LEAN + 1] * row[:, ORIGIN + 2]
+    row[:, SHAPE] = window[..., 0] ** 2
+    row[:, SHAPE + 1] = window[..., 1] ** 2 - window[..., 0] ** 2
+    start = sum(map(len, table))
+    if isinstance(surface, ZernikeSurface):
+        curvature = surface.base[..., 0]
+        size = surface.table.shape[-2] * surface.table.shape[-1]
+        values = (surface.radius_mm, curvature, (1.0 + surface.base[..., 1]) * curvature**2, surface.order)
+        place = start + size * np.arange(len(row))
+    else:
+        assert isinstance(surface, GridSurface)
+        size = surface.table.shape[-1]
+        values = (surface.spacing_mm, surface.centre_mm[..., 0], surface.centre_mm[..., 1], size)
+        place = start + size * size * surface.row
+    table.append(surface.table.ravel())
+    for k, value in enumerate((*values, place)):
+        row[:, SHAPE + 2 + k] = value
+    return ZERNIKE if isinstance(surface, ZernikeSurface) else GRID
+
+
+def _write_biconic(row: Floats, radii_mm: Floats, conic_constants: Floats, turn: Floats) -> None:
+    """Write a biconic with the axes (c y + s z, c z - s y), (y, z) counting from its origin: h = 1."""
+    curvature = 1.0 / radii_mm
+    c, s = turn[..., 0], turn[..., 1]
+    y, z = row[:, ORIGIN + 1], row[:, ORIGIN + 2]
+    for first, (along, across), whole in (
+        (NUMERATOR, (curvature[..., 0], curvature[..., 1]), 0.0),
+        (ROOT, tuple(-(1.0 + conic_constants[..., k]) * curvature[..., k] ** 2 for k in (0, 1)), 1.0),
+    ):
+        yy, yz, zz = c * c * along + s * s * across, 2.0 * c * s * (along - across), s * s * along + c * c * across
+        row[:, first] = whole + yy * y * y + yz * y * z + zz * z * z
+        row[:, first + 1], row[:, first + 2] = -2.0 * yy * y - yz * z, -2.0 * zz * z - yz * y
+        row[:, first + 3], row[:, first + 4], row[:, first + 5] = yy, yz, zz
+    row[:, LINEAR] = 1.0

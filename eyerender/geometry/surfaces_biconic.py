@@ -8,8 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from ..arrays import FloatLike, Floats
+from .biconic_kernels import Jet, Slopes, biconic_jet, biconic_slopes
 from .surfaces import fit
-from .surfaces_graph import GraphSurface, Jet, Slopes, biconic_jet, biconic_slopes
+from .surfaces_graph import GraphSurface
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Bools, FloatLike, Floats
+from ..arrays import Bools, Floats
+from .biconic_kernels import Jet, Slopes
 from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit, shift, turn, turn_back
 
 STEPS = 12
@@ -16,26 +16,6 @@ SETTLED_MM = 1e-7
 _SEARCHED_MM = 4.0
 _SAMPLES = 41
 _HALVINGS = 30
-
-
-class Jet(NamedTuple):
-    """Height h over (y, z), its slopes and its second derivatives."""
-
-    x: Floats
-    y: Floats
-    z: Floats
-    yy: Floats
-    yz: Floats
-    zz: Floats
-
-
-class Slopes(NamedTuple):
-    """Height h over (y, z), its slopes, and whether the sheet reaches there."""
-
-    x: Floats
-    y: Floats
-    z: Floats
-    inside: Bools
 
 
 class GraphSurface(Surface):
@@ -191,42 +171,3 @@ class GraphSurface(Surface):
     def eye_vector(self, vector: Xyz) -> Xyz:
         """Turn directions of the local frame to the eye frame."""
         return vector if self.untilted else turn(self.rotation, vector)
-
-
-def biconic_slopes(constants: tuple[FloatLike, ...], y: Floats, z: Floats) -> Slopes:
-    """Height and slopes of x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - k_y y^2 - k_z z^2)).
-
-    Args:
-        constants: (c_y, c_z, k_y, k_z), c = 1/R and k = (1 + Q) c^2 in the meridians of y and z.
-        y: places.
-        z: places.
-    """
-    cy, cz, ky, kz = constants
-    y_square, z_square = y * y, z * z
-    square = 1.0 - ky * y_square - kz * z_square
-    inside = np.asarray(square > 0.0)
-    w = np.sqrt(np.where(inside, square, 1.0))
-    d = 1.0 / (1.0 + w)
-    x = -(cy * y_square + cz * z_square) * d
-    lever = x / w
-    return Slopes(x, -d * y * (2.0 * cy - ky * lever), -d * z * (2.0 * cz - kz * lever), inside)
-
-
-def biconic_jet(constants: tuple[FloatLike, ...], y: Floats, z: Floats) -> Jet:
-    """Height of `biconic_slopes` with its first and second derivatives.
-
-    With N = c_y y^2 + c_z z^2 and W the square root, x (1 + W) = -N is differentiated twice.
-    """
-    cy, cz, ky, kz = constants
-    square = 1.0 - ky * y * y - kz * z * z
-    w = np.sqrt(np.where(square > 0.0, square, 1.0))
-    d = 1.0 / (1.0 + w)
-    x = -(cy * y * y + cz * z * z) * d
-    wy, wz = -ky * y / w, -kz * z / w
-    xy = -d * (2.0 * cy * y + x * wy)
-    xz = -d * (2.0 * cz * z + x * wz)
-    wyy, wzz, wyz = -(ky + wy * wy) / w, -(kz + wz * wz) / w, -wy * wz / w
-    xyy = -d * (2.0 * cy + 2.0 * xy * wy + x * wyy)
-    xzz = -d * (2.0 * cz + 2.0 * xz * wz + x * wzz)
-    xyz = -d * (xy * wz + xz * wy + x * wyz)
-    return Jet(x, xy, xz, xyy, xyz, xzz)

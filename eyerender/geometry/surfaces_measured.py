@@ -17,8 +17,9 @@ from typing import ClassVar, Self
 import numpy as np
 
 from ..arrays import FloatLike, Floats, Indices
+from .biconic_kernels import Jet, Slopes, biconic_jet, biconic_slopes
 from .surfaces import fit
-from .surfaces_graph import GraphSurface, Jet, Slopes, biconic_jet, biconic_slopes
+from .surfaces_graph import GraphSurface
 from .transforms import read_only, stacked
 from .zernike import mirrored, order_of, product_basis, products
 

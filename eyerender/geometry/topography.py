@@ -14,7 +14,7 @@ from scipy.sparse import coo_array, csr_array, diags_array, eye_array, kron, vst
 from scipy.sparse.linalg import spsolve
 
 from ..arrays import Floats
-from .surfaces_graph import biconic_slopes
+from .biconic_kernels import biconic_slopes
 from .surfaces_measured import splines
 
 RADII_MM, SHAPES = (3.0, 30.0), (-6.0, 2.0)

@@ -1,6 +1,6 @@
 """Apparent points (refraction), mirror points (reflection) and Purkinje images: the rays that join two points.
 
-Most rays are found by Newton on the optical length (`fermat`) from a paraxial start. Every path is then traced from the
+Most rays are found by Newton on the optical length (`fermat_kernels`). Every path is then traced from the
 viewpoint through the surfaces; the distance by which the traced ray misses the other point is the residual. A path that
 misses by more than rounding is searched again by shooting with ray differentials and guarded steps (`shooting`), which
 also handles surfaces that have no common graph. A refracted ray that is still not found is searched from the object's
@@ -9,7 +9,7 @@ side: at grazing angles, Newton from a straight line's guess may miss a ray that
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,16 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
-from ..geometry.graphs import Graph, graphs_of
-from ..geometry.surfaces import Surface, Xyz, components, fit, join, shift, turn, turn_back
-from ..status import Status, mark
-from .fermat import stationary_path
-from .interface import dot, minus, moved, unit
-from .shooting import RESIDUAL_LIMIT_MM, Connection, connect, nearness, taken
-from .trace import Crossing, cross, inside_rim, outward_path, trace
-
-SURE_MM = 1e-11
-"""A path that its traced ray confirms to this is taken as found; rounding stays well below."""
+from ..geometry.graphs import Graphs, graphs_of
+from ..geometry.surfaces import Surface, Xyz, components, join, shift, turn, turn_back
+from ..status import Status
+from .fermat_kernels import END, EXIT, GUESS, LOST, RESIDUAL, RESULTS, WAY, mirror_all, refract_all
+from .shooting import Connection, connect, taken
+from .trace import Crossing, outward_path, trace
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -144,104 +140,64 @@ def refracted_rays(
         Crossing(surface, index, rim_mm=rim_mm if k == 0 else np.inf, beyond_rim=Status.OUTSIDE_LIMBUS)
         for k, (surface, index) in enumerate(zip(surfaces, indices, strict=True))
     ]
-    ndim = max(target[0].ndim, viewpoint[0].ndim)
-    frame = graphs_of(surfaces, ndim)
-    if frame is None:
-        return _launched(
-            path, n_outside, viewpoint, target, _from_connection(connect(path, n_outside, viewpoint, target, target))
-        )
-    graphs, origin, rotation = frame
-    plain = not np.any(origin) and np.array_equal(rotation, np.broadcast_to(np.eye(3), rotation.shape))
-    inner = target if plain else turn_back(rotation, shift(target, origin, -1.0))
-    outer = viewpoint if plain else turn_back(rotation, shift(viewpoint, origin, -1.0))
-    ladder = [n_outside, *(fit(n, ndim) for n in indices)]
-    points = stationary_path(graphs, ladder, outer, inner, _paraxial_start(graphs, ladder, outer, inner)).points
-    first = points[0] if plain else shift(turn(rotation, points[0]), origin, 1.0)
-    return _launched(
-        path,
-        n_outside,
-        viewpoint,
-        target,
-        _confirmed(path, n_outside, viewpoint=viewpoint, target=target, first=first, aim=target),
-    )
+    graphs = graphs_of(*surfaces)
+    if graphs is None:
+        rays = _from_connection(connect(path, n_outside, viewpoint, target, target))
+    else:
+        ladder = np.stack(np.broadcast_arrays(*(np.atleast_1d(n) for n in (n_outside, *indices))), axis=-1)
+        rays, found, _ = _joined(refract_all, graphs, ladder, rim_mm, viewpoint, target)
+        if not found.all():
+            rays = _searched(path, n_outside, viewpoint, target, target, rays, ~found)
+    return _launched(path, n_outside, viewpoint, target, rays)
 
 
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
     """Compute `mirror_points` on components."""
     path = (Crossing(surface, 1.0, reflects=True, rim_mm=rim_mm, beyond_rim=Status.OUTSIDE_LIMBUS),)
-    guess = mirror_start(surface, source, viewpoint)
-    frame = graphs_of([surface], guess[0].ndim)
-    if frame is None:
-        return _from_connection(connect(path, 1.0, viewpoint, source, guess))
-    graphs, origin, rotation = frame
-    outer, other, start = (turn_back(rotation, shift(p, origin, -1.0)) for p in (viewpoint, source, guess))
-    points = stationary_path(graphs, [1.0, 1.0], outer, other, [(start[1], start[2])]).points
-    hopeless = _far_beyond(path[0], guess)
-    return _confirmed(
-        path,
-        1.0,
-        viewpoint=viewpoint,
-        target=source,
-        first=shift(turn(rotation, points[0]), origin, 1.0),
-        aim=guess,
-        hopeless=hopeless,
-    )
+    graphs = graphs_of(surface)
+    if graphs is None:
+        return _from_connection(connect(path, 1.0, viewpoint, source, components(apex_of(surface))))
+    rays, found, guess = _joined(mirror_all, graphs, np.ones((1, 2)), rim_mm, viewpoint, source)
+    return rays if found.all() else _searched(path, 1.0, viewpoint, source, guess, rays, ~found)
 
 
-def _far_beyond(crossing: Crossing, guess: Xyz) -> Bools:
-    """Whether the first guess of a mirror point is so far outside the rim that the point cannot be on the surface."""
-    surface, rim, ndim = crossing.surface, crossing.rim_mm, guess[0].ndim
-    if isinstance(rim, float) and rim == np.inf:
-        return np.zeros(guess[0].shape, dtype=bool)
-    gradient = surface.gradient_at(guess)
-    facing = sum(fit(surface.rotation[..., i, 0], ndim) * gradient[i] for i in range(3))
-    limit = rim if isinstance(rim, float) else fit(np.asarray(rim), ndim)
-    return np.asarray((facing <= 0.0) | (surface.axis_distance(guess) > 1.25 * limit))
-
-
-def _confirmed(
-    path: Sequence[Crossing],
-    n_start: FloatLike,
-    *,
+def _joined(
+    solver: Callable[..., None],
+    graphs: Graphs,
+    ladder: Floats,
+    rim_mm: FloatLike,
     viewpoint: Xyz,
     target: Xyz,
-    first: Xyz,
-    aim: Xyz,
-    hopeless: Bools | None = None,
-) -> Rays:
-    """Trace from the viewpoint over the points `first` of the first surface, and search again what misses the target.
+) -> tuple[Rays, Bools, Xyz]:
+    """Rays of a compiled solver, which of them it has found, and the first guesses of mirror points."""
+    shape = np.broadcast_shapes(*(p.shape for p in (*viewpoint, *target)))
+    full = shape or (1,)
+    if not graphs.plain:
+        viewpoint, target = (turn_back(graphs.rotation, shift(p, graphs.origin_mm, -1.0)) for p in (viewpoint, target))
+    state = np.empty((full[0], int(np.prod(full[1:], dtype=np.intp))), dtype=np.int8)
+    out = np.empty((RESULTS, *state.shape))
+    rims = np.array(np.atleast_1d(rim_mm), dtype=np.float64)
+    ends = _rows(viewpoint, full), _rows(target, full)
+    solver(graphs.kinds, graphs.numbers, graphs.table, ladder, rims, *ends, out, state)
+    values = out.reshape(RESULTS, *shape)
+    exits, way, end, guess = ((values[k], values[k + 1], values[k + 2]) for k in (EXIT, WAY, END, GUESS))
+    if not graphs.plain:
+        exits, guess = (shift(turn(graphs.rotation, p), graphs.origin_mm, 1.0) for p in (exits, guess))
+        way, end = turn(graphs.rotation, way), turn(graphs.rotation, end)
+    status = state.reshape(shape)
+    return Rays(exits, way, end, values[RESIDUAL], status), status != LOST, guess
 
-    `hopeless` rays are not searched: if they meet the surface at all, they meet it beyond its rim.
-    """
-    with np.errstate(all="ignore"):
-        way = unit(minus(first, viewpoint))
-        gradient = path[0].surface.gradient_at(first)
-        found = np.asarray(dot(gradient, way) < 0.0)
-        index, end, passes = cross(path[0], gradient, way, n_start)
-        found &= passes
-        point = first
-        for crossing in path[1:]:
-            hit = crossing.surface.hit(point, end, crossing.inward)
-            index, end, passes = cross(crossing, hit.gradient, end, index)
-            found &= hit.ok & passes
-            point = hit.point
-        gap = minus(target, point)
-        along = dot(gap, end)
-        miss = moved(gap, end, -along)
-        residual = np.sqrt(dot(miss, miss))
-        reach: FloatLike = SURE_MM
-        if path[0].reflects:
-            residual = residual * nearness(along)
-            # A distant source magnifies Newton's remaining error of the mirror point.
-            reach = np.minimum(SURE_MM + 1e-15 * along * along, RESIDUAL_LIMIT_MM)
-        found &= (residual <= reach) & (along > 0.0)
-    status = np.zeros(residual.shape, dtype=np.int8)
-    if hopeless is not None:
-        status[hopeless & ~found] = path[0].beyond_rim or Status.MISSED
-        found |= hopeless
-    mark(status, ~inside_rim(path[0], first), path[0].beyond_rim or Status.MISSED)
-    rays = Rays(first, way, end, residual, status)
-    return rays if found.all() else _searched(path, n_start, viewpoint, target, aim, rays, ~found)
+
+def _rows(point: Xyz, full: tuple[int, ...]) -> Floats:
+    """Points (3, 1 or n, 1 or m) of components that broadcast to (n, ...), m being the size of its further axes."""
+    own = np.broadcast_shapes(*(axis.shape for axis in point))
+    own = (1,) * (len(full) - len(own)) + own
+    if any(size != 1 for size in own[1:]):
+        own = (own[0], *full[1:])
+    out = np.empty((3, *own))
+    for row, axis in zip(out, point, strict=True):
+        row[...] = axis
+    return out.reshape(3, own[0], -1)
 
 
 def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target: Xyz, rays: Rays) -> Rays:
@@ -328,64 +284,6 @@ def _searched(
 
 def _from_connection(found: Connection) -> Rays:
     return Rays(found.first, found.start, found.end, found.residual_mm, found.status)
-
-
-def _paraxial_start(
-    graphs: Sequence[Graph], ladder: Sequence[FloatLike], viewpoint: Xyz, target: Xyz
-) -> list[tuple[Floats, Floats]]:
-    """First guesses (y, z) on each surface, outside in.
-
-    On the outermost surface the guess is the straight line's point, moved by m = 1 / (1 - d (n - 1) / (n R)) away from
-    the line through the viewpoint and the centre of curvature, which is not refracted; d is the object's depth, n its
-    index. On the other surfaces it is on the straight line from there to the object.
-    """
-    zero = np.zeros((1,) * target[0].ndim)
-    with np.errstate(all="ignore"):
-        apex = graphs[0].jet(zero, zero)
-        radius = -1.0 / apex.yy
-        centre = apex.x - radius
-        n = ladder[-1] / ladder[0]
-        bend = (n - 1.0) / (n * radius)
-        above = 1.0 / (viewpoint[0] - centre)
-        beyond = 1.0 / (viewpoint[0] - target[0])
-        y, z = target[1], target[2]
-        for _ in range(2):
-            height = graphs[0].height(y, z)
-            height = np.where(np.isfinite(height), height, apex.x)
-            depth = height - target[0]
-            draw = 1.0 / (1.0 - depth * bend)
-            share = depth * beyond
-            # y = (1 - draw) y_line + draw (y_t + share (y_v - y_t)), gathered.
-            far = (1.0 - draw) * (height - centre) * above + draw * share
-            near = draw - draw * share
-            y, z = far * viewpoint[1] + near * target[1], far * viewpoint[2] + near * target[2]
-        out = [(y, z)]
-        for graph in graphs[1:]:
-            inner = graph.height(y, z)
-            part = (height - np.where(np.isfinite(inner), inner, height)) / depth
-            out.append((y + part * (target[1] - y), z + part * (target[2] - z)))
-    return out
-
-
-def mirror_start(surface: Surface, source: Xyz, viewpoint: Xyz) -> Xyz:
-    """First guess of a mirror point: where the bisector through the apex' centre of curvature meets the surface.
-
-    It is exact on a sphere for source and viewpoint at infinity.
-    """
-    ndim = max(source[0].ndim, viewpoint[0].ndim)
-    shape = np.broadcast_shapes(source[0].shape, viewpoint[0].shape)
-    apex = components(apex_of(surface))
-    gradient, hessian = surface.gradient_at(apex), surface.hessian_at(apex)
-    size = np.sqrt(dot(gradient, gradient))
-    normal = (gradient[0] / size, gradient[1] / size, gradient[2] / size)
-    trace = np.asarray(hessian.xx) + np.asarray(hessian.yy) + np.asarray(hessian.zz)
-    radius = 2.0 * size / (trace - dot(normal, hessian.times(normal)))
-    centre = join((apex[0] - radius * normal[0], apex[1] - radius * normal[1], apex[2] - radius * normal[2]))
-    to_source, to_viewpoint = unit(shift(source, centre, -1.0)), unit(shift(viewpoint, centre, -1.0))
-    bisector = (to_source[0] + to_viewpoint[0], to_source[1] + to_viewpoint[1], to_source[2] + to_viewpoint[2])
-    reach = fit(np.asarray(radius), ndim) / np.sqrt(np.maximum(dot(bisector, bisector), 1e-300))
-    x, y, z = shift((reach * bisector[0], reach * bisector[1], reach * bisector[2]), centre, 1.0)
-    return np.broadcast_to(x, shape), np.broadcast_to(y, shape), np.broadcast_to(z, shape)
 
 
 def apex_of(surface: Surface) -> Floats:

@@ -24,10 +24,16 @@ def parameters_from_conic(conic):
         cx, cy = (b * e - 2.0 * c * d) / det, (b * d - 2.0 * a * e) / det
         level = -(f + 0.5 * (d * cx + e * cy))  # value of the quadratic form on the boundary
         scale = 4.0 * level / det
-        semi_a, semi_b, angle = el._axes_from_shape_matrix(scale * c, -0.5 * scale * b, scale * a)
+        values, vectors = np.linalg.eigh(np.nan_to_num(_matrices(scale * c, -0.5 * scale * b, scale * a)))
+        semi_b, semi_a = np.moveaxis(np.sqrt(values), -1, 0)
+        angle = el.wrap_angle(np.arctan2(vectors[..., 1, 1], vectors[..., 0, 1]))
     real = (det > 0.0) & (level * (a + c) > 0.0)
     nan = np.where(real, 1.0, np.nan)
     return np.stack([cx * nan, cy * nan], axis=-1), np.stack([semi_a * nan, semi_b * nan], axis=-1), angle * nan
+
+
+def _matrices(xx, xy, yy):
+    return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-1)
 
 
 def _random(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
-from eyerender.eye.build import surface_of
 from eyerender.eye.corneas import WINDOW, grid_surface, zernike_surface
 from eyerender.eye.parts import PlacedSpec
+from eyerender.eye.surfaces import surface_of
 from eyerender.geometry.surfaces import components
 from eyerender.geometry.topography import smooth_heights, spline_coefficients
 from eyerender.geometry.zernike import mirrored, orders, zernike

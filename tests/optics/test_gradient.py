@@ -154,8 +154,8 @@ def test_half_the_step_leaves_the_chief_ray_where_it_is(monkeypatch):
     spec, rays = load_eye("E5"), []
     for steps in (gradient.STEPS // 2, gradient.STEPS, 2 * gradient.STEPS, 8 * gradient.STEPS):
         monkeypatch.setattr(gradient, "STEPS", steps)
-        # Landmarks are kept by what the file says: another name is another eye.
-        rays.append(spec.model_copy(update={"name": f"E5 in {steps} steps"}).build().chief_ray.direction)
+        # Landmarks are kept by what the file says: another description is another eye.
+        rays.append(spec.model_copy(update={"description": f"{steps} steps"}).build().chief_ray.direction)
     coarse, used, fine = (np.degrees(np.linalg.norm(ray - rays[-1])) for ray in rays[:3])
     assert np.degrees(np.linalg.norm(rays[1] - rays[2])) < 1e-5
     assert used < 2e-6
