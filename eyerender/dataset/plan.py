@@ -26,7 +26,7 @@ from ..eye.spec import EyeSpec
 from ..eye.topography import topography_files
 from ..observation import EYES
 from ..population.model import SIDES
-from ..population.people import PersonChoice
+from ..population.people import PersonChoice, choice_of
 from ..scene import Scene
 from ..scene.spec import SceneSpec
 from .draws import is_draw, unit_number
@@ -70,7 +70,7 @@ class Sample:
         spec = SceneSpec.from_mapping(self.scene, source=f"sample {self.turn.sample}")
         eye = _eye(json.dumps(self.eye, sort_keys=True)) if self.eye else None
         scene = Scene.compiled(spec, eye, base=self.base)
-        for side in EYES if eye is None else EYES[:1]:
+        for side in spec.subject.eyes if eye is None else EYES[:1]:
             scene.eye(side)
         return scene
 
@@ -347,7 +347,8 @@ class Plan:
         seed = self.spec.seed
         if attempt:
             seed = int(unit_number(seed, "population", "subject", subject, attempt) * 2**53)
-        return PersonChoice.from_mapping({**self.spec.population.to_mapping(), "seed": seed, "subject": subject})
+        choice = {**self.spec.population.to_mapping(), "seed": seed, "subject": subject}
+        return choice_of(json.dumps(choice, sort_keys=True))
 
     def _eye_of(self, tree: Mapping[str, Any], turn: Turn) -> tuple[dict[str, Any], dict[str, Any], bool]:
         if self.spec.population is not None:

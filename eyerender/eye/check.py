@@ -9,9 +9,9 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..errors import InputError, Refuse
+from ..geometry.graphs import express
 from ..geometry.surfaces import Surface, components
 from ..geometry.surfaces_measured import Measured
-from .build import gradient_geometry, stop_of, stop_reach_mm
 from .corneas import WINDOW, grid_surface, misfit_mm, zernike_surface
 from .model import Stop
 from .parts import (
@@ -27,6 +27,8 @@ from .parts import (
     SurfaceLensSpec,
     ZernikeSpec,
 )
+from .stop import stop_of, stop_reach_mm
+from .surfaces import gradient_geometry, surface_of
 
 _TOUCH_MM = 1e-6
 _BULGE_MM = 0.5
@@ -83,8 +85,6 @@ def _check_widths(spec: EyeParts, refuse: Refuse, pupil_radius_mm: float) -> Non
 
 def _check_cornea(spec: EyeParts, refuse: Refuse, stop: Stop) -> None:
     """Check that the cornea's surfaces reach the limbus and follow each other, before the plane of the iris."""
-    from .build import surface_of
-
     cornea = [(f"cornea.{k}", surface_of(s)) for k, s in enumerate(spec.cornea)]
     wide = _disc(spec.limbus_radius_mm, np.zeros(2))
     depth_wide = _stop_depth(stop.centre_mm, stop.normal, wide)
@@ -103,8 +103,6 @@ def _check_cornea(spec: EyeParts, refuse: Refuse, stop: Stop) -> None:
 
 def _check_inside(spec: EyeParts, refuse: Refuse, stop: Stop, pupil_radius_mm: float) -> None:
     """Check that inner cornea, stop, lens and retina follow each other within the pupil."""
-    from .build import surface_of
-
     narrow = _disc(pupil_radius_mm, stop.centre_mm[1:])
     depth = _depth(surface_of(spec.cornea[-1]), narrow)
     if not (depth > _stop_depth(stop.centre_mm, stop.normal, narrow)).all():
@@ -130,6 +128,9 @@ def _check_inside(spec: EyeParts, refuse: Refuse, stop: Stop, pupil_radius_mm: f
 
 def _depth(surface: Surface, grid: Floats) -> Floats:
     """Depth x (mm, eye frame) of the surface over points (y, z), (m, 2) -> (m,); NaN where the line misses it."""
+    graphs = express(surface)
+    if graphs is not None and graphs.plain:
+        return graphs.heights(*grid.T)[0]
     start = np.column_stack([np.full(len(grid), _FAR_MM), grid])
     hit = surface.hit(components(start), components(np.broadcast_to([-1.0, 0.0, 0.0], start.shape)), inward=True)
     return np.where(hit.ok, _FAR_MM - hit.distance, np.nan)

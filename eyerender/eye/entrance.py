@@ -83,8 +83,11 @@ def stop_for_entrance(
     def miss(diameter: float) -> float:
         return _diameter(front, indices, stop_of(diameter), points) - entrance_mm
 
-    low, high = entrance_mm / 1.2, entrance_mm / 1.12
-    f_low, f_high = miss(low), miss(high)
+    low = entrance_mm / 1.13
+    f_low = miss(low)
+    # The cornea enlarges stops of all diameters almost alike.
+    high = low * entrance_mm / (entrance_mm + f_low)
+    f_high = miss(high)
     for _ in range(_STEPS):
         if abs(f_high) < _SETTLED_MM:
             return high

@@ -25,6 +25,7 @@ import numpy as np
 from ..arrays import ArrayValue, Floats, frozen, remembered
 from ..geometry.vectors import crosses
 from .entrance import entrance_pupil
+from .landmarks import incident_node
 from .model import EyeModel
 
 EDGE = 1.25  # half width of the grid, in semi-axes of the stop; uneven margins reach beyond 1
@@ -155,7 +156,7 @@ def retinal_scale_mm(eye: EyeModel) -> float:
     invariant. An eye with a lens is nearly in focus; then it is the distance of the nodes from the fovea.
     """
     if eye.back:
-        return float(np.linalg.norm(eye.fovea_mm - eye.incident_node_mm))
+        return float(np.linalg.norm(eye.fovea_mm - incident_node(eye)))
     depth = float(np.linalg.norm(eye.fovea_mm - eye.stop.centre_mm))
     return depth * entrance_pupil(eye)[1] / float(eye.front_indices[-1])
 

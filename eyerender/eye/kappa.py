@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..geometry.transforms import normalize
 from ..optics.trace import inward_path, trace
 from ..status import Status
-from .landmarks import field_direction, fovea_by_nodal_ray, path_to_retina
+from .landmarks import field_direction, fovea_by_nodal_ray, incident_node, path_to_retina
 from .model import EyeModel
 from .parts import FoveaSpec
 from .spec import EyeSpec
@@ -101,10 +101,10 @@ def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: flo
     wanted = eye.fovea_mm if fovea_mm is None else fovea_mm
 
     def miss(field: Floats) -> Floats:
-        return (fovea_by_nodal_ray(eye, eye.incident_node_mm, field, distance_mm) - wanted)[1:]
+        return (fovea_by_nodal_ray(eye, incident_node(eye), field, distance_mm) - wanted)[1:]
 
     # A nodal ray has the same direction on both sides, so it starts near that of the fovea from the node.
-    field = _angles(eye, normalize(eye.incident_node_mm - wanted)) * [_handed(eye), 1.0]
+    field = _angles(eye, normalize(incident_node(eye) - wanted)) * [_handed(eye), 1.0]
     for _ in range(_STEPS):
         error = miss(field)
         if np.abs(error).max() < _SETTLED_MM:

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, remembered, sealed
 from ..errors import InputError
 from ..geometry.surfaces import components, join
-from ..geometry.transforms import normalize, read_only
+from ..geometry.transforms import flip_y, normalize, read_only
 from ..optics.gradient import GradientMedium
 from ..optics.shooting import connect
 from ..optics.trace import Crossing, Traced, outward_path, trace
@@ -96,6 +96,7 @@ def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
     return tuple(replace(c, rim_mm=np.inf, beyond_rim=Status.MISSED) for c, met in zip(path, moved, strict=True) if met)
 
 
+@remembered
 def incident_node(eye: EyeModel) -> Floats:
     """Incident node (3,): the waist of a ring of nodal rays.
 
@@ -104,7 +105,11 @@ def incident_node(eye: EyeModel) -> Floats:
     it, and off the axis where surfaces are tilted or decentred. (Harris 2010, "Nodes and nodal points and lines in eyes
     and other optical systems", Ophthalmic Physiol. Opt. 30, 24-42: an aspheric or tilted eye has no nodal point, but a
     waist.)
+
+    That of a left eye is the mirror image of the right eye's.
     """
+    if eye.side == "left":
+        return sealed(flip_y(incident_node(eye.mirrored())))
     angle = 2.0 * np.pi * np.arange(NODE_RAYS) / NODE_RAYS
     ring = np.radians(NODE_RING_DEG) * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
     objects = NODE_DISTANCE_MM * field_direction(ring)
@@ -116,7 +121,7 @@ def incident_node(eye: EyeModel) -> Floats:
     square = 1.0 - cosine**2
     s, t = (cosine * along_j - along_i) / square, (along_j - cosine * along_i) / square
     middle = 0.5 * (objects[i] + s[:, None] * directions[i] + objects[j] + t[:, None] * directions[j])
-    return np.asarray(np.mean(middle, axis=0))
+    return sealed(np.mean(middle, axis=0))
 
 
 def fovea_by_nodal_ray(eye: EyeModel, node_mm: Floats, field_rad: Floats, distance_mm: float) -> Floats:

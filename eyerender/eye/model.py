@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..arrays import ArrayValue, Bools, FloatLike, Floats
 from ..geometry.surfaces import Surface, Xyz, components, fit, shift, turn_back
-from ..geometry.transforms import read_only
+from ..geometry.transforms import flip_y, mirror_rotation, read_only
 from ..optics.gradient import GradientMedium
 from .parts import Side
 
@@ -165,7 +165,6 @@ class EyeModel(ArrayValue):
         sclera: sphere of the sclera.
         rotation: centres of rotation.
         fovea_mm: (3,).
-        incident_node_mm: (3,).
         chief_ray: the fixed ray in air that reaches the fovea through the stop's centre.
         lens_gradient: medium of a gradient lens that is not made of shells.
     """
@@ -186,7 +185,6 @@ class EyeModel(ArrayValue):
     sclera: Sphere
     rotation: RotationCentres
     fovea_mm: Floats
-    incident_node_mm: Floats
     chief_ray: LineOfSight
     lens_gradient: GradientMedium | None = None
 
@@ -199,3 +197,31 @@ class EyeModel(ArrayValue):
         if len(self.back) > 1:
             orders += [3, 4]
         return tuple(orders)
+
+    def mirrored(self) -> EyeModel:
+        """Mirror the eye to the other side: every point (x, y, z) -> (x, -y, z)."""
+        side: Side = "left" if self.side == "right" else "right"
+        stop, centres, ray = self.stop, self.rotation, self.chief_ray
+
+        def flipped(points: Floats) -> Floats:
+            return read_only(flip_y(points))
+
+        return replace(
+            self,
+            side=side,
+            front=tuple(s.mirrored() for s in self.front),
+            back=tuple(s.mirrored() for s in self.back),
+            retina=self.retina.mirrored(),
+            stop=replace(
+                stop, centre_mm=flip_y(stop.centre_mm), rotation=mirror_rotation(stop.rotation), handed=-stop.handed
+            ),
+            sclera=replace(self.sclera, centre_mm=flipped(self.sclera.centre_mm)),
+            rotation=RotationCentres(
+                flipped(centres.azimuth_centre_mm),
+                flipped(centres.elevation_centre_mm),
+                flipped(centres.torsion_centre_mm),
+            ),
+            fovea_mm=flipped(self.fovea_mm),
+            chief_ray=LineOfSight(flipped(ray.point_mm), flipped(ray.direction)),
+            lens_gradient=None if self.lens_gradient is None else self.lens_gradient.mirrored(),
+        )

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
-from ..eye.build import bare_eye, index_at, stop_of, surface_of
+from ..eye.build import bare_eye
+from ..eye.check import check_eye
 from ..eye.entrance import stop_for_entrance
 from ..eye.kappa import fovea_of_kappa
 from ..eye.margin import drawn_contour
 from ..eye.parts import EyeParts
 from ..eye.spec import EyeSpec
+from ..eye.stop import stop_of
+from ..eye.surfaces import index_at, surface_of
+from ..geometry.surfaces import Surface
 from .pupil import ellipticity
 from .refraction import AQUEOUS, CORNEA, LENS, VITREOUS
 from .table import Table
@@ -67,33 +72,81 @@ def eye_file(
     Raises:
         InputError: the eye cannot exist: surfaces cross, or the stop lies outside the chamber.
     """
-    if not np.isfinite(eye["lens_c0"]):
-        raise InputError("no lens of this shape gives the eye its refraction", path="lens.surfaces.0.medium")
-    data = _mapping(name, eye, table, age_years, accommodation_d)
-    relaxed = _mapping(name, eye, table, age_years, 0.0)
-    data["fovea"] = _fovea(eye, relaxed, table.constant("refraction_nm"))
-    contour = drawn_contour(seed, eye["pupil_noncircularity"])
-    data["stop"]["contour"] = contour.to_mapping()
-    parts = EyeParts.from_mapping(data)
-    front = tuple(surface_of(s) for s in parts.cornea)
-    indices = tuple(index_at(s.medium, _DESIGN_NM, "cornea") for s in parts.cornea)
+    drawn = _accommodated(name, tuple(sorted(eye.items())), _Table(table), age_years, accommodation_d, seed)
 
     def shaped(diameter: float) -> Any:
         # The size at which the file's own pupil is, so that its shift is the same at every other size.
         flat, axis = ellipticity(diameter)
-        own = parts.stop.model_copy(update={"ellipticity": flat, "axis_deg": axis})
-        return stop_of(parts.model_copy(update={"stop": own}), diameter)
+        own = drawn.parts.stop.model_copy(update={"ellipticity": flat, "axis_deg": axis})
+        return stop_of(drawn.parts.model_copy(update={"stop": own}), diameter)
 
-    diameter = stop_for_entrance(front, indices, shaped, entrance_mm)
-    stop = shaped(diameter)
+    diameter = stop_for_entrance(drawn.front, drawn.indices, shaped, entrance_mm)
     flat, axis = ellipticity(diameter)
-    data["stop"] |= {
+    changes = {
         "diameter_mm": diameter,
-        "position_mm": [float(v) for v in stop.centre_mm],
+        "position_mm": tuple(float(v) for v in shaped(diameter).centre_mm),
         "ellipticity": flat,
         "axis_deg": axis,
     }
-    return EyeSpec.from_mapping(data)
+    stop = drawn.parts.stop.model_copy(update=changes)
+    # Every value is checked already, so that only the geometry is left to check.
+    found = EyeSpec.model_construct(**{**dict(drawn.parts), "stop": stop})
+    check_eye(found)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """A table that equals only itself, as a key of a cache."""
+
+    table: Table
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Table) and other.table is self.table
+
+    def __hash__(self) -> int:
+        return id(self.table)
+
+
+@dataclass(frozen=True, slots=True)
+class _Accommodated:
+    """A drawn eye at one accommodation, with its stop at the table's reference diameter.
+
+    Attributes:
+        parts: its eye file.
+        front: surfaces of the cornea.
+        indices: the index behind each.
+    """
+
+    parts: EyeParts
+    front: tuple[Surface, ...]
+    indices: tuple[float, ...]
+
+
+@lru_cache(maxsize=64)
+def _accommodated(
+    name: str,
+    numbers: tuple[tuple[str, float], ...],
+    table: _Table,
+    age_years: float,
+    accommodation_d: float,
+    seed: int,
+) -> _Accommodated:
+    """What all pupils of an eye share, kept because a person's frames differ in the pupil more often than in the lens.
+
+    Raises:
+        InputError: there is no such lens.
+    """
+    eye, constant = dict(numbers), table.table
+    if not np.isfinite(eye["lens_c0"]):
+        raise InputError("no lens of this shape gives the eye its refraction", path="lens.surfaces.0.medium")
+    data = _mapping(name, eye, constant, age_years, accommodation_d)
+    relaxed = _mapping(name, eye, constant, age_years, 0.0)
+    data["fovea"] = _fovea(eye, relaxed, constant.constant("refraction_nm"))
+    data["stop"]["contour"] = drawn_contour(seed, eye["pupil_noncircularity"]).to_mapping()
+    parts = EyeParts.from_mapping(data)
+    front = tuple(surface_of(s) for s in parts.cornea)
+    return _Accommodated(parts, front, tuple(index_at(s.medium, _DESIGN_NM, "cornea") for s in parts.cornea))
 
 
 def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, accommodation: float) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import fields
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -218,6 +218,30 @@ class PersonChoice(PopulationSpec):
     def chosen(self) -> Person:
         """The person."""
         return self.person(self.subject, self.seed)
+
+
+@lru_cache(maxsize=64)
+def choice_of(text: str) -> PersonChoice:
+    """The choice of a subject from its JSON."""
+    return PersonChoice.from_mapping(json.loads(text))
+
+
+@lru_cache(maxsize=64)
+def _chosen(text: str) -> Person:
+    return choice_of(text).chosen()
+
+
+def chosen_person(data: object) -> Person:
+    """The person of a mapping of `PersonChoice`, drawn once for all frames.
+
+    Raises:
+        InputError: the mapping is no choice, or hardly anybody meets its conditions.
+    """
+    try:
+        text = json.dumps(data, sort_keys=True)
+    except (TypeError, ValueError):
+        return PersonChoice.from_mapping(data).chosen()
+    return _chosen(text)
 
 
 def far_pupil_mm(table: Table, luminance: float, field: float, age_years: Floats, score: Floats | float) -> Floats:

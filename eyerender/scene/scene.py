@@ -381,6 +381,11 @@ class Scene:
             same = _responded(same, state, self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
         return _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
 
+    def eyes_of(self, index: Index) -> tuple[list[EyeModel], Indices]:
+        """Numeric eyes of an index, and which of them each row is; an eye that is not observed is not built."""
+        sides, which = np.unique(index.eye, return_inverse=True)
+        return [self.eye(EYES[side]) for side in sides], which
+
     @property
     def accommodation_d(self) -> float | None:
         """Dioptres to which the eyes accommodate; None where each frame's target is in focus, as far as it can be."""
@@ -458,9 +463,10 @@ class Scene:
         # All cameras see the same pose, so each head position, fixation and eye is solved once.
         keys = np.stack([index.head, index.fixation, index.eye], axis=-1)
         _, rows, back = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        eyes, which = self.eyes_of(index)
         found = fixations(
-            [self.eye(side) for side in EYES],
-            index.eye[rows],
+            eyes,
+            which[rows],
             index.target_mm[rows],
             index.eye_position_mm[rows] + index.head_mm[rows],
             self.spec.eye.line_of_sight,

@@ -17,7 +17,7 @@ from ..eye.model import EyeModel
 from ..eye.parts import Side
 from ..eye.spec import EyeSpec
 from ..observation import MAX_GLINTS
-from ..population.people import Person, PersonChoice
+from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
 from ..rig.imaging import Ambient, Lens, Motion
@@ -345,8 +345,7 @@ def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:
         raise InputError("cannot stand beside a population, which gives the person", path="person")
     given = data["population"]
     try:
-        choice = PersonChoice.from_mapping(given.to_mapping() if isinstance(given, Spec) else given)
-        person = choice.chosen()
+        person = chosen_person(given.to_mapping() if isinstance(given, Spec) else given)
     except InputError as error:
         raise error.placed(under="population") from None
     return with_person({key: value for key, value in data.items() if key != "population"}, person)

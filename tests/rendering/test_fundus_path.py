@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eyerender.eye.build import surface_of
+from eyerender.eye.surfaces import surface_of
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.fundus import Spread, fundus_light
 from eyerender.eye.model import Sphere

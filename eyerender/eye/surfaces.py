@@ -1,0 +1,169 @@
+"""Surfaces and media of an eye file."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ..arrays import FloatLike, Floats
+from ..errors import InputError
+from ..geometry.surfaces import Surface
+from ..geometry.surfaces_biconic import Biconic
+from ..geometry.surfaces_quadric import Quadric
+from ..geometry.transforms import read_only, tilt_rotation
+from ..optics.gradient import GradientMedium
+from ..optics.media import CauchyMedium, ConstantMedium, Medium
+from .corneas import grid_surface, zernike_surface
+from .model import Sphere
+from .parts import (
+    LARGEST_INDEX,
+    BiconicSpec,
+    ConicSpec,
+    EllipsoidSpec,
+    EyeParts,
+    GradientLensSpec,
+    GridSpec,
+    MediumSpec,
+    PlacedSpec,
+    PlaneSpec,
+    QuadricSpec,
+    SphereSpec,
+    ZernikeSpec,
+)
+from .shells import SHELLS, Layers, even_layers, lens_shells
+
+
+@lru_cache(maxsize=64)
+def surface_of(placed: PlacedSpec) -> Surface:
+    """Build a placed shape as a surface of the eye frame; equal shapes are the same object."""
+    shape = placed.shape
+    rotation = tilt_rotation(np.radians(placed.tilt_deg))
+    position = np.array(placed.position_mm)
+    if isinstance(shape, PlaneSpec):
+        return Quadric.plane(position, rotation)
+    if isinstance(shape, SphereSpec | ConicSpec):
+        conic_constant = shape.conic_constant if isinstance(shape, ConicSpec) else 0.0
+        return Quadric.conic(shape.radius_mm, conic_constant, position, rotation)
+    if isinstance(shape, BiconicSpec):
+        return Biconic(
+            origin_mm=position,
+            rotation=rotation,
+            radii_mm=np.array(shape.radii_mm),
+            conic_constants=np.array(shape.conic_constants),
+        )
+    if isinstance(shape, ZernikeSpec):
+        return zernike_surface(shape).placed(position, rotation)
+    if isinstance(shape, GridSpec):
+        return grid_surface(shape).placed(position, rotation)
+    if isinstance(shape, EllipsoidSpec):
+        front = shape.side == "front"
+        lead = shape.semi_axes_mm[0] * (-1.0 if front else 1.0)
+        return Quadric.ellipsoid(shape.semi_axes_mm, position + rotation[:, 0] * lead, rotation, front)
+    return _general_quadric(shape, position, rotation)
+
+
+def _general_quadric(shape: QuadricSpec, position: Floats, rotation: Floats) -> Quadric:
+    a, b, c, d, e, f, g, h, i, k = shape.coefficients
+    # The scale makes the size of rounding depend on distances, not on the unit of the coefficients.
+    scale = max(abs(v) for v in (a, b, c, d, e, f)) or max(abs(v) for v in (g, h, i))
+    if b == c and d == e == f == 0.0 and b != 0.0:
+        scale = abs(b)
+    matrix = np.array([[a, d, e], [d, b, f], [e, f, c]]) / scale
+    sign = 1.0 if shape.side == "front" else -1.0
+    return Quadric.oriented(matrix, np.array([g, h, i]) / scale, np.array(k / scale), sign, position, rotation)
+
+
+def medium_of(spec: MediumSpec) -> Medium:
+    """Build the medium that a spec describes."""
+    if spec.cauchy is not None:
+        return CauchyMedium(*spec.cauchy)
+    return ConstantMedium(1.0 if spec.index is None else spec.index)
+
+
+def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
+    """Index at a wavelength.
+
+    Raises:
+        InputError: the index is below 1.
+    """
+    index = medium_of(spec).index(wavelength_nm)
+    if not 1.0 <= index <= LARGEST_INDEX:
+        raise InputError(
+            f"the index at {wavelength_nm:g} nm is {index:.6g}; must be >= 1 and <= {LARGEST_INDEX:g}", path=path
+        )
+    return index
+
+
+def sclera_of(spec: EyeParts, cornea: Surface) -> Sphere:
+    """Sclera: the sphere through the limbus circle, centred on the cornea's axis unless the file gives the centre."""
+    radius = spec.sclera.radius_mm
+    if spec.sclera.centre_mm is not None:
+        return Sphere(read_only(spec.sclera.centre_mm), radius)
+    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    rim = spec.limbus_radius_mm
+    depth = float(np.mean(cornea.sag(rim * np.cos(angle), rim * np.sin(angle))))
+    local = np.array([depth - np.sqrt(max(radius**2 - rim**2, 0.0)), 0.0, 0.0])
+    return Sphere(read_only(cornea.to_eye(local)), radius)
+
+
+def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]:
+    """Geometry of a gradient lens: (front, back, centre (3,)).
+
+    Raises:
+        InputError: the surfaces cannot be those of a gradient lens.
+    """
+    for name, shape in (("front", lens.front.shape), ("back", lens.back.shape)):
+        if not isinstance(shape, SphereSpec | ConicSpec | BiconicSpec):
+            raise InputError("a gradient lens must be made of spheres, conics or biconics", path=f"lens.{name}.shape")
+        if lens.shells is None and lens.layers is None and isinstance(shape, BiconicSpec):
+            raise InputError("give a number: a gradient lens of biconics is traced as shells", path="lens.shells")
+    if lens.shells is not None and lens.layers is not None:
+        raise InputError("give either 'shells' or 'layers'", path="lens.layers")
+    for k, (outer, inner) in enumerate(pairwise(lens.layers or ()), start=1):
+        if inner.size > outer.size:
+            raise InputError("must be <= the size of the layer around it", path=f"lens.layers.{k}.size")
+    front, back = surface_of(lens.front), surface_of(lens.back)
+    if lens.centre_mm is None:
+        centre = front.origin_mm + lens.centre_fraction * (back.origin_mm - front.origin_mm)
+    else:
+        centre = np.array(lens.centre_mm)
+        if not (front.implicit(centre) < 0.0 < back.implicit(centre)):
+            raise InputError("must lie between the lens' front and its back", path="lens.centre_mm")
+    return front, back, centre
+
+
+def gradient_lens(
+    lens: GradientLensSpec, wavelength_nm: float
+) -> tuple[tuple[Surface, ...], tuple[FloatLike, ...], tuple[FloatLike, ...], GradientMedium | None]:
+    """Surfaces of a gradient lens outside in, the index behind each, their rims, and the medium (None for shells)."""
+    front, back, centre = gradient_geometry(lens)
+    edge, core, vitreous = (
+        index_at(medium, wavelength_nm, f"lens.{name}")
+        for name, medium in (("edge", lens.edge), ("core", lens.core), ("vitreous", lens.vitreous))
+    )
+    rim = _equator_radius(front, back)
+    if isinstance(front, Quadric) and isinstance(back, Quadric) and lens.shells is None and lens.layers is None:
+        medium = GradientMedium.between(front, back, centre, edge, core)
+        return (front, back), (edge, vitreous), (rim, rim), medium
+    if lens.layers is None:
+        layers = even_layers(lens.shells or SHELLS)
+    else:
+        layers = Layers(*np.array([(layer.size, layer.index_share) for layer in lens.layers]).T)
+    return *lens_shells(front, back, centre, (edge, core, vitreous), rim, layers), None
+
+
+def _equator_radius(front: Surface, back: Surface) -> float:
+    """Distance from the axis (mm) where the outer front and back surfaces meet; infinite if they do not."""
+    thickness = float(np.linalg.norm(front.origin_mm - back.origin_mm))
+
+    def gap(r: float) -> float:
+        height, zero = np.array(r), np.array(0.0)
+        return float(thickness + front.sag(height, zero) - back.sag(height, zero))
+
+    reach = 0.1
+    while reach < 20.0 and gap(reach) > 0.0:
+        reach += 0.1
+    return float(brentq(gap, reach - 0.1, reach)) if gap(reach) <= 0.0 else np.inf
