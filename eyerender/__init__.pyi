@@ -32,6 +32,7 @@ from .eye.topography import read_topography as read_topography
 from .folders.imagefolder import ImageFolder as ImageFolder
 from .imaging.capture import EyeImage as EyeImage
 from .imaging.capture import render_windows as render_windows
+from .imaging.causes import budget_steps as budget_steps
 from .imaging.comparison import Comparison as Comparison
 from .imaging.comparison import compare as compare
 from .imaging.imageobserver import ImageObserver as ImageObserver

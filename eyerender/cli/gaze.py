@@ -81,7 +81,7 @@ def fit(
         index=index,
         recalibration=recalibration,
     )
-    targets = _chosen(fixations)
+    targets = fixation_list(fixations)
     heed = Heed(strict)
     observations, built = load_observations(records, _scene(scene, heed), rig=rig, columns=columns)
     fitted, summary = fit_estimator(chosen, observations, built, targets, source=str(records), warn=heed)
@@ -144,7 +144,12 @@ def _scene(name: str | None, heed: Heed) -> Scene | None:
     return scene
 
 
-def _chosen(text: str | None) -> list[int] | None:
+def fixation_list(text: str | None) -> list[int] | None:
+    """Parse fixations such as '0,4,8'; None for none.
+
+    Raises:
+        InputError: they are not whole numbers.
+    """
     if text is None:
         return None
     try:

@@ -18,6 +18,7 @@ from ..errors import MAX_MESSAGE, EyerenderError, InputError, one_line
 # Importing them registers their commands.
 from . import (  # noqa: F401
     benchmark,
+    budget,
     dataset,
     environment,
     export,

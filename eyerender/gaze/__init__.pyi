@@ -1,3 +1,7 @@
+from .budget import IMAGE_CAUSES as IMAGE_CAUSES
+from .budget import Cause as Cause
+from .budget import ErrorBudget as ErrorBudget
+from .budget import budget as budget
 from .columns import CsvColumns as CsvColumns
 from .crossratio import CrossRatio as CrossRatio
 from .estimate import GazeEstimator as GazeEstimator

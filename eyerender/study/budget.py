@@ -17,9 +17,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
 
 from ..arrays import Floats
+from ..gaze.budget import mean_interval
 from .results import ModelResults
 
 ALGORITHM, EYE, IMAGE, NOISE, BOTH = "algorithm", "eye model", "image", "noise", "image and noise"
@@ -104,10 +104,3 @@ def _name(observer: str, steps: Mapping[str, Floats]) -> str:
     if observer == "image-noiseless":
         return IMAGE
     return NOISE if "image-noiseless" in steps else BOTH
-
-
-def mean_interval(values: Floats) -> tuple[float, float, float]:
-    """Mean of values (n,), n >= 2, such as paired differences, and its 95 % interval."""
-    n, mean = len(values), float(values.mean())
-    half = float(student.ppf(0.975, n - 1) * values.std(ddof=1) / np.sqrt(n))
-    return mean, mean - half, mean + half

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from ..gaze.budget import mean_interval
 from . import guestrin
 from . import literature as lit
-from .budget import Budget, mean_interval
+from .budget import Budget
 from .figures import heads_figure
 from .page_parts import (
     Apart,

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
+from ..gaze.budget import mean_interval
 from ..imaging.comparison import feature_errors
 from ..observation import Observations
 from ..rig.rig import RigGeometry
-from .budget import mean_interval
 
 ALL_GLINTS = "all glints"
 

@@ -36,6 +36,7 @@ COMMANDS = {
     "population": ["people.yaml"],
     "realism": ["folder", "other"],
     "study": ["conditions", "--eyes", "E2, eye.yaml"],
+    "budget": ["scene.yaml", "--estimator", "regression", "--eye", "eye.yaml"],
     "doctor": [],
 }
 NO_OUTPUT = {"setup-llvm", "schema", "live"}
@@ -83,7 +84,7 @@ def test_every_command_and_every_output_is_in_the_table():
     # What a command writes to has one of these names; these are all others of paths and texts.
     inputs = {
         "scene", "images", "folder", "other", "spec", "records", "rig", "columns", "calibration", "eye", "eyes", "name",
-        "preset", "extractor", "estimator", "function", "terms_x", "terms_y", "fixations", "side", "shard", "address",
+        "preset", "extractor", "estimator", "reference", "function", "terms_x", "terms_y", "fixations", "side", "shard", "address",
     }  # fmt: skip
     for name in sorted(names):
         function = (gaze[name[5:]] if " " in name else app[name]).default_command

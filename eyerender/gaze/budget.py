@@ -1,0 +1,335 @@
+"""The error budget of gaze: what the eye model, the features, the image, the noise and the estimator each cost.
+
+A chain of observations of the same frames, each with one cause of error more than the one before, gives a chain of gaze
+estimates. With e the error of an estimate as a vector (horizontal, vertical) in degrees, a cause moves gaze by
+
+    d_is = e_after(i, s) - e_before(i)          frame i, noise seed s,
+
+and these displacements add up to the whole error in every frame. Their mean square has three parts:
+
+    rms^2 = shift^2 + pattern^2 + scatter^2
+    shift     the mean of all d of an eye: common to all its frames (rms over the eyes)
+    pattern   what differs between frames and repeats with every seed
+    scatter   what differs between seeds (unbiased: over seeds - 1)
+
+Squares of causes add up to the square of the total only if the causes are uncorrelated. `net_deg` is the change of the
+mean |error|. It is nearly zero where a displacement is perpendicular to the existing error, and may be negative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import t as student
+
+from ..arrays import Bools, Floats, Ints
+from ..errors import InputError
+from ..observation import EYES, Observations
+from ..rig.rig import RigGeometry, RigLike
+from .estimate import GazeEstimator, GazePoints, angular_error_deg, binocular_average
+
+ESTIMATOR = "estimator"
+BUDGET_SCHEMA = "eyerender/gaze-budget/1"
+_BOTH = 2
+_EYES = {-1: "unknown", **dict(enumerate(EYES)), _BOTH: "both"}
+Steps = Mapping[str, Observations | Sequence[Observations]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cause:
+    """What one cause adds to the error of gaze, in degrees.
+
+    Attributes:
+        name: the cause.
+        frames: number of frames (of each eye, unless both are averaged) with an estimate before and after.
+        seeds: number of repetitions with other noise, 1 where nothing is random.
+        rms_deg: rms angle between the paired estimates.
+        shift_deg: the part common to all frames of an eye; rms over the eyes.
+        shift_by_eye_deg: the shift of each eye ("right", "left", "both"), to the subject's right and up.
+        pattern_deg: the part that differs between frames, but not between seeds.
+        scatter_deg: the part that differs between seeds; 0 for one seed.
+        net_deg: change of the mean error.
+        net_low_deg: lower end of its 95 % interval (Student's t over the frames); None for fewer than two.
+        net_high_deg: upper end.
+    """
+
+    name: str
+    frames: int
+    seeds: int
+    rms_deg: float
+    shift_deg: float
+    shift_by_eye_deg: dict[str, tuple[float, float]]
+    pattern_deg: float
+    scatter_deg: float
+    net_deg: float
+    net_low_deg: float | None
+    net_high_deg: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorBudget:
+    """The error of gaze, cause by cause.
+
+    Attributes:
+        causes: with the estimator calibrated anew on the features of each step. The first is the estimator's own error.
+        transferred: the same causes with the estimator calibrated once, on the features of `calibrated_on`, and tested
+            on those of the later steps.
+        calibrated_on: step whose features calibrate the estimator for `transferred`; None where there is no later step.
+        total_deg: rms error of the last step, calibrated anew.
+        mean_deg: its mean error.
+        transferred_total_deg: rms error of the last step, calibrated on `calibrated_on`; None without later steps.
+        transferred_mean_deg: its mean error.
+        frames: frames used: those with an estimate in every step and for every seed.
+        frames_missing: frames left out.
+    """
+
+    causes: tuple[Cause, ...]
+    transferred: tuple[Cause, ...]
+    calibrated_on: str | None
+    total_deg: float
+    mean_deg: float
+    transferred_total_deg: float | None
+    transferred_mean_deg: float | None
+    frames: int
+    frames_missing: int
+
+    def cause(self, name: str, *, transferred: bool = False) -> Cause:
+        """Find a cause by its name.
+
+        Raises:
+            InputError: there is none.
+        """
+        for cause in self.transferred if transferred else self.causes:
+            if cause.name == name:
+                return cause
+        raise InputError(f"has no cause {name!r}", path="causes")
+
+    def to_mapping(self) -> dict[str, Any]:
+        """JSON values (schema eyerender/gaze-budget/1)."""
+        return {"schema": BUDGET_SCHEMA, **asdict(self)}
+
+    def __str__(self) -> str:
+        """Two tables, degrees."""
+        lines = _table("calibrated anew on each step's features", self.causes, self.total_deg, self.mean_deg)
+        if self.transferred and self.transferred_total_deg is not None and self.transferred_mean_deg is not None:
+            title = f"calibrated on the features of '{self.calibrated_on}', tested on the images"
+            lines += ["", *_table(title, self.transferred, self.transferred_total_deg, self.transferred_mean_deg)]
+        missing = f", {self.frames_missing} left out" if self.frames_missing else ""
+        return "\n".join([*lines, f"{self.frames} frames{missing}"])
+
+
+def budget(
+    steps: Steps,
+    rig: RigLike,
+    estimator: GazeEstimator,
+    *,
+    calibration: Sequence[int] | None = None,
+    transfer_from: str | None = None,
+    binocular: bool = False,
+) -> ErrorBudget:
+    """Split the error of gaze by cause.
+
+    Args:
+        steps: cause -> observations of the same frames with this cause and all earlier ones, or several observations
+            that differ by random noise alone. The first step's name is that of its features; its cause is the
+            estimator. See `er.budget_steps` for the steps of a scene.
+        rig: their rig.
+        estimator: a gaze estimator, not calibrated.
+        calibration: fixations to calibrate on, counted from 0; the others are tested. None: each fixation is tested
+            with a calibration on all others.
+        transfer_from: step whose features calibrate the estimator for the second reading. None: the last step before
+            the first one of images, which is the last whose name is not among `er.gaze.IMAGE_CAUSES`.
+        binocular: use the mean of both eyes' estimates of a frame. It hides horizontal errors of eyes that are mirror
+            images of each other, because they cancel.
+
+    Raises:
+        InputError: the steps do not show the same frames and targets, or a calibration is impossible.
+    """
+    built = rig.build()
+    chain = [(name, [found] if isinstance(found, Observations) else list(found)) for name, found in steps.items()]
+    _check(chain)
+    task = _Task(built, estimator, calibration, binocular)
+    anew = [np.stack([task.errors(task.fits(one), one) for one in found]) for _, found in chain]
+    names = [name for name, _ in chain]
+    base = names.index(transfer_from) if transfer_from is not None else _last_exact(names)
+    fits = task.fits(chain[base][1][0])
+    kept = [np.stack([task.errors(fits, one) for one in found]) for _, found in chain[base:]]
+    usable: Bools = np.all([np.isfinite(e).all(axis=(0, 2)) for e in (*anew, *kept)], axis=0)
+    tested = task.tested(chain[0][1][0])
+    if usable.sum() < 2:
+        raise InputError("fewer than two frames have an estimate in every step")
+    anew, kept = ([e[:, usable] for e in part] for part in (anew, kept))
+    eye = task.eyes(chain[0][1][0])[usable]
+    causes = [_cause(ESTIMATOR, np.zeros_like(anew[0][:1]), anew[0], eye)]
+    causes += [_cause(name, a, b, eye) for name, a, b in zip(names[1:], anew, anew[1:], strict=False)]
+    moved = [_cause(name, a, b, eye) for name, a, b in zip(names[base + 1 :], kept, kept[1:], strict=False)]
+    return ErrorBudget(
+        causes=tuple(causes),
+        transferred=tuple(moved),
+        calibrated_on=names[base] if moved else None,
+        total_deg=_rms(anew[-1]),
+        mean_deg=float(_size(anew[-1]).mean()),
+        transferred_total_deg=_rms(kept[-1]) if moved else None,
+        transferred_mean_deg=float(_size(kept[-1]).mean()) if moved else None,
+        frames=int(usable.sum()),
+        frames_missing=int((tested & ~usable).sum()),
+    )
+
+
+IMAGE_CAUSES = ("extraction", "image formation", "image", "noise")
+"""Names of steps whose features come from images."""
+
+
+def error_vectors_deg(direction: Floats, wanted: Floats) -> Floats:
+    """Errors (n, 2) of directions (n, 3) from those wanted (n, 3), to the subject's right and up, in degrees.
+
+    The length is the angle between the two; the direction is that of the great circle from `wanted`.
+    """
+    wanted = wanted / np.linalg.norm(wanted, axis=1, keepdims=True)
+    right = np.cross(wanted, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    up = np.cross(right, wanted)
+    flat = np.stack([np.sum(direction * right, axis=1), np.sum(direction * up, axis=1)], axis=1)
+    angle = angular_error_deg(direction, wanted, np.zeros(3))[:, None]
+    across = np.linalg.norm(flat, axis=1, keepdims=True)
+    return np.asarray(np.where(across > 0, flat / np.where(across > 0, across, 1.0), 0.0) * angle)
+
+
+def mean_interval(values: Floats) -> tuple[float, float, float]:
+    """Mean of values (n,), n >= 2, such as paired differences, and its 95 % interval."""
+    n, mean = len(values), float(values.mean())
+    half = float(student.ppf(0.975, n - 1) * values.std(ddof=1) / np.sqrt(n))
+    return mean, mean - half, mean + half
+
+
+def displacement(before: Floats, after: Floats, eye: Ints) -> tuple[float, dict[int, Floats], float, float]:
+    """Split displacements of gaze into rms, shift (2,) by eye, pattern and scatter (degrees).
+
+    Args:
+        before: (s, n, 2) error vectors of n frames; s is 1, or the number of seeds of `after`.
+        after: (s, n, 2) error vectors with s seeds.
+        eye: (n,) the eye of each frame.
+    """
+    moved = after - before
+    seeds = len(moved)
+    shift = {int(k): np.asarray(moved[:, eye == k].mean(axis=(0, 1))) for k in np.unique(eye)}
+    common = sum(float(np.mean(eye == k)) * float(v @ v) for k, v in shift.items())
+    square = float(np.mean(np.sum(moved**2, axis=2)))
+    within = float(np.mean(np.sum((moved - moved.mean(axis=0)) ** 2, axis=2)))
+    scatter = within * seeds / (seeds - 1) if seeds > 1 else 0.0
+    pattern = max(square - common - scatter, 0.0)
+    return float(np.sqrt(square)), shift, float(np.sqrt(pattern)), float(np.sqrt(scatter))
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """How error vectors are made of observations."""
+
+    rig: RigGeometry
+    estimator: GazeEstimator
+    calibration: Sequence[int] | None
+    binocular: bool
+
+    def fits(self, learnt: Observations) -> list[tuple[Bools, GazeEstimator]]:
+        """Calibrations, each with the rows that it is tested on."""
+        fixation = learnt.index.fixation
+        if self.calibration is not None:
+            tests = [~np.isin(fixation, self.calibration)]
+        else:
+            tests = [fixation == k for k in np.unique(fixation)]
+        return [(np.asarray(test), self.estimator.fit(learnt.take(~test), self.rig)) for test in tests]
+
+    def errors(self, fits: Sequence[tuple[Bools, GazeEstimator]], seen: Observations) -> Floats:
+        """Error vectors (n, 2) of what is `seen`; NaN where there is no estimate."""
+        out = np.full((len(seen), 2), np.nan)
+        for test, fitted in fits:
+            out[test] = self._predicted(fitted, seen.take(test))
+        return self._of_frames(seen, out) if self.binocular else out
+
+    def tested(self, seen: Observations) -> Bools:
+        """Whether each row (or frame) is tested."""
+        rows = ~np.isin(seen.index.fixation, [] if self.calibration is None else self.calibration)
+        if self.binocular:
+            _, first = np.unique(seen.index.frame, return_index=True)
+            rows = rows[first]
+        return np.asarray(rows)
+
+    def eyes(self, seen: Observations) -> Ints:
+        """Eye of each row, or `_BOTH` of each frame."""
+        if self.binocular:
+            return np.full(len(np.unique(seen.index.frame)), _BOTH)
+        return np.asarray(seen.index.eye)
+
+    def _predicted(self, fitted: GazeEstimator, seen: Observations) -> Floats:
+        index = seen.index
+        gaze: GazePoints = fitted.predict(seen, self.rig)
+        eye = index.eye_position_mm + index.head_mm
+        return error_vectors_deg(gaze.point_mm - eye, index.target_mm - eye)
+
+    @staticmethod
+    def _of_frames(seen: Observations, errors: Floats) -> Floats:
+        """Mean of both eyes' error vectors of each frame, as of points on a screen."""
+        points = GazePoints.of(np.concatenate([errors, np.where(np.isnan(errors[:, :1]), np.nan, 0.0)], axis=1))
+        return np.asarray(binocular_average(seen, points)[1].point_mm[:, :2])
+
+
+def _check(chain: Sequence[tuple[str, list[Observations]]]) -> None:
+    if not chain or any(not found for _, found in chain):
+        raise InputError("needs observations for every step")
+    first = chain[0][1][0].index
+    if not np.isfinite(first.target_mm).all():
+        raise InputError("there are no targets to compare the gaze with; use a scene with 'targets' instead of 'poses'")
+    for name, found in chain:
+        for one in found:
+            same = len(one) == len(first) and all(
+                np.array_equal(getattr(one.index, key), getattr(first, key), equal_nan=True)
+                for key in ("frame", "fixation", "eye", "target_mm")
+            )
+            if not same:
+                raise InputError("its observations are not of the frames of the first step", path=name)
+
+
+def _last_exact(names: Sequence[str]) -> int:
+    exact = [k for k, name in enumerate(names) if name not in IMAGE_CAUSES]
+    return exact[-1] if exact else 0
+
+
+def _cause(name: str, before: Floats, after: Floats, eye: Ints) -> Cause:
+    # The mean over the seeds of a noisy step is what the next one is compared with.
+    paired = before if len(before) in (1, len(after)) else before.mean(axis=0, keepdims=True)
+    rms, shift, pattern, scatter = displacement(paired, after, eye)
+    net = (_size(after).mean(axis=0) - _size(before).mean(axis=0)).ravel()
+    mean, low, high = mean_interval(net)
+    return Cause(
+        name=name,
+        frames=len(net),
+        seeds=len(after),
+        rms_deg=rms,
+        shift_deg=float(np.sqrt(sum(np.mean(eye == k) * (v @ v) for k, v in shift.items()))),
+        shift_by_eye_deg={_EYES[k]: (float(v[0]), float(v[1])) for k, v in shift.items()},
+        pattern_deg=pattern,
+        scatter_deg=scatter,
+        net_deg=mean,
+        net_low_deg=low,
+        net_high_deg=high,
+    )
+
+
+def _size(errors: Floats) -> Floats:
+    return np.linalg.norm(errors, axis=-1)
+
+
+def _rms(errors: Floats) -> float:
+    return float(np.sqrt(np.mean(_size(errors) ** 2)))
+
+
+def _table(title: str, causes: Sequence[Cause], total: float, mean: float) -> list[str]:
+    width = max(len(c.name) for c in causes)
+    lines = [title, f"{'cause':<{width}} {'rms':>8} {'shift':>8} {'pattern':>8} {'scatter':>8} {'net':>9}"]
+    for c in causes:
+        numbers = "".join(f"{v:>9.4f}" for v in (c.rms_deg, c.shift_deg, c.pattern_deg, c.scatter_deg))
+        lines.append(f"{c.name:<{width}}{numbers} {c.net_deg:>+9.4f}")
+    return [*lines, f"{'total':<{width}}{total:>9.4f}   mean error {mean:.4f} deg"]
