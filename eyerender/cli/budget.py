@@ -21,6 +21,7 @@ def budget(
     eye: EyeModel = None,
     function: str = "R3",
     monocular: bool = False,
+    feature: Literal["pupil-glint", "pupil"] = "pupil-glint",
     method: Literal["A", "B"] = "A",
     index: float | None = None,
     recalibration: Literal["angle", "screen", "none"] = "angle",
@@ -45,6 +46,7 @@ def budget(
         function: regressions: the function, R1 to R12.
         monocular: regression: use the vector of one eye in pixels, without dividing it by the distance between the
             pupils.
+        feature: direction-regression: the vector from the mean of all glints to the pupil, or the pupil's centre alone.
         method: guestrin-eizenman: locate the corneal centre from all glints (A), or on the common line of the planes
             (B).
         index: guestrin-eizenman, hennessey: the assumed refractive index.
@@ -64,8 +66,9 @@ def budget(
     from .gaze import fixation_list
 
     chosen = choose_estimator(
-        estimator, function=function, normalised=not monocular, method=method, index=index, recalibration=recalibration
-    )
+        estimator, function=function, normalised=not monocular, feature=feature, method=method, index=index,
+        recalibration=recalibration,
+    )  # fmt: skip
     calibration = fixation_list(fixations)
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)

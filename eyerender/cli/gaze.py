@@ -33,6 +33,7 @@ def fit(
     terms_x: str | None = None,
     terms_y: str | None = None,
     monocular: bool = False,
+    feature: Literal["pupil-glint", "pupil"] = "pupil-glint",
     method: Literal["A", "B"] = "A",
     free_index: bool = False,
     index: float | None = None,
@@ -46,7 +47,8 @@ def fit(
     Args:
         records: Records as `features` or `extract` write them (JSON), one record per line (JSONL), or a table (CSV).
             Each needs its target.
-        estimator: regression (polynomials of the pupil-glint vector; one light), homography (normalisation by four
+        estimator: regression (polynomials of the pupil-glint vector; one light), direction-regression (polynomials of a
+            feature in pixels to directions; no screen needed), homography (normalisation by four
             lights), cross-ratio (four lights at the screen's corners and one at the camera), hennessey (one camera, two
             lights), shih-wu-liu (two cameras, two lights), or guestrin-eizenman (one camera, two lights);
             or module:Class, a class of your own that can be made without arguments.
@@ -54,11 +56,12 @@ def fit(
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
         rig: A rig file or a scene file, for its rig.
         columns: A YAML file that says what the columns of a table are (default: as their names say).
-        function: regression: the function, R1 to R12.
+        function: regression, direction-regression: the function, R1 to R12.
         terms_x: regression: your own terms of x instead of a function, such as 'x + xy + 1'.
         terms_y: regression: your own terms of y.
         monocular: regression: use the vector of one eye in pixels, without dividing it by the distance between the
             pupils.
+        feature: direction-regression: the vector from the mean of all glints to the pupil, or the pupil's centre alone.
         method: guestrin-eizenman: locate the corneal centre from all glints (A), or on the common line of the planes
             (B).
         free_index: guestrin-eizenman: also calibrate the refractive index.
@@ -76,6 +79,7 @@ def fit(
         function=function,
         terms=[terms_x, terms_y] if terms_x is not None else None,
         normalised=not monocular,
+        feature=feature,
         method=method,
         free_index=free_index,
         index=index,
@@ -108,7 +112,7 @@ def predict(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Estimate gaze points with a calibration written by `gaze fit`.
+    """Estimate gaze points, or rays if the rig has no screen, with a calibration written by `gaze fit`.
 
     Where the targets are known, the errors are reported too.
 
@@ -159,9 +163,13 @@ def fixation_list(text: str | None) -> list[int] | None:
 
 
 def _gaze_table(data: dict[str, Any]) -> str:
-    lines = [f"{'frame':>6} {'eye':<6} {'gaze point mm':>32} {'error deg':>10}"]
+    from ..gaze.store import RAYS_SCHEMA
+
+    key = "direction" if data["schema"] == RAYS_SCHEMA else "point_mm"
+    title = "gaze point mm" if key == "point_mm" else "gaze direction"
+    lines = [f"{'frame':>6} {'eye':<6} {title:>32} {'error deg':>10}"]
     for entry in data["gaze"]:
-        point = entry["point_mm"]
+        point = entry[key]
         where = f"missing: {entry['reason']}" if point is None else "".join(f"{v:>11.3f}" for v in point)
         error = "-" if entry["error_deg"] is None else f"{entry['error_deg']:.4f}"
         lines.append(f"{entry['frame']:>6} {entry['eye'] or '-':<6} {where:>32} {error:>10}")

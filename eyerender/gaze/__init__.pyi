@@ -4,12 +4,15 @@ from .budget import ErrorBudget as ErrorBudget
 from .budget import budget as budget
 from .columns import CsvColumns as CsvColumns
 from .crossratio import CrossRatio as CrossRatio
+from .directions import DirectionRegression as DirectionRegression
 from .estimate import GazeEstimator as GazeEstimator
 from .estimate import GazePoints as GazePoints
 from .estimate import GazeRays as GazeRays
+from .estimate import RayEstimator as RayEstimator
 from .estimate import StoredEstimator as StoredEstimator
 from .estimate import angular_error_deg as angular_error_deg
 from .estimate import binocular_average as binocular_average
+from .estimate import ray_errors_deg as ray_errors_deg
 from .guestrin import GuestrinEizenman as GuestrinEizenman
 from .hennessey import Hennessey as Hennessey
 from .homography import Homography as Homography

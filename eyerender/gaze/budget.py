@@ -29,7 +29,7 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry, RigLike
-from .estimate import GazeEstimator, GazePoints, angular_error_deg, binocular_average
+from .estimate import GazeEstimator, GazePoints, RayEstimator, angular_error_deg, binocular_average
 
 ESTIMATOR = "estimator"
 BUDGET_SCHEMA = "eyerender/gaze-budget/1"
@@ -265,6 +265,9 @@ class _Task:
 
     def _predicted(self, fitted: GazeEstimator, seen: Observations) -> Floats:
         index = seen.index
+        if self.rig.screen is None and isinstance(fitted, RayEstimator):
+            rays = fitted.predict_rays(seen, self.rig)
+            return error_vectors_deg(rays.direction, index.target_mm - rays.origin_mm)
         gaze: GazePoints = fitted.predict(seen, self.rig)
         eye = index.eye_position_mm + index.head_mm
         return error_vectors_deg(gaze.point_mm - eye, index.target_mm - eye)
@@ -319,7 +322,7 @@ def _cause(name: str, before: Floats, after: Floats, eye: Ints) -> Cause:
 
 
 def _size(errors: Floats) -> Floats:
-    return np.linalg.norm(errors, axis=-1)
+    return np.asarray(np.linalg.norm(errors, axis=-1))
 
 
 def _rms(errors: Floats) -> float:

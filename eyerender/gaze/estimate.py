@@ -1,6 +1,7 @@
 """The interface of gaze estimators.
 
     fit(observations, rig) -> fitted copy;   predict(observations, rig) -> GazePoints
+    predict_rays(observations, rig) -> GazeRays    of estimators that know a direction; needs no screen
 
 The targets of a calibration are those of the observations (`index.target_mm`). Targets and gaze points are world points
 in mm, one row per observation.
@@ -59,6 +60,11 @@ class GazeRays(ArrayValue):
     direction: Floats
     reason: Objects
 
+    @property
+    def ok(self) -> Bools:
+        """Whether there is a ray, (n,)."""
+        return np.array([reason is None for reason in self.reason], dtype=bool)
+
     @classmethod
     def of(cls, origin_mm: Floats, direction: Floats, reason: Objects) -> GazeRays:
         """Make rays that are NaN wherever there is a reason."""
@@ -86,6 +92,15 @@ class GazeEstimator(Protocol):
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Estimate gaze points of observations, one row each."""
+        ...
+
+
+@runtime_checkable
+class RayEstimator(GazeEstimator, Protocol):
+    """An estimator of rays. It can be calibrated and used without a screen, as head-mounted rigs have none."""
+
+    def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
+        """Estimate rays of gaze of observations, one row each."""
         ...
 
 
@@ -121,6 +136,11 @@ def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Obs
     points = np.zeros((len(frames), 3))
     np.add.at(points, which, gaze.point_mm)
     return observations.take(first), GazePoints.of(points / count[:, None], reason)
+
+
+def ray_errors_deg(observations: Observations, rays: GazeRays) -> Floats:
+    """Angle (n,) between each ray and the line from its origin to the target, in degrees; NaN where one is missing."""
+    return angular_error_deg(rays.origin_mm + rays.direction, observations.index.target_mm, rays.origin_mm)
 
 
 def angular_error_deg(point_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> Floats:

@@ -26,7 +26,7 @@ from ..rig.screen import ScreenPlane
 from .cornea import CorneaCentres, from_all_glints, from_plane, optic_axis
 from .estimate import GazePoints, GazeRays
 from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds
-from .rays import FeatureRays, feature_rays, nasal_sign, screen_of
+from .rays import OFF_PLANE_MM, FeatureRays, feature_rays, nasal_sign, screen_of, targets_on_screen, unit
 from .search import Misses, calibrate
 
 # Chebyshev degree of the centre as a function of sqrt(R); its last terms are below 1e-6 mm over 3 to 20 mm.
@@ -66,6 +66,10 @@ class GuestrinEizenman:
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate R, K, alpha, beta (and n) of each eye by bounded nonlinear least squares.
 
+        With a screen, the misses are those of gaze points on it, in mm. Without one, each target is missed on the plane
+        through it that is perpendicular to the line from the eye, in units of an angle, so that near and far targets
+        count alike.
+
         Raises:
             InputError: there are too few usable targets to determine the parameters.
         """
@@ -82,12 +86,16 @@ class GuestrinEizenman:
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Estimate gaze points on the screen's plane."""
         rig = rig.build()
-        screen = screen_of(rig)
+        screen = screen_of(rig, "predict_rays gives rays without one")
         rays = self.visual_axes(observations, rig)
         on_screen, hits = screen.intersect(rays.origin_mm, rays.direction)
         reason = rays.reason.copy()
         reason[(reason == None) & ~hits] = "the visual axis does not meet the screen"  # noqa: E711
         return GazePoints.of(screen.world(on_screen), reason)
+
+    def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
+        """Estimate rays of gaze; no screen is needed."""
+        return self.visual_axes(observations, rig.build())
 
     def visual_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Visual axes from the centre of corneal curvature, in the direction of gaze."""
@@ -148,10 +156,10 @@ class GuestrinEizenman:
         return np.array([self.free_index or name != "index" for name in NAMES])
 
     def _models(self, observations: Observations, rig: RigGeometry) -> dict[int, _Model]:
-        screen = screen_of(rig)
+        goals = _Goals.of(observations, rig.screen)
         targets = observations.index.target_mm
         rays = feature_rays(observations, rig, self.lights, least=2)
-        usable = (rays.reason == None) & np.isfinite(targets).all(axis=1)  # noqa: E711
+        usable = (rays.reason == None) & goals.known  # noqa: E711
         count = int(self.free.sum())
         need = -(-count // 2)  # each target gives two numbers
         out = {}
@@ -163,8 +171,66 @@ class GuestrinEizenman:
                     f"{name} eye: {len(rows)} usable calibration targets, "
                     f"but {count} parameters need {need} distinct ones"
                 )
-            out[int(eye)] = _Model(self, rays, rows, targets[rows], screen, float(nasal_sign(np.array(eye))))
+            out[int(eye)] = _Model(self, rays, rows, goals.take(rows), float(nasal_sign(np.array(eye))))
         return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Goals:
+    """Targets (n) as points of planes.
+
+    Attributes:
+        origin_mm: a point of the plane, (3,) for a screen, else (n, 3).
+        axes: right, up and normal of the plane in the columns, (3, 3) for a screen, else (n, 3, 3).
+        wanted: (n, 2) the targets on their planes, mm.
+        off_plane: (n,) their distances from the planes, mm.
+        weight: (n, 1) factor of a miss; None: 1.
+    """
+
+    origin_mm: Floats
+    axes: Floats
+    wanted: Floats
+    off_plane: Floats
+    weight: Floats | None
+
+    @classmethod
+    def of(cls, observations: Observations, screen: ScreenPlane | None) -> _Goals:
+        """Targets on the screen, or on planes of their own."""
+        index, targets = observations.index, observations.index.target_mm
+        if screen is not None:
+            axes = np.stack([screen.right, screen.up, screen.normal], axis=-1)
+            off = -((targets - screen.centre_mm) @ screen.normal)
+            wanted = targets_on_screen(observations, screen)
+            # Targets that are farther off have been projected.
+            off = np.where(np.abs(off) <= OFF_PLANE_MM * (1 + 1e-9), off, 0.0 * off)
+            return cls(screen.centre_mm, axes, wanted, off, None)
+        line = targets - index.eye_position_mm - index.head_mm
+        ahead = unit(line)
+        right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
+        axes = np.stack([right, np.cross(right, ahead), -ahead], axis=-1)
+        distance = np.linalg.norm(line, axis=1, keepdims=True)
+        weight = np.nanmean(distance) / distance
+        return cls(targets, axes, np.zeros((len(targets), 2)), 0.0 * distance[:, 0], weight)
+
+    @property
+    def known(self) -> Bools:
+        """Whether there is a target, and its plane is known, (n,)."""
+        return np.asarray(np.isfinite(self.wanted).all(axis=1) & np.isfinite(self.off_plane))
+
+    def take(self, rows: Ints) -> _Goals:
+        """Select rows."""
+        of_screen = self.weight is None
+        return _Goals(
+            self.origin_mm if of_screen else self.origin_mm[rows],
+            self.axes if of_screen else self.axes[rows],
+            self.wanted[rows],
+            self.off_plane[rows],
+            None if self.weight is None else self.weight[rows],
+        )
+
+    def local(self, vectors: Floats) -> Floats:
+        """Vectors (P, n, 3) in the planes' axes."""
+        return vectors @ self.axes if self.axes.ndim == 2 else np.einsum("pni,nij->pnj", vectors, self.axes)
 
 
 class _Model:
@@ -175,15 +241,11 @@ class _Model:
         estimator: GuestrinEizenman,
         rays: FeatureRays,
         rows: Ints,
-        targets_mm: Floats,
-        screen: ScreenPlane,
+        goals: _Goals,
         sign: float,
     ) -> None:
-        self.estimator, self.screen, self.sign = estimator, screen, sign
+        self.estimator, self.goals, self.sign = estimator, goals, sign
         self.origin, self.pupil = rays.origin_mm[rows], rays.pupil[rows]
-        self.wanted = screen.flat(targets_mm)
-        self.off_plane = -((targets_mm - screen.centre_mm) @ screen.normal)
-        self.axes = np.stack([screen.right, screen.up, screen.normal], axis=-1)
         low, high = estimator.bounds.lower.cornea_radius_mm, estimator.bounds.upper.cornea_radius_mm
         # The centre depends on R alone, and smoothly, so one batch of solutions serves every step of every search. Its
         # distance is nearly proportional to sqrt(R), because the glints' separation is proportional to R over the
@@ -195,22 +257,23 @@ class _Model:
         self._series = np.linalg.solve(chebvander(nodes, _DEGREE), centres)
 
     def misses(self, parameters: Floats) -> Floats:
-        """Misses (P, n, 3) mm, along the screen's right, up and normal, at P sets of parameters (P, 5)."""
+        """Misses (P, n, 3) mm, along the planes' right, up and normal, at P sets of parameters (P, 5)."""
         shape = (len(parameters), len(self.origin))
         x = (np.sqrt(parameters[:, 0]) - self.middle) / self.half
         centre = (chebvander(x, _DEGREE) @ self._series).reshape(*shape, 3)
         R, K, index = (np.broadcast_to(parameters[:, k, None], shape) for k in range(3))
         w, _, _ = optic_axis(self.origin, pupil=self.pupil, centre_mm=centre, radius_mm=R, distance_mm=K, index=index)
         alpha, beta = np.radians(parameters[:, 3, None]) * self.sign, np.radians(parameters[:, 4, None])
-        # Both are in the screen's axes: right, up, and towards the eye.
-        v, c = self.estimator.turned(w, alpha, beta) @ self.axes, (centre - self.screen.centre_mm) @ self.axes
+        # Both are in the planes' axes: right, up, and towards the eye.
+        goals = self.goals
+        v, c = goals.local(self.estimator.turned(w, alpha, beta)), goals.local(centre - goals.origin_mm)
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = -c[..., 2] / v[..., 2]
-            flat = c[..., :2] + reach[..., None] * v[..., :2] - self.wanted
+            flat = c[..., :2] + reach[..., None] * v[..., :2] - goals.wanted
         out = np.empty((*shape, 3))
         out[..., :2] = np.where(np.isfinite(flat) & (reach > 0)[..., None], flat, _OFF_SCREEN_MM)
-        out[..., 2] = self.off_plane
-        return out
+        out[..., 2] = goals.off_plane
+        return out if goals.weight is None else out * goals.weight
 
     def calibrate(self, start: EyeParameters) -> Calibration:
         if not self.estimator.free_index:

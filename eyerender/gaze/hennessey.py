@@ -53,6 +53,12 @@ class Hennessey:
         correction = self.correction or Recalibration(self.recalibration)
         return correction.apply(observations, self.optic_axes(observations, rig), rig)
 
+    def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
+        """Estimate rays of gaze; no screen is needed unless the correction acts on the screen."""
+        rig = rig.build()
+        correction = self.correction or Recalibration(self.recalibration)
+        return correction.apply_to_rays(observations, self.optic_axes(observations, rig), rig)
+
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Optic axes of the assumed eye, from the centre of corneal curvature."""
         eyes = {int(e): self.parameters for e in np.unique(observations.index.eye)}

@@ -22,7 +22,7 @@ from ..errors import InputError
 from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry, RigLike
 from .estimate import GazePoints
-from .rays import chosen_lights, glints_of, screen_of
+from .rays import chosen_lights, glints_of, screen_of, targets_on_screen
 
 # Corners of the square for the four lights: top left, top right, bottom right, bottom left, u to the right and v up.
 SQUARE = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
@@ -51,7 +51,7 @@ class Homography:
             InputError: there are fewer than four targets, or they are collinear.
         """
         rig = rig.build()
-        wanted = screen_of(rig).flat(observations.index.target_mm)
+        wanted = targets_on_screen(observations, screen_of(rig))
         s, reason = self.normalised(observations, rig)
         usable = (reason == None) & np.isfinite(wanted).all(axis=1)  # noqa: E711
         found = {}

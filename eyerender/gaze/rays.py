@@ -108,15 +108,49 @@ def camera_of(observations: Observations, rig: RigGeometry) -> tuple[Ints, Objec
     return camera, reason
 
 
-def screen_of(rig: RigGeometry) -> ScreenPlane:
-    """Screen of the rig.
+OFF_PLANE_MM = 1.0
+"""Largest distance of a target from the screen's plane at which it counts as a point of the screen."""
+
+
+def screen_of(rig: RigGeometry, instead: str = "") -> ScreenPlane:
+    """Screen of the rig; `instead` says what works without one.
 
     Raises:
         InputError: there is none.
     """
     if rig.screen is None:
-        raise InputError("this estimator needs a screen in the rig")
+        raise InputError(f"this estimator needs a screen in the rig{instead and f'; {instead}'}")
     return rig.screen
+
+
+def targets_on_screen(observations: Observations, screen: ScreenPlane) -> Floats:
+    """Screen points (n, 2) mm of the targets of observations; NaN without a target.
+
+    A target off the plane is projected along the line from the eye, because that is where the eye looks through it.
+
+    Raises:
+        InputError: a target is off the plane and the place of its eye is unknown, or the line does not meet the plane.
+    """
+    index = observations.index
+    targets = index.target_mm
+    flat = screen.flat(targets)
+    with np.errstate(invalid="ignore"):
+        off = np.abs((targets - screen.centre_mm) @ screen.normal) > OFF_PLANE_MM * (1 + 1e-9)
+    if off.any():
+        eye = (index.eye_position_mm + index.head_mm)[off]
+        flat[off], meets = screen.intersect(eye, targets[off] - eye)
+        if not meets.all():
+            why = "the place of the eye is unknown (eye_position_mm, head_mm)"
+            if np.isfinite(eye[~meets]).all():
+                why = "the line from the eye does not meet it"
+            raise InputError(f"{int((~meets).sum())} targets lie off the plane of the rig's screen, and {why}")
+    return flat
+
+
+def target_directions(observations: Observations) -> Floats:
+    """Unit directions (n, 3) from each eye's place to its target; NaN where one is unknown."""
+    index = observations.index
+    return unit(index.target_mm - index.eye_position_mm - index.head_mm)
 
 
 def unit(v: Floats) -> Floats:

@@ -19,10 +19,11 @@ from ..errors import InputError
 from ..observation import EYES, Observations
 from ..rig.rig import RigLike
 from .estimate import GazePoints, GazeRays
-from .rays import screen_of
+from .rays import screen_of, targets_on_screen, unit
 
 RecalibrationKind = Literal["none", "screen", "angle"]
 TERMS = 6
+_ANGLE = "use recalibration='angle' without one"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,14 +41,15 @@ class Recalibration:
         """
         if self.kind == "none":
             return self
-        screen, targets_mm = screen_of(rig.build()), observations.index.target_mm
+        targets_mm = observations.index.target_mm
         usable = np.array([r is None for r in rays.reason]) & np.isfinite(targets_mm).all(axis=1)
         if self.kind == "angle":
             measured, wanted = angles_of(rays.direction), angles_of(targets_mm - rays.origin_mm)
         else:
+            screen = screen_of(rig.build(), _ANGLE)
             measured, hits = screen.intersect(rays.origin_mm, rays.direction)
             usable &= hits
-            wanted = screen.flat(targets_mm)
+            wanted = targets_on_screen(observations, screen)
         out = {}
         for eye in np.unique(observations.index.eye):
             rows = usable & (observations.index.eye == eye)
@@ -67,26 +69,40 @@ class Recalibration:
 
     def apply(self, observations: Observations, rays: GazeRays, rig: RigLike) -> GazePoints:
         """Correct gaze points on the screen's plane."""
-        screen = screen_of(rig.build())
-        reason = rays.reason.copy()
-        direction, on_screen = rays.direction.copy(), np.full((len(observations), 2), np.nan)
-        if self.kind != "none":
-            if not self.coefficients:
-                raise InputError("the estimator is not calibrated; call fit first")
-            for eye in np.unique(observations.index.eye):
-                rows = observations.index.eye == eye
-                A = self.coefficients.get(int(eye))
-                if A is None:
-                    reason[rows & (reason == None)] = "this eye is not calibrated"  # noqa: E711
-                elif self.kind == "angle":
-                    direction[rows] = direction_of(monomials(angles_of(direction[rows])) @ A.T)
-        on_screen, hits = screen.intersect(rays.origin_mm, direction)
+        screen = screen_of(rig.build(), "predict_rays gives rays without one")
+        corrected = self._on_angles(observations, rays)
+        reason = corrected.reason.copy()
+        on_screen, hits = screen.intersect(corrected.origin_mm, corrected.direction)
         reason[(reason == None) & ~hits] = "the gaze ray does not meet the screen"  # noqa: E711
         if self.kind == "screen":
             for eye, A in self.coefficients.items():
                 rows = observations.index.eye == eye
                 on_screen[rows] = monomials(on_screen[rows]) @ A.T
         return GazePoints.of(screen.world(on_screen), reason)
+
+    def apply_to_rays(self, observations: Observations, rays: GazeRays, rig: RigLike) -> GazeRays:
+        """Correct gaze rays; a correction on the screen turns them to the corrected points."""
+        if self.kind != "screen":
+            return self._on_angles(observations, rays)
+        screen_of(rig.build(), _ANGLE)
+        points = self.apply(observations, rays, rig)
+        return GazeRays.of(rays.origin_mm, unit(points.point_mm - rays.origin_mm), points.reason)
+
+    def _on_angles(self, observations: Observations, rays: GazeRays) -> GazeRays:
+        """Rays whose angles are corrected, if the correction acts on angles."""
+        if self.kind == "none":
+            return rays
+        if not self.coefficients:
+            raise InputError("the estimator is not calibrated; call fit first")
+        reason, direction = rays.reason.copy(), rays.direction.copy()
+        for eye in np.unique(observations.index.eye):
+            rows = observations.index.eye == eye
+            A = self.coefficients.get(int(eye))
+            if A is None:
+                reason[rows & (reason == None)] = "this eye is not calibrated"  # noqa: E711
+            elif self.kind == "angle":
+                direction[rows] = direction_of(monomials(angles_of(direction[rows])) @ A.T)
+        return GazeRays.of(rays.origin_mm, direction, reason)
 
 
 def angles_of(direction: Floats) -> Floats:

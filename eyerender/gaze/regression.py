@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..observation import Observations
 from ..rig.rig import RigLike
 from .estimate import GazePoints
-from .rays import glints_of, screen_of
+from .rays import glints_of, screen_of, targets_on_screen
 
 Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
 
@@ -112,7 +112,7 @@ class Regression:
         Raises:
             InputError: there are too few usable targets, or they do not determine the polynomial.
         """
-        wanted = screen_of(rig.build()).flat(observations.index.target_mm)
+        wanted = targets_on_screen(observations, screen_of(rig.build()))
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
         usable = np.array([r is None for r in reason], dtype=bool) & np.isfinite(wanted).all(axis=1)
         fits = {}

@@ -20,7 +20,8 @@ from ..spec import Positive, Spec
 from ..status import Status
 from ..storage.files import read_json, shown, write_json
 from .crossratio import CrossRatio
-from .estimate import GazeEstimator, angular_error_deg, binocular_average
+from .directions import DirectionRegression, Feature
+from .estimate import GazeEstimator, RayEstimator, angular_error_deg, binocular_average, ray_errors_deg
 from .guestrin import GuestrinEizenman
 from .hennessey import Hennessey
 from .homography import Homography
@@ -31,18 +32,21 @@ from .records import rig_from_mapping
 from .regression import EyeFit, Regression
 from .twocamera import ShihWuLiu
 
-CALIBRATION_SCHEMA = "eyerender/gaze-calibration/3"
-# Still read: 1 has no rig, neither has a user's own estimators.
-_SCHEMAS = (CALIBRATION_SCHEMA, "eyerender/gaze-calibration/2", "eyerender/gaze-calibration/1")
+CALIBRATION_SCHEMA = "eyerender/gaze-calibration/4"
+# Still read: 1 to 3 have no regression of directions, 1 has no rig, 1 and 2 have no user's own estimators.
+_SCHEMAS = (CALIBRATION_SCHEMA, *(f"eyerender/gaze-calibration/{version}" for version in (3, 2, 1)))
 FIT_SCHEMA = "eyerender/gaze-fit/1"
-PREDICT_SCHEMA = "eyerender/gaze/1"
+PREDICT_SCHEMA, RAYS_SCHEMA = "eyerender/gaze/1", "eyerender/gaze/2"
+"""Schemas of gaze points on a screen, and of gaze rays of a rig without one."""
 
 
-EstimatorName = Literal["regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"]
+EstimatorName = Literal[
+    "regression", "direction-regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"
+]
 NAMES: tuple[str, ...] = get_args(EstimatorName)
 
 
-BuiltIn = Regression | Homography | CrossRatio | GuestrinEizenman | Hennessey | ShihWuLiu
+BuiltIn = Regression | DirectionRegression | Homography | CrossRatio | GuestrinEizenman | Hennessey | ShihWuLiu
 
 
 class EstimatorSpec(Spec):
@@ -52,6 +56,7 @@ class EstimatorSpec(Spec):
     function: str = "R3"
     terms: tuple[str, str] | None = Field(default=None, description="terms of x and y, instead of `function`")
     normalised: bool = True
+    feature: Feature = "pupil-glint"
     method: Literal["A", "B"] = "A"
     free_index: bool = False
     index: float | None = Field(default=None, ge=1.0, le=2.0)
@@ -69,6 +74,10 @@ class EstimatorSpec(Spec):
             key = "function" if isinstance(estimator.function, str) else "terms"
             options = {"name": "regression", key: estimator.function, "normalised": estimator.normalised}
             bare: BuiltIn = replace(estimator, fits={})
+        elif type(estimator) is DirectionRegression:
+            key = "function" if isinstance(estimator.function, str) else "terms"
+            options = {"name": "direction-regression", key: estimator.function, "feature": estimator.feature}
+            bare = replace(estimator, fits={})
         elif type(estimator) is Homography:
             options, bare = {"name": "homography"}, replace(estimator, homographies={})
         elif type(estimator) is CrossRatio:
@@ -98,6 +107,10 @@ class EstimatorSpec(Spec):
             regression = Regression(self.terms or self.function, normalised=self.normalised)
             _ = regression.terms  # a wrong function is an error here, not at the first fit
             return regression
+        if self.name == "direction-regression":
+            directions = DirectionRegression(self.terms or self.function, self.feature)
+            _ = directions.terms
+            return directions
         if self.name == "homography":
             return Homography()
         if self.name == "cross-ratio":
@@ -186,20 +199,21 @@ def fit_estimator(
 
 
 def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGeometry) -> dict[str, Any]:
-    """Estimate gaze points of every observation and of every frame with two eyes (schema eyerender/gaze/1).
+    """Estimate gaze of every observation and of every frame with two eyes.
 
-    Errors are angles at the eye's place, or at the mid-point of the eyes; null without a target or a place.
+    Schema eyerender/gaze/1 holds gaze points. Errors are angles at the place of the eye, or between both eyes; null
+    without a target or a place. For a rig without a screen, schema eyerender/gaze/2 holds the rays of an estimator of
+    rays. Their errors are angles at their origins, and there are no binocular estimates.
     """
+    if rig.screen is None and isinstance(estimator, RayEstimator):
+        return _ray_predictions(estimator, observations, rig)
     index = observations.index
     with np.errstate(all="ignore"):
         gaze = estimator.predict(observations, rig)
         at_eye = angular_error_deg(gaze.point_mm, index.target_mm, index.eye_position_mm + index.head_mm)
     single = [
         {
-            "frame": int(index.frame[i]),
-            "fixation": int(index.fixation[i]) if index.fixation[i] >= 0 else None,
-            "camera": int(index.camera[i]) if index.camera[i] >= 0 else None,
-            "eye": EYES[int(index.eye[i])] if index.eye[i] >= 0 else None,
+            **_identity(observations, i),
             "status": Status(gaze.status[i]).label,
             "reason": gaze.reason[i],
             "point_mm": gaze.point_mm[i].tolist() if gaze.ok[i] else None,
@@ -223,6 +237,37 @@ def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGe
             for i in range(len(both))
         ]
     return {"schema": PREDICT_SCHEMA, "gaze": single, "binocular": binocular}
+
+
+def _ray_predictions(estimator: RayEstimator, observations: Observations, rig: RigGeometry) -> dict[str, Any]:
+    with np.errstate(all="ignore"):
+        rays = estimator.predict_rays(observations, rig)
+        errors = ray_errors_deg(observations, rays)
+    status = np.where(rays.ok, Status.OK, Status.NO_ESTIMATE)
+    entries = [
+        {
+            **_identity(observations, i),
+            "status": Status(int(status[i])).label,
+            "reason": rays.reason[i],
+            "origin_mm": _numbers(rays.origin_mm[i]),
+            "direction": _numbers(rays.direction[i]),
+            "target_mm": _numbers(observations.index.target_mm[i]),
+            "error_deg": _number(errors[i]),
+        }
+        for i in range(len(observations))
+    ]
+    return {"schema": RAYS_SCHEMA, "gaze": entries, "binocular": []}
+
+
+def _identity(observations: Observations, i: int) -> dict[str, Any]:
+    """Keys that say which observation row `i` is."""
+    index = observations.index
+    return {
+        "frame": int(index.frame[i]),
+        "fixation": int(index.fixation[i]) if index.fixation[i] >= 0 else None,
+        "camera": int(index.camera[i]) if index.camera[i] >= 0 else None,
+        "eye": EYES[int(index.eye[i])] if index.eye[i] >= 0 else None,
+    }
 
 
 def save_estimator(path: str | Path, estimator: GazeEstimator, rig: RigLike | None = None) -> None:
@@ -353,6 +398,7 @@ class _ModelState(Spec):
 
 _STATES: dict[type[BuiltIn], type[Spec]] = {
     Regression: _RegressionState,
+    DirectionRegression: _RegressionState,
     Homography: _HomographyState,
     CrossRatio: _CrossRatioState,
     GuestrinEizenman: _ModelState,
@@ -368,7 +414,7 @@ def _checked(estimator: BuiltIn, state: object) -> Spec:
         InputError: with the path of the key.
     """
     found = _STATES[type(estimator)].from_mapping(state)
-    if isinstance(estimator, Regression) and isinstance(found, _RegressionState):
+    if isinstance(estimator, Regression | DirectionRegression) and isinstance(found, _RegressionState):
         for key, values, terms in zip("ab", (found.a, found.b), estimator.terms, strict=True):
             if len(values) != len(terms):
                 raise InputError(f"must be {len(terms)} numbers, one for each term", path=key)
@@ -378,7 +424,7 @@ def _checked(estimator: BuiltIn, state: object) -> Spec:
 def _state(estimator: BuiltIn) -> dict[str, Any]:
     """Calibrated values by eye."""
     found: dict[int, Any]
-    if isinstance(estimator, Regression):
+    if isinstance(estimator, Regression | DirectionRegression):
         found = {
             e: {"origin": f.origin.tolist(), "scale": f.scale.tolist(), "a": f.a.tolist(), "b": f.b.tolist()}
             for e, f in estimator.fits.items()
@@ -401,7 +447,7 @@ def _restored(estimator: BuiltIn, eyes: dict[int, Any]) -> BuiltIn:
     def arrays(key: str) -> dict[int, Floats]:
         return {e: frozen(getattr(state, key)) for e, state in eyes.items()}
 
-    if isinstance(estimator, Regression):
+    if isinstance(estimator, Regression | DirectionRegression):
         parts = [arrays(key) for key in ("origin", "scale", "a", "b")]
         return replace(estimator, fits={e: EyeFit(*(part[e] for part in parts)) for e in eyes})
     if isinstance(estimator, Homography):

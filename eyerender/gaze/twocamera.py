@@ -63,6 +63,12 @@ class ShihWuLiu:
         correction = self.correction or Recalibration(self.recalibration)
         return correction.apply(observations, self.optic_axes(observations, rig), rig)
 
+    def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
+        """Estimate rays of gaze; no screen is needed unless the correction acts on the screen."""
+        rig = rig.build()
+        correction = self.correction or Recalibration(self.recalibration)
+        return correction.apply_to_rays(observations, self.optic_axes(observations, rig), rig)
+
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Optic axes from the centre of corneal curvature, one row per observation."""
         if len(set(self.cameras)) != 2 or not all(0 <= k < len(rig.cameras) for k in self.cameras):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..gaze.budget import error_vectors_deg
 from ..gaze.estimate import angular_error_deg, binocular_average
 from ..gaze.regression import FUNCTIONS, Regression
 from ..observation import Observations
@@ -59,12 +60,16 @@ CORRECTED: frozenset[str] = frozenset()
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Errors of one function and calibration set: `error_deg` (f,) by frame, or the reason why there are none."""
+    """Errors of one function and calibration set: `error_deg` (f,) by frame, or the reason why there are none.
+
+    `vector_deg` (f, 2) are the same errors to the right and up.
+    """
 
     function: str
     calibration: str
     error_deg: Floats
     reason: str | None
+    vector_deg: Floats = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def mean_deg(self) -> float | None:
@@ -125,7 +130,10 @@ def run(
             if "error" in departures and rig.screen is not None:
                 # The software assumes that the screen's centre is straight ahead of the origin.
                 eye = eye + rig.screen.centre_mm * np.array([0.0, 1.0, 1.0])
-            out.append(Outcome(function, name, angular_error_deg(gaze.point_mm, index.target_mm, eye), None))
+            error = angular_error_deg(gaze.point_mm, index.target_mm, eye)
+            out.append(
+                Outcome(function, name, error, None, error_vectors_deg(gaze.point_mm - eye, index.target_mm - eye))
+            )
     return out
 
 

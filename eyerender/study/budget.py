@@ -6,20 +6,25 @@
     I   features of M's images exposed without noise:          I - E is what forming and reading an image adds
     N   features of the same images with the sensor's noise:   N - I is what the noise adds
 
-Each is a mean over the frames for which all four have an estimate, so the terms add up exactly. A difference has a 95 %
-interval (Student's t of the paired differences). The frames are a design, not a sample, and a symmetric rig shows each
-with its mirror image. The interval of E - A is therefore narrower than for independent frames, by 2^1/2 at most.
+Each is a mean over the frames for which all four have an estimate, so the terms add up exactly. These are net effects:
+a cause that moves gaze across the existing error has nearly none. The rms angle between the paired estimates shows
+how far it moves gaze; its square is that of the shift (the mean of each eye) plus that of the pattern over the frames.
+
+A difference has a 95 % interval (Student's t of the paired differences). The frames are a design, not a sample, and a
+symmetric rig shows each with its mirror image. The interval of E - A is therefore narrower than for independent frames,
+by 2^1/2 at most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from ..arrays import Floats
-from ..gaze.budget import mean_interval
+from ..arrays import Bools, Floats, Ints
+from ..gaze.budget import displacement, mean_interval
 from .results import ModelResults
 
 ALGORITHM, EYE, IMAGE, NOISE, BOTH = "algorithm", "eye model", "image", "noise", "image and noise"
@@ -29,12 +34,25 @@ _STEPS = ("image-noiseless", "image")
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """A contribution in degrees, with its interval if it is a difference."""
+    """A contribution in degrees.
+
+    Attributes:
+        name: the cause.
+        deg: its net effect on the mean error.
+        low_deg: lower end of the 95 % interval, if it is a difference.
+        high_deg: upper end.
+        rms_deg: rms angle between the paired estimates; of the algorithm, between estimate and truth.
+        shift_deg: what is common to all frames of an eye.
+        pattern_deg: what differs between the frames, with the noise of this one exposure.
+    """
 
     name: str
     deg: float
     low_deg: float | None = None
     high_deg: float | None = None
+    rms_deg: float | None = None
+    shift_deg: float | None = None
+    pattern_deg: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,45 +77,80 @@ def budgets(parts: Sequence[ModelResults]) -> list[Budget]:
 
     The reference is the first eye model of the run, which is E1 by default.
     """
-    errors: dict[tuple[str, str, str, str], Floats] = {
-        (protocol, name, part.eye_model, observer): found
-        for part in parts
-        for (protocol, observer), by_name in part.errors.items()
-        for name, found in by_name.items()
-    }
+    errors = _by_key(parts, "errors")
+    vectors = _by_key(parts, "vectors")
     models = list(dict.fromkeys(part.eye_model for part in parts))
     reference = "E1" if "E1" in models else models[0]
     out = []
     for protocol, name, model in dict.fromkeys(key[:3] for key in errors):
-        first = errors.get((protocol, name, reference, "analytic"))
-        own = {observer: errors.get((protocol, name, model, observer)) for observer in ("analytic", *_STEPS)}
-        steps = {observer: found for observer, found in own.items() if found is not None}
-        if first is None or "analytic" not in steps or any(len(v) != len(first) for v in steps.values()):
+        keys = [(protocol, name, reference, "analytic")]
+        keys += [(protocol, name, model, observer) for observer in ("analytic", *_STEPS)]
+        keys = [key for k, key in enumerate(keys) if key in errors and (k != 1 or model != reference)]
+        first = keys[0]
+        if first[2:] != (reference, "analytic") or (protocol, name, model, "analytic") not in errors:
             continue
-        budget = _budget(protocol, name=name, model=model, reference=reference, first=first, steps=steps)
+        if any(len(errors[key]) != len(errors[first]) for key in keys):
+            continue
+        steps = [_Step(key[3], errors[key], vectors.get(key)) for key in keys]
+        budget = _budget(steps, _eyes(parts, protocol, len(errors[first])))
         if budget is not None:
-            out.append(budget)
+            out.append(Budget(protocol, name, model, reference, *budget))
     return out
 
 
-def _budget(
-    protocol: str, *, name: str, model: str, reference: str, first: Floats, steps: Mapping[str, Floats]
-) -> Budget | None:
-    rows = np.isfinite(first) & np.all([np.isfinite(v) for v in steps.values()], axis=0)
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """Errors (n,) and error vectors (n, 2) of one observer."""
+
+    observer: str
+    errors: Floats
+    vectors: Floats | None
+
+
+def _by_key(parts: Sequence[ModelResults], kind: str) -> dict[tuple[str, str, str, str], Floats]:
+    """Arrays by (protocol, estimator, eye model, observer)."""
+    return {
+        (protocol, name, part.eye_model, observer): found
+        for part in parts
+        for (protocol, observer), by_name in getattr(part, kind).items()
+        for name, found in by_name.items()
+    }
+
+
+def _eyes(parts: Sequence[ModelResults], protocol: str, n: int) -> Ints:
+    """Eye of each error; zeros where an error belongs to a frame of both."""
+    for part in parts:
+        for (name, _), (_, seen) in part.seen.items():
+            if name == protocol and len(seen) == n:
+                return seen.index.eye
+    return np.zeros(n, np.int64)
+
+
+def _budget(steps: Sequence[_Step], eye: Ints) -> tuple[int, tuple[Term, ...], float] | None:
+    """Number of frames, terms and total error."""
+    rows = np.all([np.isfinite(step.errors) for step in steps], axis=0)
     n = int(rows.sum())
     if n < 2:
         return None
-    before = first[rows]
-    terms = [Term(ALGORITHM, float(before.mean()))]
-    for observer, errors in steps.items():
-        after = errors[rows]
-        if observer != "analytic" or model != reference:
-            terms.append(Term(_name(observer, steps), *mean_interval(after - before)))
-        before = after
-    return Budget(protocol, name, model, reference, n, tuple(terms), float(before.mean()))
+    observers = [step.observer for step in steps]
+    start = _Step("", np.zeros(len(rows)), None if steps[0].vectors is None else np.zeros((len(rows), 2)))
+    terms = [Term(ALGORITHM, float(steps[0].errors[rows].mean()), None, None, *_moved(start, steps[0], rows, eye))]
+    for before, after in pairwise(steps):
+        net = mean_interval((after.errors - before.errors)[rows])
+        terms.append(Term(_name(after.observer, observers), *net, *_moved(before, after, rows, eye)))
+    return n, tuple(terms), float(steps[-1].errors[rows].mean())
 
 
-def _name(observer: str, steps: Mapping[str, Floats]) -> str:
+def _moved(before: _Step, after: _Step, rows: Bools, eye: Ints) -> tuple[float, float, float] | tuple[()]:
+    """Rms angle, shift and pattern of a displacement."""
+    if before.vectors is None or after.vectors is None:
+        return ()
+    rms, shift, pattern, _ = displacement(before.vectors[None, rows], after.vectors[None, rows], eye[rows])
+    common = sum(float(np.mean(eye[rows] == k)) * float(v @ v) for k, v in shift.items())
+    return rms, float(np.sqrt(common)), pattern
+
+
+def _name(observer: str, steps: Sequence[str]) -> str:
     """Name of the contribution of the step to an observer."""
     if observer == "analytic":
         return EYE

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats, frozen
+from ..gaze.budget import error_vectors_deg
 from ..gaze.estimate import GazePoints, angular_error_deg
 from ..gaze.parameters import NAMES, EyeParameters, ParameterBounds
 from ..observation import EYES, Observations
@@ -103,11 +104,15 @@ SOFTWARE_BOUNDS = ParameterBounds(
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One calibration at H1 and its errors: `error_deg` (n,) by observation, `head` (n,) 0 for H1."""
+    """One calibration at H1 and its errors: `error_deg` (n,) by observation, `head` (n,) 0 for H1.
+
+    `vector_deg` (n, 2) are the errors to the right and up at the eye, whatever the protocol's own measure.
+    """
 
     observations: Observations
     gaze: GazePoints
     error_deg: Floats
+    vector_deg: Floats
     estimator: AuthorsGuestrinEizenman
 
     def mean_deg(self, head: str) -> float | None:
@@ -193,7 +198,10 @@ def run(
     central = observations.take(observations.index.head == 0)
     fitted = estimator(departures, free_index=free_index).fit(central, told)
     gaze = fitted.predict(observations, told)
-    return Outcome(observations, gaze, errors_deg(observations, gaze, departures), fitted)
+    index = observations.index
+    eye = index.eye_position_mm + index.head_mm
+    vectors = error_vectors_deg(gaze.point_mm - eye, index.target_mm - eye)
+    return Outcome(observations, gaze, errors_deg(observations, gaze, departures), vectors, fitted)
 
 
 def rows_of(outcome: Outcome, **keys: Any) -> list[Row]:

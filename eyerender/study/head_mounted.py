@@ -17,9 +17,12 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Bools, Floats
-from ..gaze.estimate import angular_error_deg
+from ..errors import InputError
+from ..gaze.budget import error_vectors_deg
+from ..gaze.directions import DirectionRegression, Feature
 from ..gaze.recalibration import direction_of
 from ..observation import Observations
+from ..rig.rig import RigGeometry
 from ..scene import Scene, load_scene
 from ..scene.spec import SceneSpec
 from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
@@ -29,7 +32,7 @@ from .results import Finding, ModelResults, mean_row
 SCENE, PROTOCOL = "head_mounted", "head-mounted"
 AZIMUTHS_DEG = (15.0, 7.5, 0.0, -7.5, -15.0)
 ELEVATIONS_DEG = (12.0, 6.0, 0.0, -6.0, -12.0)
-FEATURES = ("pupil-glint vector", "pupil centre")
+FEATURES: dict[str, Feature] = {"pupil-glint vector": "pupil-glint", "pupil centre": "pupil"}
 
 
 def scene(eye: str) -> Scene:
@@ -55,10 +58,11 @@ def head_mounted_part(eye: str, observings: Sequence[Observing]) -> ModelResults
         seen = observing.observe(own)
         key = PROTOCOL, observing.kind
         out.seen[key] = own.rig, seen
-        out.errors[key] = {}
+        out.errors[key], out.vectors[key] = {}, {}
         for name in FEATURES:
-            error = direction_errors_deg(feature(seen, name), directions_deg(), learnt)
-            out.errors[key][name] = error
+            vector = direction_errors_deg(seen, own.rig, name)
+            error = np.linalg.norm(vector, axis=1)
+            out.errors[key][name], out.vectors[key][name] = error, vector
             out.rows.append(
                 mean_row(
                     error[~learnt], protocol=PROTOCOL, observer=observing.kind, variant=name, eye_model=eye,
@@ -73,34 +77,24 @@ def directions_deg() -> Floats:
     return np.array([(a, e) for e in ELEVATIONS_DEG for a in AZIMUTHS_DEG])
 
 
-def feature(seen: Observations, name: str) -> Floats:
-    """Pupil centre (n, 2) px, or its vector from the mean of all lights' glints; NaN where one is missing."""
-    centre = np.where(seen.pupil.ok[:, None], seen.pupil.centre_px, np.nan)
-    if name == "pupil centre":
-        return np.asarray(centre)
-    lights = np.unique(seen.glints.light[seen.glints.light >= 0])
-    places = []
-    for light in lights:
-        place, found = seen.glints.of_light(int(light))
-        places.append(np.where(found[:, None], place, np.nan))
-    return np.asarray(centre - np.mean(places, axis=0))
+def direction_errors_deg(seen: Observations, rig: RigGeometry, name: str) -> Floats:
+    """Errors (25, 2) of estimated directions, to the right and up, deg; NaN where learnt or not estimated.
 
-
-def direction_errors_deg(feature_px: Floats, truth_deg: Floats, learnt: Bools) -> Floats:
-    """Angles (n,) between estimated and true directions; NaN for the rows `learnt` and where there is no estimate."""
-    usable = np.isfinite(feature_px).all(axis=1)
-    rows = learnt & usable
-    out = np.full(len(feature_px), np.nan)
-    if rows.sum() < 6:
+    Args:
+        seen: observations of the 25 directions.
+        rig: their rig.
+        name: the feature, one of `FEATURES`.
+    """
+    learnt = calibration_rows()
+    truth = direction_of(np.radians(directions_deg()))
+    out = np.full((len(seen), 2), np.nan)
+    estimator = DirectionRegression("R3", FEATURES[name])
+    try:
+        fitted = estimator.fit_directions(seen.take(learnt), rig, truth[learnt])
+    except InputError:  # fewer directions than coefficients
         return out
-    origin = feature_px[rows].mean(axis=0)
-    u = (feature_px - origin) / np.abs(feature_px[rows] - origin).max()
-    design = np.stack([np.ones(len(u)), u[:, 0], u[:, 1], u[:, 0] ** 2, u[:, 0] * u[:, 1], u[:, 1] ** 2], axis=1)
-    coefficients, *_ = np.linalg.lstsq(design[rows], truth_deg[rows], rcond=None)
-    test = usable & ~learnt
-    found = design[test] @ coefficients
-    way, true_way = (direction_of(np.radians(angles)) for angles in (found, truth_deg[test]))
-    out[test] = angular_error_deg(way, true_way, np.zeros(3))
+    rays = fitted.predict_rays(seen.take(~learnt), rig)
+    out[~learnt] = error_vectors_deg(rays.direction, truth[~learnt])
     return out
 
 

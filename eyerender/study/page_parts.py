@@ -87,9 +87,10 @@ def _bar(term: Term) -> tuple[str, float, float, float]:
 def _told(term: Term | None) -> str:
     if term is None:
         return "-"
+    rms = "" if term.rms_deg is None else f" ({number(term.rms_deg)})"
     if term.low_deg is None or term.high_deg is None:
-        return number(term.deg)
-    return f"{term.deg:+.4f} ± {(term.high_deg - term.low_deg) / 2:.4f}"
+        return number(term.deg) + rms
+    return f"{term.deg:+.4f} ± {(term.high_deg - term.low_deg) / 2:.4f}{rms}"
 
 
 def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> Values:

@@ -93,6 +93,7 @@ def guestrin_part(
             keys = {"protocol": protocol, "observer": observing.kind, "variant": variant, "eye_model": eye}
             out.rows += guestrin.rows_of(done, **keys)
             out.errors.setdefault((protocol, observing.kind), {})[f"model-based, {variant}"] = done.error_deg
+            out.vectors.setdefault((protocol, observing.kind), {})[f"model-based, {variant}"] = done.vector_deg
             if not free:
                 out.seen[protocol, observing.kind] = scene.rig, seen
                 out.means[protocol, observing.kind] = {h: np.nan if m is None else m for h, m in done.means.items()}
@@ -121,6 +122,7 @@ def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> B
         out.clouds[key] = Cloud.of(seen)
         out.seen[key] = scene.rig, seen
         out.errors[key] = {f"{o.function} on {o.calibration}": o.error_deg for o in done if len(o.error_deg)}
+        out.vectors[key] = {f"{o.function} on {o.calibration}": o.vector_deg for o in done if len(o.error_deg)}
         keys = {"protocol": protocol, "observer": observing.kind, "eye_model": eye}
         out.rows += blignaut.rows_of(done, variant="vector", **keys)
         if protocol == "corrected":

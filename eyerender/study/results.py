@@ -55,12 +55,14 @@ class ModelResults:
         rows: mean errors.
         seen: by (protocol, observer) the rig and its observations.
         errors: by (protocol, observer) and name of the estimator the errors (n,) deg.
+        vectors: the same errors to the right and up (n, 2) deg (`error_vectors_deg`).
     """
 
     eye_model: str
     rows: list[Row] = field(default_factory=list)
     seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
     errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
+    vectors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -201,7 +201,7 @@ def test_refusals(scene):
     with pytest.raises(InputError, match="call fit first"):
         GuestrinEizenman().predict(seen, world())
     with pytest.raises(InputError, match="needs a screen"):
-        GuestrinEizenman().fit(seen, replace(world(), screen=None))
+        GuestrinEizenman().fit(seen, world()).predict(seen, replace(world(), screen=None))
     with pytest.raises(InputError, match="less than its upper bound"):
         ParameterBounds(lower=EyeParameters(cornea_radius_mm=9.0), upper=EyeParameters(cornea_radius_mm=8.0))
 

@@ -137,7 +137,7 @@ def test_it_is_fitted_stored_and_loaded_again(place, tmp_path, capsys):
     assert run(fit(reference)) == 0
     assert f"{reference}: calibrated on" in capsys.readouterr().out
     data = json.loads((tmp_path / "c.json").read_text())
-    assert data["schema"] == "eyerender/gaze-calibration/3"
+    assert data["schema"] == "eyerender/gaze-calibration/4"
     assert data["estimator"] == {"reference": reference}
     assert set(data["state"]["means"]) == {"0", "1"}
     assert run(predict("--estimator", reference, "--json", "gaze.json")) == 0

@@ -242,7 +242,7 @@ def test_calibrations_without_a_rig_are_still_read(guestrin, tmp_path, capsys):
     fitted, _ = fit_estimator(estimator, seen, rig)
     save_estimator(tmp_path / "c.json", fitted, rig)
     data = json.loads((tmp_path / "c.json").read_text())
-    assert data["schema"] == "eyerender/gaze-calibration/3"
+    assert data["schema"] == "eyerender/gaze-calibration/4"
     assert data["rig"] == json.loads(guestrin.read_text())["rig"]
     del data["rig"]
     (tmp_path / "c.json").write_text(json.dumps({**data, "schema": "eyerender/gaze-calibration/1"}))

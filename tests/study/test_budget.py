@@ -20,6 +20,8 @@ class Seen:
 
     eye_model: str
     errors: dict = field(default_factory=dict)
+    vectors: dict = field(default_factory=dict)
+    seen: dict = field(default_factory=dict)
 
 
 def drawn(observers=("analytic", "image", "image-noiseless"), models=("E1", "E2", "E3"), n=40):
@@ -45,6 +47,23 @@ def test_terms_add_up_and_intervals_are_those_of_paired_t_tests():
         test = ttest_rel(after, before).confidence_interval(0.95)
         np.testing.assert_allclose([term.low_deg, term.high_deg], [test.low, test.high], atol=1e-12)
         assert term.deg == pytest.approx((after - before).mean(), abs=1e-12)
+
+
+def test_a_term_moves_gaze_by_the_rms_angle_though_its_net_effect_vanishes():
+    """Errors of .2 deg to the right; the image moves gaze up by .05 deg, and noise by .03 to the right and left."""
+    parts = drawn(models=("E1",), n=4)
+    right, sides = np.tile([0.2, 0.0], (4, 1)), 0.03 * np.array([[1, 0], [-1, 0], [1, 0], [-1, 0]])
+    up = np.tile([0.2, 0.05], (4, 1))
+    vectors = {"analytic": right, "image-noiseless": up, "image": up + sides}
+    for observer, vector in vectors.items():
+        parts[0].vectors["corrected", observer] = {"a": vector}
+        parts[0].errors["corrected", observer] = {"a": np.linalg.norm(vector, axis=1)}
+    (found,) = budgets(parts)
+    image, noise = found.term(IMAGE), found.term(NOISE)
+    np.testing.assert_allclose([image.rms_deg, image.shift_deg, image.pattern_deg], [0.05, 0.05, 0], atol=1e-8)
+    np.testing.assert_allclose([noise.rms_deg, noise.shift_deg, noise.pattern_deg], [0.03, 0, 0.03], atol=1e-8)
+    assert image.deg == pytest.approx(np.hypot(0.2, 0.05) - 0.2)
+    assert abs(noise.deg) < 2e-4  # .03^2 .05^2 / (2 .2^3) and smaller
 
 
 def test_what_was_not_observed_has_no_term():
@@ -74,4 +93,6 @@ def test_the_report_says_what_the_summary_holds(tmp_path):
     algorithm, eye = budget["terms"]
     assert f"the error of the algorithm itself is {algorithm['deg']:.3f} deg" in page
     assert f"eye model {eye['deg']:+.3f} deg" in page
-    assert f"{eye['deg']:+.4f} ± {(eye['high_deg'] - eye['low_deg']) / 2:.4f}" in page
+    assert f"{eye['deg']:+.4f} ± {(eye['high_deg'] - eye['low_deg']) / 2:.4f} ({eye['rms_deg']:.4f})" in page
+    np.testing.assert_allclose(eye["rms_deg"] ** 2, eye["shift_deg"] ** 2 + eye["pattern_deg"] ** 2)
+    assert eye["rms_deg"] > abs(eye["deg"])

@@ -1,0 +1,123 @@
+"""Regression of gaze directions, for rigs without a screen, such as head-mounted ones.
+
+    f = pupil - mean of the glints   (or the pupil alone),      (azimuth, elevation) = sum_k (a_k, b_k) m_k(f)
+
+with the monomials of `regression.py`, fitted by least squares for each eye. Azimuth and elevation are those of the line
+from the eye to the target, so targets may be at any distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
+
+import numpy as np
+
+from ..arrays import Floats, Objects
+from ..errors import InputError
+from ..observation import Observations
+from ..rig.rig import RigLike
+from .estimate import GazePoints, GazeRays
+from .rays import camera_of, chosen_lights, glints_of, screen_of, target_directions
+from .recalibration import angles_of, direction_of
+from .regression import EyeFit, Regression, Terms, monomials
+
+Feature = Literal["pupil-glint", "pupil"]
+
+
+@dataclass(frozen=True, slots=True)
+class DirectionRegression:
+    """Polynomial from a feature of one eye in one camera, in pixels, to the direction of gaze.
+
+    The rays start at the eye's place, the apex of the unrotated cornea.
+
+    Args:
+        function: R1 to R12 of Table 2, or the terms of azimuth and of elevation.
+        feature: "pupil-glint", the vector from the mean of the glints to the pupil, or "pupil", its centre alone.
+        lights: lights of the glints; None: all of the rig's. An observation that lacks one of them has no vector.
+        fits: by eye (0 right, 1 left), set by `fit`.
+    """
+
+    function: str | tuple[str, str] = "R3"
+    feature: Feature = "pupil-glint"
+    lights: tuple[int, ...] | None = None
+    fits: Mapping[int, EyeFit] = field(default_factory=dict, repr=False)
+
+    @property
+    def terms(self) -> tuple[Terms, Terms]:
+        """Exponents of the terms of azimuth and of elevation."""
+        return self._polynomial.terms
+
+    @property
+    def _polynomial(self) -> Regression:
+        # A feature in pixels may lie far from 0, so the polynomial is about its mean.
+        return Regression(self.function, normalised=False, centred=True)
+
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
+        """Calibrate each eye on the directions of the targets from the eye's place.
+
+        Raises:
+            InputError: there are too few usable targets, or they do not determine the polynomial.
+        """
+        return self.fit_directions(observations, rig, target_directions(observations))
+
+    def fit_directions(self, observations: Observations, rig: RigLike, direction: Floats) -> Self:
+        """Calibrate each eye on known directions (n, 3), such as those of the optic axis; NaN where there is none.
+
+        Raises:
+            InputError: as for `fit`.
+        """
+        features, reason = self.features(observations, rig)
+        wanted = angles_of(np.asarray(direction, dtype=float))
+        usable = (reason == None) & np.isfinite(wanted).all(axis=1)  # noqa: E711
+        fits = {}
+        for eye in np.unique(observations.index.eye):
+            rows = np.asarray(usable & (observations.index.eye == eye), dtype=bool)
+            name = "left" if eye == 1 else "right"
+            fits[int(eye)] = self._polynomial.fit_eye(features[rows], wanted[rows], name)
+        return replace(self, fits=fits)
+
+    def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
+        """Estimate rays of gaze; no screen is needed."""
+        if not self.fits:
+            raise InputError("the estimator is not calibrated; call fit first")
+        index = observations.index
+        features, reason = self.features(observations, rig)
+        angles = np.full((len(observations), 2), np.nan)
+        for eye in np.unique(index.eye):
+            rows = np.flatnonzero(index.eye == eye)
+            fit = self.fits.get(int(eye))
+            if fit is None:
+                reason[rows] = "this eye is not calibrated"
+                continue
+            u = (features[rows] - fit.origin) / fit.scale
+            x_terms, y_terms = self.terms
+            angles[rows] = np.stack([monomials(u, x_terms) @ fit.a, monomials(u, y_terms) @ fit.b], axis=-1)
+        return GazeRays.of(index.eye_position_mm + index.head_mm, direction_of(angles), reason)
+
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
+        """Estimate gaze points on the screen's plane.
+
+        Raises:
+            InputError: the rig has no screen; `predict_rays` works without one.
+        """
+        screen = screen_of(rig.build(), "predict_rays gives rays without one")
+        rays = self.predict_rays(observations, rig)
+        on_screen, meets = screen.intersect(rays.origin_mm, rays.direction)
+        reason = rays.reason.copy()
+        reason[(reason == None) & ~meets] = "the gaze ray does not meet the screen"  # noqa: E711
+        return GazePoints.of(screen.world(on_screen), reason)
+
+    def features(self, observations: Observations, rig: RigLike) -> tuple[Floats, Objects]:
+        """Features (n, 2) px, and the reasons why there are none (n,), None where there are."""
+        built = rig.build()
+        _, unknown = camera_of(observations, built)
+        lights = () if self.feature == "pupil" else chosen_lights(built, self.lights, 1)
+        places, reason = glints_of(observations, lights)
+        reason = np.where(unknown == None, reason, unknown)  # noqa: E711
+        found = observations.pupil.centre_px
+        if lights:
+            found = found - places.mean(axis=1)
+        good = np.asarray(reason == None)  # noqa: E711
+        return np.where(good[:, None], found, np.nan), reason
