@@ -3,6 +3,10 @@
 Two trackers are calibrated at the central head position with a 4 mm pupil, on analytic features of both studies'
 corrected scenes: the model-based one of [28] (nine targets, index fixed) and the interpolation-based one of [29] (R8 on
 C14). Angles are measured from the right eye (model-based) or the mid-point of both (interpolation).
+
+Pupils are tested twice: widening about a fixed centre, and about a centre that shifts with the diameter (`eye.margin`).
+The eyes of a published model are mirror images of each other, so their horizontal errors cancel in the mean of both.
+The errors of the right eye alone stand beside it, and a few drawn people, whose eyes differ.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from ..gaze.estimate import angular_error_deg, binocular_average
 from ..gaze.guestrin import GuestrinEizenman
 from ..gaze.quality import Quality, quality
 from ..gaze.regression import Regression
-from ..observation import Observations
+from ..observation import EYES, Observations
 from ..scene import Scene
 from ..scene.spec import SceneSpec
 from . import blignaut, guestrin
@@ -30,10 +34,17 @@ from .results import Row, mean_row
 
 TRACKERS = ("model-based", "interpolation")
 FUNCTION, CALIBRATION = "R8", "C14"
+CALIBRATED_MM = 4.0
 DIAMETERS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 HEAD_MM = (-40.0, -20.0, 0.0, 20.0, 40.0)
 GRID = (13, 11)
 NOISE_PX, SAMPLES, SEED = 0.05, 100, 2014
+DRAWN_PEOPLE = "drawn people"
+"""Name of the job of drawn people, among the names of eye models."""
+PEOPLE_PRESET, PEOPLE_SEED, PEOPLE = "adults", 0, 4
+FIXED, SHIFTED = "centre fixed", "centre shifts"
+CENTRES: dict[str, dict[str, Any]] = {FIXED: {}, SHIFTED: {"margin": {}}}
+"""How the pupil widens -> keys of the scene's eye."""
 QUALITY = tuple(field.name for field in fields(Quality))
 
 
@@ -78,8 +89,17 @@ class ConditionsPart:
     screen_maps: dict[str, Floats] = field(default_factory=dict)
     head_maps: dict[str, Floats] = field(default_factory=dict)
     diameters: dict[str, list[float]] = field(default_factory=dict)
+    """Mean errors over `DIAMETERS_MM` by the name of the curve: tracker, whose errors, how the pupil widens."""
     sensitivity: list[dict[str, Any]] = field(default_factory=list)
     precision: dict[str, dict[str, float]] = field(default_factory=dict)
+    rows: list[Row] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class PeoplePart:
+    """Mean errors (deg) over `DIAMETERS_MM` of drawn people, by subject and curve as in `ConditionsPart.diameters`."""
+
+    diameters: dict[int, dict[str, list[float]]] = field(default_factory=dict)
     rows: list[Row] = field(default_factory=list)
 
 
@@ -102,6 +122,15 @@ class _Tracker:
         """Points from which the angles are measured, (n, 3)."""
         place = np.asarray(seen.index.head_mm)
         return place if self.name == "interpolation" else place + seen.index.eye_position_mm
+
+    def errors_by_eye_deg(self, seen: Observations) -> dict[str, Floats]:
+        """Errors (n,) of what the tracker reports, and of each single eye where it averages both."""
+        index = seen.index
+        if self.name == "model-based":
+            return {EYES[0]: self.errors_deg(seen)}
+        points = self.estimator.predict(seen, self.scene.rig).point_mm
+        single = angular_error_deg(points, index.target_mm, index.eye_position_mm + index.head_mm)
+        return {"both": self.errors_deg(seen)} | {side: single[index.eye == k] for k, side in enumerate(EYES)}
 
     def errors_deg(self, seen: Observations) -> Floats:
         """Errors (n,) by frame."""
@@ -126,15 +155,9 @@ def conditions_part(eye: str) -> ConditionsPart:
         out.rows.append(mean_row(over, variant=f"{name}, {columns} x {rows} targets", **keys))
         out.head_maps[name], head_rows = _over_heads(tracker, keys)
         out.rows += head_rows
-        out.diameters[name] = []
-        for diameter in DIAMETERS_MM:
-            row = mean_row(
-                tracker.errors_deg(trace(_changed(tracker.scene, {"eye": {"pupil_diameter_mm": diameter}}))),
-                variant=f"{name}, pupil {diameter:g} mm",
-                **keys,
-            )
-            out.rows.append(row)
-            out.diameters[name].append(np.nan if row.mean_deg is None else row.mean_deg)
+        curves, pupil_rows = _over_diameters(tracker, eye, sides=("both", EYES[0]))
+        out.diameters |= curves
+        out.rows += pupil_rows
         out.precision[name] = _precision(tracker, seen)
     base = {name: _mean(_scene(name, eye)) for name in TRACKERS}
     for label, paths, step, unit in PARAMETERS:
@@ -154,6 +177,55 @@ def conditions_part(eye: str) -> ConditionsPart:
             entry[name] |= {"at_plus": up, "at_minus": down, "per_step": 0.5 * (up - down)}
         out.sensitivity.append(entry)
     return out
+
+
+def people_part() -> PeoplePart:
+    """Compute the errors over the pupil's diameter of a few drawn people."""
+    out = PeoplePart()
+    for subject in range(PEOPLE):
+        out.diameters[subject] = {}
+        for name in TRACKERS:
+            choice = {"preset": PEOPLE_PRESET, "seed": PEOPLE_SEED, "subject": subject}
+            data = _scene(name, "E2").spec.to_mapping()
+            data["subject"].pop("ipd_mm", None)
+            data["eye"] = {"pupil_diameter_mm": data["eye"].get("pupil_diameter_mm") or CALIBRATED_MM}
+            data = {key: value for key, value in data.items() if key not in ("look", "region")}
+            scene = Scene.of(SceneSpec.from_mapping({**data, "population": choice}, source=name))
+            tracker, _ = _calibrated(scene)
+            label = f"{PEOPLE_PRESET} {PEOPLE_SEED}/{subject}"
+            # A person's eye file has its own shift of the centre.
+            curves, rows = _over_diameters(tracker, label, sides=("both", *EYES), centres={SHIFTED: {}})
+            out.diameters[subject] |= curves
+            out.rows += rows
+    return out
+
+
+def _over_diameters(
+    tracker: _Tracker, eye: str, *, sides: Sequence[str], centres: dict[str, dict[str, Any]] | None = None
+) -> tuple[dict[str, list[float]], list[Row]]:
+    """Mean errors over the diameters by curve, and their rows."""
+    curves: dict[str, list[float]] = {}
+    rows = []
+    for centre, keys in (CENTRES if centres is None else centres).items():
+        for diameter in DIAMETERS_MM:
+            scene = _changed(tracker.scene, {"eye": {"pupil_diameter_mm": diameter, **keys}})
+            for side, errors in tracker.errors_by_eye_deg(trace(scene)).items():
+                if side not in sides:
+                    continue
+                more = {} if tracker.name == "model-based" else {"function": FUNCTION, "calibration": CALIBRATION}
+                row = mean_row(
+                    errors, protocol="corrected", observer="analytic", eye_model=eye, eye=side,
+                    variant=f"{tracker.name}, pupil {diameter:g} mm, {centre}", **more,
+                )  # fmt: skip
+                rows.append(row)
+                mean = np.nan if row.mean_deg is None else row.mean_deg
+                curves.setdefault(curve(tracker.name, side, centre), []).append(mean)
+    return curves, rows
+
+
+def curve(tracker: str, side: str, centre: str) -> str:
+    """Name of a curve of errors over the pupil's diameter."""
+    return f"{tracker}, {side} {'eyes' if side == 'both' else 'eye'}, {centre}"
 
 
 def _scene(tracker: str, eye: str) -> Scene:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from . import conditions as c
-from .conditions import ConditionsPart
+from .conditions import ConditionsPart, PeoplePart
 from .figures import lines_figure, map_figure, sensitivity_figure
 from .page_parts import Report, Values, number
 from .results import Finding
@@ -20,29 +20,44 @@ _WHO = {
 }
 
 
-def findings(parts: Sequence[ConditionsPart]) -> list[Finding]:
+_D1 = "largest error on the screen (deg)"
+_D2 = "largest mean error over head positions within 40 mm (deg)"
+_D3 = "largest change of the mean error over pupils of 2 to 8 mm (deg)"
+
+
+def findings(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> list[Finding]:
     """Effects of the conditions as values; there is no published claim to compare them with."""
     out = []
+
+    def add(name: str, rule: str, value: float, detail: str) -> None:
+        out.append(Finding(name, "corrected", "analytic", rule, float(value), "none", None, detail))
+
     for tracker in c.TRACKERS:
         for part in parts:
-            base = part.rows[0 if tracker == "model-based" else len(part.rows) // 2].mean_deg or np.nan
-            sizes = np.array(part.diameters[tracker])
-            for name, rule, value in (
-                ("D1", "largest error on the screen (deg)", np.nanmax(part.screen_maps[tracker])),
-                ("D2", "largest mean error over head positions within 40 mm (deg)", np.nanmax(part.head_maps[tracker])),
-                (
-                    "D3",
-                    "largest change of the mean error over pupils of 2 to 8 mm (deg)",
-                    np.nanmax(np.abs(sizes - base)),
-                ),
-            ):
-                rule = f"{part.eye_model}, {tracker}: {rule}"
-                detail = f"as calibrated {base:.4f} deg"
-                out.append(Finding(name, "corrected", "analytic", rule, float(value), "none", None, detail))
+            base = next(r.mean_deg for r in part.rows if r.variant == f"{tracker}, as calibrated") or np.nan
+            detail = f"as calibrated {base:.4f} deg"
+            add("D1", f"{part.eye_model}, {tracker}: {_D1}", np.nanmax(part.screen_maps[tracker]), detail)
+            add("D2", f"{part.eye_model}, {tracker}: {_D2}", np.nanmax(part.head_maps[tracker]), detail)
+    curves = [(p.eye_model, name, values) for p in parts for name, values in p.diameters.items()]
+    curves += [
+        (f"{c.PEOPLE_PRESET} {subject}", name, values)
+        for p in people
+        for subject, by_name in p.diameters.items()
+        for name, values in by_name.items()
+    ]
+    for who, name, values in curves:
+        base = values[c.DIAMETERS_MM.index(c.CALIBRATED_MM)]
+        change = np.nanmax(np.abs(np.array(values) - base))
+        add(
+            "D3",
+            f"{who}, {name}: {_D3}",
+            change,
+            f"{base:.4f} deg at 4 mm, {values[0]:.4f} at 2, {values[-1]:.4f} at 8",
+        )
     return out
 
 
-def more(parts: Sequence[ConditionsPart]) -> dict[str, Any]:
+def more(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> dict[str, Any]:
     """Content of the summary besides its rows."""
     return {
         "trackers": _WHO,
@@ -56,13 +71,19 @@ def more(parts: Sequence[ConditionsPart]) -> dict[str, Any]:
                 "head_maps_deg": {k: _listed(v) for k, v in part.head_maps.items()},
                 "sensitivity": part.sensitivity,
                 "precision": part.precision,
+                "diameters_deg": part.diameters,
             }
             for part in parts
         ],
+        "people": {
+            "preset": c.PEOPLE_PRESET,
+            "seed": c.PEOPLE_SEED,
+            "diameters_deg": {str(subject): found for part in people for subject, found in part.diameters.items()},
+        },
     }
 
 
-def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Report:
+def page(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found: Sequence[Finding]) -> Report:
     """Make the report."""
     head = np.array(c.HEAD_MM)
     moved = ("to the subject's left (mm)", "towards the screen (mm)", "mean error (deg)", [(0.0, 0.0)])
@@ -82,12 +103,12 @@ def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Report:
         "head_maps": {
             t: map_figure({p.eye_model: p.head_maps[t] for p in parts}, head, head, *moved) for t in c.TRACKERS
         },
-        "diameters": lines_figure(
-            {t: {p.eye_model: p.diameters[t] for p in parts} for t in c.TRACKERS},
-            c.DIAMETERS_MM,
-            "diameter of the anatomical pupil (mm)",
-            "mean error (deg)",
-        ),
+        "diameters": {t: _over_diameters(t, {p.eye_model: p.diameters for p in parts}) for t in c.TRACKERS},
+        "people": {
+            t: _over_diameters(t, {f"person {k}": found for p in people for k, found in p.diameters.items()})
+            for t in c.TRACKERS
+            if people
+        },
         "sensitivity": _sensitivity_figure(parts),
         "failed": [text for p in parts if (text := _failed(p))],
         "noise_px": f"{c.NOISE_PX:g}",
@@ -99,11 +120,18 @@ def page(parts: Sequence[ConditionsPart], found: Sequence[Finding]) -> Report:
         "values": [(f.id, f.rule, f"{f.value:.4f}", f.detail) for f in found],
         "rows": [
             (r.eye_model, r.variant or "", number(r.mean_deg), number(r.sd_deg), str(r.n), str(r.missing))
-            for p in parts
+            for p in (*parts, *people)
             for r in p.rows
         ],
     }
     return Report("conditions.html.j2", values)
+
+
+def _over_diameters(tracker: str, who: dict[str, dict[str, list[float]]]) -> str:
+    """Draw a tracker's errors over the pupil's diameter: a panel per curve, a line per eye model or person."""
+    names = [name for name in next(iter(who.values())) if name.startswith(tracker)]
+    panels = {name.removeprefix(f"{tracker}, "): {k: curves[name] for k, curves in who.items()} for name in names}
+    return lines_figure(panels, c.DIAMETERS_MM, "diameter of the anatomical pupil (mm)", "mean error (deg)")
 
 
 def _sensitivity_figure(parts: Sequence[ConditionsPart]) -> str:

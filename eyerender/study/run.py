@@ -21,7 +21,7 @@ from ..scene import Scene
 from ..storage.files import read_json, write_json, write_text
 from ..storage.lock import writer_lock
 from . import blignaut, guestrin, head_mounted, together
-from .conditions import conditions_part
+from .conditions import DRAWN_PEOPLE, conditions_part, people_part
 from .head_mounted import head_mounted_part
 from .images import make_images
 from .literature import MODELS, VARIANTS
@@ -166,13 +166,15 @@ def _models(
     out = [(eye, tuple(protocols)) for eye in eyes]
     if name == "guestrin2006" and observings[0].kind == "analytic" and "E5" in eyes and "published" in protocols:
         out += [(v, ("published",)) for v in VARIANTS if v not in eyes]
+    if name == "conditions":
+        out.append((DRAWN_PEOPLE, tuple(protocols)))
     return out
 
 
 def _job(name: str, job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> Any:
     observings, eye, protocols = job
     if name == "conditions":
-        return conditions_part(eye)
+        return people_part() if eye == DRAWN_PEOPLE else conditions_part(eye)
     if name == "observers":
         return head_mounted_part(eye, observings)
     return (guestrin_part if name == "guestrin2006" else blignaut_part)(eye, protocols, observings[0])

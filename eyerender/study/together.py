@@ -20,7 +20,7 @@ from . import (
     observers_compared,
 )
 from .budget import Budget, budgets
-from .conditions import ConditionsPart
+from .conditions import ConditionsPart, PeoplePart
 from .literature import VARIANTS
 from .page_parts import Apart, Report
 from .replicate import BlignautPart, GuestrinPart
@@ -79,11 +79,14 @@ def blignaut_results(parts: Sequence[BlignautPart], protocols: Sequence[str]) ->
     return rows, found, more, blignaut_page.page(parts, found, faults, apart, made_of)
 
 
-def conditions_results(parts: Sequence[ConditionsPart], protocols: Sequence[str] = ()) -> Results:
+def conditions_results(parts: Sequence[ConditionsPart | PeoplePart], protocols: Sequence[str] = ()) -> Results:
     """Results of conditions: values without a published claim."""
     rows = [row for part in parts for row in part.rows]
-    found = conditions_page.findings(parts)
-    return rows, found, conditions_page.more(parts), conditions_page.page(parts, found)
+    models = [part for part in parts if isinstance(part, ConditionsPart)]
+    people = [part for part in parts if isinstance(part, PeoplePart)]
+    found = conditions_page.findings(models, people)
+    more = conditions_page.more(models, people)
+    return rows, found, more, conditions_page.page(models, people, found)
 
 
 def observers_results(parts: Sequence[ModelResults], protocols: Sequence[str] = ()) -> Results:

@@ -16,7 +16,7 @@ from eyerender.errors import InputError
 from eyerender.scene import load_scene
 from eyerender.status import Status
 from eyerender.study import guestrin, head_mounted, observers_compared
-from eyerender.study.conditions import PARAMETERS, TRACKERS, conditions_part
+from eyerender.study.conditions import FIXED, PARAMETERS, SHIFTED, TRACKERS, conditions_part, people_part
 from eyerender.study.images import StudyImages, facing_scene
 from eyerender.study.observing import Observing, moved, with_index_of
 from eyerender.study.run import run_study
@@ -209,7 +209,9 @@ def test_conditions():
         assert centre == np.nanmin(part.head_maps[tracker]) or tracker == "model-based"
         # 4 mm is what it was calibrated with.
         own = next(r for r in part.rows if r.variant == f"{tracker}, as calibrated")
-        assert part.diameters[tracker][2] == pytest.approx(own.mean_deg, rel=1e-9)
+        reported = "right eye" if tracker == "model-based" else "both eyes"
+        for centre in (FIXED, SHIFTED):
+            assert part.diameters[f"{tracker}, {reported}, {centre}"][2] == pytest.approx(own.mean_deg, rel=1e-9)
         assert part.precision[tracker]["rms_s2s_deg"] / part.precision[tracker]["sd_deg"] == pytest.approx(
             2**0.5, rel=0.03
         )
@@ -223,6 +225,35 @@ def test_conditions():
     # A rounder cornea (Q towards 0) is what the model-based tracker assumes.
     q = next(e for e in part.sensitivity if e["parameter"] == "corneal asphericity Q")
     assert q["model-based"]["at_plus"] < q["model-based"]["base"] < q["model-based"]["at_minus"]
+
+
+def test_shifts_of_mirrored_pupils_cancel_in_the_mean_of_both_eyes():
+    """The shift moves the gaze of each eye horizontally; the mean of both hides that."""
+    part = conditions_part("E2")
+    both, right = (part.diameters[f"interpolation, {who}, {SHIFTED}"] for who in ("both eyes", "right eye"))
+    base = right[2]
+    # .06 mm per mm, 2 mm from the calibration: .12 mm at 4.2 mm from the centre of curvature are 1.6 degrees.
+    assert 1.0 < right[0] - base < 2.0
+    assert right[-1] > right[-2] > right[-3] > base
+    assert max(np.abs(np.array(both) - both[2])) < 0.3 * (right[0] - base)
+    fixed = part.diameters[f"interpolation, right eye, {FIXED}"]
+    assert max(np.abs(np.array(fixed) - fixed[2])) < 0.5 * (right[0] - base)
+
+
+def test_pupil_sizes_of_drawn_people():
+    """Their eyes differ, so single eyes and the mean of both do; every curve meets its calibration at 4 mm."""
+    part = people_part()
+    assert len(part.diameters) == 4
+    for curves in part.diameters.values():
+        assert set(curves) == {
+            f"{tracker}, {SHIFTED}"
+            for tracker in ("model-based, right eye", "interpolation, both eyes", "interpolation, right eye",
+                            "interpolation, left eye")
+        }  # fmt: skip
+        for values in curves.values():
+            assert np.isfinite(values).all()
+            assert np.argmin(values) in (1, 2, 3)  # 3, 4 or 5 mm
+    assert {row.eye for row in part.rows} == {"both", "right", "left"}
 
 
 @pytest.mark.slow
