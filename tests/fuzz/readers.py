@@ -145,7 +145,7 @@ def _png_seeds() -> list[bytes]:
 
 
 def _map(path: Path) -> Any:
-    from eyerender.rendering.transport.environment import read_map
+    from eyerender.rendering.transport.environmentmap import read_map
 
     return read_map(path)
 

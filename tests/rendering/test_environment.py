@@ -138,7 +138,8 @@ def test_irradiance_against_the_integral(renderer, tmp_path):
     """Matte surfaces against the sum over the map, with a window and a sun of two degrees in it."""
     import mitsuba as mi
 
-    from eyerender.rendering.transport.environment import Ambience, Maps, map_rotation
+    from eyerender.rendering.transport.environment import Ambience, Maps
+    from eyerender.rendering.transport.environmentmap import map_rotation
 
     rng = np.random.default_rng(5)
     spec = RadianceMap(file=str(tmp_path / "m.npy"), azimuth_deg=40.0, elevation_deg=-20.0, roll_deg=65.0)
@@ -151,8 +152,8 @@ def test_irradiance_against_the_integral(renderer, tmp_path):
     weight = (edges[:-1] - edges[1:])[:, None, None] * (np.pi / 64)
     world = w @ map_rotation(spec).T
     expected = np.array([np.sum(weight[..., 0] * values * np.maximum(world @ k, 0)) for k in n]) * 1e-3
-    ambience = Ambience.upload(0.0, np.zeros((0, 13)), spec, Maps())
-    seen = ambience.irradiance(mi.Vector3f(0), mi.Vector3f(*n.T.astype(np.float32))).numpy()
+    ambience = Ambience.build(0.0, np.zeros((0, 13)), spec, Maps())
+    seen = ambience.at(mi.Vector3f(0), mi.Vector3f(*n.T.astype(np.float32))).numpy()
     # The table's cells are 3.75 degrees large: cosines between them are good to 5e-4, and where the sun sets to .01.
     np.testing.assert_allclose(seen, expected, atol=0.01 * expected.max())
     assert np.abs(seen - expected).mean() < 5e-4 * expected.max()
@@ -181,8 +182,8 @@ def test_a_panels_irradiance_against_the_integral(renderer, point, normal):
     n = np.array(normal) / np.linalg.norm(normal)
     area = 4 * np.linalg.norm(right) * np.linalg.norm(up) / s.size**2
     expected = 2e-3 * np.sum(np.maximum(q @ n, 0) * np.maximum(-q @ front, 0) / r**4) * area
-    ambience = Ambience.upload(0.0, table, None, Maps())
-    seen = float(ambience.irradiance(mi.Vector3f(*map(float, point)), mi.Vector3f(*map(float, n))).numpy()[0])
+    ambience = Ambience.build(0.0, table, None, Maps())
+    seen = float(ambience.at(mi.Vector3f(*map(float, point)), mi.Vector3f(*map(float, n))).numpy()[0])
     assert seen == pytest.approx(expected, rel=2e-3, abs=1e-9)
 
 
@@ -214,7 +215,7 @@ def test_formats_and_channels(renderer, tmp_path, ending):
     import mitsuba as mi
 
     from eyerender.rendering.scene.exr import second_thread
-    from eyerender.rendering.transport.environment import read_map
+    from eyerender.rendering.transport.environmentmap import read_map
 
     colours = np.random.default_rng(3).uniform(0.1, 40.0, (8, 16, 3)).astype(np.float32)
     path = tmp_path / f"map.{ending}"
@@ -227,17 +228,18 @@ def test_formats_and_channels(renderer, tmp_path, ending):
 
 
 def test_a_large_map_is_averaged_not_sampled(renderer):
-    from eyerender.rendering.transport.environment import surrounding
+    from eyerender.rendering.transport.environmentmap import environment_map
 
     rng = np.random.default_rng(2)
     values = rng.exponential(size=(1200, 2400)) ** 4
-    made = surrounding(values)
+    made = environment_map(values)
     assert made.values.shape == (512, 1024)
     assert made.values.mean() == pytest.approx(values.mean(), rel=1e-6)
 
 
 def test_files_that_are_no_maps_are_refused(renderer, tmp_path):
-    from eyerender.rendering.transport.environment import Maps, read_map
+    from eyerender.rendering.transport.environment import Maps
+    from eyerender.rendering.transport.environmentmap import read_map
 
     (tmp_path / "cut.hdr").write_bytes(b"#?RADIANCE\n")
     (tmp_path / "text.exr").write_text("hello")

@@ -98,7 +98,10 @@ def job_of(
     from eyerender.rendering.records.job import RenderJob
 
     M, t = rigid_motion(Poses.from_degrees([pose_deg[0]], [pose_deg[1]]), eye)
-    job = RenderJob(eye, M[0], t[0], rig.camera, window, rig.lights, Sensor(noise=False), apex_mm=np.zeros(3), seed=1)
+    job = RenderJob(
+        eye=eye, M=M[0], t=t[0], camera=rig.camera, window=window, lights=rig.lights, sensor=Sensor(noise=False),
+        apex_mm=np.zeros(3), seed=1,
+    )  # fmt: skip
     return replace(job, **changes)
 
 

@@ -234,10 +234,7 @@ def _limbus(scene: Scene, view: EyeInWindow) -> Floats | None:
 def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
     """Check the spots of the glints: each is the mean of the lamp's image, or within it where a part is hidden."""
     eye, camera = view.eye, scene.rig.cameras[view.camera]
-    mirror = GlintScene(
-        eye.front[0], float(eye.front_indices[0]), film_index(eye, scene.spec.look), float(eye.limbus_radius_mm),
-        np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), view.M, view.t, camera,
-    )  # fmt: skip
+    mirror = GlintScene.of(eye, film_index(eye, scene.spec.look), view.M, view.t, camera, None)
     images = mirror.images(scene.rig.lights, scene.spec.sensor.psf_sigma_px)
     glints = mirror.glints(scene.rig.lights, images, _all_clear)
     picture = scene.spec.image

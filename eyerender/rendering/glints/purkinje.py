@@ -61,7 +61,12 @@ def purkinje_images(
         scale = camera.K[0, 0] * camera.K[1, 1] * distortion_determinant(camera, x, y) / z**3
         energy = node.weight * float(lamp.intensity_mw_sr) * lobe * passed * scale / np.where(ok, tube, 1.0)
         entry, leave = traced.points_mm[-1] @ M.T + t, traced.points_mm[1] @ M.T + t
-        images.append(Image(points, entry, leave, camera.pixels_of(x, y), np.where(ok, energy, 0.0), ok, ok))
+        images.append(
+            Image(
+                source_mm=points, entry_mm=entry, exit_mm=leave, xy_px=camera.pixels_of(x, y),
+                energy=np.where(ok, energy, 0.0), there=ok, found=ok,
+            )
+        )  # fmt: skip
     return images
 
 

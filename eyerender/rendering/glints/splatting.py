@@ -70,7 +70,7 @@ class Mirrored:
         return Mirrored(glints, self.others, reasons)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MirrorImages:
     """The mirror images of a job's lamps and of the sun, before it is known what hides them.
 
@@ -94,17 +94,15 @@ class MirrorImages:
     def of(cls, job: RenderJob, mesh: SurfaceMesh | None) -> MirrorImages:
         """Find the images, with NumPy alone unless a mesh takes the place of the cornea's front."""
         eye = job.eye
-        scene = GlintScene(
-            eye.front[0], float(eye.front_indices[0]), job.film_index, float(eye.limbus_radius_mm),
-            np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm), job.M, job.t, job.camera, mesh,
-        )  # fmt: skip
+        scene = GlintScene.of(eye, job.film_index, job.M, job.t, job.camera, mesh)
         lamps = (*job.lights, *sun_lamps(job.ambient, job.anchor_mm))
         # Further images are small, because their mirrors are strongly curved, or concave with a short focus.
         nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in lamps]
         further = {order: purkinje_images(scene, eye, order, lamps, nodes) for order in sorted({*job.purkinje} - {1})}
         near = 1 in job.purkinje and job.lens.focus_mm is not None
         nearness = scene.nearness(lamps) if near else np.full((len(lamps), 2), np.nan)
-        return cls(job, lamps, scene, scene.images(lamps, job.sensor.psf_sigma_px), further, nearness)
+        first = scene.images(lamps, job.sensor.psf_sigma_px)
+        return cls(job=job, lamps=lamps, scene=scene, first=first, further=further, nearness=nearness)
 
     def seen(self, place: Background | RegionScene, blur: Blur, share: float = 1.0) -> tuple[Mirrored, list[Shine]]:
         """What is seen of the images in posed surroundings, and what they add to the blurred picture.

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import ArrayValue, Bools, Floats, frozen, remembered
+from ...eye.model import EyeModel
 from ...geometry.surfaces import Surface, Xyz, components, join
 from ...geometry.transforms import normalize
 from ...optics.interface import fresnel
@@ -72,7 +73,7 @@ class Spots(ArrayValue):
     energy: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Image:
     """A lamp's image, one row per point of the lamp.
 
@@ -101,11 +102,16 @@ class Image:
 
     def and_(self, other: Image) -> Image:
         """Points of both images."""
-        return Image(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+        return Image(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
+
+    def parts(self, counts: Sequence[int]) -> list[Image]:
+        """Parts with so many points each."""
+        columns = {f.name: _parted(getattr(self, f.name), counts) for f in fields(self)}
+        return [Image(**{name: part[k] for name, part in columns.items()}) for k in range(len(counts))]
 
     def last(self, count: int) -> Image:
         """The last points."""
-        return Image(*(getattr(self, f.name)[-count:] for f in fields(self)))
+        return Image(**{f.name: getattr(self, f.name)[-count:] for f in fields(self)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +137,7 @@ class Images:
     counts: dict[int, tuple[int, int]]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GlintScene:
     """Input of the glints: front cornea with its film and rim, pose (x_world = M x + t), and camera.
 
@@ -149,6 +155,17 @@ class GlintScene:
     t: Floats
     camera: PinholeCamera
     mesh: SurfaceMesh | None = None
+
+    @classmethod
+    def of(
+        cls, eye: EyeModel, film_index: float, M: Floats, t: Floats, camera: PinholeCamera, mesh: SurfaceMesh | None
+    ) -> GlintScene:
+        """The mirrors of an eye; a mesh takes the place of the cornea's front."""
+        return cls(
+            surface=eye.front[0], index=float(eye.front_indices[0]), film_index=film_index,
+            limbus_radius_mm=float(eye.limbus_radius_mm), sclera_centre_mm=np.asarray(eye.sclera.centre_mm),
+            sclera_radius_mm=float(eye.sclera.radius_mm), M=M, t=t, camera=camera, mesh=mesh,
+        )  # fmt: skip
 
     def images(self, lights: Sequence[Lamp], sigma_px: float) -> Images:
         """Compute the image of each lamp as finely as its size and the point-spread function require."""
@@ -278,8 +295,10 @@ class GlintScene:
         there &= found & ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
         energy = np.where(found, weights * strength[which] * lobe * F / np.where(found, J, 1.0) * scale, 0.0)
         mirrors, xy = y @ self.M.T + self.t, camera.pixels_of(x, v)
-        columns = (_parted(a, counts) for a in (points, mirrors, mirrors, xy, energy, there, found))
-        return [Image(*c) for c in zip(*columns, strict=True)]
+        whole = Image(
+            source_mm=points, entry_mm=mirrors, exit_mm=mirrors, xy_px=xy, energy=energy, there=there, found=found
+        )
+        return whole.parts(counts)
 
     def _mirrors(self, rays: Rays, lamp: Xyz, node: Xyz, found: Bools) -> tuple[Floats, ...]:
         """Mirror points of the closed form, directions of arriving and leaving light, normals, ray tubes."""
@@ -300,7 +319,7 @@ class GlintScene:
         return np.asarray((disc > 0) & (-b - np.sqrt(np.maximum(disc, 0)) > 1e-6))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Emitters:
     """Points of lamps.
 
@@ -327,13 +346,13 @@ class _Emitters:
         """Take the given points of the discs of lamps."""
         counts = [len(n.weight) for n in nodes]
         return cls(
-            np.concatenate([disc_points(lamp, n.point) for lamp, n in zip(lights, nodes, strict=True)]),
-            np.concatenate([n.weight for n in nodes]),
-            np.repeat(np.arange(len(lights)), counts),
-            counts,
-            np.stack([lamp.axis for lamp in lights]),
-            np.array([float(lamp.intensity_mw_sr) for lamp in lights]),
-            np.array([float(lamp.lobe_exponent) for lamp in lights]),
+            points=np.concatenate([disc_points(lamp, n.point) for lamp, n in zip(lights, nodes, strict=True)]),
+            weights=np.concatenate([n.weight for n in nodes]),
+            which=np.repeat(np.arange(len(lights)), counts),
+            counts=counts,
+            axes=np.stack([lamp.axis for lamp in lights]),
+            strength=np.array([float(lamp.intensity_mw_sr) for lamp in lights]),
+            exponent=np.array([float(lamp.lobe_exponent) for lamp in lights]),
         )
 
 

@@ -104,7 +104,7 @@ class SurfaceInteraction:
         w, none = frame.vector_to_eye(d), mi.Vector3f(0)
         at = []
         for points, ways in (([self.distance * e for e in turned], turned), (moved, [none, none])):
-            bundle = front.bend(Bundle(y, w, *points, *ways), form)[0]
+            bundle = front.bend(Bundle(y=y, w=w, da=points[0], db=points[1], wa=ways[0], wb=ways[1]), form)[0]
             for surface in frame.surfaces[1:]:
                 bundle = surface.refract_bundle(bundle)[0]
             s = dr.dot(frame.stop.centre - bundle.y, frame.stop.normal) / dr.dot(bundle.w, frame.stop.normal)

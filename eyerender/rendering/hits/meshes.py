@@ -224,7 +224,7 @@ class MeshedSurface(Surface):
         t, form = hit.t, self._mesh().form(hit)[1]
         far, ok, _ = Surface.meet(self, self.point_in(b.y), self.vector_in(b.w))
         t = dr.select(met, t, far)
-        there = Bundle(b.y + t * b.w, b.w, b.da + t * b.wa, b.db + t * b.wb, b.wa, b.wb)
+        there = b.advance(t)
         out, share, c = self.bend(there, _either(met, form, self._normal_form(self.point_in(there.y))))
         return out, share, (met | ok) & (c > 1e-4)
 

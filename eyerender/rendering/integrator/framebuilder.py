@@ -145,7 +145,7 @@ class FrameBuilder:
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
             panels = panel_table(job.ambient, job.anchor_mm)
-            frame.caches.ambience = Ambience.upload(even, panels, job.ambient.map, self._maps)
+            frame.caches.ambience = Ambience.build(even, panels, job.ambient.map, self._maps)
         if lit:
             self._light(host, frame, place, after)
         return BoundFrame(frame, host), place

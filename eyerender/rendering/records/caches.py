@@ -1,4 +1,10 @@
-"""Light that is computed once per frame, before its samples, and looked up at their places."""
+"""Light that is computed once per frame, before its samples, and looked up at their places.
+
+Every cache has the same two functions: `build(frame, ...)` computes it, and `at(...)` looks it up at points. A cache
+that holds light of several surfaces has a lookup for each: `at_skin`, `at_globe`, `at_iris`, `at_background`. The
+radiosity field takes two steps instead of `build`, because the device computes other caches between them (`gather` and
+`solve` of `radiosity`).
+"""
 
 from __future__ import annotations
 

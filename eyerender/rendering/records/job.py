@@ -46,7 +46,7 @@ _PANEL_PARTS = 4  # along each side
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RenderJob(ArrayValue):
     """One window of one exposure to render.
 
@@ -162,12 +162,12 @@ def parameters_of(job: RenderJob) -> Parameters:
             axes=tuple(stop.semi_axes_mm),
         ),
         iris=IrisParameters(
-            eye.iris_root_radius_mm,
-            look.iris_albedo,
-            look.iris_contrast,
-            look.limbal_ring,
-            look.iris.relief,
-            look.iris.convexity_mm,
+            root_radius=eye.iris_root_radius_mm,
+            albedo=look.iris_albedo,
+            contrast=look.iris_contrast,
+            ring=look.limbal_ring,
+            relief=look.iris.relief,
+            convexity=look.iris.convexity_mm,
         ),
         limbus=LimbusParameters(
             radius=eye.limbus_radius_mm,
@@ -196,7 +196,7 @@ def parameters_of(job: RenderJob) -> Parameters:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Still:
     """Parameters that depend on the eye alone; the surfaces have no film."""
 
@@ -236,7 +236,7 @@ def _still(eye: EyeModel) -> _Still:
 def _surface_parameters(surface: Surface, eta: float, limbus_mm: float) -> SurfaceParameters:
     rotation = np.asarray(surface.rotation)
     axes = None if np.array_equal(rotation, np.eye(3)) else (rotation[:, 0], rotation[:, 1], rotation[:, 2])
-    return SurfaceParameters(surface.origin_mm, tuple(_shape(surface, limbus_mm)), eta, axes)
+    return SurfaceParameters(origin=surface.origin_mm, shape=tuple(_shape(surface, limbus_mm)), eta=eta, axes=axes)
 
 
 def boundary_waves(eye: EyeModel) -> Floats:

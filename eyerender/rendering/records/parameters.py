@@ -21,7 +21,7 @@ Kind = Literal["quadric", "biconic", "measured"]
 _Tree = TypeVar("_Tree")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SurfaceParameters:
     """One refracting surface in the eye frame, lengths in mm.
 
@@ -41,7 +41,7 @@ class SurfaceParameters:
     film: Number | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StopParameters:
     """The aperture stop: centre, normal, directions u and v of its semi-axes (all (3,)), and the semi-axes (mm)."""
 
@@ -52,7 +52,7 @@ class StopParameters:
     axes: tuple[Number, Number]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class IrisParameters:
     """The iris.
 
@@ -68,7 +68,7 @@ class IrisParameters:
     convexity: Number
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LimbusParameters:
     """The limbus and the cornea before it.
 
@@ -107,7 +107,7 @@ class PoseParameters:
     shift: Vector
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CameraParameters:
     """Camera as the kernels use it.
 
@@ -132,7 +132,7 @@ class ImageParameters:
     shift: Number
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Parameters:
     """All parameters of a frame; eye frame and scene's frame are in mm.
 

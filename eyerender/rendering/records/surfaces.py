@@ -14,7 +14,7 @@ differentials follow Igehy (1999), 'Tracing ray differentials', equations 10-18.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import drjit as dr
@@ -25,7 +25,7 @@ from .parameters import Kind
 _SETTLED_MM = 0.1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Bundle:
     """A ray (point y, unit direction w) with two differentials (da, db of the point; wa, wb of the direction)."""
 
@@ -35,6 +35,10 @@ class Bundle:
     db: mi.Vector3f
     wa: mi.Vector3f
     wb: mi.Vector3f
+
+    def advance(self, t: mi.Float) -> Bundle:
+        """Move the point along the ray."""
+        return replace(self, y=self.y + t * self.w, da=self.da + t * self.wa, db=self.db + t * self.wb)
 
 
 class NormalForm(NamedTuple):
@@ -246,7 +250,7 @@ class Surface:
         if self.kind != "quadric":
             t, ok, jet = self._refined(o, d, t, ok, 2)
             form = _form_of(jet)
-        there = Bundle(b.y + t * b.w, b.w, b.da + t * b.wa, b.db + t * b.wb, b.wa, b.wb)
+        there = b.advance(t)
         out, share, c = self.bend(there, self._normal_form(self.point_in(there.y)) if form is None else form)
         return out, share, ok & (c > 1e-4)
 
@@ -271,7 +275,8 @@ class Surface:
             dc = -(dr.dot(e, N) + dr.dot(d, dN))
             moved.append(self.vector_out(dy))
             turned.append(self.vector_out(eta * e + dc * slope * N + k * dN))
-        return Bundle(b.y, self.vector_out(w), *moved, *turned), mirrored if mirror else 1 - mirrored, c
+        out = Bundle(y=b.y, w=self.vector_out(w), da=moved[0], db=moved[1], wa=turned[0], wb=turned[1])
+        return out, mirrored if mirror else 1 - mirrored, c
 
 
 def _form_of(jet: tuple[mi.Float, ...]) -> NormalForm:

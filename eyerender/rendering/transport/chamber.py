@@ -21,7 +21,7 @@ with E_s the irradiance of the limbus in sector s from outside, and w_is the sha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -51,7 +51,7 @@ _BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
 _WALL_MM = 1.0  # thickness of the sclera
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Chamber(ArrayValue):
     """The chamber of one eye, in the eye frame; arrays with PATCHES rows list the rings from the middle, then the wall.
 
@@ -185,7 +185,7 @@ def _in_plane(centre: Floats, normal: Floats, y: Floats, z: Floats) -> Floats:
 
 
 def patch_albedo(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: float) -> Floats:
-    """Mean albedo (PATCHES,) of patches: of pupil (`inside`), iris, and limbal tissue (`beyond` and on the wall)."""
+    """Mean albedo (PATCHES,) of the patches, from that of pupil (`inside`), iris, and limbal tissue (`beyond`)."""
     fine = (np.arange(4) + 0.5) / 4
     ring, turn = np.arange(IRIS)[:, None] // TURNS, np.arange(IRIS)[:, None] % TURNS
     part, side = (v.ravel() for v in np.meshgrid(fine, fine))
@@ -202,7 +202,7 @@ def _radius(ring: Floats, root: float, reach: float) -> Floats:
     return np.asarray(np.sqrt(root**2 * np.minimum(ring / ROOT_RINGS, 1) + (reach**2 - root**2) * beyond))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Walls:
     """Surfaces about the chamber: refracting ones from outside inwards, their indices, film, plane and wall.
 
@@ -215,7 +215,6 @@ class _Walls:
     film: float
     centre: Floats
     normal: Floats
-    limbus: float
     rim: float
     top: float
     slope: float
@@ -271,7 +270,10 @@ def _chamber(
     for index, weight in _onto(arrived.back, arrived.on_wall, (root, reach), points, valid):
         np.add.at(exchange, (row[arrived.ray], index), weight * arrived.share / RAYS)
     exchange = _turned(exchange, valid)
-    return Chamber(root, reach, frozen(points), frozen(normals), valid, frozen(exchange), frozen(leaving))
+    return Chamber(
+        root_mm=root, reach_mm=reach, points=frozen(points), normals=frozen(normals), valid=valid,
+        exchange=frozen(exchange), leaving=frozen(leaving),
+    )  # fmt: skip
 
 
 def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],
@@ -282,7 +284,10 @@ def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, 
     wide = np.sqrt(max((sclera[3] - _WALL_MM) ** 2 - (bottom - sclera[0]) ** 2, limbus**2))
     if foot is not None:
         bottom, wide = min(centre[0], top - 0.1), foot
-    return _Walls(front, indices, film, centre, normal, limbus, limbus, top, (wide - limbus) / (top - bottom))
+    return _Walls(
+        front=front, indices=indices, film=film, centre=centre, normal=normal, rim=limbus, top=top,
+        slope=(wide - limbus) / (top - bottom),
+    )  # fmt: skip
 
 
 def _patches(walls: _Walls, root: float, reach: float) -> tuple[Floats, Floats, Bools]:
@@ -330,7 +335,7 @@ def _pattern(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
     return np.repeat(points, RAYS, axis=0), d.reshape(-1, 3)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Arrived:
     """Where traced rays end: those that left (`out`: their numbers), and arrivals (`ray`: their numbers)."""
 
@@ -344,7 +349,7 @@ class _Arrived:
     on_wall: Bools
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Rays:
     """Rays on their way: numbers, weights, points, directions, and in which medium (surfaces in front of it)."""
 
@@ -355,11 +360,10 @@ class _Rays:
     layer: Ints
 
     def only(self, some: Bools) -> _Rays:
-        return _Rays(self.number[some], self.weight[some], self.o[some], self.d[some], self.layer[some])
+        return _Rays(**{f.name: getattr(self, f.name)[some] for f in fields(self)})
 
     def and_(self, other: _Rays) -> _Rays:
-        names = ("number", "weight", "o", "d", "layer")
-        return _Rays(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+        return _Rays(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
 
 
 def _traced(walls: _Walls, o: Floats, d: Floats, layer: Ints) -> _Arrived:
@@ -367,7 +371,7 @@ def _traced(walls: _Walls, o: Floats, d: Floats, layer: Ints) -> _Arrived:
 
     The cornea's back refracts them; it mirrors only what it mirrors totally.
     """
-    rays = _Rays(np.arange(len(o)), np.ones(len(o)), o, d, layer)
+    rays = _Rays(number=np.arange(len(o)), weight=np.ones(len(o)), o=o, d=d, layer=layer)
     first = np.ones(len(o), dtype=bool)
     ends, left = [], []
     for _ in range(_STEPS):
@@ -395,9 +399,8 @@ def _traced(walls: _Walls, o: Floats, d: Floats, layer: Ints) -> _Arrived:
         rays = further[0]
         for more in further[1:]:
             rays = rays.and_(more)
-    arrived = [np.concatenate(column) for column in zip(*ends, strict=True)]
-    out = [np.concatenate(column) for column in zip(*left, strict=True)]
-    return _Arrived(out[0], out[1], out[2], out[3], *arrived)
+    columns = [np.concatenate(column) for part in (left, ends) for column in zip(*part, strict=True)]
+    return _Arrived(**dict(zip((f.name for f in fields(_Arrived)), columns, strict=True)))
 
 
 def _to_surfaces(walls: _Walls, rays: _Rays) -> tuple[Floats, Floats]:
@@ -409,7 +412,7 @@ def _to_surfaces(walls: _Walls, rays: _Rays) -> tuple[Floats, Floats]:
         if k == 0:
             hit = rays.o[here] + np.where(np.isfinite(t), t, 0)[:, None] * rays.d[here]
             local = surface.to_local(hit)
-            t[(np.hypot(local[:, 1], local[:, 2]) > walls.limbus) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
+            t[(np.hypot(local[:, 1], local[:, 2]) > walls.rim) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
         outer[here] = t
         here = rays.layer == k
         hit = surface.hit(components(rays.o[here] + _AHEAD_MM * rays.d[here]), components(rays.d[here]), True)

@@ -15,7 +15,7 @@ from ..materials.gloss import sheen
 from ..records.frame import ALL, BITS, Frame, Lamp
 from ..records.recording import syntax
 from ..records.surfaces import Surface
-from .manifold import connect
+from .manifold import Target, connect
 
 
 def lamp_blocked(
@@ -222,7 +222,7 @@ def irradiance_off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: 
     while dr.hint(i < frame.lights.count, label="mirrored lamps", exclude=[frame]):
         lamp = frame.lights[i]
         source = lamp.point(u, sine, cosine)
-        path = connect(frame.surfaces[:1], source, x, normal, x, reach, mi.Bool(True), mirror=True)
+        path = connect(frame.surfaces[:1], source, Target(x, normal, x), reach, mi.Bool(True), mirror=True)
         local = frame.surfaces[0].point_in(path.entry)
         out = dr.sqrt(local.y * local.y + local.z * local.z)
         there = path.found & (out < reach)
@@ -253,7 +253,7 @@ def on_relief(frame: Frame, view: SurfaceInteraction) -> SurfaceInteraction:
     return replace(view, inner=frame.caches.relief.hit(frame, view.inner, view.slant, seen))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LampPath:
     """Light path from a point of a lamp through the cornea to a point behind it.
 
@@ -294,14 +294,15 @@ class LampPath:
         # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
         scale, shift = frame.image.scale, frame.image.shift
         aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
-        normal = frame.stop.normal if normal is None else normal
-        path = connect(
-            surfaces or frame.surfaces, source, inner, normal, aim, frame.limbus.radius, active, ahead_mm=ahead_mm
-        )
+        target = Target(inner, frame.stop.normal if normal is None else normal, aim)
+        path = connect(surfaces or frame.surfaces, source, target, frame.limbus.radius, active, ahead_mm=ahead_mm)
         local = frame.surfaces[0].point_in(path.entry)
         out = dr.sqrt(local.y * local.y + local.z * local.z)
         clear = 1 - opacity(frame, out)
         enters = path.found & (clear > 0)
         blocked = lamp_blocked(frame, path.entry, source, True, False, enters)
         whole = dr.select(path.found, lamp.radiant_intensity(path.leaving) * path.transfer, 0)
-        return cls(whole * clear, whole, out, path.entry, enters, blocked, path.failed)
+        return cls(
+            gain=whole * clear, whole=whole, out=out, entry=path.entry, enters=enters, blocked=blocked,
+            failed=path.failed,
+        )  # fmt: skip

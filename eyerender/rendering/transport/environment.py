@@ -1,20 +1,11 @@
-"""Light other than that of the lamps: even light, emitting panels, and surroundings given as an HDR map.
+"""Light other than that of the lamps: even light, emitting panels, and an environment map.
 
 The front cornea mirrors all of it along exact rays (those of the integrator). Matte surfaces are lit by its irradiance,
-from which `exchange` takes what is hidden. A map is infinitely far away. It is the sum of two maps: the soft one ends
-at a ceiling, and the rest, which may be as bright and small as the sun, is represented by directions that stand for
-equal shares of its light (median cut: Debevec 2005). The irradiance of both is a table over the normals,
-
-    E(n) = sum_k max(0, n . V_k),    V_k = integral of L w dw over a block of texels,
-
-exact for every block that the horizon does not cut.
+from which `radiosity` takes what is hidden. A map is infinitely far away.
 """
 
 from __future__ import annotations
 
-import math
-import re
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,215 +15,26 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import ArrayValue, Floats, frozen
+from ...arrays import Floats, frozen
 from ...errors import InputError
 from ...rig.imaging import RadianceMap
 from ...rig.light import Lamp
-from ...rig.surroundings import paint
-from ...spec import file_digest
-from ...storage.files import opened
 from ..records.frame import upload_scalars
-from ..scene.exr import second_thread
+from .environmentmap import NORMALS, EnvironmentMap, environment_map, map_rotation, map_values
 from .panels import Panels
 
-_WIDTH, _HEIGHT = 1024, 512
-_FINE, _BLOCKS, _NORMALS = 256, 32, 48  # rows from which blocks are summed, and of blocks and normals
-_CEILING = 2.0  # of the soft part of a map, over its mean
-_CUTS = 6  # 2^6 directions
 _FAR_MM = 1e6
-_FORMATS = (".hdr", ".exr", ".pfm", ".npy")
-# Rec. 709.
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _KEPT = 4
-# 16384 x 8192, of which 1024 x 512 are used.
-MAX_MAP_PIXELS = 2**27
-_HEADER_BYTES = 65536
-_SIDES = {
-    ".hdr": rb"[-+][XY] *([0-9]{1,20}) *[-+][XY] *([0-9]{1,20})",
-    ".pfm": rb"^P[fF]\s+([0-9]{1,20})\s+([0-9]{1,20})",
-}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Surrounding(ArrayValue):
-    """A map made ready, in its own frame.
-
-    Attributes:
-        values: (h, 2 h) radiance, float32.
-        ceiling: largest radiance of the soft part.
-        irradiance: (rows, 2 rows, 2) irradiance of surfaces whose normal is the direction of a texel, from the soft
-            part and from the rest, float32.
-        bright: (n, 3) directions that stand for the rest, times their irradiance of surfaces that face them.
-    """
-
-    values: Any
-    ceiling: float
-    irradiance: Any
-    bright: Floats
-
-
-def read_map(path: str | Path, channel: str = "red") -> Floats:
-    """Read the values (h, w) of a latitude-longitude map; w = 2 h.
-
-    Args:
-        path: Radiance .hdr, OpenEXR .exr, .pfm, or a NumPy array .npy of shape (h, w) or (h, w, channels).
-        channel: channel of a colour map that is used: red, green, blue, or luminance (Rec. 709).
-
-    Raises:
-        InputError: it is missing, unreadable, of another shape, or holds negative or non-finite values.
-    """
-    source, path = str(path), Path(path)
-    if path.suffix.lower() not in _FORMATS:
-        raise InputError(f"must end with one of {', '.join(_FORMATS)}", source=source)
-    with opened(path) as file:
-        size = _size(path.suffix.lower(), file.read(_HEADER_BYTES))
-    if size is not None and size > MAX_MAP_PIXELS:
-        raise InputError(f"has {size} pixels; at most {MAX_MAP_PIXELS}", source=source)
-    try:
-        if path.suffix.lower() == ".npy":
-            with opened(path) as file:
-                data = np.lib.format.read_array(file, allow_pickle=False)
-        else:
-            with second_thread():
-                bitmap = mi.Bitmap(str(path))
-            data = np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
-    except InputError:
-        raise
-    except Exception as error:
-        # For a broken file, image readers may raise any exception.
-        detail = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"is not a readable map ({detail})", source=source) from None
-    if data.dtype.kind not in "fiu" or data.ndim not in (2, 3):
-        raise InputError("must hold numbers (height, width) or (height, width, channels)", source=source)
-    values: Floats = np.asarray(_channel(data, channel), dtype=np.float64)
-    height, width = values.shape
-    if width != 2 * height or height < 4:
-        raise InputError(f"is {width} x {height}; a map of all directions must be twice as wide as high", source=source)
-    if not np.all(np.isfinite(values)) or np.min(values) < 0:
-        raise InputError("holds values that are negative or not finite", source=source)
-    return values
-
-
-def _channel(data: NDArray[Any], channel: str) -> NDArray[Any]:
-    """Select one channel (h, w) of a map (h, w) or (h, w, channels).
-
-    Maps with fewer than three channels have no colours, and their first channel is used.
-    """
-    if data.ndim == 2:
-        return data
-    if data.shape[2] < 3:
-        return data[..., 0]
-    if channel == "luminance":
-        return np.asarray(data[..., :3] @ _LUMINANCE)
-    return data[..., ("red", "green", "blue").index(channel)]
-
-
-def _size(kind: str, head: bytes) -> int | None:
-    """Number of pixels that the header of a map's file declares; None where it declares none.
-
-    The reader allocates all of them before it notices that the file is too short.
-    """
-    if kind == ".npy":
-        shape = re.search(rb"'shape': *\(([0-9, ]{1,99})\)", head)
-        return math.prod(int(n) for n in re.findall(rb"[0-9]+", shape[1])) if shape else None
-    if kind == ".exr":
-        window = re.search(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", head, re.DOTALL)
-        x0, y0, x1, y1 = struct.unpack("<4i", window[1]) if window else (0, 0, -1, -1)
-        return max(int(x1 - x0) + 1, 0) * max(int(y1 - y0) + 1, 0)
-    sides = re.search(_SIDES[kind], head)
-    return int(sides[1]) * int(sides[2]) if sides else None
-
-
-def surrounding(values: Floats) -> Surrounding:
-    """Prepare a map (h, 2 h): average it down to at most 1024 x 512, and compute its irradiance."""
-    reduced = _reduced(values)
-    if not reduced.any():  # every renderer keeps such a map for scenes without one
-        dark = np.zeros((_NORMALS, 2 * _NORMALS, 2))
-        return Surrounding(frozen(reduced, np.float32), 0.0, frozen(dark, np.float32), frozen(np.zeros((0, 3))))
-    fold = max(1, -(-_FINE // len(reduced)))
-    fine = np.repeat(np.repeat(reduced, fold, axis=0), fold, axis=1)
-    way, angle = _directions(len(fine))
-    ceiling = _CEILING * float(np.sum(fine * angle)) / (4 * np.pi)
-    # Blocks have whole rows and columns of texels, but for the last ones.
-    size = len(fine) // _BLOCKS
-    starts = np.arange(0, len(fine), size), np.arange(0, 2 * len(fine), size)
-
-    def blocks(radiance: Floats) -> Floats:
-        flux = (radiance * angle)[..., None] * way
-        out = np.add.reduceat(np.add.reduceat(flux, starts[0], axis=0), starts[1], axis=1)
-        return np.asarray(out.reshape(-1, 3))
-
-    soft, rest = blocks(np.minimum(fine, ceiling)), blocks(np.maximum(fine - ceiling, 0))
-    whole = blocks(np.ones_like(fine))
-    normals = _directions(_NORMALS)[0]
-    table = [[np.maximum(row @ flux.T, 0).sum(axis=1) for flux in (soft, rest, whole)] for row in normals]
-    irradiance = np.moveaxis(np.asarray(table), 1, -1)
-    # Cut blocks are a little off, and by the known light of all directions most of that is taken away.
-    irradiance = np.pi * irradiance[..., :2] / irradiance[..., 2:]
-    return Surrounding(
-        frozen(reduced, np.float32), ceiling, frozen(irradiance, np.float32), frozen(_median_cut(rest, _CUTS))
-    )
-
-
-def _directions(rows: int) -> tuple[Floats, Floats]:
-    """Directions (rows, 2 rows, 3) of a map's texels in its own frame, and their solid angles (rows, 1)."""
-    edge = np.pi * np.arange(rows + 1) / rows
-    polar, turn = 0.5 * (edge[1:] + edge[:-1])[:, None], (np.pi - np.pi * (np.arange(2 * rows) + 0.5) / rows)[None]
-    s = np.sin(polar)
-    way = np.stack(np.broadcast_arrays(s * np.cos(turn), s * np.sin(turn), np.cos(polar)), axis=-1)
-    return way, -np.diff(np.cos(edge))[:, None] * (np.pi / rows)
-
-
-def _median_cut(flux: Floats, cuts: int) -> Floats:
-    """Sums (m, 3) of vectors (n, 3) in at most 2^cuts groups of neighbouring directions and like sums of lengths."""
-    length = np.linalg.norm(flux, axis=1)
-    flux, length = flux[length > 0], length[length > 0]
-    groups = [np.arange(len(flux))] if len(flux) else []
-    for _ in range(cuts):
-        halves = []
-        for group in groups:
-            at = flux[group] / length[group, None]
-            spread = np.average(
-                (at - np.average(at, axis=0, weights=length[group])) ** 2, axis=0, weights=length[group]
-            )
-            order = group[np.argsort(at[:, np.argmax(spread)], kind="stable")]
-            before = np.cumsum(length[order]) - 0.5 * length[order]
-            split = int(np.searchsorted(before, 0.5 * length[order].sum()))
-            halves += [half for half in (order[:split], order[split:]) if len(half)]
-        groups = halves
-    return np.array([flux[group].sum(axis=0) for group in groups]).reshape(-1, 3)
-
-
-def map_rotation(spec: RadianceMap) -> Floats:
-    """Rotation M (3, 3) = Rz(az) Ry(-el) Rx(roll) from the map's frame to the world.
-
-    In the map's frame x is its middle, y to its left, z up.
-    """
-    az, el, roll = np.radians([spec.azimuth_deg, spec.elevation_deg, spec.roll_deg])
-    (ca, sa), (ce, se), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (az, el, roll))
-    Rz = np.array([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1.0]])
-    Ry = np.array([[ce, 0, -se], [0, 1.0, 0], [se, 0, ce]])
-    Rx = np.array([[1.0, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    return np.asarray(Rz @ Ry @ Rx)
-
-
-def _values(spec: RadianceMap) -> Floats:
-    """Values of a map: those of its file, or painted ones."""
-    if spec.file is None:
-        return paint(str(spec.place), spec.place_seed)
-    if spec.sha256 is not None and file_digest(Path(spec.file)) != spec.sha256:
-        raise InputError("does not have the given sha256", source=spec.file)
-    return read_map(spec.file, spec.channel)
 
 
 class Maps:
     """The maps in use, on the device; each is read and sent there once."""
 
     def __init__(self) -> None:
-        self._kept: dict[Any, tuple[Any, Any, Surrounding]] = {}
-        self._none = self._sent(surrounding(np.zeros((2, 4))))
+        self._kept: dict[Any, tuple[Any, Any, EnvironmentMap]] = {}
+        self._none = self._sent(environment_map(np.zeros((2, 4))))
 
-    def of(self, spec: RadianceMap | None) -> tuple[Any, Any, Surrounding]:
+    def of(self, spec: RadianceMap | None) -> tuple[Any, Any, EnvironmentMap]:
         """Textures of radiance and irradiance, and map, of a spec (its path is absolute or from the current folder)."""
         if spec is None:
             return self._none
@@ -246,11 +48,11 @@ class Maps:
         if key not in self._kept:
             if len(self._kept) >= _KEPT:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self._sent(surrounding(_values(spec)))
+            self._kept[key] = self._sent(environment_map(map_values(spec)))
         return self._kept[key]
 
     @staticmethod
-    def _sent(made: Surrounding) -> tuple[Any, Any, Surrounding]:
+    def _sent(made: EnvironmentMap) -> tuple[Any, Any, EnvironmentMap]:
         return _texture(made.values[..., None]), _texture(made.irradiance), made
 
 
@@ -286,8 +88,8 @@ class Ambience:
     axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]
 
     @classmethod
-    def upload(cls, even_mw_mm2: float, panels: Floats, spec: RadianceMap | None, maps: Maps) -> Ambience:
-        """Send the light to the device.
+    def build(cls, even_mw_mm2: float, panels: Floats, spec: RadianceMap | None, maps: Maps) -> Ambience:
+        """Send the light to the device; it does not depend on the frame.
 
         Args:
             even_mw_mm2: irradiance of even light.
@@ -328,14 +130,14 @@ class Ambience:
         polar = dr.acos(dr.clip(w.z, -1, 1)) * dr.inv_pi
         return mi.Point2f(0.5 - dr.atan2(w.y, w.x) * (0.5 * dr.inv_pi), (1 + polar * rows) / (rows + 2))
 
-    def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
+    def at(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
         """Irradiance (mW/mm^2) of a matte surface at points x with unit normals n of the scene's frame, unshadowed."""
-        soft, hard = self.irradiances(x, n)
+        soft, hard = self.soft_and_hard(x, n)
         return soft + hard
 
-    def irradiances(self, x: mi.Vector3f, n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """The same: of even light and of the soft part of the map; of the rest of the map and of panels."""
-        soft, rest = self.table.eval(self._place(n, float(_NORMALS)))
+    def soft_and_hard(self, x: mi.Vector3f, n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Irradiance of even light and of the soft part of the map, and of the rest of the map and of panels."""
+        soft, rest = self.table.eval(self._place(n, float(NORMALS)))
         return self.even + self.scale * soft, self.scale * rest + self.panels.irradiance(x, n)
 
 
@@ -362,19 +164,3 @@ def bright_lamps(spec: RadianceMap | None, maps: Maps, anchor_mm: Floats) -> tup
         for flux, one in zip(bright, size, strict=True)
         if one > 0
     )
-
-
-def _reduced(values: Floats) -> Floats:
-    """Average a map down to at most 1024 x 512, by whole texels or by linear resampling of its running sum."""
-    if values.shape[0] <= _HEIGHT:
-        return values
-    return _averaged(_averaged(values, _HEIGHT).T, _WIDTH).T
-
-
-def _averaged(values: Floats, count: int) -> Floats:
-    """Means of rows over `count` equal intervals."""
-    running = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    at = np.linspace(0, len(values), count + 1)
-    low = np.minimum(at.astype(int), len(values) - 1)
-    sums = running[low] + (at - low)[:, None] * values[low]
-    return np.asarray(np.diff(sums, axis=0) * (count / len(values)))

@@ -132,7 +132,7 @@ class RayPlan:
         return int(self.count.sum())
 
     def at_vertices(self, patches: Floats) -> mi.Float:
-        """Interpolate numbers of patches (n, 4), as in `RadiosityField` with the whole sky last, at the vertices."""
+        """Interpolate the numbers of patches (n, 4), the last of which is the whole sky, at all vertices."""
         assert self.skin is not None
         vertices, each = self.skin.near.shape
         count = dr.opaque(mi.UInt32, vertices)

@@ -31,7 +31,7 @@ CORNEA_MM = 7.8  # radius of corneas, about
 _BISECTIONS = 8
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Connection:
     """The path: irradiance per radiant intensity (mm^-2), the entry point, the direction on leaving the lamp.
 
@@ -47,51 +47,61 @@ class Connection:
     failed: mi.Bool
 
 
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Points that paths lead to, unit normals there towards the light, and where the line from the lamp aims at first.
+
+    `aim` is near the image of the point seen from outside.
+    """
+
+    point: mi.Vector3f
+    normal: mi.Vector3f
+    aim: mi.Vector3f
+
+
 @syntax
 def connect(
     surfaces: tuple[Surface, ...],
     lamp: mi.Vector3f,
-    x: mi.Vector3f,
-    normal: mi.Vector3f,
-    aim: mi.Vector3f,
+    target: Target,
     reach: mi.Float,
     active: mi.Bool,
     *,
     mirror: bool = False,
     ahead_mm: float = 0.0,
 ) -> Connection:
-    """Paths from `lamp` to `x` through all `surfaces`, all points in the eye frame (mm).
+    """Find paths from `lamp` to `target` through all `surfaces`, all points in the eye frame (mm).
 
     Args:
         surfaces: refracting surfaces, from the front.
         lamp: points on the lamps.
-        x: points behind the surfaces.
-        normal: unit normals there, towards the light.
-        aim: where the straight line from the lamp is aimed at first: near the image of `x` seen from outside.
+        target: points behind the surfaces.
         reach: radius about the front surface's axis (mm) beyond which no path enters.
         active: lanes that matter.
         mirror: whether the light comes to points before the first surface, which mirrors it, the only one.
         ahead_mm: how far before the last surface points may be that are met when a path is extended backwards.
     """
     front = surfaces[0]
-    y = _mirror_guess(front, lamp, aim) if mirror else _entry_guess(front, lamp, aim)
+    y = (_mirror_guess if mirror else _entry_guess)(front, lamp, target.aim)
     last, steps, transfer = mi.Vector3f(y), mi.UInt32(0), mi.Float(0)
     on, dark = mi.Bool(active), mi.Bool(False)
-    while dr.hint(on, label="manifold", exclude=[surfaces, front, mirror, ahead_mm]):
+    while dr.hint(on, label="manifold", exclude=[surfaces, front, target, mirror, ahead_mm]):
         y, form = front.on_surface(y)
         d = y - lamp
         distance = dr.norm(d)
         d /= distance
         e1, e2 = mi.coordinate_system(d)
-        b, passed, cosine = front.bend(Bundle(y, d, distance * e1, distance * e2, e1, e2), form, mirror=mirror)
+        b = Bundle(y=y, w=d, da=distance * e1, db=distance * e2, wa=e1, wb=e2)
+        b, passed, cosine = front.bend(b, form, mirror=mirror)
         ya, yb = b.da, b.db
         over = cosine < _GRAZING  # beyond the horizon, go half the way back
         b, share, good = _refract_all(surfaces[1:], b)
-        s = dr.dot(x - b.y, b.w)
-        miss = x - (b.y + s * b.w)
+        s = dr.dot(target.point - b.y, b.w)
+        b = b.advance(s)
+        miss = target.point - b.y
         done = on & ~over & good & (s > -ahead_mm) & (dr.squared_norm(miss) < TOLERANCE_MM * TOLERANCE_MM)
-        move, det = _newton_step(b, s, miss, ya, yb)
-        transfer = dr.select(done, passed * share * dr.maximum(-dr.dot(b.w, normal), 0) / dr.abs(det), transfer)
+        move, det = _newton_step(b, miss, ya, yb)
+        transfer = dr.select(done, passed * share * dr.maximum(-dr.dot(b.w, target.normal), 0) / dr.abs(det), transfer)
         after = dr.select(over, 0.5 * (y + last), y + move)  # the next step brings it to the surface
         steps += 1
         local = front.point_in(y)
@@ -102,7 +112,7 @@ def connect(
         y = dr.select(on, after, y)
     found = mi.Bool(active) & (transfer > 0)
     failed = mi.Bool(active) & ~found & (steps >= MAX_STEPS) & ~dark
-    return Connection(transfer, y, dr.normalize(y - lamp), found, failed)
+    return Connection(transfer=transfer, entry=y, leaving=dr.normalize(y - lamp), found=found, failed=failed)
 
 
 def _refract_all(surfaces: tuple[Surface, ...], b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
@@ -115,22 +125,18 @@ def _refract_all(surfaces: tuple[Surface, ...], b: Bundle) -> tuple[Bundle, mi.F
     return b, passed, ok
 
 
-def _newton_step(
-    b: Bundle, s: mi.Float, miss: mi.Vector3f, ya: mi.Vector3f, yb: mi.Vector3f
-) -> tuple[mi.Vector3f, mi.Float]:
+def _newton_step(b: Bundle, miss: mi.Vector3f, ya: mi.Vector3f, yb: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
     """Motion of the entry point that takes the `miss` away, at most `_STEP_MM` long, and the determinant.
 
     Args:
-        b: the bundle behind the surfaces.
-        s: distance from there to the target.
+        b: the bundle where it passes the target.
         miss: from the ray to the target.
         ya: motion of the entry point with the first differential.
         yb: the same with the second.
     """
-    a1, a2 = b.da + s * b.wa, b.db + s * b.wb
-    det = dr.dot(b.w, dr.cross(a1, a2))
+    det = dr.dot(b.w, dr.cross(b.da, b.db))
     inv = dr.rcp(dr.select(dr.abs(det) > 1e-9, det, 1e-9))
-    move = (dr.dot(b.w, dr.cross(miss, a2)) * inv) * ya + (dr.dot(b.w, dr.cross(a1, miss)) * inv) * yb
+    move = (dr.dot(b.w, dr.cross(miss, b.db)) * inv) * ya + (dr.dot(b.w, dr.cross(b.da, miss)) * inv) * yb
     return move * dr.minimum(1, _STEP_MM / dr.maximum(dr.norm(move), 1e-9)), det
 
 

@@ -23,7 +23,7 @@ from ..records.recording import syntax
 _WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rectangle:
     """One rectangle of the scene's frame; `right` and `up` are over the half sizes, so that |q . right| < 1 inside."""
 
@@ -54,7 +54,7 @@ class Panels:
     def __getitem__(self, i: mi.UInt32) -> Rectangle:
         row = [dr.gather(mi.Float, self.rows, i * _WIDTH + k) for k in range(_WIDTH)]
         centre, normal, right, up = (mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9))
-        return Rectangle(centre, normal, right, up, row[12])
+        return Rectangle(centre=centre, normal=normal, right=right, up=up, radiance=row[12])
 
     @syntax
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:

@@ -27,7 +27,7 @@ _STEEP, _LOW_MM, _TOP_MM = 4.0, 0.04, 1.6
 _LID_MM = 4.0  # from the sclera's sphere to the outside of a lid over the cornea
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SkinPatches(ArrayValue):
     """Vertices of a region that stand for the skin about them; they move with the tissue.
 
@@ -85,7 +85,9 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
     lids = np.flatnonzero(over & (out[:, 0] > 0))
     index = np.full(len(chosen), -1)
     index[lids] = np.arange(len(lids))
-    return SkinPatches(chosen, nearest, lids, index[nearest], near, weight)
+    return SkinPatches(
+        vertices=chosen, nearest=nearest, lids=lids, behind=index[nearest], near=near, weight=weight
+    )  # fmt: skip
 
 
 def _from_globe(globe: Globe, points: Floats) -> Floats:
@@ -113,7 +115,7 @@ def _spread(normals: Floats, where: Floats, chosen: Ints, size: Floats) -> tuple
     return index.astype(np.int64), weight.astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GlobePatches(ArrayValue):
     """Points of the globe in the scene's frame, on a grid of `rows` by `columns`.
 
@@ -178,7 +180,7 @@ def _placed(
 ) -> GlobePatches:
     way = way / np.linalg.norm(way, axis=1, keepdims=True)
     points = centre + globe.radial(way * mirror)[:, None] * way
-    return GlobePatches(points, way, table, columns, rows)
+    return GlobePatches(points=points, normals=way, table=table, columns=columns, rows=rows)
 
 
 RINGS, TURNS = 24, 16  # patches on the plane of a surround

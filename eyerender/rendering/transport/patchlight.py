@@ -133,7 +133,7 @@ def gather_light(frame: Frame, panels: Lights, field: RadiosityField, tables: Pa
 def _ambient(frame: Frame, tables: PatchTables, count: int) -> tuple[mi.Float, mi.Float]:
     """Irradiance of the patches outside the eye from the soft and the hard part of the ambient light."""
     n = gather_rows(tables.outer, 6, dr.arange(mi.UInt32, count))
-    soft, hard = frame.caches.ambience.irradiances(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
+    soft, hard = frame.caches.ambience.soft_and_hard(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
     dr.eval(soft, hard)
     return soft, hard
 

@@ -63,10 +63,10 @@ class RadiositySolver:
         if job.interreflection or frame.structure.ambient:
             tables = PatchTables.upload(patches, lamps, lanes)
             gathered = gather_light(frame, Lights.upload(panels), field, tables, lanes)
-        return PendingField(region, patches, field, lanes, gathered)
+        return PendingField(region=region, patches=patches, field=field, lanes=lanes, gathered=gathered)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class PendingField:
     """A radiosity field that is still dark: the device may be at work until `read`, and may work on during `solve`."""
 
