@@ -34,7 +34,7 @@ class Nodes:
     point: Floats
     weight: Floats
 
-    def and_(self, other: Nodes) -> Nodes:
+    def join(self, other: Nodes) -> Nodes:
         """Points of both."""
         return Nodes(np.concatenate([self.point, other.point]), np.concatenate([self.weight, other.weight]))
 

@@ -45,7 +45,7 @@ _MAP_ERROR = 1e-3  # of the extent of a lamp's image
 Visibility = Callable[[Floats, Floats], Bools]
 _ON_RIM = 16  # points: an edge that passes between them hides less than 0.2 % of a disc
 _LEAST = 2, 10  # circles, and points on each, of a wide lamp
-_ROUGH = quadrature(*_LEAST).and_(rim(_ON_RIM))
+_ROUGH = quadrature(*_LEAST).join(rim(_ON_RIM))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,13 +100,13 @@ class Image:
         """Points that the eye mirrors to the camera."""
         return Spots(frozen(self.xy_px[self.there]), frozen(self.energy[self.there]))
 
-    def and_(self, other: Image) -> Image:
-        """Points of both images."""
+    def join(self, other: Image) -> Image:
+        """Join the points of both images."""
         return Image(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
 
     def parts(self, counts: Sequence[int]) -> list[Image]:
-        """Parts with so many points each."""
-        columns = {f.name: _parted(getattr(self, f.name), counts) for f in fields(self)}
+        """Split the image into parts with so many points each."""
+        columns = {f.name: _split(getattr(self, f.name), counts) for f in fields(self)}
         return [Image(**{name: part[k] for name, part in columns.items()}) for k in range(len(counts))]
 
     def last(self, count: int) -> Image:
@@ -176,7 +176,7 @@ class GlintScene:
         if more := [k for k, count in counts.items() if count != _LEAST]:
             finely = self._trace([lights[k] for k in more], [quadrature(*counts[k]) for k in more])
             for k, image in zip(more, finely, strict=True):
-                images[k] = image.and_(images[k].last(_ON_RIM))
+                images[k] = image.join(images[k].last(_ON_RIM))
         return Images(images, counts)
 
     def glints(self, lights: Sequence[Lamp], images: Images, clear: Visibility) -> list[Glint]:
@@ -208,7 +208,7 @@ class GlintScene:
         """Glints of images, made of their points that the camera sees."""
         out = []
         ways = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm"))
-        free = _parted(self._clear(clear, *ways), [len(i.energy) for i in images])
+        free = _split(self._clear(clear, *ways), [len(i.energy) for i in images])
         for image, open_ in zip(images, free, strict=True):
             lit = open_ & image.there & (image.energy > 0)
             out.append(Glint(image, open_, Spots(frozen(image.xy_px[lit]), frozen(image.energy[lit]))))
@@ -376,8 +376,8 @@ def glint_table(glints: Sequence[Glint]) -> GlintTable:
     )
 
 
-def _parted(array: NDArray[Any], counts: Sequence[int]) -> list[NDArray[Any]]:
-    """Parts of an array with so many rows each."""
+def _split(array: NDArray[Any], counts: Sequence[int]) -> list[NDArray[Any]]:
+    """Split an array into parts with so many rows each."""
     ends = list(accumulate(counts))
     return [array[end - count : end] for end, count in zip(ends, counts, strict=True)]
 

@@ -150,7 +150,7 @@ def grid_nodes(side: int) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def nodes_about(cell: mi.UInt32, side: int) -> list[mi.UInt32]:
-    """The sixteen nodes about cells of a grid, row by row."""
+    """Numbers of the sixteen nodes about cells of a grid, row by row."""
     nodes = (mi.Int32(cell) + dv * side + du for dv in range(-1, 3) for du in range(-1, 3))
     return [mi.UInt32(dr.clip(node, 0, side**2 - 1)) for node in nodes]
 

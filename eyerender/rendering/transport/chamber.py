@@ -21,7 +21,7 @@ with E_s the irradiance of the limbus in sector s from outside, and w_is the sha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -31,8 +31,8 @@ from scipy.sparse import csr_array
 from ...arrays import ArrayValue, Bools, Floats, Ints, Singles, frozen, remembered
 from ...eye.meshes import chamber_rim
 from ...eye.model import EyeModel
-from ...geometry.surfaces import Surface, components
-from ...optics.interface import fresnel
+from ...geometry.surfaces import Surface
+from .chamberrays import ChamberShape, Walls, air_side, trace_inside
 
 IRIS_RINGS, TURNS = 16, 16  # points in the plane of the iris, over radius and angle
 ROOT_RINGS = 14  # of these on iris and pupil, the others beyond the root
@@ -41,14 +41,8 @@ LEVELS = 2  # of points on the wall
 PATCHES = IRIS + TURNS * LEVELS
 RAYS = 256  # from each point
 _FAR_MM = 8.0  # distance of what rays that leave the eye meet: so far apart are two rays at an angle of 1
-_WEAK, _FEW = 0.25, 4  # of the rays of which the cornea mirrors less, one of four stands for all
 _ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
-_STEPS = 20  # crossings and mirrorings of a ray
-_NEAR_MM = 1e-6
 _SAME_MM = 0.005  # chambers of depths and radii that differ by less are one
-_AHEAD_MM = 1e-4  # hits are looked for from here on: a root cannot be computed from a point of the surface itself
-_BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
-_WALL_MM = 1.0  # thickness of the sclera
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,14 +79,17 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
     if np.array_equal(eye.stop.normal, [1.0, 0.0, 0.0]):
         depth, root_mm = (_SAME_MM * round(v / _SAME_MM) for v in (float(eye.stop.centre_mm[0]), root_mm))
         eye = replace(eye, stop=replace(eye.stop, centre_mm=frozen([depth, 0.0, 0.0])))
-    plane = (*np.asarray(eye.stop.centre_mm).tolist(), *np.asarray(eye.stop.normal).tolist())
-    sclera = (*np.asarray(eye.sclera.centre_mm).tolist(), float(eye.sclera.radius_mm))
-    indices = tuple(float(n) for n in eye.front_indices)
     foot = None
     if len(eye.front) > 1:
         foot = float(np.mean(chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(TURNS) / TURNS)))
-    radii = root_mm, float(eye.limbus_radius_mm)
-    return _chamber(tuple(eye.front), indices, film, plane, radii, sclera, foot)
+    return _chamber(
+        ChamberShape(
+            front=tuple(eye.front), indices=tuple(float(n) for n in eye.front_indices), film=film,
+            centre=tuple(np.asarray(eye.stop.centre_mm).tolist()), normal=tuple(np.asarray(eye.stop.normal).tolist()),
+            limbus=float(eye.limbus_radius_mm), root=root_mm, sclera_x=float(eye.sclera.centre_mm[0]),
+            sclera_radius=float(eye.sclera.radius_mm), foot=foot,
+        )
+    )  # fmt: skip
 
 
 def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
@@ -202,95 +199,31 @@ def _radius(ring: Floats, root: float, reach: float) -> Floats:
     return np.asarray(np.sqrt(root**2 * np.minimum(ring / ROOT_RINGS, 1) + (reach**2 - root**2) * beyond))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Walls:
-    """Surfaces about the chamber: refracting ones from outside inwards, their indices, film, plane and wall.
-
-    The wall is a cone about x with radius `rim` at x = `top`, which grows by `slope` per mm downwards. Where the cornea
-    has a back surface, which meets the plane of the iris, the wall is the rim of the cornea in front of that.
-    """
-
-    front: tuple[Surface, ...]
-    indices: tuple[float, ...]
-    film: float
-    centre: Floats
-    normal: Floats
-    rim: float
-    top: float
-    slope: float
-
-    @property
-    def layer(self) -> int:
-        """Medium that the wall bounds, as the number of surfaces in front of it."""
-        return max(len(self.front) - 1, 1)
-
-    def height(self, p: Floats) -> Floats:
-        """Height (n,) mm of points above the plane of the iris."""
-        return np.asarray((p - self.centre) @ self.normal)
-
-    def to_plane(self, o: Floats, d: Floats) -> Floats:
-        """Distance (n,) to the plane of the iris, infinite for rays that leave it."""
-        down = d @ self.normal
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = -self.height(o) / down
-        return np.where((down < -1e-9) & (t > _NEAR_MM), t, np.inf)
-
-    def to_wall(self, o: Floats, d: Floats) -> Floats:
-        """Distance (n,) to the wall above the plane, infinite where it is not met."""
-        r, s = self.rim + self.slope * (self.top - o[:, 0]), -self.slope * d[:, 0]
-        a = d[:, 1] ** 2 + d[:, 2] ** 2 - s * s
-        b = o[:, 1] * d[:, 1] + o[:, 2] * d[:, 2] - r * s
-        c = o[:, 1] ** 2 + o[:, 2] ** 2 - r * r
-        with np.errstate(divide="ignore", invalid="ignore"):
-            root = np.sqrt(np.maximum(b * b - a * c, 0))
-            t = np.where(a > 0, (root - b) / a, -c / (b + root))
-        hit = o + np.where(np.isfinite(t), t, 0)[:, None] * d
-        there = (b * b > a * c) & (t > _NEAR_MM) & (hit[:, 0] < self.top) & (self.height(hit) > 0)
-        return np.where(there, t, np.inf)
-
-
 @lru_cache(maxsize=64)
-def _chamber(
-    front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],
-    radii: tuple[float, float], sclera: tuple[float, ...], foot: float | None,
-) -> Chamber:  # fmt: skip
-    walls = _walls(front, indices, film, plane, radii[1], sclera, foot)
+def _chamber(shape: ChamberShape) -> Chamber:
+    walls = Walls.of(shape)
     reach = walls.rim + walls.slope * max(walls.top - walls.centre[0], 0)
-    root = min(radii[0], 0.99 * reach)
-    points, normals, valid = _patches(walls, root, reach)
+    root = min(shape.root, 0.99 * reach)
+    points, normals, valid = _choose_patches(walls, root, reach)
     exchange = np.zeros((PATCHES, PATCHES))
     leaving = np.zeros((PATCHES, RAYS, 7))
     rows = np.flatnonzero(valid)
     o, d = _pattern(points[rows], normals[rows])
     row = np.repeat(rows, RAYS)
     left = leaving.reshape(-1, 7)
-    arrived = _traced(walls, o, d, np.where(row < IRIS, len(front), walls.layer))
+    arrived = trace_inside(walls, o, d, np.where(row < IRIS, len(walls.front), walls.layer))
     slot = (row * RAYS + np.tile(np.arange(RAYS), len(rows)))[arrived.out]
     left[slot] = np.concatenate([arrived.origin, arrived.way, arrived.weight[:, None]], axis=1)
-    for index, weight in _onto(arrived.back, arrived.on_wall, (root, reach), points, valid):
+    for index, weight in _patches_at(arrived.back, arrived.on_wall, (root, reach), points, valid):
         np.add.at(exchange, (row[arrived.ray], index), weight * arrived.share / RAYS)
-    exchange = _turned(exchange, valid)
+    exchange = _average_over_sectors(exchange, valid)
     return Chamber(
         root_mm=root, reach_mm=reach, points=frozen(points), normals=frozen(normals), valid=valid,
         exchange=frozen(exchange), leaving=frozen(leaving),
     )  # fmt: skip
 
 
-def _walls(front: tuple[Surface, ...], indices: tuple[float, ...], film: float, plane: tuple[float, ...],
-           limbus: float, sclera: tuple[float, ...], foot: float | None) -> _Walls:  # fmt: skip
-    centre, normal = np.array(plane[:3]), np.array(plane[3:])
-    top = float(np.asarray(front[0].origin_mm)[0] + front[0].sag(np.array(limbus), np.array(0.0)))
-    bottom = centre[0] - _BELOW_MM
-    wide = np.sqrt(max((sclera[3] - _WALL_MM) ** 2 - (bottom - sclera[0]) ** 2, limbus**2))
-    if foot is not None:
-        bottom, wide = min(centre[0], top - 0.1), foot
-    return _Walls(
-        front=front, indices=indices, film=film, centre=centre, normal=normal, rim=limbus, top=top,
-        slope=(wide - limbus) / (top - bottom),
-    )  # fmt: skip
-
-
-def _patches(walls: _Walls, root: float, reach: float) -> tuple[Floats, Floats, Bools]:
+def _choose_patches(walls: Walls, root: float, reach: float) -> tuple[Floats, Floats, Bools]:
     n, c = walls.normal, walls.centre
     ring, turn = np.arange(IRIS) // TURNS, np.arange(IRIS) % TURNS
     radius, angle = _radius(np.asarray(ring + 0.5, dtype=float), root, reach), 2 * np.pi * (turn + 0.5) / TURNS
@@ -299,7 +232,7 @@ def _patches(walls: _Walls, root: float, reach: float) -> tuple[Floats, Floats, 
     inside = np.ones(IRIS, dtype=bool)
     inner = walls.front[-1]
     if len(walls.front) > 1:
-        inside &= inner.implicit(grid) * _sign(inner) < 0
+        inside &= inner.implicit(grid) * air_side(inner) < 0
     angle = 2 * np.pi * (np.arange(TURNS * LEVELS) // LEVELS + 0.5) / TURNS
     share = (np.arange(TURNS * LEVELS) % LEVELS + 0.5) / LEVELS
     foot = c[0] - (n[1] * reach * np.cos(angle) + n[2] * reach * np.sin(angle)) / n[0]
@@ -311,12 +244,6 @@ def _patches(walls: _Walls, root: float, reach: float) -> tuple[Floats, Floats, 
     there = (walls.height(wall) > 0.02) & (walls.top - foot > 0.1)
     points = np.concatenate([grid, wall + 1e-4 * across])
     return points, np.concatenate([np.tile(n, (IRIS, 1)), across]), np.append(inside, there)
-
-
-def _sign(surface: Surface) -> float:
-    """Sign of the implicit function of a surface on its air side."""
-    apex = np.asarray(surface.origin_mm) + np.asarray(surface.rotation)[:, 0]
-    return float(np.sign(surface.implicit(apex[None])[0]))
 
 
 def _pattern(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
@@ -335,140 +262,7 @@ def _pattern(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
     return np.repeat(points, RAYS, axis=0), d.reshape(-1, 3)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Arrived:
-    """Where traced rays end: those that left (`out`: their numbers), and arrivals (`ray`: their numbers)."""
-
-    out: Ints
-    origin: Floats
-    way: Floats
-    weight: Floats
-    ray: Ints
-    share: Floats
-    back: Floats
-    on_wall: Bools
-
-
-@dataclass(slots=True, kw_only=True)
-class _Rays:
-    """Rays on their way: numbers, weights, points, directions, and in which medium (surfaces in front of it)."""
-
-    number: Ints
-    weight: Floats
-    o: Floats
-    d: Floats
-    layer: Ints
-
-    def only(self, some: Bools) -> _Rays:
-        return _Rays(**{f.name: getattr(self, f.name)[some] for f in fields(self)})
-
-    def and_(self, other: _Rays) -> _Rays:
-        return _Rays(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
-
-
-def _traced(walls: _Walls, o: Floats, d: Floats, layer: Ints) -> _Arrived:
-    """Follow rays until they arrive at the plane or the wall; what first leaves through the front is kept.
-
-    The cornea's back refracts them; it mirrors only what it mirrors totally.
-    """
-    rays = _Rays(number=np.arange(len(o)), weight=np.ones(len(o)), o=o, d=d, layer=layer)
-    first = np.ones(len(o), dtype=bool)
-    ends, left = [], []
-    for _ in range(_STEPS):
-        if not len(rays.number):
-            break
-        outer, inner = _to_surfaces(walls, rays)
-        plane = np.where(rays.layer == len(walls.front), walls.to_plane(rays.o, rays.d), np.inf)
-        wall = np.where(rays.layer == walls.layer, walls.to_wall(rays.o, rays.d), np.inf)
-        nearest = np.minimum(np.minimum(plane, wall), np.minimum(outer, inner))
-        known = np.isfinite(nearest)
-        # Where the rim of a tilted cornea is above the wall's edge, rays pass between them: they meet the wall there.
-        arrives = ~known | (nearest == np.minimum(plane, wall))
-        at = rays.o + np.where(known, nearest, 0)[:, None] * rays.d
-        ends.append((rays.number[arrives], rays.weight[arrives], at[arrives], (~known | (wall < plane))[arrives]))
-        rays.o = at
-        known &= ~arrives
-        outwards = nearest == outer
-        at_front = rays.only(known & outwards & (rays.layer == 1))
-        at_front, gone = _mirrored(walls, at_front, first)
-        left.append(gone)
-        further = [at_front]
-        for k in range(1, len(walls.front)):
-            further.append(_crossed(walls, rays.only(known & outwards & (rays.layer == k + 1)), k, outwards=True))
-            further.append(_crossed(walls, rays.only(known & ~outwards & (rays.layer == k)), k, outwards=False))
-        rays = further[0]
-        for more in further[1:]:
-            rays = rays.and_(more)
-    columns = [np.concatenate(column) for part in (left, ends) for column in zip(*part, strict=True)]
-    return _Arrived(**dict(zip((f.name for f in fields(_Arrived)), columns, strict=True)))
-
-
-def _to_surfaces(walls: _Walls, rays: _Rays) -> tuple[Floats, Floats]:
-    """Distances (n,) to the surface in front of the rays' medium and to that behind it; infinite where it is missed."""
-    outer, inner = np.full(len(rays.number), np.inf), np.full(len(rays.number), np.inf)
-    for k, surface in enumerate(walls.front):
-        here = rays.layer == k + 1
-        t = _outward(surface, rays.o[here], rays.d[here])
-        if k == 0:
-            hit = rays.o[here] + np.where(np.isfinite(t), t, 0)[:, None] * rays.d[here]
-            local = surface.to_local(hit)
-            t[(np.hypot(local[:, 1], local[:, 2]) > walls.rim) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
-        outer[here] = t
-        here = rays.layer == k
-        hit = surface.hit(components(rays.o[here] + _AHEAD_MM * rays.d[here]), components(rays.d[here]), True)
-        inner[here] = np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
-    return outer, inner
-
-
-def _mirrored(walls: _Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tuple[Ints, Floats, Floats, Floats]]:
-    """Mirror rays at the inner side of the front; also returns what leaves the eye there for the first time.
-
-    `first` marks the rays of which nothing has left.
-    """
-    n, w = walls.front[0].normal(rays.o), rays.d
-    cosine = np.sum(n * w, axis=1)
-    mirrored = fresnel(cosine, walls.indices[0], 1.0, walls.film).unpolarized
-    go = first[rays.number] & (mirrored < 1)
-    full = rays.weight * walls.indices[0] ** 2 * (1 - mirrored)
-    gone = rays.number[go], rays.o[go], _refracted(w[go], -n[go], walls.indices[0]), full[go]
-    first[rays.number[go]] = False
-    rays.d = w - 2 * cosine[:, None] * n
-    weak = mirrored < _WEAK
-    rays.weight = rays.weight * np.where(weak, _FEW * mirrored, mirrored)
-    return rays.only((rays.weight > 1e-3) & (~weak | (rays.number % _FEW == 0))), gone
-
-
-def _crossed(walls: _Walls, rays: _Rays, k: int, *, outwards: bool) -> _Rays:
-    """Refract rays at surface k behind the front, with the change of radiance between media; mirror the others."""
-    n = walls.front[k].normal(rays.o)
-    before, after = walls.indices[k - 1], walls.indices[k]
-    if outwards:
-        n, before, after = -n, after, before
-    eta = before / after
-    cosine = -np.sum(n * rays.d, axis=1)
-    passes = 1 - eta * eta * (1 - cosine * cosine) > 0
-    mirrored = rays.d + 2 * cosine[:, None] * n
-    rays.d = np.where(passes[:, None], _refracted(rays.d, n, eta), mirrored)
-    rays.weight = rays.weight * np.where(passes, eta * eta, 1.0)
-    rays.layer = rays.layer + np.where(passes, -1 if outwards else 1, 0)
-    return rays
-
-
-def _outward(surface: Surface, o: Floats, d: Floats) -> Floats:
-    """Distance (n,) to a surface from inside, infinite where it is not met."""
-    hit = surface.hit(components(o + _AHEAD_MM * d), components(d), False)
-    return np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
-
-
-def _refracted(d: Floats, n: Floats, eta: float) -> Floats:
-    """Refract directions at normals against them; grazing beyond total reflection."""
-    c = -np.sum(n * d, axis=1)
-    c2 = np.sqrt(np.maximum(1 - eta * eta * (1 - c * c), 0))
-    w = eta * d + (eta * c - c2)[:, None] * n
-    return np.asarray(w / np.linalg.norm(w, axis=1, keepdims=True))
-
-
-def _turned(exchange: Floats, valid: Bools) -> Floats:
+def _average_over_sectors(exchange: Floats, valid: Bools) -> Floats:
     """Exchange (PATCHES, PATCHES) averaged over neighbouring sectors, because an eye is nearly round."""
     patch = np.arange(PATCHES)
     on_wall = patch >= IRIS
@@ -481,7 +275,7 @@ def _turned(exchange: Floats, valid: Bools) -> Floats:
     return np.asarray(total * np.where(valid & (weight > 0), 1 / np.maximum(weight, 1), 0)[:, None])
 
 
-def _onto(
+def _patches_at(
     back: Floats, on_wall: Bools, radii: tuple[float, float], points: Floats, valid: Bools
 ) -> list[tuple[Ints, Floats]]:
     """Patches that stand for points of arrival, each with its weight (n,): on the same side of the iris' root."""

@@ -32,7 +32,7 @@ class Maps:
 
     def __init__(self) -> None:
         self._kept: dict[Any, tuple[Any, Any, EnvironmentMap]] = {}
-        self._none = self._sent(environment_map(np.zeros((2, 4))))
+        self._none = self._upload(environment_map(np.zeros((2, 4))))
 
     def of(self, spec: RadianceMap | None) -> tuple[Any, Any, EnvironmentMap]:
         """Textures of radiance and irradiance, and map, of a spec (its path is absolute or from the current folder)."""
@@ -48,11 +48,11 @@ class Maps:
         if key not in self._kept:
             if len(self._kept) >= _KEPT:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self._sent(environment_map(map_values(spec)))
+            self._kept[key] = self._upload(environment_map(map_values(spec)))
         return self._kept[key]
 
     @staticmethod
-    def _sent(made: EnvironmentMap) -> tuple[Any, Any, EnvironmentMap]:
+    def _upload(made: EnvironmentMap) -> tuple[Any, Any, EnvironmentMap]:
         return _texture(made.values[..., None]), _texture(made.irradiance), made
 
 

@@ -138,7 +138,7 @@ def _size(kind: str, head: bytes) -> int | None:
 
 def environment_map(values: Floats) -> EnvironmentMap:
     """Prepare a map (h, 2 h): average it down to at most 1024 x 512, and compute its irradiance."""
-    reduced = _reduced(values)
+    reduced = _reduce(values)
     if not reduced.any():  # every renderer keeps such a map for scenes without one
         dark = np.zeros((NORMALS, 2 * NORMALS, 2))
         return EnvironmentMap(frozen(reduced, np.float32), 0.0, frozen(dark, np.float32), frozen(np.zeros((0, 3))))
@@ -218,14 +218,14 @@ def map_values(spec: RadianceMap) -> Floats:
     return read_map(spec.file, spec.channel)
 
 
-def _reduced(values: Floats) -> Floats:
+def _reduce(values: Floats) -> Floats:
     """Average a map down to at most 1024 x 512, by whole texels or by linear resampling of its running sum."""
     if values.shape[0] <= _HEIGHT:
         return values
-    return _averaged(_averaged(values, _HEIGHT).T, _WIDTH).T
+    return _average(_average(values, _HEIGHT).T, _WIDTH).T
 
 
-def _averaged(values: Floats, count: int) -> Floats:
+def _average(values: Floats, count: int) -> Floats:
     """Means of rows over `count` equal intervals."""
     running = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     at = np.linspace(0, len(values), count + 1)

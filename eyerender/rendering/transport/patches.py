@@ -61,10 +61,10 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
     solid = np.arange(ends[0])
     if len(ends) > 4:  # a head mesh: what is neither hair nor tears
         solid = np.append(solid, np.arange(ends[3], ends[4]))
-    where = _where(mesh, globe)
+    where = _coordinates(mesh, globe)
     p, n, w = mesh.vertices[solid], mesh.normals[solid], where[solid]
     level = np.maximum(np.round(2 * np.log2(np.maximum(np.linalg.norm(p, axis=1), 1e-3) / _NEAR_MM)), 0)
-    out = _from_globe(globe, p)
+    out = _relative_to_globe(globe, p)
     away = np.linalg.norm(out, axis=1)
     # The margins of the lids, which do not face away from the globe.
     margin = (away < globe.radius_mm + _LID_MM) & (np.sum(out * n, axis=1) < 0.6 * away) & (w[:, 3] > 0)
@@ -77,9 +77,9 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
     away = np.linalg.norm(w - middle[group], axis=1)
     order = np.lexsort((away, group))
     chosen = solid[order[np.searchsorted(group[order], np.arange(len(first)))]]
-    near, weight = _spread(mesh.normals, where, chosen, size[first])
+    near, weight = _neighbours(mesh.normals, where, chosen, size[first])
     nearest = near[np.arange(len(near)), np.argmax(weight, axis=1)]
-    out = _from_globe(globe, mesh.vertices[chosen])
+    out = _relative_to_globe(globe, mesh.vertices[chosen])
     away = np.linalg.norm(out, axis=1)
     over = (away < globe.radius_mm + _LID_MM) & (np.sum(out * mesh.normals[chosen], axis=1) > 0.2 * away)
     lids = np.flatnonzero(over & (out[:, 0] > 0))
@@ -90,19 +90,19 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
     )  # fmt: skip
 
 
-def _from_globe(globe: Globe, points: Floats) -> Floats:
+def _relative_to_globe(globe: Globe, points: Floats) -> Floats:
     """Points (n, 3) of the scene's frame relative to the centre of a globe at rest."""
     return np.asarray(points - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
 
 
-def _where(mesh: RegionMesh, globe: Globe) -> Floats:
+def _coordinates(mesh: RegionMesh, globe: Globe) -> Floats:
     """Where vertices are (n, 4): their points (mm), and a fourth coordinate that grows across the lids' margins."""
     height = globe.clearance(mesh.vertices * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
     return np.column_stack([mesh.vertices, _STEEP * (np.clip(height, _LOW_MM, _TOP_MM) - _LOW_MM)])
 
 
-def _spread(normals: Floats, where: Floats, chosen: Ints, size: Floats) -> tuple[Ints, Singles]:
-    """The nearest patches at every vertex, and their weights.
+def _neighbours(normals: Floats, where: Floats, chosen: Ints, size: Floats) -> tuple[Ints, Singles]:
+    """Find the nearest patches at every vertex, and their weights.
 
     A patch has less weight with distance and where the skin faces another way.
     """
@@ -143,14 +143,14 @@ def globe_patches(globe: Globe, mesh: RegionMesh | None) -> GlobePatches:
     mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
     centre = globe.centre * mirror
     if mesh is None:
-        return _front(globe, centre, mirror)
+        return _on_front(globe, centre, mirror)
     y, low, high = _opening(globe, centre, mesh)
     share = (np.arange(GLOBE_ROWS) + 0.5) / GLOBE_ROWS
     z = low + share[:, None] * (high - low)
     dy, dz = np.broadcast_to(y - centre[1], z.shape), z - centre[2]
     dx = np.sqrt(np.maximum(globe.radius_mm**2 - dy * dy - dz * dz, 1.0))
     table = np.concatenate([centre, [y[0], (GLOBE_COLUMNS - 1) / (y[-1] - y[0])], np.stack([low, high], 1).ravel()])
-    return _placed(globe, centre, mirror, np.stack([dx, dy, dz], -1).reshape(-1, 3), table, GLOBE_COLUMNS, GLOBE_ROWS)
+    return _on_globe(globe, centre, mirror, np.stack([dx, dy, dz], -1).reshape(-1, 3), table, GLOBE_COLUMNS, GLOBE_ROWS)
 
 
 def _opening(globe: Globe, centre: Floats, mesh: RegionMesh) -> tuple[Floats, Floats, Floats]:
@@ -166,16 +166,16 @@ def _opening(globe: Globe, centre: Floats, mesh: RegionMesh) -> tuple[Floats, Fl
     return y, low, np.maximum(high, low + 1e-3)
 
 
-def _front(globe: Globe, centre: Floats, mirror: Floats) -> GlobePatches:
+def _on_front(globe: Globe, centre: Floats, mirror: Floats) -> GlobePatches:
     at = np.linspace(-WIDEST, WIDEST, MAP_SIDE)
     a, b = (v.ravel() for v in np.meshgrid(at, at))
     polar = np.minimum(np.hypot(a, b), np.pi - 0.01)
     s = np.sinc(polar / np.pi)
     table = np.concatenate([centre, np.zeros(2 + 2 * GLOBE_COLUMNS)])
-    return _placed(globe, centre, mirror, np.stack([np.cos(polar), a * s, b * s], -1), table, MAP_SIDE, MAP_SIDE)
+    return _on_globe(globe, centre, mirror, np.stack([np.cos(polar), a * s, b * s], -1), table, MAP_SIDE, MAP_SIDE)
 
 
-def _placed(
+def _on_globe(
     globe: Globe, centre: Floats, mirror: Floats, way: Floats, table: Floats, columns: int, rows: int
 ) -> GlobePatches:
     way = way / np.linalg.norm(way, axis=1, keepdims=True)
@@ -201,8 +201,10 @@ def plane_patches(globe: Globe, plane_x: float) -> tuple[Floats, float]:
     return np.stack([np.full(y.size, plane_x), y.ravel(), z.ravel()], axis=1), float(inner)
 
 
-def filled(values: Floats, valid: Bools, rows: int, columns: int, across: tuple[float, float] = (1.0, 1.0)) -> Floats:
-    """Values (rows * columns, k) of a grid averaged over valid neighbours; farther ones where none is valid.
+def fill_gaps(
+    values: Floats, valid: Bools, rows: int, columns: int, across: tuple[float, float] = (1.0, 1.0)
+) -> Floats:
+    """Average the values (rows * columns, k) of a grid over valid neighbours; over farther ones where none is valid.
 
     across: weight of each neighbour along columns and along rows, beside 2 for the patch itself.
     """
@@ -210,7 +212,7 @@ def filled(values: Floats, valid: Bools, rows: int, columns: int, across: tuple[
     total = values.reshape(rows, columns, -1) * weight
     out, known = np.zeros_like(total), np.zeros((rows, columns), dtype=bool)
     while True:
-        total, weight = _blurred(total, across), _blurred(weight, across)
+        total, weight = _blur(total, across), _blur(weight, across)
         new = (weight[..., 0] > 0) & ~known
         out[new] = total[new] / weight[new]
         known |= new
@@ -219,8 +221,8 @@ def filled(values: Floats, valid: Bools, rows: int, columns: int, across: tuple[
         across = (1.0, 1.0)
 
 
-def _blurred(values: Floats, across: tuple[float, float]) -> Floats:
-    """Weighted sums of 3 x 3 neighbours."""
+def _blur(values: Floats, across: tuple[float, float]) -> Floats:
+    """Sum 3 x 3 neighbours with weights."""
     height, width, count = values.shape
     padded = np.zeros((height + 2, width + 2, count))
     padded[1:-1, 1:-1] = values

@@ -26,7 +26,7 @@ from .chamber import IRIS, IRIS_RINGS, PATCHES
 from .chamber import TURNS as IRIS_TURNS
 from .formfactors import share_of
 from .framepatches import FramePatches, Patches
-from .patches import GlobePatches, filled
+from .patches import GlobePatches, fill_gaps
 from .patchlight import Gathered, PatchLight, gather_light
 from .patchtables import Lanes, PatchTables
 from .radiosityfield import RadiosityField
@@ -88,7 +88,7 @@ class PendingField:
             others = np.tile(_UNLIT, (count, 1))
             if region is not None:
                 region.skin.received = upload_array(others)
-            return self.field.filled(np.tile(_UNLIT, (patches.on_globe, 1)), others, np.zeros(IRIS))
+            return self.field.with_light(np.tile(_UNLIT, (patches.on_globe, 1)), others, np.zeros(IRIS))
         valid = light.rays.mean(light.rays.near)[: patches.on_globe] < 0.5
         if region is None:
             valid &= patches.globe.points[:, 0] > -patches.job.look.backdrop_distance_mm
@@ -102,7 +102,9 @@ class PendingField:
             part[:, 1], part[:, 3] = share_of(part[:, 1], part[:, 3]), 0
         from_outside = (solution.gathered + ambient.sky)[patches.outside :]
         iris = _smooth_on_iris(patches, from_outside, 1.0)
-        return self.field.filled(globe, others, iris + _smooth_on_iris(patches, solution.inside + light.panels, 0.0))
+        return self.field.with_light(
+            globe, others, iris + _smooth_on_iris(patches, solution.inside + light.panels, 0.0)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +175,7 @@ def _outer_tables(
         table[patches.on_globe :, 2] *= job.look.backdrop_albedo
     # Between lids the light changes fast from lid to lid, so it is averaged along them only.
     across = (1.0, 0.0 if in_region else 1.0)
-    globe = filled(table[: patches.on_globe], valid, patches.globe.rows, patches.globe.columns, across)
+    globe = fill_gaps(table[: patches.on_globe], valid, patches.globe.rows, patches.globe.columns, across)
     return globe, table[patches.on_globe : outside - IRIS_TURNS]
 
 
@@ -182,5 +184,5 @@ def _smooth_on_iris(patches: FramePatches, values: Floats, along: float) -> Floa
     known = patches.interior.chamber.valid[:IRIS]
     grids = (values[:IRIS].reshape(IRIS_RINGS, IRIS_TURNS), known.reshape(IRIS_RINGS, IRIS_TURNS))
     closed = [np.concatenate([g[:, -2:], g, g[:, :2]], axis=1).ravel() for g in grids]
-    out = filled(closed[0], closed[1], IRIS_RINGS, IRIS_TURNS + 4, (along, 0.0))
+    out = fill_gaps(closed[0], closed[1], IRIS_RINGS, IRIS_TURNS + 4, (along, 0.0))
     return np.asarray(out.reshape(IRIS_RINGS, -1)[:, 2:-2].ravel())

@@ -84,7 +84,7 @@ class RadiosityField:
             ends=upload_array(globe.table[5:]), globe=none, background=none, iris=none,
         )  # fmt: skip
 
-    def filled(self, globe: Floats, background: Floats, iris: Floats) -> RadiosityField:
+    def with_light(self, globe: Floats, background: Floats, iris: Floats) -> RadiosityField:
         """The same patches with the light that they receive."""
         return replace(self, globe=upload_array(globe), background=upload_array(background), iris=upload_array(iris))
 
