@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 
 from ...arrays import ArrayValue, Bools, Floats, frozen, remembered
 from ...eye.model import EyeModel
-from ...geometry.surfaces import Surface, Xyz, components, join
+from ...geometry.surfaces import Surface, components, join
 from ...geometry.transforms import normalize
 from ...optics.interface import fresnel
 from ...optics.shooting import RESIDUAL_LIMIT_MM, ray_tube
-from ...optics.solve import Rays, mirrored_rays
+from ...optics.solve import mirrored_rays
 from ...optics.trace import Crossing
 from ...rig.camera import PinholeCamera
 from ...rig.light import Lamp
@@ -169,12 +169,12 @@ class GlintScene:
 
     def images(self, lights: Sequence[Lamp], sigma_px: float) -> Images:
         """Compute the image of each lamp as finely as its size and the point-spread function require."""
-        images = self._traced(_roughly(*lights))
+        images = self._images_of(_roughly(*lights))
         wide = [k for k, lamp in enumerate(lights) if lamp.radius_mm > 0]
         rims = ((images[k].xy_px[-_ON_RIM:], images[k].there[-_ON_RIM:]) for k in wide)
         counts = {k: _node_counts(xy[there], sigma_px) for k, (xy, there) in zip(wide, rims, strict=True)}
         if more := [k for k, count in counts.items() if count != _LEAST]:
-            finely = self._trace([lights[k] for k in more], [quadrature(*counts[k]) for k in more])
+            finely = self._images_at([lights[k] for k in more], [quadrature(*counts[k]) for k in more])
             for k, image in zip(more, finely, strict=True):
                 images[k] = image.join(images[k].last(_ON_RIM))
         return Images(images, counts)
@@ -193,16 +193,14 @@ class GlintScene:
 
         When the nodal point moves by q, the image of a point at depth z moves by -f q / z. NaN where there is no image.
         """
-        camera, out = self.camera, []
-        for axis in (0, 1):
-            xy = []
-            for step in (_PARALLAX_MM, -_PARALLAX_MM):
-                K, R = camera.K, camera.R
-                moved = PinholeCamera.of(K, R, camera.t - step * np.eye(3)[axis], camera.resolution_px)
-                images = replace(self, camera=moved)._trace(lights, [POINT] * len(lights))
-                xy.append([i.xy_px[0, axis] if i.found[0] else np.nan for i in images])
-            out.append((np.array(xy[1]) - xy[0]) / (2 * _PARALLAX_MM * camera.K[axis, axis]))
-        return np.stack(out, axis=1)
+        R, n = self.camera.R, len(lights)
+        steps = _PARALLAX_MM * np.array([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
+        sources = (np.stack([lamp.position_mm for lamp in lights]) - self.t) @ self.M
+        reflected = self._reflect(np.tile(sources, (4, 1)), np.repeat(self._eyepoint + steps @ R @ self.M, n, axis=0))
+        cam = (-(reflected.leaves @ self.M.T) @ R.T).reshape(2, 2, n, 3)
+        found = reflected.found.reshape(2, 2, n) & (cam[..., 2] > 0)
+        xy = np.where(found[..., None], cam[..., :2] / np.where(found, cam[..., 2], 1.0)[..., None], np.nan)
+        return np.stack([(xy[1, k, :, k] - xy[0, k, :, k]) / (2 * _PARALLAX_MM) for k in (0, 1)], axis=1)
 
     def seen(self, images: Sequence[Image], clear: Visibility) -> list[Glint]:
         """Glints of images, made of their points that the camera sees."""
@@ -219,7 +217,7 @@ class GlintScene:
         mirror = self._mirror_map(lamp, image)
 
         def visible(points: Floats) -> Bools:
-            (seen,) = self._trace([lamp], [Nodes(points, np.ones(len(points)))])
+            (seen,) = self._images_at([lamp], [Nodes(points, np.ones(len(points)))])
             return seen.there & self._clear(clear, seen.source_mm, seen.entry_mm, seen.exit_mm)
 
         def nearly_visible(points: Floats) -> Bools:
@@ -231,7 +229,7 @@ class GlintScene:
             return np.asarray(there & self._clear(clear, source, at, at))
 
         nodes = cut_nodes(visible if mirror is None else nearly_visible, *counts)
-        (cut,) = self._trace([lamp], [nodes])
+        (cut,) = self._images_at([lamp], [nodes])
         return cut.spots
 
     def _mirror_map(self, lamp: Lamp, image: Image) -> Callable[[Floats], Floats] | None:
@@ -261,54 +259,59 @@ class GlintScene:
         both = clear(np.concatenate([sources, node]), np.concatenate([entries, exits]))
         return np.asarray(both[: len(sources)] & both[len(sources) :])
 
-    def _trace(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
+    def _images_at(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
         """Images of lamps through the given points of their discs; all lamps in one batch."""
-        return self._traced(_Emitters.of(lights, nodes))
+        return self._images_of(_Emitters.of(lights, nodes))
 
-    def _traced(self, emitters: _Emitters) -> list[Image]:
+    def _images_of(self, emitters: _Emitters) -> list[Image]:
         """Images of lamps through points of them."""
-        camera, which, counts, weights = self.camera, emitters.which, emitters.counts, emitters.weights
-        points, axes, strength, exponent = emitters.points, emitters.axes @ self.M, emitters.strength, emitters.exponent
-        eyepoint = self._eyepoint
-        sources = (points - self.t) @ self.M
-        lamp_xyz, node_xyz = components(sources), components(np.broadcast_to(eyepoint, sources.shape))
-        rays = mirrored_rays(self.surface, lamp_xyz, node_xyz, rim_mm=self.limbus_radius_mm)
-        # Where a larger cornea would mirror a point, the solver finds the ray too.
-        found = np.asarray((rays.status == Status.OK) | (rays.status == Status.OUTSIDE_LIMBUS))
-        found &= rays.residual_mm < RESIDUAL_LIMIT_MM
-        there = found & (rays.status == Status.OK)
-        y, d, w, N, J = self._mirrors(rays, lamp_xyz, node_xyz, found)
-        if self.mesh is not None:
-            seen = self.mesh.mirrored(y, sources, np.broadcast_to(eyepoint, sources.shape))
-            y, N, d, w, J = seen.point, seen.normal, seen.arrives, seen.leaves, seen.cross_section
-            found &= seen.found
-            there = found & (self.surface.axis_distance(components(y)) <= self.limbus_radius_mm)
-        F = fresnel(np.clip(-_dot(N, d), 0, 1), 1.0, self.index, self.film_index).unpolarized
-        leaving = np.maximum(_dot(d, axes[which]), 0)
-        power = exponent[which]
+        camera, which = self.camera, emitters.which
+        sources = (emitters.points - self.t) @ self.M
+        r = self._reflect(sources, np.broadcast_to(self._eyepoint, sources.shape))
+        F = fresnel(np.clip(-_dot(r.normal, r.arrives), 0, 1), 1.0, self.index, self.film_index).unpolarized
+        leaving = np.maximum(_dot(r.arrives, (emitters.axes @ self.M)[which]), 0)
+        power = emitters.exponent[which]
         lobe = np.where(power == 0, 1.0, np.where(leaving > 0, leaving ** np.where(power == 0, 1.0, power), 0.0))
-        cam = -(w @ self.M.T) @ camera.R.T
-        found &= cam[:, 2] > 0
+        cam = -(r.leaves @ self.M.T) @ camera.R.T
+        found = r.found & (cam[:, 2] > 0)
         z = np.where(found, cam[:, 2], 1.0)
         x, v = cam[:, 0] / z, cam[:, 1] / z
         scale = camera.K[0, 0] * camera.K[1, 1] * distortion_determinant(camera, x, v) / z**3
-        there &= found & ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, eyepoint - y)
-        energy = np.where(found, weights * strength[which] * lobe * F / np.where(found, J, 1.0) * scale, 0.0)
+        y, strength = r.point, emitters.weights * emitters.strength[which]
+        there = r.there & found & ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, self._eyepoint - y)
+        energy = np.where(found, strength * lobe * F / np.where(found, r.cross_section, 1.0) * scale, 0.0)
         mirrors, xy = y @ self.M.T + self.t, camera.pixels_of(x, v)
         whole = Image(
-            source_mm=points, entry_mm=mirrors, exit_mm=mirrors, xy_px=xy, energy=energy, there=there, found=found
-        )
-        return whole.parts(counts)
+            source_mm=emitters.points, entry_mm=mirrors, exit_mm=mirrors, xy_px=xy, energy=energy, there=there,
+            found=found,
+        )  # fmt: skip
+        return whole.parts(emitters.counts)
 
-    def _mirrors(self, rays: Rays, lamp: Xyz, node: Xyz, found: Bools) -> tuple[Floats, ...]:
-        """Mirror points of the closed form, directions of arriving and leaving light, normals, ray tubes."""
-        mirror = (Crossing(self.surface, 1.0, reflects=True),)
-        J = ray_tube(mirror, 1.0, node, rays.way, lamp).cross_section_mm2_sr
+    def _reflect(self, sources: Floats, viewpoints: Floats) -> _Reflections:
+        """Find the points that mirror sources (k, 3) to viewpoints (k, 3); eye frame."""
+        lamp, node = components(sources), components(viewpoints)
+        rays = mirrored_rays(self.surface, lamp, node, rim_mm=self.limbus_radius_mm)
+        # Where a larger cornea would mirror a point, the solver finds the ray too.
+        found = np.asarray((rays.status == Status.OK) | (rays.status == Status.OUTSIDE_LIMBUS))
+        found &= rays.residual_mm < RESIDUAL_LIMIT_MM
         # The solver's ray runs from the camera to the lamp, the light in the other direction.
         y, d, w = (
             np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (join(rays.exit), -join(rays.end), -join(rays.way))
         )
-        return y, d, w, self.surface.normal(y), J
+        if self.mesh is not None:
+            seen = self.mesh.mirrored(y, sources, viewpoints)
+            found &= seen.found
+            there = found & (self.surface.axis_distance(components(seen.point)) <= self.limbus_radius_mm)
+            return _Reflections(
+                point=seen.point, normal=seen.normal, arrives=seen.arrives, leaves=seen.leaves,
+                cross_section=seen.cross_section, found=found, there=there,
+            )  # fmt: skip
+        mirror = (Crossing(self.surface, 1.0, reflects=True),)
+        J = ray_tube(mirror, 1.0, node, rays.way, lamp).cross_section_mm2_sr
+        return _Reflections(
+            point=y, normal=self.surface.normal(y), arrives=d, leaves=w, cross_section=J, found=found,
+            there=found & (rays.status == Status.OK),
+        )  # fmt: skip
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
         """Whether the sclera's sphere blocks the way from points of the cornea (eye frame)."""
@@ -317,6 +320,29 @@ class GlintScene:
         b = _dot(o, d)
         disc = b * b - (_dot(o, o) - self.sclera_radius_mm**2)
         return np.asarray((disc > 0) & (-b - np.sqrt(np.maximum(disc, 0)) > 1e-6))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Reflections:
+    """Points that mirror sources to viewpoints, one row each (eye frame).
+
+    Attributes:
+        point: (k, 3) on the cornea.
+        normal: (k, 3) unit normals there.
+        arrives: (k, 3) direction of the light before it is mirrored.
+        leaves: (k, 3) the same after it.
+        cross_section: (k,) of the ray tube, mm^2 per sr.
+        found: (k,) whether the cornea mirrors the point, or a larger one would.
+        there: (k,) whether the cornea does.
+    """
+
+    point: Floats
+    normal: Floats
+    arrives: Floats
+    leaves: Floats
+    cross_section: Floats
+    found: Bools
+    there: Bools
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
