@@ -16,7 +16,7 @@ import numpy as np
 from ..materials.albedo import opacity, stop_coordinates
 from ..records.frame import Frame
 from ..records.recording import syntax
-from .interaction import EPSILON_MM, WET, SurfaceInteraction
+from .interaction import EPSILON_MM, SurfaceInteraction
 
 _NEAR_MM = 20.0
 _FAR = float(np.finfo(np.float32).max)
@@ -41,18 +41,6 @@ class EyeHit:
     to_cornea: mi.Float
     to_sclera: mi.Float
     facing: mi.Vector3f
-
-
-@dataclass(kw_only=True)
-class IrisView:
-    """What the cornea mirrors and lets pass, and where the refracted ray meets the plane of the iris."""
-
-    normal: mi.Vector3f
-    mirrored: mi.Float
-    passed: mi.Float
-    inner: mi.Vector3f
-    slant: mi.Vector3f
-    pupil: mi.Bool
 
 
 @dataclass(kw_only=True)
@@ -87,24 +75,12 @@ class EyeShape:
         _, oe, de = self._start(o, d)
         dl = front.vector_in(de)
         xc, xs = oe + hit.to_cornea * de, oe + hit.to_sclera * de
-        iris = self._iris_view(hit, xc, dl)
-        return SurfaceInteraction(
-            cornea=hit.cornea,
-            sclera=hit.sclera,
-            other=mi.Bool(False),
-            distance=hit.t,
-            point=dr.select(hit.cornea, xc, xs),
-            normal=dr.normalize(dr.select(hit.cornea, iris.normal, xs - frame.sclera.centre)),
-            opacity=dr.select(hit.cornea, opacity(frame, _from_axis(front.point_in(oe) + hit.to_cornea * dl)), 1),
-            mirrored=iris.mirrored,
-            passed=iris.passed,
-            inner=iris.inner,
-            slant=iris.slant,
-            pupil=iris.pupil,
-            albedo=mi.Float(0),
-            gloss=mi.Float(WET),
-            received=mi.Vector4f(0),
-        )
+        si = SurfaceInteraction.blank()
+        si.cornea, si.sclera, si.distance, si.point = hit.cornea, hit.sclera, hit.t, dr.select(hit.cornea, xc, xs)
+        si.opacity = dr.select(hit.cornea, opacity(frame, _from_axis(front.point_in(oe) + hit.to_cornea * dl)), 1)
+        si = self._through_cornea(si, hit.facing, xc, dl)
+        si.normal = dr.normalize(dr.select(hit.cornea, si.normal, xs - frame.sclera.centre))
+        return si
 
     def ray_intersect(self, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
         """Compute what rays (scene's frame) meet of the eye, as if it stood alone."""
@@ -132,25 +108,24 @@ class EyeShape:
         return t0, self.frame.point_to_eye(o + t0 * d), self.frame.vector_to_eye(d)
 
     @syntax
-    def _iris_view(self, hit: EyeHit, x: mi.Vector3f, dl: mi.Vector3f) -> IrisView:
+    def _through_cornea(
+        self, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3f
+    ) -> SurfaceInteraction:
         """Follow rays that meet the cornea in x (eye frame) along dl (the cornea's frame) to the plane of the iris."""
-        nothing = mi.Vector3f(0)
-        iris = IrisView(
-            normal=nothing, mirrored=mi.Float(0), passed=mi.Float(0), inner=nothing, slant=nothing, pupil=mi.Bool(False)
-        )
-        if dr.hint(hit.cornea, exclude=[self, hit, x, dl]):
-            iris = _refracted(self.frame, hit.facing, x, dl)
-        return iris
+        on_cornea = si.cornea
+        if dr.hint(on_cornea, exclude=[self, facing, x, dl, on_cornea]):
+            _refract(self.frame, si, facing, x, dl)
+        return si
 
 
-def _refracted(frame: Frame, normal: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3f) -> IrisView:
-    """Refract rays at the cornea, whose normal and ray direction dl are given in its own frame, x in the eye frame."""
+def _refract(frame: Frame, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3f) -> None:
+    """Refract rays at the cornea, and set what they meet; see `EyeShape._through_cornea`."""
     front = frame.surfaces[0]
-    c = -dr.dot(normal, dl)
+    c = -dr.dot(facing, dl)
     c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
     mirrored = front.mirrored(c, c2)
     passed = 1 - mirrored
-    w = front.vector_out(front.eta * dl + (front.eta * c - c2) * normal)
+    w = front.vector_out(front.eta * dl + (front.eta * c - c2) * facing)
     inside = mi.Vector3f(x)
     reached = mi.Bool(True)
     for surface in frame.surfaces[1:]:
@@ -163,15 +138,11 @@ def _refracted(frame: Frame, normal: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3
     inner = dr.select(s > 0, inside + s * w, _beyond_root(frame, inside))
     pu, pv = stop_coordinates(frame, inner)
     margin = frame.boundary.radius(pu, pv)
-    return IrisView(
-        normal=front.vector_out(normal),
-        mirrored=mirrored,
-        passed=dr.select(reached, passed, 0),
-        # A ray that finds no way may have no place at all, and nothing may be computed from that.
-        inner=dr.select(reached, inner, frame.stop.centre),
-        slant=dr.select(reached & (down < -0.05), w / down - n, 0),
-        pupil=reached & (pu * pu + pv * pv < margin * margin),
-    )
+    si.normal, si.mirrored, si.passed = front.vector_out(facing), mirrored, dr.select(reached, passed, 0)
+    # A ray that finds no way may have no place at all, and nothing may be computed from that.
+    si.inner = dr.select(reached, inner, frame.stop.centre)
+    si.slant = dr.select(reached & (down < -0.05), w / down - n, 0)
+    si.pupil = reached & (pu * pu + pv * pv < margin * margin)
 
 
 def _beyond_root(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:

@@ -13,7 +13,7 @@ from ..records.recording import syntax
 from ..records.surfaces import Bundle
 
 EPSILON_MM = 2e-3  # points closer than this are the same in single precision
-WET = 0.93  # gloss of the sclera
+_WET = 0.93  # gloss of the sclera
 _DEEPEST = 0.75  # least inverse depth of the image of an iris, relative to the cornea's: grazing rays come from afar
 
 
@@ -56,6 +56,19 @@ class SurfaceInteraction:
     gloss: mi.Float
     received: mi.Vector4f
     level: mi.Vector3f | None = None
+
+    @classmethod
+    def blank(cls) -> SurfaceInteraction:
+        """Return the interaction of rays that meet nothing, for others to fill."""
+        # Arrays of their own, because Dr.Jit writes the results of branches into them.
+        cornea, sclera, other, pupil = (mi.Bool(False) for _ in range(4))
+        distance, mirrored, passed, albedo = (mi.Float(0) for _ in range(4))
+        point, normal, inner, slant = (mi.Vector3f(0) for _ in range(4))
+        return cls(
+            cornea=cornea, sclera=sclera, other=other, distance=distance, point=point, normal=normal,
+            opacity=mi.Float(1), mirrored=mirrored, passed=passed, inner=inner, slant=slant, pupil=pupil,
+            albedo=albedo, gloss=mi.Float(_WET), received=mi.Vector4f(0),
+        )  # fmt: skip
 
     @property
     def matte(self) -> mi.Bool:

@@ -20,7 +20,7 @@ from ..records.frame import Frame
 from ..records.recording import syntax
 from .eyeshape import EyeShape
 from .interaction import SurfaceInteraction
-from .primary import RegionHit, region_interaction, segment
+from .primary import TriangleHit, region_interaction, segment
 
 _INDEX = float(TEARS.index(850.0))
 _LEAST = 0.1  # cosine below which a ray is not followed
@@ -34,10 +34,10 @@ class View:
     d: mi.Vector3f
 
 
-def water_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> RegionHit:
+def water_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> TriangleHit:
     """Intersect camera rays (scene's frame) with menisci in front of what they meet."""
     hit = frame.region.water.ray_intersect_preliminary(segment(o, d, nearest), coherent=True, active=True)
-    return RegionHit(t=dr.select(hit.is_valid(), hit.t, dr.inf), face=frame.region.on_water(hit), prim_uv=hit.prim_uv)
+    return replace(TriangleHit.of(hit), prim_index=frame.region.on_water(hit))
 
 
 def on_water(frame: Frame, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
@@ -46,14 +46,14 @@ def on_water(frame: Frame, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3
         return si
     hit = water_hit(frame, o, d, si.distance)
     wet = hit.is_valid()
-    water = region_interaction(frame, hit.face, hit.prim_uv, d, wet)
+    water = region_interaction(frame, hit.prim_index, hit.prim_uv, d, wet)
     first: SurfaceInteraction = dr.select(wet, replace(water, level=None), replace(si, level=None))
     return first
 
 
 @syntax
 def through_water(
-    frame: Frame, hit: RegionHit, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f
+    frame: Frame, hit: TriangleHit, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f
 ) -> tuple[SurfaceInteraction, mi.Vector3f]:
     """Bend camera rays at menisci that they hit in front of the globe.
 
@@ -66,11 +66,11 @@ def through_water(
     return view.si, view.d
 
 
-def _bent(frame: Frame, hit: RegionHit, view: View, o: mi.Vector3f, d: mi.Vector3f) -> View:
+def _bent(frame: Frame, hit: TriangleHit, view: View, o: mi.Vector3f, d: mi.Vector3f) -> View:
     """Refract rays into the water and out of it; those that find no way keep their direction."""
     si = view.si
     x = o + hit.t * d
-    surface = frame.region.surface(hit.face, hit.prim_uv, hit.is_valid() & ~si.other)
+    surface = frame.region.surface(hit.prim_index, hit.prim_uv, hit.is_valid() & ~si.other)
     below = frame.vector_to_scene(si.normal)
     inside, enters = _refracted(d, surface.normal, 1 / _INDEX)
     cosine = dr.maximum(-dr.dot(inside, below), _LEAST)

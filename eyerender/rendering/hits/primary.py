@@ -6,7 +6,6 @@ The eye is met in closed form (`EyeShape`), and everything else by Embree or Opt
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -15,33 +14,26 @@ from ..records.frame import Frame
 from ..records.recording import syntax
 from ..scene.background import HALF_MM
 from .eyeshape import EyeShape
-from .interaction import WET, SurfaceInteraction
+from .interaction import SurfaceInteraction
 
 
 @dataclass(kw_only=True)
-class RegionHit:
-    """Hit on a triangle (`face`) of an eye region, infinitely far where there is none."""
-
-    t: mi.Float
-    face: mi.UInt32
-    prim_uv: mi.Point2f
-
-    def is_valid(self) -> mi.Bool:
-        """Whether anything is hit."""
-        return self.t < dr.inf
-
-
-@dataclass(kw_only=True)
-class PlaneHit:
-    """Hit on the plane of the background in closed form, as on its first triangle, extended."""
+class TriangleHit:
+    """Hit on a triangle, infinitely far where there is none, with Mitsuba's names."""
 
     t: mi.Float
     prim_index: mi.UInt32
     prim_uv: mi.Point2f
 
     @classmethod
-    def of(cls, plane_x: mi.Float, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> PlaneHit:
-        """Hit of a ray nearer than a distance on the plane x = `plane_x`, which reaches as far as its triangles."""
+    def of(cls, hit: mi.PreliminaryIntersection3f) -> TriangleHit:
+        """Take what is needed of a hit of Embree or OptiX."""
+        t = dr.select(hit.is_valid(), hit.t, dr.inf)
+        return cls(t=t, prim_index=mi.UInt32(hit.prim_index), prim_uv=hit.prim_uv)
+
+    @classmethod
+    def on_plane(cls, plane_x: mi.Float, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> TriangleHit:
+        """Intersect the plane x = `plane_x` in closed form, nearer than a distance, as its first triangle, extended."""
         t = (plane_x - o.x) / d.x
         y, z = o.y + t * d.y, o.z + t * d.z
         met = (t > 0) & (t < nearest) & (dr.maximum(dr.abs(y), dr.abs(z)) < HALF_MM)
@@ -49,11 +41,8 @@ class PlaneHit:
         return cls(t=dr.select(met, t, dr.inf), prim_index=mi.UInt32(0), prim_uv=uv)
 
     def is_valid(self) -> mi.Bool:
-        """Whether the plane is hit."""
+        """Whether anything is hit."""
         return self.t < dr.inf
-
-
-Hit: TypeAlias = "mi.PreliminaryIntersection3f | PlaneHit"
 
 
 def first_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> SurfaceInteraction:
@@ -64,28 +53,28 @@ def first_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> 
 
 def intersect(
     frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True
-) -> tuple[SurfaceInteraction, Hit]:
+) -> tuple[SurfaceInteraction, TriangleHit]:
     """Trace rays (scene's frame); the surface of what is not the eye is not evaluated yet (see `appearance`).
 
     coherent: whether neighbouring rays are alike, as those of a camera.
     """
     eye = EyeShape(frame=frame).ray_intersect(o, d)
-    hit: Hit
     if frame.structure.obstacles:
-        hit = frame.scene.ray_intersect_preliminary(segment(o, d, eye.distance), coherent=coherent, active=active)
+        ray = segment(o, d, eye.distance)
+        hit = TriangleHit.of(frame.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active))
     else:
-        hit = PlaneHit.of(frame.backdrop_x, o, d, eye.distance)
+        hit = TriangleHit.on_plane(frame.backdrop_x, o, d, eye.distance)
     return behind(eye, hit, active), hit
 
 
-def behind(eye: SurfaceInteraction, hit: Hit | RegionHit, active: mi.Bool) -> SurfaceInteraction:
+def behind(eye: SurfaceInteraction, hit: TriangleHit, active: mi.Bool) -> SurfaceInteraction:
     """Keep what rays meet of the eye where nothing is hit in front of it."""
     other, clear = hit.is_valid() & active, ~hit.is_valid() & active
     distance = dr.select(other, hit.t, eye.distance)
     return replace(eye, cornea=eye.cornea & clear, sclera=eye.sclera & clear, other=other, distance=distance)
 
 
-def appearance(frame: Frame, si: SurfaceInteraction, hit: Hit, d: mi.Vector3f) -> SurfaceInteraction:
+def appearance(frame: Frame, si: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f) -> SurfaceInteraction:
     """Add the surface of what is not the eye to the result of `intersect` along d."""
     region, background = frame.region, frame.background
     if region is not None:
@@ -103,18 +92,16 @@ def appearance(frame: Frame, si: SurfaceInteraction, hit: Hit, d: mi.Vector3f) -
     )
 
 
-def region_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> RegionHit:
+def region_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> TriangleHit:
     """Intersect camera rays (scene's frame) with an eye region in front of the globe."""
-    reach = EyeShape(frame=frame).ray_intersect_preliminary(o, d).t
-    hit = frame.scene.ray_intersect_preliminary(segment(o, d, reach), coherent=True, active=True)
-    t = dr.select(hit.is_valid(), hit.t, dr.inf)
-    return RegionHit(t=t, face=frame.region.face(hit), prim_uv=hit.prim_uv)
+    ray = segment(o, d, EyeShape(frame=frame).ray_intersect_preliminary(o, d).t)
+    return TriangleHit.of(frame.scene.ray_intersect_preliminary(ray, coherent=True, active=True))
 
 
 def hidden(frame: Frame, eye: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
     """Whether anything of the scene is in front of the globe where the rays of `EyeShape` meet it."""
     if not frame.structure.obstacles:
-        return eye.globe & PlaneHit.of(frame.backdrop_x, o, d, eye.distance).is_valid()
+        return eye.globe & TriangleHit.on_plane(frame.backdrop_x, o, d, eye.distance).is_valid()
     return ray_blocked(frame.scene, segment(o, d, eye.distance), eye.globe)
 
 
@@ -148,24 +135,8 @@ def _matte(
     frame: Frame, point: mi.Vector3f, normal: mi.Vector3f, d: mi.Vector3f, active: mi.Bool
 ) -> SurfaceInteraction:
     """Interaction with matte points of the scene; normals are turned to the viewer."""
-    no, nothing = mi.Bool(False), mi.Float(0)
-    return SurfaceInteraction(
-        cornea=no,
-        sclera=no,
-        other=active,
-        distance=nothing,
-        point=frame.point_to_eye(point),
-        normal=_facing(frame, normal, d),
-        opacity=mi.Float(1),
-        mirrored=nothing,
-        passed=nothing,
-        inner=mi.Vector3f(0),
-        slant=mi.Vector3f(0),
-        pupil=no,
-        albedo=nothing,
-        gloss=mi.Float(WET),
-        received=mi.Vector4f(0),
-    )
+    place = frame.point_to_eye(point)
+    return replace(SurfaceInteraction.blank(), other=active, point=place, normal=_facing(frame, normal, d))
 
 
 def _facing(frame: Frame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:

@@ -16,7 +16,7 @@ from ...arrays import Ints, frozen
 from ..hits.primary import intersect
 from ..records.frame import Frame, aligned_copy
 from ..records.recording import recorded
-from .request import LANES, FilmRequest
+from .request import FilmRequest
 from .sampling import Pattern, Pixels, Samples, lattice_generator
 from .shading import shade
 
@@ -24,26 +24,14 @@ _MANY = 8  # samples, of which even pixels need the first four alone
 _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and between it and its neighbours
 
 
-def render_bare(request: FilmRequest) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sums over the samples of each pixel of a window, and failed light paths."""
-    if not request.layered and request.spp >= _MANY:
-        return _adaptive(request)
-    sums: list[mi.Float] = []
-    failed = mi.UInt32(0)
-    count = max(1, min(request.spp, LANES // request.pixels))
-    for first in range(0, request.spp, count):
-        if sums:
-            dr.sync_thread()  # else all passes would need memory at once
-        seen, failures = _every_sample(request, first, min(count, request.spp - first))
-        sums = [a + b for a, b in zip(sums, seen, strict=True)] if sums else seen
-        failed += failures
-        dr.eval(sums, failed)
-    return sums, failed
+def is_adaptive(request: FilmRequest) -> bool:
+    """Whether even pixels may do with their first four samples."""
+    return not request.layered and request.spp >= _MANY
 
 
-def _every_sample(request: FilmRequest, first: int, count: int) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sums over `count` samples of each pixel, from number `first`."""
-    index = dr.arange(mi.UInt32, request.pixels * count)
+def render_samples(request: FilmRequest, first: int, count: int) -> tuple[list[mi.Float], mi.UInt32]:
+    """Sums over `count` samples of each pixel, from number `first`, and failed light paths."""
+    index = dr.arange(mi.UInt32, request.window[2] * request.window[3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
     k = index - pixel * n + dr.opaque(mi.UInt32, first)
@@ -52,11 +40,12 @@ def _every_sample(request: FilmRequest, first: int, count: int) -> tuple[list[mi
     return [dr.block_sum(x, count) for x in lanes], failed
 
 
-def _adaptive(request: FilmRequest) -> tuple[list[mi.Float], mi.UInt32]:
+def render_adaptively(request: FilmRequest, most: int) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums over the samples of each pixel, taking all of them only where the first four differ.
 
     Where these agree, and their mean is not far from those of the eight neighbours, no edge crosses the pixel, and they
-    stand for all samples. The pixels around the window are looked at, too, so that no pixel depends on the window.
+    stand for all samples. The pixels around the window are looked at, too, so that no pixel depends on the window. At
+    `most` so many samples are taken at a time.
     """
     x0, y0, width, height = request.window
     first, failed = _first_samples(request.spp), mi.UInt32(0)
@@ -75,14 +64,14 @@ def _adaptive(request: FilmRequest) -> tuple[list[mi.Float], mi.UInt32]:
         return radiance
 
     # Few pixels at a time, because there may be more than can be held.
-    count, stretch = (width + 2) * (height + 2), LANES // len(first)
+    count, stretch = (width + 2) * (height + 2), most // len(first)
     ends = [(start, min(start + stretch, count)) for start in range(0, count, stretch)]
     parts = [radiance_of(dr.arange(mi.UInt32, *span), first) for span in ends]
     radiance = parts[0] if len(parts) == 1 else dr.concat(parts)
     total, places, uneven = _with_uneven(radiance, (width, height), request.spp)
     if dr.width(places):
         rest = np.setdiff1d(np.arange(request.spp), first)
-        at_once = int(np.clip(LANES // dr.width(places), 1, len(rest)))
+        at_once = int(np.clip(most // dr.width(places), 1, len(rest)))
         for start in range(0, len(rest), at_once):
             numbers = rest[start : start + at_once]
             more = dr.block_sum(radiance_of(uneven, numbers), len(numbers))

@@ -10,7 +10,9 @@ So have those at menisci, in which the mirror images of lamps are thinner still;
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,28 +22,16 @@ from ...arrays import Singles
 from ...rig.camera import Window
 from ..records.frame import SMALL, Frame
 from ..records.recording import recorded, syntax
-from .bare import render_bare
-from .groups import LampTurns, PixelGroup, shade_group, shade_parts
+from .bare import is_adaptive, render_adaptively, render_samples
+from .groups import LampTurns, PixelGroup, shade_group
 from .hostdata import FINE, PLAIN, WET
-from .request import LANES, BoundFrame, FilmRequest
+from .request import BoundFrame, FilmRequest
 from .sampling import Pattern, Pixels, Samples
 from .visibility import GroupPass, HitTable, trace_region
 
-_LARGEST_GROUP = 4
+_LANES = 2**24  # samples at a time; more are rendered in several passes
 _TILE = 4  # pixels across and down
-_LEAST_GROUPS = 4  # a pixel
 _FEW_LAMPS = 2  # with so few lamps shadows are dark, and they are sampled finely
-_TIMES, _ENOUGH = 3, 32  # times as many samples at hairs, unless a pixel has more than enough
-
-
-def group_size(spp: int, soft: bool = False) -> int:
-    """Number of samples of a pixel in a group; `soft`: where light spreads in the skin, there are no fine shadows."""
-    if soft and spp == _LARGEST_GROUP:
-        return spp
-    size = _LARGEST_GROUP
-    while size > 1 and (spp % size or spp // size < min(_LEAST_GROUPS, spp // 2)):
-        size //= 2
-    return size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,45 +72,52 @@ def start(shown: BoundFrame, window: Window, spp: int, seed: int, *, layered: bo
     that of `mean_radiance`; the share of the samples that show it; that share times their mean inverse depth (1/mm).
     """
     request = FilmRequest(shown=shown, window=window, spp=spp, seed=seed, layered=layered)
-    render = render_region if shown.frame.structure.region else render_bare
-    sums, failed = render(request)
+    if shown.frame.structure.region:
+        sums, failed = _in_passes(request, request.groups, request.group_size, _render_groups)
+    elif is_adaptive(request):
+        sums, failed = render_adaptively(request, _LANES)
+    else:
+        sums, failed = _in_passes(request, spp, 1, render_samples)
     return Film(sums=sums, failed=failed, request=request)
 
 
-def render_region(request: FilmRequest) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sums over the samples of each pixel, and failed light paths, before an eye region."""
-    spp, times = request.spp, _TIMES if request.spp <= _ENOUGH else 1
-    size = group_size(spp, request.shown.frame.structure.scattering)
-    total, failed = spp // size, mi.UInt32(0)
+def _in_passes(
+    request: FilmRequest, parts: int, size: int, render: Callable[[FilmRequest, int, int], tuple[Any, mi.UInt32]]
+) -> tuple[list[mi.Float], mi.UInt32]:
+    """Add up the sums and failures of as many passes as memory needs, for `parts` of each pixel of `size` samples."""
+    each = max(1, min(parts, _LANES // (request.window[2] * request.window[3] * size)))
     sums: list[mi.Float] = []
-    count = max(1, min(total, LANES // (request.pixels * size)))
-    for first in range(0, total, count):
+    failed = mi.UInt32(0)
+    for first in range(0, parts, each):
         if sums:
             dr.sync_thread()  # else all passes would need memory at once
-        groups = GroupPass(first=first, count=min(count, total - first), total=total, size=size, times=times)
-        seen, failures = _render_pass(request, groups)
+        seen, failures = render(request, first, min(each, parts - first))
         sums = [a + b for a, b in zip(sums, seen, strict=True)] if sums else seen
         failed += failures
         dr.eval(sums, failed)
     return sums, failed
 
 
-def _render_pass(request: FilmRequest, groups: GroupPass) -> tuple[list[mi.Float], mi.UInt32]:
-    """The same of one pass."""
-    shown, pattern = request.shown, Pattern.of(request.spp, request.seed, times=groups.times)
-    frame, lamps = shown.frame, shown.host.lamps
+def _render_groups(request: FilmRequest, first: int, count: int) -> tuple[list[mi.Float], mi.UInt32]:
+    """Sums over some groups of samples of each pixel before an eye region, and failed light paths."""
+    frame, lamps = request.shown.frame, request.shown.host.lamps
+    pattern = Pattern.of(request.spp, request.seed, times=request.times)
     sharp = int(lamps.suns and lamps.widths[-1] < SMALL)
-    others = max(len(lamps) - sharp, 1)
-    few = others <= min(_FEW_LAMPS, groups.total) and lamps.widest < SMALL
+    few = max(len(lamps) - sharp, 1) <= min(_FEW_LAMPS, request.groups) and lamps.widest < SMALL
     own_shadows = bool(sharp or few)
     # Then, samples in pixels that show only skin may have rays of their own, too.
-    every = own_shadows and not frame.structure.scattering
-    hits = trace_region(request, groups, pattern, every=every)
-    tiles = _Tiles.of(request.window, groups)
-    lanes = tiles.lanes(request.window, groups.count)
-    return _shade(
-        frame, tiles, pattern, hits, dr.opaque(mi.Bool, own_shadows), lanes, request.pixels, request.layered
-    )  # fmt: skip
+    hits = trace_region(request, pattern, first, count, every=own_shadows and not frame.structure.scattering)
+    width, height = request.window[2:]
+    columns, rows = (-(-n // _TILE) for n in (width, height))
+    tiles = _Tiles(
+        pixels=Pixels.of(request.window),
+        height=dr.opaque(mi.UInt32, height),
+        columns=dr.opaque(mi.UInt32, columns),
+        groups=GroupPass.upload(request, first, count),
+        own_shadows=dr.opaque(mi.Bool, own_shadows),
+        layered=request.layered,
+    )
+    return _shade(frame, tiles, pattern, hits, columns * rows * count * _TILE**2, width * height)
 
 
 @dataclass(kw_only=True)
@@ -134,45 +131,47 @@ class _Tiles:
         pixels: the window.
         height: of the window.
         columns: number of tiles across.
-        first: number of the first group.
-        count: number of groups of a pixel in this pass.
-        total: number of groups of a pixel.
-        size: samples of a group.
-        times: how many times as many there are in supersampled pixels.
+        groups: the groups of each pixel.
+        own_shadows: as of `PixelGroup`.
+        layered: as of `PixelGroup`.
     """
 
     pixels: Pixels
     height: mi.UInt32
     columns: mi.UInt32
-    first: mi.UInt32
-    count: mi.UInt32
-    total: mi.UInt32
-    size: mi.UInt32
-    times: mi.UInt32
+    groups: GroupPass
+    own_shadows: mi.Bool
+    layered: bool
 
-    @classmethod
-    def of(cls, window: Window, groups: GroupPass) -> _Tiles:
-        """Upload the layout of a pass."""
-        numbers = {name: getattr(groups, name) for name in ("first", "count", "total", "size", "times")}
-        numbers |= {"height": window[3], "columns": -(-window[2] // _TILE)}
-        return cls(pixels=Pixels.of(window), **{name: dr.opaque(mi.UInt32, n) for name, n in numbers.items()})
-
-    @staticmethod
-    def lanes(window: Window, count: int) -> int:
-        """Number of lanes."""
-        return -(-window[2] // _TILE) * -(-window[3] // _TILE) * count * _TILE**2
-
-    def place(self, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Column and row in the window of lanes, and the number of their group in this pass."""
+    def group(self, frame: Frame, pattern: Pattern, hits: HitTable, lane: mi.UInt32) -> tuple[PixelGroup, mi.Bool]:
+        """The groups of lanes, and whether their pixels are inside the window."""
         packet = lane // _TILE**2
         lane = lane - packet * _TILE**2
-        tile = packet // self.count
+        tile = packet // self.groups.count
         row = tile // self.columns
-        return (
-            (tile - row * self.columns) * _TILE + lane % _TILE,
-            row * _TILE + lane // _TILE,
-            packet - tile * self.count,
+        x, y = (tile - row * self.columns) * _TILE + lane % _TILE, row * _TILE + lane // _TILE
+        inside, pixel = (x < self.pixels.width) & (y < self.height), y * self.pixels.width + x
+        marks = mi.UInt32(dr.gather(mi.UInt8, hits.marks, pixel, inside))
+        fine, wet, plain = ((marks & mark) > 0 for mark in (FINE, WET, PLAIN))
+        (left, top), lights = self.pixels.corner, frame.lights
+        samples = Samples.of(mi.Int32(x) + left, mi.Int32(y) + top, pattern, fine)
+        number, count = packet - tile * self.groups.count, self.groups.size * dr.select(fine, self.groups.times, 1)
+        group = PixelGroup(
+            samples=samples,
+            number=number + self.groups.first,
+            count=count,
+            hits=hits,
+            first_hit=dr.gather(mi.UInt32, hits.first, pixel, inside) + number * dr.select(plain, 1, count),
+            plain=plain,
+            wet=wet,
+            halved=fine & frame.structure.scattering,
+            turns=LampTurns(lights=lights, users=self.groups.total),
+            sample_turns=LampTurns(lights=lights, users=samples.count),
+            own_shadows=self.own_shadows,
+            sharp=lights.suns > 0,
+            layered=self.layered,
         )
+        return group, inside
 
     @syntax
     def splat(self, lanes: list[mi.Float], pixels: int) -> list[mi.Float]:
@@ -180,11 +179,10 @@ class _Tiles:
         pixel = dr.arange(mi.UInt32, pixels)
         y = pixel // self.pixels.width
         x = pixel - y * self.pixels.width
-        at = (y // _TILE * self.columns + x // _TILE) * self.count * _TILE**2 + y % _TILE * _TILE + x % _TILE
-        k, sums = mi.UInt32(0), [mi.Float(0) for _ in lanes]
-        while dr.hint(k < self.count, label="groups of a pixel", exclude=[self, lanes, at]):
-            i = at + k * _TILE**2
-            sums = _added(sums, lanes, i)
+        tile = (y // _TILE * self.columns + x // _TILE) * self.groups.count
+        at, k, sums = tile * _TILE**2 + y % _TILE * _TILE + x % _TILE, mi.UInt32(0), [mi.Float(0) for _ in lanes]
+        while dr.hint(k < self.groups.count, label="groups of a pixel", exclude=[self, lanes, at]):
+            sums = _added(sums, lanes, at + k * _TILE**2)
             k += 1
         return sums
 
@@ -196,58 +194,15 @@ def _added(sums: list[mi.Float], lanes: list[mi.Float], i: mi.UInt32) -> list[mi
 
 @recorded
 def _shade(
-    frame: Frame, tiles: _Tiles, pattern: Pattern, hits: HitTable, own_shadows: mi.Bool, lanes: int, pixels: int,
-    layered: bool,
-) -> tuple[list[mi.Float], mi.UInt32]:  # fmt: skip
-    """Merge and shade the groups of a pass, one per lane, and sum over those of each pixel.
-
-    own_shadows: as of `PixelGroup`.
-    """
-    x, y, number = tiles.place(dr.arange(mi.UInt32, lanes))
-    inside = (x < tiles.pixels.width) & (y < tiles.height)
-    group = _group_at(frame, tiles, pattern, hits, (x, y, number), inside)
-    group.own_shadows, group.layered = own_shadows, layered
-    one = dr.rcp(group.ray(frame, mi.UInt32(0))[2])  # the weight of a sample hardly differs within a pixel
-    if layered:
-        parts, failures = shade_parts(frame, group)
-        sums = [x for p in parts for x in (p.radiance, p.weight * one, p.near * one)]
-    else:
-        radiance, failures = shade_group(frame, group)
-        sums = [radiance]
-    more = mi.Float(group.count) / mi.Float(tiles.size)
-    sums = [x / more for x in sums]
+    frame: Frame, tiles: _Tiles, pattern: Pattern, hits: HitTable, lanes: int, pixels: int
+) -> tuple[list[mi.Float], mi.UInt32]:
+    """Merge and shade the groups of a pass, one per lane, and sum over those of each pixel."""
+    group, inside = tiles.group(frame, pattern, hits, dr.arange(mi.UInt32, lanes))
+    sums, failures = shade_group(frame, group)
+    times = mi.Float(group.count) / mi.Float(tiles.groups.size)
+    sums = [total / times for total in sums]
     failures = dr.select(inside, failures, 0)
     dr.eval(sums, failures)
     sums, failed = tiles.splat(sums, pixels), dr.sum(failures)
     dr.eval(sums, failed)
     return sums, failed
-
-
-def _group_at(
-    frame: Frame, tiles: _Tiles, pattern: Pattern, hits: HitTable, place: tuple[mi.UInt32, mi.UInt32, mi.UInt32],
-    inside: mi.Bool,
-) -> PixelGroup:  # fmt: skip
-    """Groups of pixels, where these are inside the window; `place` as of `_Tiles.place`."""
-    x, y, number = place
-    pixel = y * tiles.pixels.width + x
-    marks = mi.UInt32(dr.gather(mi.UInt8, hits.marks, pixel, inside))
-    fine, wet, plain = ((marks & mark) > 0 for mark in (FINE, WET, PLAIN))
-    corner = tiles.pixels.corner
-    samples = Samples.of(mi.Int32(x) + corner[0], mi.Int32(y) + corner[1], pattern, fine)
-    count = tiles.size * dr.select(fine, tiles.times, 1)
-    lights = frame.lights
-    turns = LampTurns(lights=lights, users=tiles.total)
-    return PixelGroup(
-        samples=samples,
-        number=number + tiles.first,
-        count=count,
-        hits=hits,
-        first_hit=dr.gather(mi.UInt32, hits.first, pixel, inside) + number * dr.select(plain, 1, count),
-        plain=plain,
-        wet=wet,
-        halved=fine & frame.structure.scattering,
-        turns=turns,
-        sample_turns=LampTurns(lights=lights, users=samples.count),
-        own_shadows=mi.Bool(False),
-        sharp=lights.suns > 0,
-    )

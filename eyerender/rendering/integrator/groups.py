@@ -19,7 +19,7 @@ import mitsuba as mi
 from ..hits.eyeshape import EyeShape
 from ..hits.interaction import SurfaceInteraction, outer_albedo
 from ..hits.meniscus import View, through_water, water_hit
-from ..hits.primary import RegionHit, behind, region_hit, region_interaction
+from ..hits.primary import TriangleHit, behind, region_hit, region_interaction
 from ..materials.gloss import film_normal, glossy_normal
 from ..records.frame import Frame, Lamp, Lights, quotient
 from ..records.recording import syntax
@@ -99,7 +99,7 @@ class PixelGroup:
     sample_turns: LampTurns
     own_shadows: mi.Bool
     sharp: mi.Bool
-    layered: bool = False
+    layered: bool
 
     def in_order(self, i: mi.UInt32) -> mi.UInt32:
         """The i-th sample to look at: the middle one first, then the others in turn."""
@@ -116,7 +116,7 @@ class PixelGroup:
         return o, d, cosine * cosine
 
     @syntax
-    def hit(self, frame: Frame, j: mi.UInt32) -> RegionHit:
+    def hit(self, frame: Frame, j: mi.UInt32) -> TriangleHit:
         """What sample j hits of the region."""
         hit = self.hits.at(self.first_hit + dr.select(self.plain, 0, j))
         # A ray in some ten thousand slips between two triangles, and then it stands for itself alone.
@@ -150,7 +150,7 @@ class WeightedHit:
     """
 
     j: mi.UInt32
-    hit: RegionHit
+    hit: TriangleHit
     on_sheet: mi.Bool
     weight: mi.Float
     near: mi.Float
@@ -189,7 +189,7 @@ class RegionSample:
         """Add a sample where it has `met` the surface; `blocked` is the result of its own ray to the lamp."""
         first, weight = met & (self.weight == 0), dr.select(met, sample.weight, 0)
         self.j = dr.select(first, sample.j, self.j)
-        self.face = dr.select(first, sample.hit.face, self.face)
+        self.face = dr.select(first, sample.hit.prim_index, self.face)
         self.uv = dr.select(first, sample.hit.prim_uv, self.uv)
         self.weight = self.weight + weight
         self.shared = self.shared + dr.select(sample.own_ray, 0, weight)
@@ -229,35 +229,23 @@ class GlobeSamples:
         return self.water + self.lit * dr.select(self.shaded > 0, self.weight / self.shaded, 0)
 
 
-@dataclass(kw_only=True)
-class Part:
-    """What a group sees of one part of the scene: radiance, weight of the samples, and weight times inverse depth."""
+def shade_group(frame: Frame, group: PixelGroup) -> tuple[list[mi.Float], mi.UInt32]:
+    """Sum what a group's samples show, and count the failed light paths.
 
-    radiance: mi.Float
-    weight: mi.Float
-    near: mi.Float
-
-
-def shade_group(frame: Frame, group: PixelGroup) -> tuple[mi.Float, mi.UInt32]:
-    """Radiance times weight, summed over a group's samples, and the number of failed light paths."""
+    Returns:
+        The radiance times weight. If layered, for each part of the scene from front to back (before the skin, skin,
+        globe): that of the part, its number of samples, and this number times inverse depth (1/mm).
+    """
     sheet, before = merge_hits(frame, group)
     globe = shade_globe(frame, group)
-    radiance = shade_region(frame, group, sheet, globe.radiance, on_sheet=True)
-    return shade_region(frame, group, before, radiance, on_sheet=False), globe.failures
-
-
-def shade_parts(frame: Frame, group: PixelGroup) -> tuple[tuple[Part, Part, Part], mi.UInt32]:
-    """The same of each part, from front to back: what is before the skin, the skin, and the globe."""
-    sheet, before = merge_hits(frame, group)
-    globe = shade_globe(frame, group)
+    if not group.layered:
+        radiance = shade_region(frame, group, sheet, globe.radiance, on_sheet=True)
+        return [shade_region(frame, group, before, radiance, on_sheet=False)], globe.failures
     front = shade_region(frame, group, before, mi.Float(0), on_sheet=False)
     skin = shade_region(frame, group, sheet, mi.Float(0), on_sheet=True)
-    parts = (
-        Part(radiance=front, weight=before.weight, near=before.near),
-        Part(radiance=skin, weight=sheet.weight, near=sheet.near),
-        Part(radiance=globe.radiance, weight=globe.weight, near=globe.near),
-    )
-    return parts, globe.failures
+    one = dr.rcp(group.ray(frame, mi.UInt32(0))[2])  # the weight of a sample hardly differs within a pixel
+    parts = ((front, before), (skin, sheet), (globe.radiance, globe))
+    return [x for radiance, part in parts for x in (radiance, part.weight * one, part.near * one)], globe.failures
 
 
 # Stage 2: merging
@@ -285,7 +273,7 @@ def merge_hits(frame: Frame, group: PixelGroup) -> tuple[RegionSample, RegionSam
 def _weighted_hit(frame: Frame, group: PixelGroup, j: mi.UInt32) -> WeightedHit:
     """Read sample j's hit, and decide whether its shadow needs a ray of its own."""
     hit, (o, d, weight), near = group.hit(frame, j), group.ray(frame, j), mi.Float(0)
-    x, on_sheet = o + hit.t * d, frame.region.on_sheet(hit.face)
+    x, on_sheet = o + hit.t * d, frame.region.on_sheet(hit.prim_index)
     own_ray = hit.is_valid() & group.own_shadows
     if frame.structure.scattering:
         own_ray &= ~on_sheet
@@ -332,7 +320,7 @@ def shade_globe(frame: Frame, group: PixelGroup) -> GlobeSamples:
 
 
 @syntax
-def _add_globe_sample(frame: Frame, group: PixelGroup, globe: GlobeSamples, j: mi.UInt32, hit: RegionHit) -> None:
+def _add_globe_sample(frame: Frame, group: PixelGroup, globe: GlobeSamples, j: mi.UInt32, hit: TriangleHit) -> None:
     """Add what sample j shows of the globe and of menisci."""
     o, d, weight = group.ray(frame, j)
     view = View(si=behind(EyeShape(frame=frame).ray_intersect(o, d), hit, mi.Bool(True)), d=mi.Vector3f(d))

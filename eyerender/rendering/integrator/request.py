@@ -8,7 +8,9 @@ from ...rig.camera import Window
 from ..records.frame import Frame
 from .hostdata import HostData
 
-LANES = 2**24  # samples at a time; more are rendered in several passes
+_LARGEST_GROUP = 4
+_LEAST_GROUPS = 4  # a pixel
+_TIMES, _ENOUGH = 3, 32  # times as many samples at hairs, unless a pixel has more than enough
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,21 @@ class FilmRequest:
     layered: bool
 
     @property
-    def pixels(self) -> int:
-        """Number of pixels."""
-        return self.window[2] * self.window[3]
+    def group_size(self) -> int:
+        """Number of samples of a pixel in a group; where light spreads in the skin, there are no fine shadows."""
+        if self.shown.frame.structure.scattering and self.spp == _LARGEST_GROUP:
+            return self.spp
+        size = _LARGEST_GROUP
+        while size > 1 and (self.spp % size or self.spp // size < min(_LEAST_GROUPS, self.spp // 2)):
+            size //= 2
+        return size
+
+    @property
+    def groups(self) -> int:
+        """Number of groups of a pixel."""
+        return self.spp // self.group_size
+
+    @property
+    def times(self) -> int:
+        """How many times as many samples supersampled pixels have."""
+        return _TIMES if self.spp <= _ENOUGH else 1

@@ -13,8 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Bools
-from ..hits.primary import RegionHit, region_hit
+from ..hits.primary import TriangleHit, region_hit
 from ..records.frame import Frame, aligned_copy
 from ..records.recording import recorded
 from .hostdata import FINE, PLAIN
@@ -22,7 +21,7 @@ from .request import FilmRequest
 from .sampling import Pattern, Pixels, Samples
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(kw_only=True)
 class GroupPass:
     """The groups of samples that one pass takes of each pixel.
 
@@ -34,11 +33,18 @@ class GroupPass:
         times: how many times as many there are in supersampled pixels.
     """
 
-    first: int
-    count: int
-    total: int
-    size: int
-    times: int
+    first: mi.UInt32
+    count: mi.UInt32
+    total: mi.UInt32
+    size: mi.UInt32
+    times: mi.UInt32
+
+    @classmethod
+    def upload(cls, request: FilmRequest, first: int, count: int) -> GroupPass:
+        """Upload the numbers of a pass."""
+        numbers = (first, count, request.groups, request.group_size, request.times)
+        first, count, total, size, times = (dr.opaque(mi.UInt32, n) for n in numbers)
+        return cls(first=first, count=count, total=total, size=size, times=times)
 
 
 @dataclass(kw_only=True)
@@ -48,114 +54,86 @@ class HitTable:
     Attributes:
         marks: class of each pixel of the window, as of `HostData.marks`.
         first: index of its first hit.
-        t: distance of each hit, infinite where there is none.
-        face: its triangle.
-        u: first barycentric coordinate.
-        v: second barycentric coordinate.
+        hits: the hits, those of a pixel side by side.
     """
 
     marks: mi.UInt8
     first: mi.UInt32
-    t: mi.Float
-    face: mi.UInt32
-    u: mi.Float
-    v: mi.Float
+    hits: TriangleHit
 
-    def at(self, i: mi.UInt32) -> RegionHit:
+    def at(self, i: mi.UInt32) -> TriangleHit:
         """Read hit `i`."""
-        uv = mi.Point2f(dr.gather(mi.Float, self.u, i), dr.gather(mi.Float, self.v, i))
-        return RegionHit(t=dr.gather(mi.Float, self.t, i), face=dr.gather(mi.UInt32, self.face, i), prim_uv=uv)
+        t, uv = dr.gather(mi.Float, self.hits.t, i), self.hits.prim_uv
+        u, v = dr.gather(mi.Float, uv.x, i), dr.gather(mi.Float, uv.y, i)
+        return TriangleHit(t=t, prim_index=dr.gather(mi.UInt32, self.hits.prim_index, i), prim_uv=mi.Point2f(u, v))
 
 
 @dataclass(kw_only=True)
 class _Lanes:
-    """Pixels ordered by their class, and where the classes end, for lanes with one sample each.
+    """Lanes with one sample each, ordered by the classes of their pixels.
 
     Attributes:
         lane: numbers of the lanes.
         order: the pixels: supersampled ones, usual ones, and those that show only skin.
         pixel_ends: ends of the first two classes in `order`.
         lane_ends: their ends in `lane`.
-        first: number of the first group of the pass.
-        groups: number of groups.
-        size: samples of a group.
-        times: how many times as many there are in supersampled pixels.
     """
 
     lane: mi.UInt32
     order: mi.UInt32
     pixel_ends: tuple[mi.UInt32, mi.UInt32]
     lane_ends: tuple[mi.UInt32, mi.UInt32]
-    first: mi.UInt32
-    groups: mi.UInt32
-    size: mi.UInt32
-    times: mi.UInt32
 
-    def samples(self) -> tuple[mi.UInt32, mi.UInt32, mi.Bool]:
+    def samples(self, groups: GroupPass) -> tuple[mi.UInt32, mi.UInt32, mi.Bool]:
         """Pixel and number of each lane's sample, and whether the pixel is supersampled."""
         fine, plain = self.lane < self.lane_ends[0], self.lane >= self.lane_ends[1]
         before = dr.select(fine, 0, dr.select(plain, self.pixel_ends[1], self.pixel_ends[0]))
         i = self.lane - dr.select(fine, 0, dr.select(plain, self.lane_ends[1], self.lane_ends[0]))
-        each = dr.select(plain, self.groups, self.groups * self.size)
-        each = dr.select(fine, each * self.times, each)
+        size = groups.size * dr.select(fine, groups.times, 1)
+        each = groups.count * dr.select(plain, 1, size)
         place = i // each
         k = i - place * each
-        number = dr.select(
-            plain,
-            (self.first + k) * self.size + (self.size >> 1),
-            self.first * self.size * dr.select(fine, self.times, 1) + k,
-        )
-        return dr.gather(mi.UInt32, self.order, before + place), number, fine
+        middle = (groups.first + k) * size + (size >> 1)
+        pixel = dr.gather(mi.UInt32, self.order, before + place)
+        return pixel, dr.select(plain, middle, groups.first * size + k), fine
 
 
-def trace_region(request: FilmRequest, groups: GroupPass, pattern: Pattern, *, every: bool) -> HitTable:
-    """Trace the samples of a pass.
+def trace_region(request: FilmRequest, pattern: Pattern, first: int, count: int, *, every: bool) -> HitTable:
+    """Trace the samples of some groups of each pixel.
 
     Args:
         request: what is shown.
-        groups: the pass.
         pattern: the samples.
+        first: number of the first group.
+        count: number of groups.
         every: whether every sample is traced, even in pixels that show only skin.
     """
     marks = request.shown.host.marks(request.window)
-    fine = (marks & FINE) > 0
-    plain: Bools = np.zeros_like(fine) if every else (marks & PLAIN) > 0
+    if every:
+        marks = marks & ~np.uint8(PLAIN)
+    fine, plain = (marks & FINE) > 0, (marks & PLAIN) > 0
     classes = [np.flatnonzero(c) for c in (fine, ~fine & ~plain, plain)]
-    samples = groups.count * groups.size
-    each = (samples * groups.times, samples, groups.count)
-    counts = [len(c) for c in classes]
-    lane_ends = np.cumsum([n * k for n, k in zip(counts, each, strict=True)])
-    first = np.empty(len(marks), np.uint32)
-    for pixels, k, end in zip(classes, each, lane_ends, strict=True):
-        first[pixels] = end - k * len(pixels) + k * np.arange(len(pixels))
+    samples = count * request.group_size
+    each = (samples * request.times, samples, count)
+    pixel_ends = np.cumsum([len(c) for c in classes])
+    lane_ends = np.cumsum([len(c) * n for c, n in zip(classes, each, strict=True)])
+    starts = np.empty(len(marks), np.uint32)
+    for pixels, n, end in zip(classes, each, lane_ends, strict=True):
+        starts[pixels] = end - n * np.arange(len(pixels), 0, -1)
     lane = dr.arange(mi.UInt32, int(lane_ends[-1]))
     dr.eval(lane)
-    lanes = _Lanes(
-        lane=lane,
-        order=mi.UInt32(aligned_copy(np.concatenate(classes).astype(np.uint32))),
-        pixel_ends=(dr.opaque(mi.UInt32, counts[0]), dr.opaque(mi.UInt32, counts[0] + counts[1])),
-        lane_ends=(dr.opaque(mi.UInt32, int(lane_ends[0])), dr.opaque(mi.UInt32, int(lane_ends[1]))),
-        first=dr.opaque(mi.UInt32, groups.first),
-        groups=dr.opaque(mi.UInt32, groups.count),
-        size=dr.opaque(mi.UInt32, groups.size),
-        times=dr.opaque(mi.UInt32, groups.times),
-    )
-    hit = _trace(request.shown.frame, Pixels.of(request.window), pattern, lanes)
-    kept = np.where(plain, PLAIN, 0) | (marks & ~np.uint8(PLAIN))
-    return HitTable(
-        marks=mi.UInt8(aligned_copy(kept.astype(np.uint8))),
-        first=mi.UInt32(aligned_copy(first)),
-        t=hit.t,
-        face=hit.face,
-        u=hit.prim_uv.x,
-        v=hit.prim_uv.y,
-    )
+    (a, b), (c, d) = ((dr.opaque(mi.UInt32, int(end)) for end in ends[:2]) for ends in (pixel_ends, lane_ends))
+    order = mi.UInt32(aligned_copy(np.concatenate(classes).astype(np.uint32)))
+    lanes = _Lanes(lane=lane, order=order, pixel_ends=(a, b), lane_ends=(c, d))
+    groups = GroupPass.upload(request, first, count)
+    hits = _trace(request.shown.frame, Pixels.of(request.window), pattern, lanes, groups)
+    return HitTable(marks=mi.UInt8(aligned_copy(marks)), first=mi.UInt32(aligned_copy(starts)), hits=hits)
 
 
 @recorded
-def _trace(frame: Frame, pixels: Pixels, pattern: Pattern, lanes: _Lanes) -> RegionHit:
+def _trace(frame: Frame, pixels: Pixels, pattern: Pattern, lanes: _Lanes, groups: GroupPass) -> TriangleHit:
     """Trace one sample per lane."""
-    pixel, k, fine = lanes.samples()
+    pixel, k, fine = lanes.samples(groups)
     samples = Samples.of(*pixels.at(pixel), pattern, fine)
     o, d, _ = samples.ray(frame, k)
     hit = region_hit(frame, o, d)

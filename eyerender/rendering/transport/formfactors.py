@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 
 from ...arrays import Floats, Ints, Reals, remembered
 from ..hits.interaction import SurfaceInteraction, outer_albedo
-from ..hits.primary import Hit, appearance, intersect
+from ..hits.primary import TriangleHit, appearance, intersect
 from ..materials.albedo import iris_albedo
 from ..records.frame import Frame
 from .chamber import IRIS_RINGS
@@ -205,7 +205,7 @@ def _meet(
 
 
 def _patch_on_skin(
-    frame: Frame, tables: PatchTables, view: SurfaceInteraction, hit: Hit, d: mi.Vector3f, s: mi.Float
+    frame: Frame, tables: PatchTables, view: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f, s: mi.Float
 ) -> tuple[mi.UInt32, mi.Bool, mi.Bool]:
     """Patch of a region that is met, whether it sends light back, and whether it is the sheet's outer side."""
     face = frame.region.face(hit)
