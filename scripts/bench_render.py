@@ -520,7 +520,7 @@ class Bench:
                 MirrorImages.of(turned, None).seen(place, shown.host.blur)
             traced = self.renderer._traced(turned, 4, (), None)
             with timed("lens and sensor"):
-                done = traced.developed()
+                done = traced.develop()
             assert done.labels is not None
             with timed("PNG of image and labels"):
                 for picture in (done.dn.astype(np.uint8), done.labels.part):

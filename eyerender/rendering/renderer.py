@@ -44,7 +44,7 @@ class Renderer:
         self.backend = backend
         self.spp = spp
         self._beside = ThreadPoolExecutor(1, "develop")
-        self._stage = FrameBuilder(self._beside, obstacles)
+        self._builder = FrameBuilder(self._beside, obstacles)
 
     def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
         """Render one window.
@@ -52,13 +52,13 @@ class Renderer:
         Args:
             job: what to render.
             spp: samples per pixel; None: those of the renderer.
-            moments: the same window at moments of the exposure. Their mean is the image, with the samples shared among
-                them; labels, glints and margins are those of `job`, the middle of the exposure.
+            moments: sub-frames of an exposure with motion. The image is their mean, and they share the samples;
+                labels, glints and margins are those of `job`, at mid-exposure.
 
         Raises:
             InputError: numbers so extreme that the image is not finite.
         """
-        return self._traced(job, spp, moments, None).developed()
+        return self._traced(job, spp, moments, None).develop()
 
     def begin(
         self,
@@ -68,7 +68,7 @@ class Renderer:
         moments: Sequence[RenderJob] = (),
         after: RenderJob | None = None,
     ) -> Future[RenderedWindow]:
-        """Trace one window now, and develop it in a second thread, beside the tracing of the next.
+        """Trace one window now, and apply lens and sensor in a second thread while the next window is traced.
 
         The result is that of `render`, whatever comes next.
 
@@ -76,16 +76,16 @@ class Renderer:
             job: what to render.
             spp: as in `render`.
             moments: as in `render`.
-            after: the very job that comes next, if it is known: what NumPy alone makes of it is made in the second
-                thread, too.
+            after: the next job, if it is known. Its host data are then computed in the second thread, too. It must be
+                passed next as the same object.
         """
-        return self._beside.submit(self._traced(job, spp, moments, after).developed)
+        return self._beside.submit(self._traced(job, spp, moments, after).develop)
 
     @uncollected
     def _traced(
         self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob], after: RenderJob | None
     ) -> RawFrame:
-        """Trace a job, or its moments: the mean of their pictures, with labels and glints of the job itself."""
+        """Trace a job, or average its sub-frames; take labels and glints from mid-exposure."""
         shots = moments or (job,)
         spp = max(1, (spp or self.spp) // len(shots))
         blur: Blur | None = None
@@ -94,13 +94,13 @@ class Renderer:
         glints: list[Shine] = []
         marks: tuple[Any, ...] | None = None
         for shot in shots:
-            shown, place = self._stage.set(shot, after=None if moments else after)
-            blur = blur or (Blur.of(job, place.posed) if moments else shown.host.blur)
-            film = start(shown, blur.window, spp, shot.seed, layered=blur.layered)
-            # The device is at work until something is read, so the host's own work comes first.
-            found = _marks(shown, job) if shot.M is job.M and shot.t is job.t else None
-            self._stage.prepare()
-            mirrored, shines = self._mirror_images(shown.host).seen(place, blur, 1 / len(shots))
+            bound, surroundings = self._builder.set(shot, after=None if moments else after)
+            blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
+            film = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
+            # The device works until something is read, so host work comes first.
+            found = _marks(bound, job) if shot.M is job.M and shot.t is job.t else None
+            self._builder.prepare()
+            mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / len(shots))
             glints += shines
             mean, missed = film.means()
             pictures.append(mean)
@@ -108,40 +108,43 @@ class Renderer:
             if found is not None:
                 marks = mirrored, *found()
         assert blur is not None
-        if marks is None:  # no moment is the middle of the exposure
-            shown, place = self.bind(job, lit=False)
-            marks = self._mirror_images(shown.host).seen(place, blur)[0], *_marks(shown, job)()
+        if marks is None:  # no sub-frame is at mid-exposure
+            bound, surroundings = self.bind(job, lit=False)
+            marks = self._mirror_images(bound.host).seen(surroundings, blur)[0], *_marks(bound, job)()
         mirrored, labels, margins, bright = marks
         picture = np.mean(pictures, axis=0) if moments else pictures[0]
-        return RawFrame(job, picture, tuple(glints), blur, mirrored, labels, failed, margins, bright)
+        return RawFrame(
+            job=job, picture=picture, glints=tuple(glints), blur=blur, mirrored=mirrored, labels=labels, failed=failed,
+            lid_margins_px=margins, highlights=bright,
+        )  # fmt: skip
 
     def _mirror_images(self, host: HostData) -> MirrorImages:
-        """The lamps' mirror images, in the closed form of the cornea or in a mesh of it."""
+        """Find the lamps' mirror images, in the closed form of the cornea or in a mesh of it."""
         job = host.job
         if job.mesh_edge_mm is None:
             return host.mirror_images
-        return MirrorImages.of(job, self._stage.meshes.of(job.eye, job.mesh_edge_mm)[0])
+        return MirrorImages.of(job, self._builder.meshes.of(job.eye, job.mesh_edge_mm)[0])
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), before lens and glints."""
-        shown, _ = self.bind(job)
-        return mean_radiance(shown, job.window, spp or self.spp, job.seed)[0].astype(float)
+        bound, _ = self.bind(job)
+        return mean_radiance(bound, job.window, spp or self.spp, job.seed)[0].astype(float)
 
     def labels(self, job: RenderJob) -> PartLabels:
         """Compute the labels of a window alone."""
         return part_labels(self.bind(job, lit=False)[0], job.window)()
 
     def bind(self, job: RenderJob, *, lit: bool = True) -> tuple[BoundFrame, Background | RegionScene]:
-        """Set up a job's frame on the device, with the surroundings of its eye.
+        """Set up a job's frame on the device, with the surroundings of its eye; both are valid until the next call.
 
-        It is valid until the next call. `lit`: whether radiance is wanted, not only what is seen where.
+        lit: whether radiance is wanted, not only geometry.
         """
-        return self._stage.set(job, lit=lit)
+        return self._builder.set(job, lit=lit)
 
 
-def _marks(shown: BoundFrame, job: RenderJob) -> Callable[[], tuple[PartLabels | None, Any, Bools | None]]:
-    """Begin with labels, margins of the lids (px) and highlights, as far as the job wants them."""
-    labels = part_labels(shown, job.window) if job.labels else lambda: None
+def _marks(bound: BoundFrame, job: RenderJob) -> Callable[[], tuple[PartLabels | None, Any, Bools | None]]:
+    """Start computing labels, margins of the lids (px) and highlights, as far as the job wants them."""
+    labels = part_labels(bound, job.window) if job.labels else lambda: None
     return lambda: (
-        labels(), shown.host.lid_margins_px, highlights(shown, job.window) if job.highlights else None
+        labels(), bound.host.lid_margins_px, highlights(bound, job.window) if job.highlights else None
     )  # fmt: skip

@@ -60,7 +60,7 @@ def test_the_device_meets_the_surface_of_the_host(renderer, name):
 
     eye = eye_with(SHAPES[name]).build()
     job = job_of(eye, remote_rig(), (0, 0, 8, 8))
-    kinds = Structure((("measured", False), ("quadric", False)))
+    kinds = Structure(surfaces=(("measured", False), ("quadric", False)))
     values = Frame.upload(kinds, parameters_of(job), np.zeros((0, 2)), tables(eye))
     rng = np.random.default_rng(2)
     y, z = rng.uniform(-4.0, 4.0, (2, 4000))

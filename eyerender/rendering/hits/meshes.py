@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -35,7 +35,8 @@ _SETTLED = 1e-12
 _PARALLEL = 1e-9
 
 
-class Mirror(NamedTuple):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mirror:
     """Mirror points of a mesh (n, 3), in the eye frame.
 
     Attributes:
@@ -157,7 +158,10 @@ class SurfaceMesh:
         N = _unit(n)
         tube = _tube(out, x, N, n, normal_slope, lamp, node)
         point, normal, arrives, leaves = (p @ self.rotation.T for p in (x, N, arrive, -out))
-        return Mirror(point + self.origin, normal, arrives, leaves, tube, found)
+        point = point + self.origin
+        return Mirror(
+            point=point, normal=normal, arrives=arrives, leaves=leaves, cross_section=tube, found=found
+        )  # fmt: skip
 
     def _at(self, q: Floats) -> tuple[Floats, Floats, Floats, Floats, Bools]:
         """Points of the mesh at (y, z) (n, 2).

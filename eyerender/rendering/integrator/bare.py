@@ -36,7 +36,7 @@ def render_samples(request: FilmRequest, first: int, count: int) -> tuple[list[m
     pixel = index // n
     k = index - pixel * n + dr.opaque(mi.UInt32, first)
     pixels, pattern = Pixels.of(request.window), Pattern.of(request.spp, request.seed)
-    lanes, failed = _shade_samples(request.shown.frame, pixels, pattern, pixel, k, request.layered)
+    lanes, failed = _shade_samples(request.bound.frame, pixels, pattern, pixel, k, request.layered)
     return [dr.block_sum(x, count) for x in lanes], failed
 
 
@@ -59,7 +59,7 @@ def render_adaptively(request: FilmRequest, most: int) -> tuple[list[mi.Float], 
         place = index // each
         pixel = dr.gather(mi.UInt32, pixel, place)
         k = dr.gather(mi.UInt32, mi.UInt32(aligned_copy(numbers.astype(np.uint32))), index - place * each)
-        (radiance,), failures = _shade_samples(request.shown.frame, pixels, pattern, pixel, k, False)
+        (radiance,), failures = _shade_samples(request.bound.frame, pixels, pattern, pixel, k, False)
         failed += failures
         return radiance
 

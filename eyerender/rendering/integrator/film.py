@@ -41,7 +41,7 @@ class Film:
     Attributes:
         sums: over the samples of each pixel: the radiance, or for each part what `start` says.
         failed: number of failed light paths.
-        request: what is shown.
+        request: what is bound.
     """
 
     sums: list[mi.Float]
@@ -59,20 +59,20 @@ class Film:
         return np.maximum(means[0], 0, out=means[0]), failed
 
 
-def mean_radiance(shown: BoundFrame, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
+def mean_radiance(bound: BoundFrame, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
     """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
-    return start(shown, window, spp, seed, layered=False).means()
+    return start(bound, window, spp, seed, layered=False).means()
 
 
-def start(shown: BoundFrame, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
+def start(bound: BoundFrame, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
     """Begin to take the samples of a window.
 
     Its `means` are those of `mean_radiance`. If `layered`, there are three numbers for each part of the scene, from
     front to back (hairs and tears, skin, globe; or background and globe): the radiance of the part, which adds up to
     that of `mean_radiance`; the share of the samples that show it; that share times their mean inverse depth (1/mm).
     """
-    request = FilmRequest(shown=shown, window=window, spp=spp, seed=seed, layered=layered)
-    if shown.frame.structure.region:
+    request = FilmRequest(bound=bound, window=window, spp=spp, seed=seed, layered=layered)
+    if bound.frame.structure.region:
         sums, failed = _in_passes(request, request.groups, request.group_size, _render_groups)
     elif is_adaptive(request):
         sums, failed = render_adaptively(request, _LANES)
@@ -100,7 +100,7 @@ def _in_passes(
 
 def _render_groups(request: FilmRequest, first: int, count: int) -> tuple[list[mi.Float], mi.UInt32]:
     """Sums over some groups of samples of each pixel before an eye region, and failed light paths."""
-    frame, lamps = request.shown.frame, request.shown.host.lamps
+    frame, lamps = request.bound.frame, request.bound.host.lamps
     pattern = Pattern.of(request.spp, request.seed, times=request.times)
     sharp = int(lamps.suns and lamps.widths[-1] < SMALL)
     few = max(len(lamps) - sharp, 1) <= min(_FEW_LAMPS, request.groups) and lamps.widest < SMALL

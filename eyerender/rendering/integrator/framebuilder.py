@@ -1,4 +1,4 @@
-"""What is kept from frame to frame (scenes, textures, maps), and the set-up of a job's frame from it."""
+"""Caches that survive between frames (scenes, textures, maps), and per-frame set-up."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from ..transport.shadowmaps import ShadowMaps
 from .hostdata import HostData
 from .request import BoundFrame
 
-_REGIONS, _TEXTURES = 4, 8  # kept
-_REMEMBERED = 32  # subjects; then recordings are made anew, because those of sizes that never come back take 3 MB each
-_FARTHEST_MM = 60.0  # of places in the plane of a surround that have a grid
+_REGIONS, _TEXTURES = 4, 8  # cached
+_SUBJECTS = 32  # then recordings are forgotten, because those of sizes that never come back take 3 MB each
+_FARTHEST_MM = 60.0  # half the largest width of the grid over the background's plane
 
 
 @dataclass(slots=True)
 class _Next:
-    """The job of the frame that comes next, and what a second thread makes of it: the mesh, then all the rest."""
+    """The job of the next frame, and its data from the second thread: the mesh of its region, then the rest."""
 
     job: RenderJob
     posed: Future[RegionMesh] | None = None
@@ -71,20 +71,20 @@ def _grids_behind_cornea(
 
 
 class FrameBuilder:
-    """Scenes, textures and maps.
+    """Builds frames from cached scenes, textures and maps.
 
     Args:
-        beside: what makes what NumPy alone can make, in one other thread.
-        obstacles: in the scene's frame about eyes without a region.
+        beside: runs host work in one second thread.
+        obstacles: bodies in the scene's frame about eyes without a region.
     """
 
     def __init__(self, beside: Executor, obstacles: Sequence[Obstacle] = ()) -> None:
         self._beside = beside
-        self._surround = Background(obstacles)
+        self._background = Background(obstacles)
         self._textures: dict[Any, Textures] = {}
-        self._regions: dict[Any, RegionScene] = {}  # the one that was used last is last
+        self._regions: dict[Any, RegionScene] = {}  # least recently used first
         self._filled = 0
-        self._replaced: deque[Any] = deque(maxlen=_REGIONS)  # subjects whose scenes others took
+        self._replaced: deque[Any] = deque(maxlen=_REGIONS)  # subjects whose scenes were reused for others
         self._maps = Maps()
         self.meshes = Meshes()
         self._radiosity = RadiositySolver()
@@ -92,19 +92,19 @@ class FrameBuilder:
         self._next: _Next | None = None
 
     def _expect(self, job: RenderJob) -> None:
-        """Have the mesh of the next job made by the second thread, but for a head mesh."""
+        """Start making the mesh of the next job in the second thread; head meshes need none."""
         self._next = _Next(job)
         region = job.region
         if region is not None and region.head is None:
             self._next.posed = self._beside.submit(region_mesh, region, job.globe)
 
     def prepare(self) -> None:
-        """Have what can be made of the next job without the device made by the second thread, once all is launched."""
+        """Start the host work of the next job in the second thread, once this frame is launched."""
         after = self._next
         if after is None or (after.job.region is not None and after.posed is None):
             return
         if after.posed is not None and after.posed.exception():
-            return  # its own frame shall raise the error
+            return  # its own frame raises the error
         posed = None if after.posed is None else after.posed.result()
         after.host = self._beside.submit(HostData.made, after.job, posed)
 
@@ -115,28 +115,28 @@ class FrameBuilder:
 
         Args:
             job: the job.
-            lit: whether radiance is wanted, not only what is seen where.
+            lit: whether radiance is wanted, not only geometry.
             after: the job of the next frame, if it is known.
         """
-        host, place = self._prepared(job)
-        region = place if isinstance(place, RegionScene) else None
+        host, surroundings = self._host_data(job)
+        region = surroundings if isinstance(surroundings, RegionScene) else None
         textures = self._textures_of(job)
-        # What is large and needs little is launched first, so that the device has work while NumPy prepares the rest.
+        # Large kernels that need little are launched first, so that the device is busy while NumPy prepares the rest.
         shadow_maps = None if region is None else ShadowMaps.build(region, host.views)
         structure = Structure(
-            kinds(job.eye),
-            bool(np.any(job.camera.distortion)),
-            place.obstructed,
-            region is not None,
-            job.ambient.model_copy(update={"sun": None}) != Ambient(),
-            region is not None and region.skin.is_sheet and job.look.scattering is not None,
+            surfaces=kinds(job.eye),
+            distorted=bool(np.any(job.camera.distortion)),
+            obstacles=surroundings.obstructed,
+            region=region is not None,
+            ambient=job.ambient.model_copy(update={"sun": None}) != Ambient(),
+            scattering=region is not None and region.skin.is_sheet and job.look.scattering is not None,
         )
-        frame = Frame.upload(
-            structure, host.parameters, boundary_waves(job.eye), tables(job.eye),
-            lights=Lights.upload(host.lamps), textures=textures, scene=place.scene,
-            region=None if region is None else region.skin,
-            background=place.geometry if isinstance(place, Background) else None,
-        )  # fmt: skip
+        frame = Frame.upload(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
+        frame.lights, frame.textures, frame.scene = Lights.upload(host.lamps), textures, surroundings.scene
+        if isinstance(surroundings, RegionScene):
+            frame.region = surroundings.skin
+        else:
+            frame.background = surroundings.geometry
         frame.caches.shadow_maps = shadow_maps
         if job.mesh_edge_mm is not None:
             frame.surfaces = meshed(frame.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
@@ -147,27 +147,29 @@ class FrameBuilder:
             panels = panel_table(job.ambient, job.anchor_mm)
             frame.caches.ambience = Ambience.build(even, panels, job.ambient.map, self._maps)
         if lit:
-            self._light(host, frame, place, after)
-        return BoundFrame(frame, host), place
+            self._light(host, frame, surroundings, after)
+        return BoundFrame(frame, host), surroundings
 
-    def _light(self, host: HostData, frame: Frame, place: Background | RegionScene, after: RenderJob | None) -> None:
-        """Add the light between surfaces, and the grids of the lamps' light that the frame can use."""
+    def _light(
+        self, host: HostData, frame: Frame, surroundings: Background | RegionScene, after: RenderJob | None
+    ) -> None:
+        """Compute the radiosity, and fill the grids of irradiance that the frame can use."""
         job = host.job
         parts = panel_lamps(job.ambient, job.anchor_mm) + bright_lamps(job.ambient.map, self._maps, job.anchor_mm)
         panels = LampTable.of(parts, job.M, job.t)
-        pending = self._radiosity.gather(frame, job, host.lamps, panels, host.patches, place)
+        pending = self._radiosity.gather(frame, job, host.lamps, panels, host.patches, surroundings)
         if after is not None:
             self._expect(after)
         gathered = pending.read()
-        self._fill_grids(host, frame, place)
+        self._fill_grids(host, frame, surroundings)
         frame.caches.radiosity = pending.solve(gathered)
-        if not place.obstructed:
+        if not surroundings.obstructed:
             reach = dr.opaque(mi.Float, min(host.reach_mm, _FARTHEST_MM))
             points = dr.opaque(mi.UInt32, host.lamps.points)
             frame.caches.globe = GlobeIrradiance.build(frame, reach, points, host.lamps.gridded)
 
-    def _fill_grids(self, host: HostData, frame: Frame, place: Background | RegionScene) -> None:
-        """Add the light of the lamps behind the cornea."""
+    def _fill_grids(self, host: HostData, frame: Frame, surroundings: Background | RegionScene) -> None:
+        """Fill the grids of irradiance behind the cornea."""
         job, lamps, heights = host.job, host.lamps, frame.textures.heights
         size = ReliefSize.of(job)
         side, shape = dr.opaque(mi.UInt32, size.side), None
@@ -177,7 +179,7 @@ class FrameBuilder:
                 (size.side, job.look.iris_seed, job.look.iris),
                 lambda: relief_shape(frame.bare(), heights, side, dr.opaque(mi.UInt32, size.about), size),
             )
-        gridded = not place.obstructed or (isinstance(place, RegionScene) and place.skin.is_sheet)
+        gridded = not surroundings.obstructed or (isinstance(surroundings, RegionScene) and surroundings.skin.is_sheet)
         points = lamps.points * max(len(lamps), 1)
         sizes = _GridSizes(gridded, len(lamps) if lamps.gridded else 0, size.side**2, points)
         factors = host.returned.factors
@@ -187,54 +189,54 @@ class FrameBuilder:
             frame, shape, side, dr.opaque(mi.UInt32, lamps.points), sent_factors, sizes
         )
 
-    def _prepared(self, job: RenderJob) -> tuple[HostData, Background | RegionScene]:
-        """What NumPy makes of a job, and its posed surroundings."""
+    def _host_data(self, job: RenderJob) -> tuple[HostData, Background | RegionScene]:
+        """Return the host data of a job, and its posed surroundings."""
         expected, self._next = self._next, None
         host = None
         if expected is not None and expected.job is job and expected.host is not None:
             host = expected.host.result()
-        place = self._place(job, None if host is None else host.posed)
-        return host or HostData(job, place.posed), place
+        surroundings = self._pose_surroundings(job, None if host is None else host.posed)
+        return host or HostData(job, surroundings.posed), surroundings
 
-    def _place(self, job: RenderJob, known: RegionMesh | None) -> Background | RegionScene:
-        """Posed surroundings; the mesh of a region may be known."""
+    def _pose_surroundings(self, job: RenderJob, known: RegionMesh | None) -> Background | RegionScene:
+        """Pose the surroundings of a job; the mesh of a region may be known."""
         if job.region is None:
-            self._surround.show(job.look)
-            return self._surround
-        if self._surround.obstructed:
+            self._background.show(job.look)
+            return self._background
+        if self._background.obstructed:
             raise InputError("obstacles cannot be combined with an eye region")
-        place = self._region(job, known)
-        place.show(job.region, job.globe, known)
-        return place
+        surroundings = self._region(job, known)
+        surroundings.show(job.region, job.globe, known)
+        return surroundings
 
     def _region(self, job: RenderJob, known: RegionMesh | None) -> RegionScene:
-        """The scene of a subject.
+        """Find the scene of a subject.
 
-        A subject never seen before takes over that of another one, so recordings last. One that comes back after that
-        gets a scene of its own, because subjects that take turns would else fill one again and again.
+        A new subject reuses the scene buffers of an earlier one, so recordings stay valid. A subject that returns after
+        its scene was reused gets its own, or subjects that take turns would refill one scene forever.
         """
         assert job.region is not None
         spec, globe = job.region, job.globe
         key = RegionScene.key(spec, globe)
-        place = self._regions.pop(key, None)
-        if place is None:
+        surroundings = self._regions.pop(key, None)
+        if surroundings is None:
             full, back = len(self._regions) >= _REGIONS, key in self._replaced
             oldest = next((k for k, kept in self._regions.items() if kept.takes(spec)), None)
             if oldest is None or (back and not full):
                 if full:
                     self._regions.pop(next(iter(self._regions)))
                 forget()
-                place = place_scene(spec, globe, known)
+                surroundings = place_scene(spec, globe, known)
             else:
-                place = self._regions.pop(oldest)
+                surroundings = self._regions.pop(oldest)
                 self._replaced.append(oldest)
                 self._filled += 1
-                if self._filled % _REMEMBERED == 0:
+                if self._filled % _SUBJECTS == 0:
                     forget()
                     dr.flush_malloc_cache()
-                place.fill(spec, globe, known)
-        self._regions[key] = place
-        return place
+                surroundings.fill(spec, globe, known)
+        self._regions[key] = surroundings
+        return surroundings
 
     def _textures_of(self, job: RenderJob) -> Textures:
         key = (job.look.iris_seed, job.look.iris)

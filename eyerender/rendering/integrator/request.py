@@ -1,4 +1,4 @@
-"""What a film is asked to show."""
+"""Requests to the film: which window of which frame, with which samples."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class FilmRequest:
     """A window of a frame and its samples.
 
     Attributes:
-        shown: the frame.
+        bound: the frame.
         window: (x0, y0, width, height) in full-sensor pixels.
         spp: samples per pixel.
         seed: of the samples.
         layered: whether the parts of the scene are wanted one by one, with their depths.
     """
 
-    shown: BoundFrame
+    bound: BoundFrame
     window: Window
     spp: int
     seed: int
@@ -42,7 +42,7 @@ class FilmRequest:
     @property
     def group_size(self) -> int:
         """Number of samples of a pixel in a group; where light spreads in the skin, there are no fine shadows."""
-        if self.shown.frame.structure.scattering and self.spp == _LARGEST_GROUP:
+        if self.bound.frame.structure.scattering and self.spp == _LARGEST_GROUP:
             return self.spp
         size = _LARGEST_GROUP
         while size > 1 and (self.spp % size or self.spp // size < min(_LEAST_GROUPS, self.spp // 2)):

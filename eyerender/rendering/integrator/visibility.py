@@ -102,13 +102,13 @@ def trace_region(request: FilmRequest, pattern: Pattern, first: int, count: int,
     """Trace the samples of some groups of each pixel.
 
     Args:
-        request: what is shown.
+        request: what is bound.
         pattern: the samples.
         first: number of the first group.
         count: number of groups.
         every: whether every sample is traced, even in pixels that show only skin.
     """
-    marks = request.shown.host.marks(request.window)
+    marks = request.bound.host.marks(request.window)
     if every:
         marks = marks & ~np.uint8(PLAIN)
     fine, plain = (marks & FINE) > 0, (marks & PLAIN) > 0
@@ -126,7 +126,7 @@ def trace_region(request: FilmRequest, pattern: Pattern, first: int, count: int,
     order = mi.UInt32(aligned_copy(np.concatenate(classes).astype(np.uint32)))
     lanes = _Lanes(lane=lane, order=order, pixel_ends=(a, b), lane_ends=(c, d))
     groups = GroupPass.upload(request, first, count)
-    hits = _trace(request.shown.frame, Pixels.of(request.window), pattern, lanes, groups)
+    hits = _trace(request.bound.frame, Pixels.of(request.window), pattern, lanes, groups)
     return HitTable(marks=mi.UInt8(aligned_copy(marks)), first=mi.UInt32(aligned_copy(starts)), hits=hits)
 
 

@@ -52,10 +52,10 @@ class PartLabels(ArrayValue):
         return both / whole if whole else float("nan")
 
 
-def part_labels(shown: BoundFrame, window: Window) -> Callable[[], PartLabels]:
+def part_labels(bound: BoundFrame, window: Window) -> Callable[[], PartLabels]:
     """Begin to compute the labels of a window; the result waits for them. Rays that miss the globe are not traced."""
     _, _, width, height = window
-    found = _parts(shown.frame.bare(), Pixels.of(window), width * height)
+    found = _parts(bound.frame.bare(), Pixels.of(window), width * height)
     return lambda: PartLabels(*(frozen(part.numpy().reshape(height, width), np.uint8) for part in found))
 
 
@@ -73,16 +73,16 @@ def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8
     return part, amodal
 
 
-def highlights(shown: BoundFrame, window: Window) -> Bools:
+def highlights(bound: BoundFrame, window: Window) -> Bools:
     """Pixels (height, width) whose skin, lids, lashes and tears mirror lamps: more than half of what they scatter.
 
     Both are light of the lamps alone, with its shadows. Lens and sensor do not matter, nor do glints of the cornea.
     Pixels that show mostly cornea are not marked. Without an eye region nothing but the cornea mirrors lamps.
     """
     mirrored = scattered = beside = np.zeros(window[2] * window[3], np.float32)
-    for i in range(_ACROSS * _ACROSS if shown.frame.structure.region else 0):
+    for i in range(_ACROSS * _ACROSS if bound.frame.structure.region else 0):
         right, down = ((k + 0.5) / _ACROSS - 0.5 for k in (i % _ACROSS, i // _ACROSS))
-        shine, matte, share = _lamps_at(shown.frame, window, right, down)
+        shine, matte, share = _lamps_at(bound.frame, window, right, down)
         dr.eval(shine, matte, share)
         mirrored, scattered, beside = mirrored + shine.numpy(), scattered + matte.numpy(), beside + share.numpy()
     marked = (mirrored > _HIGHLIGHT * scattered) & (beside > 0.5)

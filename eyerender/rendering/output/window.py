@@ -1,4 +1,4 @@
-"""What a frame gives: its traced picture, and the window of the sensor that is developed from it without the device."""
+"""A traced frame, and the window of the sensor that lens and sensor make of it on the host."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..scene.blur import Blur
 from .labels import PartLabels
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RenderedWindow(ArrayValue):
     """A rendered window.
 
@@ -49,14 +49,14 @@ class RenderedWindow(ArrayValue):
     highlights: Bools | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RawFrame(ArrayValue):
     """A frame before the lens and the sensor.
 
     Attributes:
         job: the frame's job.
         picture: mean radiance of the pixels with the border that the lens needs, or its parts.
-        glints: what the lamps' mirror images add.
+        glints: light of the lamps' mirror images.
         blur: the lens.
         mirrored: the glints' places and energies.
         labels: raster labels, if they were requested.
@@ -75,14 +75,14 @@ class RawFrame(ArrayValue):
     lid_margins_px: dict[str, list[list[float]]] | None
     highlights: Bools | None
 
-    def developed(self) -> RenderedWindow:
-        """The window through lens and sensor. It needs NumPy alone, so another thread may do it.
+    def develop(self) -> RenderedWindow:
+        """Apply lens and sensor. This never touches the device, so another thread may do it.
 
         Raises:
             InputError: numbers so extreme that the image is not finite.
         """
         job, labels, mirrored, highlights = self.job, self.labels, self.mirrored, self.highlights
-        irradiance = sealed(self._through_the_lens())
+        irradiance = sealed(self._irradiance())
         if not np.all(np.isfinite(irradiance)):
             raise InputError("the numbers of the scene are too extreme: its image is not finite")
         # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
@@ -93,20 +93,20 @@ class RawFrame(ArrayValue):
             mirrored = mirrored.behind(covered, job.window)
             highlights = None if highlights is None else frozen(highlights & ~covered, np.bool_)
         return RenderedWindow(
-            job.window,
-            irradiance,
-            sealed(dn),
-            job.sensor.bit_depth,
-            labels,
-            mirrored.glints,
-            mirrored.others,
-            self.failed,
-            mirrored.reasons,
-            self.lid_margins_px,
-            highlights,
+            window=job.window,
+            irradiance=irradiance,
+            dn=sealed(dn),
+            bit_depth=job.sensor.bit_depth,
+            labels=labels,
+            glints=mirrored.glints,
+            purkinje=mirrored.others,
+            failed_paths=self.failed,
+            glint_reasons=mirrored.reasons,
+            lid_margins_px=self.lid_margins_px,
+            highlights=highlights,
         )
 
-    def _through_the_lens(self) -> Singles:
+    def _irradiance(self) -> Singles:
         """Irradiance (height, width) of the window, W/m^2."""
         job = self.job
         seen = (job.lens, job.camera, job.window)

@@ -1,7 +1,7 @@
 """A frame on the device; its parameters are opaque Dr.Jit arrays of size one.
 
 A literal that changes between frames would be compiled into the kernel, so everything that can change is stored here.
-What determines the kernel (the kinds of surfaces, whether the lens distorts) is the `Structure`.
+`Structure` holds what chooses the kernel (the kinds of surfaces, whether the lens distorts).
 """
 
 from __future__ import annotations
@@ -76,13 +76,17 @@ def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
     return mi.UInt32((mi.Float(a) + 0.5) / mi.Float(b))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
-    """What a kernel is compiled for.
+    """Plain values that choose the compiled kernels.
 
-    It holds (kind, tilted) of each surface, whether the camera's lens distorts, whether anything can stand in the
-    way of light (the surround's plane cannot: it hides no lamp before it), whether the scene is an eye region instead
-    of a surround, whether there is other light than that of the lamps, and whether light spreads inside the tissues.
+    Attributes:
+        surfaces: (kind, tilted) of each refracting surface.
+        distorted: whether the camera's lens distorts.
+        obstacles: whether anything can block light; the background's plane alone hides no lamp before it.
+        region: whether the eye has a region instead of a background.
+        ambient: whether there is other light than that of the lamps.
+        scattering: whether light spreads inside skin and sclera.
     """
 
     surfaces: tuple[tuple[Kind, bool], ...]
@@ -98,14 +102,14 @@ class Frame:
     """A frame on the device: its parameters (see `parameters.Parameters`), and all that kernels read.
 
     Attributes:
-        structure: what kernels are compiled for.
+        structure: chooses the kernels.
         boundary: the shape of the pupil's boundary.
-        lights: the lamps.
+        lights: the lamps (`Lights`).
         textures: the maps of the eye (`albedo.Textures`).
         region: the eye region (`region.SkinGeometry`), if there is one.
-        background: else what is about the eye (`background.BackgroundGeometry`).
-        caches: light that was computed before the samples.
-        scene: what may stand in the way.
+        background: else the surroundings of the eye (`background.BackgroundGeometry`).
+        caches: light that is computed before the samples.
+        scene: Mitsuba's scene of all that is not the eye.
     """
 
     structure: Structure
@@ -123,39 +127,24 @@ class Frame:
     globe_reach: mi.Float
     backdrop_x: mi.Float
     ambient_irradiance: mi.Float
-    lights: Lights
-    textures: Any
-    region: Any
-    background: Any
     caches: Caches
-    scene: mi.Scene
+    lights: Any = None
+    textures: Any = None
+    region: Any = None
+    background: Any = None
+    scene: Any = None
 
     @classmethod
     def upload(
-        cls,
-        structure: Structure,
-        parameters: Parameters,
-        waves: Floats,
-        tables: Sequence[Singles | None],
-        *,
-        lights: Lights | None = None,
-        textures: Any = None,
-        region: Any = None,
-        background: Any = None,
-        scene: mi.Scene | None = None,
+        cls, structure: Structure, parameters: Parameters, waves: Floats, tables: Sequence[Singles | None]
     ) -> Frame:
-        """Send the numbers to the device.
+        """Send the numbers of a frame to the device; its other parts are set afterwards.
 
         Args:
-            structure: what kernels are compiled for.
+            structure: chooses the kernels.
             parameters: the numbers.
             waves: the pupil's boundary.
             tables: the cells of measured surfaces.
-            lights: the lamps.
-            textures: as the attribute.
-            region: as the attribute.
-            background: as the attribute.
-            scene: as the attribute.
         """
         left = iter(upload_scalars(packed(parameters)))
 
@@ -172,15 +161,11 @@ class Frame:
             for s, (kind, _), table in zip(others.pop("surfaces"), structure.surfaces, tables, strict=True)
         )
         boundary = PupilBoundary.upload(waves)
-        seen: dict[str, Any] = {"lights": lights, "textures": textures, "region": region, "background": background}
-        return cls(
-            structure=structure, boundary=boundary, surfaces=surfaces, **others, **seen, scene=scene, caches=Caches()
-        )
+        return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, caches=Caches())
 
     def bare(self) -> Frame:
         """The frame without lamps, textures and light, for recordings that should last when these change."""
-        without: dict[str, Any] = {"lights": None, "textures": None, "caches": Caches()}
-        return replace(self, **without)
+        return replace(self, lights=None, textures=None, caches=Caches())
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the scene's frame to the eye frame: M^T (x - t)."""

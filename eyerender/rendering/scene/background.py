@@ -1,8 +1,8 @@
-"""Everything in the scene that is not the eye: the matte surround and other obstacles.
+"""Background of an eye without a region: a matte plane and other obstacles.
 
 It is fixed in the scene's frame (the world's axes, origin at the apex of the unrotated eye), so neither a pose nor a
-camera rebuilds it. The surround is a plane of matte skin behind the apex, through which the globe protrudes. It does
-not imitate lids and brow, because these are not modelled here.
+camera rebuilds it. The plane is of matte skin behind the apex, through which the globe protrudes. It does
+not imitate lids and brow.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Obstacle(ArrayValue):
 
 @dataclass(frozen=True, slots=True)
 class Matte:
-    """Points of the surround: place, geometric normal (scene's frame), albedo."""
+    """Points of the background: place, geometric normal (scene's frame), albedo."""
 
     point: mi.Vector3f
     normal: mi.Vector3f
@@ -48,7 +48,7 @@ class Matte:
 
 @dataclass(kw_only=True)
 class BackgroundGeometry:
-    """The triangles of the surround for the kernels, and the map of its plane.
+    """Triangles of the background for the kernels, and the map of its plane.
 
     Kernels read them from buffers and do not call methods of Mitsuba's shapes and materials: the code of such a call
     depends on how many objects the process has made.
@@ -93,7 +93,7 @@ class BackgroundGeometry:
 
 
 class Background:
-    """The Mitsuba scene of the surround; `show` changes its look in place."""
+    """The Mitsuba scene of the background; `show` changes its look in place."""
 
     posed = None  # no region
 
@@ -108,26 +108,26 @@ class Background:
             np.concatenate(albedos),
             np.concatenate(faces),
         )
-        mesh = mi.Mesh("surround", len(self._vertices), len(triangles))
+        mesh = mi.Mesh("background", len(self._vertices), len(triangles))
         params = mi.traverse(mesh)
         params["vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
         params["faces"] = mi.UInt32(triangles.astype(np.uint32).ravel())
         params.update()
         # Without robust intersections rays slip between neighbouring triangles on some processors.
-        self.scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surround": mesh})
+        self.scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "background": mesh})
         self._params: Any = mi.traverse(self.scene)
         self.geometry = BackgroundGeometry.of(triangles)
         self.obstructed = len(obstacles) > 0
         self._shown: tuple[float, float, float] | None = None
 
     def show(self, look: Look) -> None:
-        """Update the surround to a look: its plane, albedo and unevenness."""
+        """Update distance, albedo and contrast of the plane to a look."""
         wanted = (look.backdrop_distance_mm, look.backdrop_albedo, look.backdrop_contrast)
         if wanted == self._shown:
             return
         if self._shown is None or self._shown[0] != wanted[0]:
             self._vertices[:4] = _corners(wanted[0])
-            self._params["surround.vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
+            self._params["background.vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
             self._params.update()
             self.geometry.place(self._vertices, self._albedos)
         tile = wanted[1] * (1 + wanted[2] * (kept(skin_texture, 1) - 1))
@@ -135,12 +135,12 @@ class Background:
         self._shown = wanted
 
     def clear(self, a: Floats, b: Floats) -> Bools:
-        """Whether nothing of the surround stands between points (n, 3) of the scene's frame; ends not included."""
+        """Whether nothing of the background stands between points (n, 3) of the scene's frame; ends not included."""
         return clear_between(self.scene, a, b) if self.obstructed else _beside_plane(self._vertices[0, 0], a, b)
 
 
 def _beside_plane(x: float, a: Floats, b: Floats) -> Bools:
-    """The same for the plane of the surround alone."""
+    """Whether the plane at x does not stand between points (n, 3)."""
     table = _between(a, b).astype(float)
     o, d, length = table[:, :3], table[:, 3:6], table[:, 6]
     with np.errstate(divide="ignore", invalid="ignore"):

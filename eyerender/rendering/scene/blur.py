@@ -1,4 +1,4 @@
-"""Blur of a job by the lens: one kernel where all things are as much out of focus, else one for each depth."""
+"""Defocus of a job: one kernel where everything is equally out of focus, else one per depth."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _BESIDE = 0.25  # of a window's size: the border about it whose things may blur 
 
 @dataclass(frozen=True, slots=True)
 class Blur:
-    """How a job's picture is blurred by defocus.
+    """Defocus of a job's picture.
 
     Attributes:
         job: the job.
         subject_px: diameter of the circle of confusion of the eye.
-        layered: whether other things have visibly other ones.
+        layered: whether other depths are blurred visibly more or less.
         reach: pixels beyond the window's border that are needed.
     """
 

@@ -1,4 +1,4 @@
-"""Which cells of the grids of light in the tissues matter in a pose (see `diffusion`), found with NumPy alone."""
+"""Cells of the grids of light in the tissues that matter in a pose (see `diffusion`), found on the host."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DiffusionGrids:
         return cls(sheet, globe, thick, thin)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SheetCells:
     """Cells of the grid over a posed sheet of skin.
 
@@ -54,7 +54,7 @@ class SheetCells:
         columns: number of its columns, which close.
         numbers: of the cells that matter, and of the cells about them on the grid reduced by 2 and by 4.
         edges: row of the sheet's vertices at the edges of the grid's rows.
-        middles: the same in their middles.
+        middles: row of the sheet's vertices in their middles.
     """
 
     rows: int
@@ -79,7 +79,8 @@ class SheetCells:
             rows_of = marks[-1][::2] | marks[-1][1::2]
             marks.append(_grown(rows_of[:, ::2] | rows_of[:, 1::2]))
         numbers = tuple(np.flatnonzero(m) for m in marks)
-        return cls(rows, columns, numbers, edges.astype(np.float32), middle.astype(np.float32))
+        vertex_rows = {"edges": edges.astype(np.float32), "middles": middle.astype(np.float32)}
+        return cls(rows=rows, columns=columns, numbers=numbers, **vertex_rows)
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,7 +76,7 @@ class RegionScene:
         return {"solid": (slice(0, v), slice(0, f)), "film": (slice(v, None), slice(f, None))}
 
     def _dress(self, spec: Region, globe: Globe, posed: RegionMesh) -> None:
-        """Take the appearance of a subject."""
+        """Send the appearance of a subject to the device."""
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
         pixels = aligned_copy(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
@@ -93,7 +93,7 @@ class RegionScene:
         self.subject = self.key(spec, globe)
 
     def takes(self, spec: Region) -> bool:
-        """Whether the scene has the meshes that a subject needs."""
+        """Whether a subject fits into the scene's meshes."""
         return not self.fixed and spec.head is None
 
     def fill(self, spec: Region, globe: Globe, known: RegionMesh | None) -> None:
@@ -106,7 +106,7 @@ class RegionScene:
 
     @staticmethod
     def key(spec: Region, globe: Globe) -> tuple[Any, ...]:
-        """What a scene is made for: a subject, a side, and the state of a head mesh's files."""
+        """Identify a scene: the subject, the side, and the state of a head mesh's files."""
         files = () if spec.head is None else file_states(spec.head)
         return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
 
@@ -150,7 +150,7 @@ class RegionScene:
         return kept(skin_texels, spec.model_copy(update={"blink": 0.0}))
 
     def _inner(self) -> Bools | None:
-        """Which triangles of the sheet of skin are not at its ends; None if it is not known to be one surface."""
+        """Mark triangles of the sheet of skin away from its ends; None if it is not known to be one surface."""
         return ~sheet_ends()
 
     def clear(self, a: Floats, b: Floats) -> Bools:
@@ -195,8 +195,8 @@ def _instance(mesh: mi.Mesh) -> dict[str, Any]:
     return {"group": group, "shown": mi.load_dict({"type": "instance", "of": group})}
 
 
-@dataclass(frozen=True, slots=True)
-class Surface:
+@dataclass(kw_only=True)
+class SkinPoint:
     """Points of the region: place, normals with and without relief, albedo, gloss, received light (see `radiosity`)."""
 
     point: mi.Vector3f
@@ -324,7 +324,7 @@ class SkinGeometry:
         behind = dr.dot(n, d) * dr.dot(n, mi.Vector3f(turned.x, turned.y, turned.z)) > 0
         return behind & self.on_sheet(face) if self.is_sheet else behind  # hairs are thin, and some are open tubes
 
-    def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Surface:
+    def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> SkinPoint:
         """Surface at barycentric coordinates `uv` of triangles."""
         corner = dr.gather(mi.Vector4u, self.faces, face, active)
         weights = (1 - uv.x - uv.y, uv.x, uv.y)
@@ -336,7 +336,10 @@ class SkinGeometry:
         albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in self.map.eval(mi.Point2f(place.w, turned.w), active))
         smooth = dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
         normal = self.tilted(smooth, slope_y, slope_z)
-        return Surface(mi.Vector3f(place.x, place.y, place.z), normal, smooth, albedo, gloss, received)
+        return SkinPoint(
+            point=mi.Vector3f(place.x, place.y, place.z), normal=normal, smooth=smooth, albedo=albedo, gloss=gloss,
+            received=received,
+        )  # fmt: skip
 
 
 def _sheet_vertex(row: mi.UInt32, column: mi.UInt32) -> mi.UInt32:
