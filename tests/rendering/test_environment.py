@@ -205,9 +205,9 @@ def test_maps_strength_and_turn_compile_nothing_and_send_nothing_anew(renderer, 
         radiance(renderer, first.model_copy(update={"panels": (panel,)}))
         missed = [k for k in dr.kernel_history() if k.get("type") == dr.KernelType.JIT and not k["cache_hit"]]
     assert not missed
-    sent = renderer._stage._maps.of(first.map)[0]
+    sent = renderer._builder._maps.of(first.map)[0]
     radiance(renderer, first)
-    assert renderer._stage._maps.of(first.map)[0] is sent
+    assert renderer._builder._maps.of(first.map)[0] is sent
 
 
 @pytest.mark.parametrize("ending", ["hdr", "exr", "pfm"])

@@ -106,7 +106,7 @@ class FrameBuilder:
         if after.posed is not None and after.posed.exception():
             return  # its own frame raises the error
         posed = None if after.posed is None else after.posed.result()
-        after.host = self._beside.submit(HostData.made, after.job, posed)
+        after.host = self._beside.submit(HostData.compute, after.job, posed)
 
     def set(
         self, job: RenderJob, *, lit: bool = True, after: RenderJob | None = None
@@ -122,7 +122,7 @@ class FrameBuilder:
         region = surroundings if isinstance(surroundings, RegionScene) else None
         textures = self._textures_of(job)
         # Large kernels that need little are launched first, so that the device is busy while NumPy prepares the rest.
-        shadow_maps = None if region is None else ShadowMaps.build(region, host.views)
+        shadow_maps = None if region is None else ShadowMaps.build(region, host.shadow_map_table)
         structure = Structure(
             surfaces=kinds(job.eye),
             distorted=bool(np.any(job.camera.distortion)),

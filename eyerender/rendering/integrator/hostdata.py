@@ -26,7 +26,7 @@ FINE, WET, PLAIN = 1, 2, 4  # classes of pixels
 
 
 class HostData:
-    """Host-side precomputation for a job. Every part is made when it is first asked for, or all by `made`.
+    """Host-side precomputation for a job. Every part is computed on first use, or all by `compute`.
 
     Args:
         job: the job.
@@ -38,18 +38,18 @@ class HostData:
         self._marks: dict[Window, NDArray[np.uint8]] = {}
 
     @classmethod
-    def made(cls, job: RenderJob, posed: RegionMesh | None) -> HostData:
-        """Make all that a picture needs."""
-        made = cls(job, posed)
-        _ = made.parameters, made.lamps, made.returned, made.patches, made.lid_margins_px
+    def compute(cls, job: RenderJob, posed: RegionMesh | None) -> HostData:
+        """Compute everything that a picture needs."""
+        data = cls(job, posed)
+        _ = data.parameters, data.lamps, data.returned, data.patches, data.lid_margins_px
         if job.mesh_edge_mm is None:
-            _ = made.mirror_images
-        if made.posed is not None:
-            made.marks(made.blur.window)
-            _ = made.views
+            _ = data.mirror_images
+        if data.posed is not None:
+            data.marks(data.blur.window)
+            _ = data.shadow_map_table
             if job.look.scattering is not None:
-                _ = made.tissue_cells
-        return made
+                _ = data.tissue_cells
+        return data
 
     @cached_property
     def sunlit(self) -> RenderJob:
@@ -80,7 +80,7 @@ class HostData:
 
     @cached_property
     def reach_mm(self) -> float:
-        """Distance from the apex of the unrotated eye within which the window shows skin; with some to spare."""
+        """Distance from the apex of the unrotated eye within which the window shows skin, with a margin."""
         job = self.job
         x0, y0, width, height = job.window
         corners = np.array([[x, y] for x in (x0, x0 + width) for y in (y0, y0 + height)], dtype=float) - 0.5
@@ -91,8 +91,8 @@ class HostData:
         return 1.5 * float(np.max(np.linalg.norm(corners - apex, axis=1))) / px_per_mm + 5.0
 
     @cached_property
-    def views(self) -> Singles:
-        """Numbers of the lamps' views of a region, the sun's too."""
+    def shadow_map_table(self) -> Singles:
+        """Table of the lamps' shadow maps of a region, the sun's too."""
         return shadow_map_table(self.sunlit.lights, self.job.anchor_mm, self.reach_mm)
 
     @cached_property
@@ -107,13 +107,13 @@ class HostData:
 
     @cached_property
     def tissue_cells(self) -> DiffusionGrids:
-        """Where light in the tissues of a procedural region is computed."""
+        """Cells where the light in the tissues of a procedural region is computed."""
         assert self.posed is not None
         return DiffusionGrids.of(self.job, self.posed, self.blur.border_px)
 
     @cached_property
     def lid_margins_px(self) -> dict[str, list[list[float]]] | None:
-        """Landmarks along the lids, where there are any."""
+        """Landmarks along the lids; None for a bare eye."""
         return None if self.posed is None else lid_margins_px(self.posed, self.job.camera, self.job.anchor_mm)
 
     def marks(self, window: Window) -> NDArray[np.uint8]:

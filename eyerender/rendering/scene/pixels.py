@@ -1,4 +1,4 @@
-"""Plain tiles: the parts of a window that show nothing but skin, without hairs, margins or the globe.
+"""Classes of pixels: skin-only tiles, and pixels at thin hairs and menisci, which are supersampled.
 
 The skin is a sheet with a hole, the fissure, that ends at a border. A ray whose pixel lies within the border's outline
 and not within the hole's outline crosses the sheet, because the number of crossings is the difference of the two
@@ -19,13 +19,13 @@ _STEP_PX = 4.0  # between marked points of a curve
 _SPARE_PX = 1.0
 _HAIR_MM = 0.1  # no hair and no part of a margin is thicker
 _THICK_PX, _FINE_STEP_PX, _SLACK_PX = 2.0, 0.5, 0.02
-_NEAREST_MM = 3.0  # if hairs are closer to the camera, nothing is plain
+_NEAREST_MM = 3.0  # if hairs are closer to the camera, no tile is skin-only
 
 
 def skin_only_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, int]:
-    """Tiles (rows, columns) of a window that show nothing but skin and thin hairs, and the size of a tile in pixels.
+    """Find the tiles (rows, columns) of a window that show nothing but skin and thin hairs, and the tile size (px).
 
-    `supersampled_pixels` tells where thin hairs are. No tile is like that where the region's border is unknown or hairs
+    `supersampled_pixels` finds the thin hairs. There are no such tiles if the region's border is unknown, or if hairs
     come too close to the camera.
     """
     nothing = np.zeros((1, 1), dtype=bool), max(window[2:])
@@ -59,9 +59,9 @@ def skin_only_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats
 def supersampled_pixels(
     region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window
 ) -> tuple[Bools, Bools]:
-    """Pixels (height, width) of a window at menisci and those that hairs at most two pixels thick touch.
+    """Find the pixels (height, width) of a window at menisci or touched by hairs at most two pixels thick.
 
-    The second result marks those that may show menisci, which are all pixels if a meniscus is too close. Marks do not
+    The second result marks pixels that may show menisci; these are all pixels if a meniscus is too close. Marks do not
     depend on the window.
     """
     if region is None:
@@ -77,13 +77,13 @@ def supersampled_pixels(
 
 
 def _thin(depth_mm: float, camera: PinholeCamera) -> bool:
-    """Whether hairs that come so close are thin in the picture."""
+    """Whether hairs at this depth are thin in the picture."""
     focal = float(max(camera.K[0, 0], camera.K[1, 1]))
     return depth_mm >= _NEAREST_MM and _HAIR_MM * focal <= _THICK_PX * depth_mm
 
 
 def _mark_hairs(marked: Bools, curves: Floats, radii: Floats, camera: PinholeCamera, window: Window) -> None:
-    """Mark the pixels of a window that hairs touch, unless these are thick or too close."""
+    """Mark the pixels of a window that hairs touch, unless the hairs are thick or too close."""
     depth = (curves - camera.nodal_point_mm) @ camera.R[2]
     focal = float(max(camera.K[0, 0], camera.K[1, 1]))
     if not curves.size or not _thin(float(depth.min()), camera):
@@ -136,7 +136,7 @@ def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, windo
 
 
 def _with_beside(marked: Bools) -> Bools:
-    """Marks of a grid without its border, and of what is beside them."""
+    """Dilate the marks of a grid by one cell, and drop its border."""
     out = marked[1:-1, 1:-1].copy()
     for beside in (marked[:-2, 1:-1], marked[2:, 1:-1], marked[1:-1, :-2], marked[1:-1, 2:]):
         out |= beside
@@ -144,7 +144,7 @@ def _with_beside(marked: Bools) -> Bools:
 
 
 def _pieces(xy: Floats, shape: tuple[int, int], values: Floats | None = None) -> tuple[Floats, Floats, Floats]:
-    """Straight pieces of polylines (n, k, 2) that come near a grid of so many cells: start and way (m, 2).
+    """Cut polylines (n, k, 2) into the straight pieces near a grid of this shape: start and way (m, 2).
 
     The third result (m, 2) are `values` (n, k) at the ends of the pieces.
     """
