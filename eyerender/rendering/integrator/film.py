@@ -1,7 +1,8 @@
 """The film: a window's samples, and the mean radiance of each pixel.
 
 Bare eyes are shaded sample by sample (`bare`). Before an eye region, which fills the image, there are four stages:
-visibility of all samples, merging of the hits of a group, shading, and the weighted sum over a pixel's groups.
+visibility of all samples (`visibility`), merging of the hits of a group (`merging`), shading (`groupshading`), and the
+weighted sum over a pixel's groups.
 
 Hairs are thinner than the distance of a pixel's few samples, and every pixel has the same lattice of them. So hairs
 would be rows of dots. The groups of pixels at hairs have several times as many samples; their shading costs no more.
@@ -23,7 +24,8 @@ from ...rig.camera import Window
 from ..records.frame import SMALL, Frame
 from ..records.recording import recorded, syntax
 from .bare import is_adaptive, render_adaptively, render_samples
-from .groups import LampTurns, PixelGroup, shade_group
+from .groups import LampTurns, PixelGroup
+from .groupshading import shade_group
 from .hostdata import FINE, PLAIN, WET
 from .request import BoundFrame, FilmRequest
 from .sampling import Pattern, Pixels, Samples

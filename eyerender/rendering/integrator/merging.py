@@ -1,0 +1,133 @@
+"""Stage 2 before an eye region: merging the hits of a group of samples.
+
+There are at most two merged points, one on the sheet of skin and one before it (hairs, tears). Each is the hit of the
+first sample there and has the weight of all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..hits.primary import TriangleHit
+from ..records.frame import Frame, Lamp
+from ..records.recording import syntax
+from ..transport.directlight import lamp_blocked, shadowless
+from .groups import PixelGroup
+
+_LIDS_MM = 18.0  # about the axis of the unrotated eye: the region of the lids, where lashes cast shadows
+
+
+@dataclass(kw_only=True)
+class WeightedHit:
+    """A sample's hit on the region, with its weight.
+
+    Attributes:
+        j: number of the sample in its group.
+        hit: where it hits.
+        on_sheet: whether it hits the sheet of skin.
+        weight: of the sample.
+        near: weight times inverse depth (1/mm).
+        own_ray: whether the sample does not rely on the group's ray to the lamp.
+    """
+
+    j: mi.UInt32
+    hit: TriangleHit
+    on_sheet: mi.Bool
+    weight: mi.Float
+    near: mi.Float
+    own_ray: mi.Bool
+
+
+@dataclass(kw_only=True)
+class RegionSample:
+    """The surface point that stands for all samples of a group on one kind of surface.
+
+    Attributes:
+        j: number of its sample.
+        face: its triangle.
+        uv: barycentric coordinates there.
+        weight: of the samples.
+        shared: of those that rely on the group's ray to the lamp.
+        clear: of the others that see the lamp.
+        near: sum of weights times inverse depth (1/mm).
+    """
+
+    j: mi.UInt32
+    face: mi.UInt32
+    uv: mi.Point2f
+    weight: mi.Float
+    shared: mi.Float
+    clear: mi.Float
+    near: mi.Float
+
+    @classmethod
+    def none(cls) -> RegionSample:
+        """Return the point of no samples."""
+        j, face, uv = mi.UInt32(0), mi.UInt32(0), mi.Point2f(0)
+        return cls(j=j, face=face, uv=uv, weight=mi.Float(0), shared=mi.Float(0), clear=mi.Float(0), near=mi.Float(0))
+
+    def add(self, met: mi.Bool, sample: WeightedHit, blocked: mi.Bool) -> None:
+        """Add a sample where it has `met` the surface; `blocked` is the result of its own ray to the lamp."""
+        first, weight = met & (self.weight == 0), dr.select(met, sample.weight, 0)
+        self.j = dr.select(first, sample.j, self.j)
+        self.face = dr.select(first, sample.hit.prim_index, self.face)
+        self.uv = dr.select(first, sample.hit.prim_uv, self.uv)
+        self.weight = self.weight + weight
+        self.shared = self.shared + dr.select(sample.own_ray, 0, weight)
+        self.clear = self.clear + dr.select(sample.own_ray & ~blocked, weight, 0)
+        self.near = self.near + dr.select(met, sample.near, 0)
+
+
+@syntax
+def merge_hits(frame: Frame, group: PixelGroup) -> tuple[RegionSample, RegionSample]:
+    """Merge a group's hits to a point on the sheet of skin and a point before it."""
+    sheet, before = RegionSample.none(), RegionSample.none()
+    i, asked, blocked = mi.UInt32(0), mi.Bool(False), mi.Bool(False)
+    while dr.hint(i < group.count, label="merge", exclude=[frame, group]):
+        sample = _weighted_hit(frame, group, group.in_order(i))
+        # Two samples share one ray, unless the shadows are sharp.
+        asked &= ((i & 1) == 1) & ~group.sharp
+        asks = sample.own_ray & ~asked
+        if dr.hint(asks, exclude=[frame, group, sample, asks]):
+            blocked = _own_shadow(frame, group, sample, asks)
+        asked |= asks
+        sheet.add(sample.hit.is_valid() & sample.on_sheet, sample, blocked)
+        before.add(sample.hit.is_valid() & ~sample.on_sheet, sample, blocked)
+        i += 1
+    return sheet, before
+
+
+def _weighted_hit(frame: Frame, group: PixelGroup, j: mi.UInt32) -> WeightedHit:
+    """Read sample j's hit, and decide whether its shadow needs a ray of its own."""
+    hit, (o, d, weight), near = group.hit(frame, j), group.ray(frame, j), mi.Float(0)
+    x, on_sheet = o + hit.t * d, frame.region.on_sheet(hit.prim_index)
+    own_ray = hit.is_valid() & group.own_shadows
+    if frame.structure.scattering:
+        own_ray &= ~on_sheet
+    else:
+        own_ray &= ~on_sheet | group.sharp | (x.y * x.y + x.z * x.z < _LIDS_MM * _LIDS_MM)
+    if group.layered:
+        along = group.ray(frame, dr.select(group.plain, group.in_order(mi.UInt32(0)), j))[1]
+        near = weight * dr.rcp(dr.maximum(hit.t * dr.dot(along, frame.camera.forward), 1e-3))
+    return WeightedHit(j=j, hit=hit, on_sheet=on_sheet, weight=weight, near=near, own_ray=own_ray)
+
+
+def _own_shadow(frame: Frame, group: PixelGroup, sample: WeightedHit, active: mi.Bool) -> mi.Bool:
+    """Whether the group's first lamp is blocked from a sample's own hit."""
+    lamp, spot = group.turns.share(group.number, mi.UInt32(0)).lamp, group.spot(sample.j)
+    source = lamp.point(spot.x, *dr.sincos(spot.y * (2 * dr.pi)))
+    o, d, _ = group.ray(frame, sample.j)
+    x = frame.point_to_eye(o + sample.hit.t * d)
+    return blocked_from_region(frame, lamp, source, x, sample.on_sheet, active)
+
+
+def blocked_from_region(
+    frame: Frame, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, active: mi.Bool
+) -> mi.Bool:
+    """Whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
+    # Where the lamp's shadow map shows bare skin alone, only the globe may be in the way.
+    clear = shadowless(frame, lamp.number, frame.point_to_scene(x), active & on_sheet)
+    return lamp_blocked(frame, x, source, True, True, active & ~clear)
