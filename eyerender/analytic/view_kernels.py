@@ -71,4 +71,7 @@ def project_all(
             down = r[1, 0] * x[i, k] + r[1, 1] * y[i, k] + r[1, 2] * z[i, k] + t[1]
             status[i, k] = behind if status[i, k] == 0 and not depth > 0.0 else status[i, k]
             inverse = 1.0 / depth if status[i, k] == 0 else np.nan
-            out[i, k, 0], out[i, k, 1] = scale[0] * (across * inverse) + scale[1], scale[2] * (down * inverse) + scale[3]
+            out[i, k, 0], out[i, k, 1] = (
+                scale[0] * (across * inverse) + scale[1],
+                scale[2] * (down * inverse) + scale[3],
+            )

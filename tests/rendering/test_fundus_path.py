@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eyerender.eye.surfaces import surface_of
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.fundus import Spread, fundus_light
 from eyerender.eye.model import Sphere
 from eyerender.eye.parts import PlacedSpec, SphereSpec
+from eyerender.eye.surfaces import surface_of
 
 RADIUS, INDEX, DEPTH, PUPIL = 10.0, 1.9, 19.0, 1.0  # mm
 RHO, DISTANCE, LAMP = 0.5, 600.0, 8.0

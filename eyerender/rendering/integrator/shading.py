@@ -97,11 +97,11 @@ def off_eye(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Flo
     """Radiance as of `indirect` of what is not the clear cornea."""
     even, mirrored = received.x, mi.Float(0)
     if frame.structure.ambient:
-        facing = view.normal if view.level is None else view.level
-        x, normal = frame.point_to_scene(view.point), frame.vector_to_scene(facing)
+        facing = si.normal if si.level is None else si.level
+        x, normal = frame.point_to_scene(si.point), frame.vector_to_scene(facing)
         even += received.y * frame.caches.ambience.at(x, normal)
-        mirrored = _mirrored(frame, view, d, 1 - _cover(view))
-    return dr.select(view.met, _cover(view) * albedo * even * dr.inv_pi + mirrored, 0)
+        mirrored = _mirrored(frame, si, d)
+    return dr.select(si.met, si.cover * albedo * even * dr.inv_pi + mirrored, 0)
 
 
 @syntax
