@@ -27,7 +27,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
 from numba.core import config as numba_config
@@ -73,41 +73,68 @@ _CODE: Counter[str] = Counter()  # bytes of bytecode per module
 HELPER: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 ABOUT_S = 15  # time that compilation takes on two cores, as people are told
 _MOST_WORKERS = 4
-_COMPLETE = "complete"  # file in FOLDER: all functions were compiled
 _LOCK = threading.Lock()  # of `ensure_compiled`
 
 
-def ensure_compiled() -> None:
-    """Compile the whole extractor in up to four processes, unless its machine code is kept on disk."""
+class Program(NamedTuple):
+    """Functions that are compiled together.
+
+    Attributes:
+        title: what people are told.
+        about_s: time that compilation takes on two cores, as people are told.
+        packages: packages of its modules.
+        module: module that imports them all, and compiles a share when it is run.
+        complete: file in FOLDER that says that all functions were compiled.
+    """
+
+    title: str
+    about_s: int
+    packages: tuple[str, ...]
+    module: str
+    complete: str
+
+
+EXTRACTOR = Program("the extractor", ABOUT_S, ("eyerender.extraction",), "eyerender.extraction.compile", "complete")
+RAYS = Program(
+    "the ray optics",
+    10,
+    ("eyerender.geometry", "eyerender.optics", "eyerender.eye", "eyerender.analytic"),
+    "eyerender.analytic.compile",
+    "complete-rays",
+)
+
+
+def ensure_compiled(program: Program = EXTRACTOR) -> None:
+    """Compile a whole program in up to four processes, unless its machine code is kept on disk."""
     with _LOCK:
-        _compile_missing()
+        _compile_missing(program)
 
 
 @cache
-def _compile_missing() -> None:
+def _compile_missing(program: Program) -> None:
     """Announce the compilation on stderr, start the other processes, and compile a share of the functions here.
 
     A function that another process failed to compile is compiled when it is called.
     """
-    if FOLDER is not None and Path(FOLDER, _COMPLETE).exists():
+    if FOLDER is not None and Path(FOLDER, program.complete).exists():
         return
-    print(f"compiling the extractor (once per machine), about {ABOUT_S} s ...", file=sys.stderr)
+    print(f"compiling {program.title} (once per machine), about {program.about_s} s ...", file=sys.stderr)
     if FOLDER is None:
         return  # no other process could use the machine code, so each function is compiled when it is called
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
     null = subprocess.DEVNULL
     with suppress(OSError), tempfile.TemporaryDirectory(prefix="eyerender-compile-") as claims, ExitStack() as workers:
-        command = [sys.executable, "-P", "-m", "eyerender.extraction.compile", claims]
+        command = [sys.executable, "-P", "-m", program.module, claims]
         for k in range(1, min(cores, _MOST_WORKERS)):
             one = subprocess.Popen([*command, str(k)], env=environment, stdin=null, stdout=null, stderr=null)
             workers.enter_context(one)  # it waits for the process at the end
-        compile_share(Path(claims), 0)
-        Path(FOLDER, _COMPLETE).touch()
+        compile_share(Path(claims), 0, program)
+        Path(FOLDER, program.complete).touch()
 
 
-def compile_share(claims: Path, worker: int) -> None:
-    """Compile the functions of the extractor's modules, except those of modules that other processes claimed.
+def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> None:
+    """Compile the functions of a program's modules, except those of modules that other processes claimed.
 
     Functions of one package share helpers, which every process compiles for itself. So even workers begin with the
     modules of glints and odd ones with those of the pupil, the largest first.
@@ -115,8 +142,9 @@ def compile_share(claims: Path, worker: int) -> None:
     Args:
         claims: folder in which a process claims a module by making a folder of its name.
         worker: number of this process.
+        program: what is compiled.
     """
-    made = functions()
+    made = functions(program)
     modules = sorted(
         {one.py_func.__module__ for one in made}, key=lambda one: _CODE[one] if ".pupil." in one else -_CODE[one]
     )
@@ -134,9 +162,9 @@ def compile_share(claims: Path, worker: int) -> None:
             gc.enable()
 
 
-def functions() -> list[Any]:
-    """Return the extractor's compiled functions, as numba's dispatchers."""
-    return [one for one in FUNCTIONS if one.py_func.__module__.startswith("eyerender.extraction")]
+def functions(program: Program = EXTRACTOR) -> list[Any]:
+    """Return the compiled functions of a program, as numba's dispatchers."""
+    return [one for one in FUNCTIONS if one.py_func.__module__.startswith(program.packages)]
 
 
 def argument_types(function: Any) -> tuple[Any, ...]:

@@ -159,9 +159,10 @@ set_up() {
     say "environment ready after $(($(date +%s) - began)) s"
 }
 
-# Compiles the extractor, once per version of it. Without it the first extraction does so.
+# Compiles the extractor and the ray optics, once per version of them. Without it their first use does so.
 set_up_extractor() {
     "$venv/bin/python" -m eyerender.extraction.compile || :
+    "$venv/bin/python" -m eyerender.analytic.compile || :
 }
 
 # Tries once whether rendering works here, and fetches the library that a bare Debian lacks for it. All but rendering works

@@ -21,9 +21,9 @@ X0, NUMERATOR, LINEAR, ROOT, LEAN, APEX, ORIGIN, AXIS, TURN, SHAPE = 0, 1, 7, 10
 
 with polynomials N and R of second degree and h of first degree in (y, z). X0 is x_0; NUMERATOR and ROOT have the six
 coefficients of 1, y, z, yy, yz and zz in N and R, LINEAR the three of 1, y and z in h, and LEAN has l_y and l_z. A
-measured surface has those of its outer biconic. APEX is the place (y, z) of the apex, ORIGIN a point of the axis and AXIS its direction. A
-measured surface also has TURN, cosine and sine of its turn about x, and from SHAPE the squared radius at which the
-window begins, the window's width in squared radii, and
+measured surface has those of its outer biconic. APEX is the place (y, z) of the apex, ORIGIN a point of the axis and
+AXIS its direction. A measured surface also has TURN, cosine and sine of its turn about x, and from SHAPE the squared
+radius at which the window begins, the window's width in squared radii, and
 
 ZERNIKE: radius, curvature c and (1 + Q) c^2 of the conic, order, place in the table.
 GRID: spacing, centre (y, z), size, place in the table.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats, Ints, remembered
+from ..jit import RAYS, ensure_compiled
 from .biconic_kernels import Jet
 from .graph_kernels import (
     APEX,
@@ -86,6 +87,7 @@ def express(*surfaces: Surface) -> Graphs | None:
     Returns:
         None where the surfaces have no common plane.
     """
+    ensure_compiled(RAYS)
     frame = next((surface for surface in surfaces if isinstance(surface, GraphSurface)), None)
     first = surfaces[0]
     origin, rotation = np.zeros_like(first.origin_mm), np.broadcast_to(np.eye(3), first.rotation.shape)

@@ -20,7 +20,8 @@ from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
 from ..geometry.graphs import Graphs, graphs_of
 from ..geometry.surfaces import Surface, Xyz, components, join, shift, turn, turn_back
 from ..status import Status
-from .fermat_kernels import END, EXIT, GUESS, LOST, RESIDUAL, RESULTS, WAY, mirror_all, refract_all
+from .fermat_kernels import END, EXIT, GUESS, LOST, RESIDUAL, RESULTS, WAY, refract_all
+from .mirror_kernels import mirror_all
 from .shooting import Connection, connect, taken
 from .trace import Crossing, outward_path, trace
 
@@ -174,7 +175,7 @@ def _joined(
     full = shape or (1,)
     if not graphs.plain:
         viewpoint, target = (turn_back(graphs.rotation, shift(p, graphs.origin_mm, -1.0)) for p in (viewpoint, target))
-    state = np.empty((full[0], int(np.prod(full[1:], dtype=np.intp))), dtype=np.int8)
+    state = np.full((full[0], int(np.prod(full[1:], dtype=np.intp))), LOST, dtype=np.int8)
     out = np.empty((RESULTS, *state.shape))
     rims = np.array(np.atleast_1d(rim_mm), dtype=np.float64)
     ends = _rows(viewpoint, full), _rows(target, full)

@@ -1,0 +1,18 @@
+"""Compile the ray optics and keep the machine code: `python -m eyerender.analytic.compile`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from ..eye import pose_kernels
+from ..geometry import ellipse_kernels, graph_kernels
+from ..jit import RAYS, compile_share, ensure_compiled
+from ..optics import fermat_kernels, mirror_kernels
+from . import view_kernels
+
+MODULES = (graph_kernels, ellipse_kernels, fermat_kernels, mirror_kernels, pose_kernels, view_kernels)
+"""All modules with compiled functions of the ray optics."""
+
+if __name__ == "__main__":
+    compile_share(Path(sys.argv[1]), int(sys.argv[2]), RAYS) if len(sys.argv) > 2 else ensure_compiled(RAYS)
