@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..observation import Observations
+from .literature import SENTENCES
 from .results import Finding
 
 COLUMNS, ROWS = 15, 9
@@ -60,7 +61,9 @@ def findings(clouds: Mapping[str, Cloud], protocol: str, observer: str) -> list[
     out = []
 
     def add(name: str, rule: str, value: float, threshold: str, verdict: bool, detail: str) -> None:
-        out.append(Finding(name, protocol, observer, rule, float(value), threshold, bool(verdict), detail))
+        out.append(
+            Finding(name, protocol, observer, rule, float(value), threshold, bool(verdict), detail, SENTENCES[name])
+        )
 
     if "E1" in clouds:
         moved = extent_px(clouds["E1"].glint_px)

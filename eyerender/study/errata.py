@@ -57,8 +57,9 @@ def blignaut() -> list[Erratum]:
         Erratum(
             where="Table 5, best functions",
             printed="R5 for C9",
-            used="the experiment's own figures: R7 (.80 deg), then R4 (.87 deg); R5 has 1.09 deg",
-            effect="decides B1 for C9",
+            used="R5 for the paper's own sentence (B1); the experiment's figures have R7 (.80 deg), then R4 (.87 deg), "
+            "and 1.09 deg for R5",
+            effect="B1 for C9 is false in either way",
         ),
         Erratum(
             where="section 3.1",

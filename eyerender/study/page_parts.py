@@ -172,19 +172,20 @@ def findings_values(found: Sequence[Finding]) -> Values:
     rows = [
         (
             f.id, told[f.verdict] or "-", f.rule, "-" if f.value is None else f"{f.value:.4g}", f.threshold,
-            f.protocol, f.observer, f.detail,
+            f.protocol, f.observer, f.detail, f.sentence,
         )
         for f in found
     ]  # fmt: skip
     keys = list(dict.fromkeys((f.protocol, f.observer) for f in found))
     by = {(f.id, f.rule, f.threshold, f.protocol, f.observer): f for f in found}
+    sentences = {(f.id, f.rule, f.threshold): f.sentence for f in found}
     together = []
     for statement in dict.fromkeys((f.id, f.rule, f.threshold) for f in found):
         cells = []
         for key in keys:
             f = by.get((*statement, *key))
             cells.append("" if f is None or f.value is None else f"{told[f.verdict]} {f.value:.3g}".strip())
-        together.append((*statement, *cells))
+        together.append((*statement, *cells, sentences[statement]))
     return {"rows": rows, "readings": [", ".join(key) for key in keys], "together": together}
 
 

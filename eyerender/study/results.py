@@ -18,7 +18,7 @@ from ..rig.rig import RigGeometry
 from ..storage.files import write_json, write_text
 
 SUMMARY_SCHEMA = "eyerender/study-summary/1"
-FINDINGS_SCHEMA = "eyerender/study-findings/1"
+FINDINGS_SCHEMA = "eyerender/study-findings/2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,10 @@ class ModelResults:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One statement tested on the study's own data; `verdict` is None where it cannot be tested."""
+    """One statement tested on the study's own data; `verdict` is None where it cannot be tested.
+
+    `sentence` is what the paper says, in its own words; empty where there is no published claim.
+    """
 
     id: str
     protocol: str
@@ -77,6 +80,7 @@ class Finding:
     threshold: str
     verdict: bool | None
     detail: str
+    sentence: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -40,7 +40,7 @@ def test_files(folders, name):
     summary = json.loads((folder / "summary.json").read_text())
     found = json.loads((folder / "findings.json").read_text())
     assert summary["schema"] == "eyerender/study-summary/1"
-    assert found["schema"] == "eyerender/study-findings/1"
+    assert found["schema"] == "eyerender/study-findings/2"
     wanted = {"protocol", "observer", "eye_model", "eye", "head", "calibration", "function", "mean_deg", "sd_deg", "n"}
     assert all(wanted <= set(row) for row in summary["rows"])
     assert {row["protocol"] for row in summary["rows"]} == {"published", "corrected"}
