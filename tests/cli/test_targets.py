@@ -84,7 +84,8 @@ def test_every_command_and_every_output_is_in_the_table():
     # What a command writes to has one of these names; these are all others of paths and texts.
     inputs = {
         "scene", "images", "folder", "other", "spec", "records", "rig", "columns", "calibration", "eye", "eyes", "name",
-        "preset", "extractor", "estimator", "reference", "function", "terms_x", "terms_y", "fixations", "side", "shard", "address",
+        "preset", "extractor", "estimator", "reference", "function", "terms_x", "terms_y", "fixations", "side", "shard",
+        "address",
     }  # fmt: skip
     for name in sorted(names):
         function = (gaze[name[5:]] if " " in name else app[name]).default_command
