@@ -134,29 +134,30 @@ def _compile_missing(program: Program) -> None:
 
 
 def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> None:
-    """Compile the functions of a program's modules, except those of modules that other processes claimed.
+    """Compile the functions of a program, except those that other processes claimed.
 
-    Functions of one package share helpers, which every process compiles for itself. So even workers begin with the
-    modules of glints and odd ones with those of the pupil, the largest first.
+    Functions of one module or package share helpers, which every process compiles for itself. So even workers begin
+    with the modules of glints and odd ones with those of the pupil, the largest first.
 
     Args:
-        claims: folder in which a process claims a module by making a folder of its name.
+        claims: folder in which a process claims a function by making a folder of its name.
         worker: number of this process.
         program: what is compiled.
     """
-    made = functions(program)
-    modules = sorted(
-        {one.py_func.__module__ for one in made}, key=lambda one: _CODE[one] if ".pupil." in one else -_CODE[one]
-    )
-    modules.sort(key=lambda one: ".pupil." in one)
+
+    def place(function: Any) -> tuple[bool, int, str]:
+        module = function.py_func.__module__
+        pupil = ".pupil." in module
+        return pupil, _CODE[module] if pupil else -_CODE[module], module
+
+    ordered = sorted(functions(program), key=place)
     collecting = gc.isenabled()
     gc.disable()  # numba makes millions of objects, which the collector would visit again and again
     try:
-        for module in modules if worker % 2 == 0 else reversed(modules):
+        for one in ordered if worker % 2 == 0 else reversed(ordered):
             with suppress(FileExistsError):
-                (claims / module).mkdir()
-                for one in (one for one in made if one.py_func.__module__ == module):
-                    one.compile(argument_types(one))
+                (claims / f"{one.py_func.__module__}.{one.py_func.__name__}").mkdir()
+                one.compile(argument_types(one))
     finally:
         if collecting:
             gc.enable()

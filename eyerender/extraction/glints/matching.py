@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
 
 from ...arrays import Floats, Indices
 from ...errors import InputError
@@ -274,6 +273,8 @@ def _promising(
 
 def _match(glints: Floats, *, lights: Floats, middle: Floats, reach: Floats, shift: Floats, scale: float) -> Indices:
     """Light (m,) of every glint, one to one, with the least sum of squared misfits within reach; -1 for none."""
+    from scipy.optimize import linear_sum_assignment  # which takes a third of a second
+
     offset = glints[:, None, :] - _placed(lights, middle, shift, scale)[None]
     misfit = np.hypot(offset[..., 0], offset[..., 1]) / reach[None, :]
     cost = np.where(misfit < 1.0, misfit**2 - 1.0, 0.0)  # not matching them costs nothing
