@@ -1,24 +1,24 @@
 #!/usr/bin/env python3
-"""Bench of dataset runs: rate, time outside rendering, syncing, scaling over workers, memory, disk, killed runs.
+"""Bench of dataset runs: people, time outside rendering, syncing, scaling over workers, memory, disk, killed runs.
 
     bench_generate.py [--quick] [--json F] [--backend llvm|cuda] [--against CHECKOUT]
 
-Images are 640 x 480 px at 4 samples per pixel, with E2, two LEDs, labels and files. Rates are measured after every
-worker has made its first samples, so they exclude starting and compiling. The time outside rendering is CPU time, so
-other work on the machine has little influence. --quick makes fewer images and kills. The
-exit code is 1 if a `must` is missed.
+Four recipes of people (scripts/recipes) are measured with an eighth of their resolution and 4 samples per pixel, with
+half of it and 4 samples, and as they are: CPU per image of all threads of one worker, after the first images of a
+subject, and the share that does not depend on pixels, from a straight line over the number of samples. The file of
+--json also has the top rows of a profile. The rest is made with `dataset_quick` at 640 x 480 px and 4 samples per
+pixel. Rates exclude starting and compiling. --quick measures one recipe and makes fewer images and kills. The exit
+code is 1 if a `must` is missed.
 
-With --against, only images with a region are measured, here and in another checkout of this project in turns: the
-command `generate` with `dataset_region`, new subjects in every run. A long and a short run are compared, so what a run
-takes besides its images does not count.
+With --against, only the recipes are measured, here and in another checkout of this project in turns.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import random
-import resource
 import shutil
 import subprocess
 import sys
@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from _bench import Report, Row, options_of, resident_mib, row, single_threaded
+from _people import recipe
 
 single_threaded()
 
@@ -38,15 +39,21 @@ import numpy as np  # noqa: E402
 import yaml  # noqa: E402
 
 from eyerender.dataset import shard  # noqa: E402
+from eyerender.dataset.estimate import estimate  # noqa: E402
 from eyerender.dataset.maker import Maker  # noqa: E402
 from eyerender.dataset.plan import Plan  # noqa: E402
 from eyerender.dataset.pool import LocalPool  # noqa: E402
 from eyerender.dataset.realise import frames_of  # noqa: E402
+from eyerender.dataset.run import generate  # noqa: E402
 from eyerender.dataset.shard import Staged, commit, write_shard  # noqa: E402
 from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
 from eyerender.dataset.worker import Job  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "scripts" / "recipes"
+RECIPES = ("people_openeds", "people_nvgaze", "people_eyelink", "people_pupil_core")
+SIZES: dict[str, tuple[int, int | None]] = {"1/8, 4 samples": (8, 4), "1/2, 4 samples": (2, 4), "as shipped": (1, None)}
+"""Divisor of the resolution, and samples per pixel (the recipe's own if None)."""
 
 
 def plan(count: int, shard_size: int, window: tuple[int, int] = (640, 480), spp: int = 4) -> Plan:
@@ -100,56 +107,85 @@ class Bench:
 
     def __init__(self, backend: str, small: bool) -> None:
         self.backend, self.small = backend, small
+        self.profiles: dict[str, Any] = {}
 
     def rows(self) -> Iterable[Row]:
         """All rows, as they are measured."""
+        yield from self.people()
+        yield from self.scaling()
+        yield from self.prediction()
         yield from self.apart()
-        yield from self.rates()
         yield from self.memory()
         yield from self.kills()
 
+    def people(self) -> Iterable[Row]:
+        """CPU per image of each recipe and size, and what of it does not depend on pixels."""
+        for name in self.recipes:
+            found = {size: self.made(ROOT, name, size) for size in SIZES}
+            samples = {size: _samples(name, size) for size in SIZES}
+            small, large = "1/8, 4 samples", "1/2, 4 samples"
+            rate = (found[large]["cpu_s"] - found[small]["cpu_s"]) / (samples[large] - samples[small])
+            fixed = found[small]["cpu_s"] - rate * samples[small]
+            for size, one in found.items():
+                self.profiles[f"{name}, {size}"] = one["profile"]
+                yield row(f"{name}, {size}: CPU", one["cpu_s"], "s/image")
+                yield row(f"{name}, {size}: one worker", 1.0 / one["wall_s"], "images/s")
+                yield row(f"{name}, {size}: not of pixels", 100.0 * fixed / one["cpu_s"], "%")
+                yield row(f"{name}, {size}: memory of the worker", one["memory_mib"], "MiB", must=800.0)
+
     def against(self, other: Path) -> Iterable[Row]:
-        """Images a second with a region, 640 x 480 px, 4 samples, 2 workers, here and in another checkout.
-
-        Both make `dataset_region` as it is in the other, which may be older.
-        """
-        text = (other / "scenes" / "dataset_region.yaml").read_text(encoding="utf-8")
-        data = yaml.safe_load(text)
-        turns, few, many = (1, 4, 12) if self.small else (4, 8, 40)
+        """CPU per image of each recipe and size, here and in another checkout in turns: the least of each."""
         trees = {"here": ROOT, "there": other.resolve()}
-        found: dict[str, list[tuple[float, float]]] = {name: [] for name in trees}
-        for turn in range(turns):
-            for name, tree in trees.items():
-                short, long = (_generated(tree, data, self.backend, n, 1000 * turn + n) for n in (few, many))
-                found[name].append(tuple((b - a) / (many - few) for a, b in zip(short, long, strict=True)))  # type: ignore[arg-type]
-        here, there = (np.array(found[name]) for name in trees)
-        wall, cpu = (there / here).T
-        yield row("with a region, 640x480, 4 samples, 2 workers", 1 / np.median(here[:, 0]), "images/s")
-        yield row("the same, CPU", np.median(here[:, 1]), "s/image")
-        yield row("the same in the other checkout", 1 / np.median(there[:, 0]), "images/s")
-        yield row("the same, CPU", np.median(there[:, 1]), "s/image")
-        yield row(
-            f"images a second, here / there: median of {turns}", np.median(wall), "ratio", must=1.5, at_least=True
-        )
-        yield row("the same, least", np.min(wall), "ratio")
-        yield row("CPU of an image, there / here: median", np.median(cpu), "ratio")
+        for name in self.recipes:
+            for size in SIZES:
+                least = dict.fromkeys(trees, np.inf)
+                for _ in range(1 if self.small else 3):
+                    for place, tree in trees.items():
+                        least[place] = min(least[place], self.made(tree, name, size)["cpu_s"])
+                for place, cpu in least.items():
+                    yield row(f"{name}, {size}: CPU {place}", cpu, "s/image")
+                yield row(f"{name}, {size}: here / there", least["here"] / least["there"], "ratio")
 
-    def rates(self) -> Iterable[Row]:
-        """Images a second of one and of two workers of one thread each."""
-        count = 24 if self.small else 96
+    @property
+    def recipes(self) -> tuple[str, ...]:
+        """Names of the recipes."""
+        return RECIPES[:1] if self.small else RECIPES
+
+    def made(self, tree: Path, name: str, size: str) -> dict[str, Any]:
+        """What `_people.py` measures in a process of its own with the package of a checkout."""
+        divisor, spp = SIZES[size]
+        images, warm = (2, 2) if self.small else (8, 3)
+        job = {"recipe": str(FOLDER / f"{name}.yaml"), "divisor": divisor, "spp": spp}
+        job |= {"images": images, "warm": warm, "backend": self.backend}
+        command = [sys.executable, str(ROOT / "scripts" / "_people.py"), json.dumps(job)]
+        environment = {**os.environ, "PYTHONPATH": str(tree)}
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        if run.returncode:
+            raise RuntimeError(run.stderr)
+        return dict(json.loads(run.stdout.splitlines()[-1]))
+
+    def scaling(self) -> Iterable[Row]:
+        """Images a second of one and of two workers of one thread each, with people."""
+        count = 6 if self.small else 24
         rates = {}
         for workers in (1, 2):
-            made = plan(count * workers, count)
-            with tempfile.TemporaryDirectory() as folder:
-                clock = Clock(workers)
-                job = Job.of(made, frames_of(made), Path(folder), self.backend, 1)
-                lost = LocalPool(job, workers).run(range(workers), clock)
-                if lost:
-                    raise RuntimeError(str(lost))
-                rates[workers] = clock.rate
-        yield row("one worker of one thread", rates[1], "images/s")
-        yield row("two workers of one thread each", rates[2], "images/s", aim=8.0, at_least=True)
-        yield row("two workers against one", rates[2] / rates[1], "ratio", must=1.8, at_least=True)
+            made = Plan.of(DatasetSpec.from_mapping(recipe(FOLDER / f"{RECIPES[0]}.yaml", 2, 4, count, workers)))
+            rates[workers] = _rate(made, workers, self.backend)
+        yield row("people_openeds, 1/2, 4 samples: one worker of one thread", rates[1], "images/s")
+        yield row("the same, two workers", rates[2], "images/s")
+        yield row("two workers against one", rates[2] / rates[1], "ratio", must=1.85, at_least=True)
+
+    def prediction(self) -> Iterable[Row]:
+        """The time that a dry run predicts for one worker, over what the run takes."""
+        count = 8 if self.small else 24
+        made = Plan.of(DatasetSpec.from_mapping(recipe(FOLDER / f"{RECIPES[0]}.yaml", 2, 4, count)))
+        foretold = estimate(made, backend=self.backend, workers=1, measure=True)["seconds"]
+        with tempfile.TemporaryDirectory() as place:
+            start = time.perf_counter()
+            generate(made, f"{place}/out", backend=self.backend, workers=1)
+            spent = time.perf_counter() - start
+        yield row("time that a dry run predicts / time of the run", foretold / spent, "ratio")
+        yield row("the prediction is off by", 100.0 * abs(foretold / spent - 1.0), "%", aim=20.0)
 
     def apart(self) -> Iterable[Row]:
         """What an image takes besides rendering, what syncing takes of a run, and bytes on disk."""
@@ -251,27 +287,23 @@ def syncing_timed() -> Iterator[list[float]]:
             setattr(shard, name, sync)
 
 
-def _generated(tree: Path, data: dict[str, Any], backend: str, count: int, seed: int) -> tuple[float, float]:
-    """Seconds of the clock and of the processors that `generate` takes in a checkout for images with a region."""
-    image = {**data["scene"].get("image", {}), "window_px": [640, 480], "spp": 4}
-    data = {
-        **data,
-        "count": count,
-        "subjects": min(8, count),
-        "shard_size": max(count // 4, 1),
-        "seed": seed,
-        "scene": {**data["scene"], "image": image},
-    }
-    with tempfile.TemporaryDirectory() as place:
-        spec = Path(place) / "spec.yaml"
-        spec.write_text(yaml.safe_dump(data), encoding="utf-8")
-        command = [sys.executable, "-m", "eyerender", "generate", str(spec), f"{place}/out", "--workers", "2"]
-        start, used = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-        environment = {**os.environ, "PYTHONPATH": str(tree)}
-        subprocess.run([*command, "--backend", backend], check=True, capture_output=True, env=environment, cwd=place)
-        now = resource.getrusage(resource.RUSAGE_CHILDREN)
-        cpu = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
-        return time.perf_counter() - start, cpu
+def _rate(made: Plan, workers: int, backend: str) -> float:
+    """Images a second of so many workers of one thread, each with a shard."""
+    with tempfile.TemporaryDirectory() as folder:
+        clock = Clock(workers)
+        lost = LocalPool(Job.of(made, frames_of(made), Path(folder), backend, 1), workers).run(range(workers), clock)
+        if lost:
+            raise RuntimeError(str(lost))
+        return clock.rate
+
+
+def _samples(name: str, size: str) -> int:
+    """Number of samples of an image of a recipe."""
+    divisor, spp = SIZES[size]
+    made = Plan.of(DatasetSpec.from_mapping(recipe(FOLDER / f"{name}.yaml", divisor, spp, 2)))
+    scene = made.draw(0).build()
+    (_, _, width, height), *_ = scene.windows().values()
+    return int(width * height * scene.spec.image.spp)
 
 
 def _tree(folder: Path) -> dict[str, str]:
@@ -290,7 +322,11 @@ def main() -> int:
     options = parser.parse_args()
     report, bench = Report(), Bench(options.backend, options.quick)
     report.extend(bench.rows() if options.against is None else bench.against(options.against))
-    return report.finish(options.json, ("eyerender", "mitsuba", "drjit", "numpy", "pillow"))
+    code = report.finish(options.json, ("eyerender", "mitsuba", "drjit", "numpy", "pillow"))
+    if options.json is not None and bench.profiles:
+        found = json.loads(options.json.read_text(encoding="utf-8"))
+        options.json.write_text(json.dumps({**found, "profiles": bench.profiles}, indent=1) + "\n", encoding="utf-8")
+    return code
 
 
 if __name__ == "__main__":
