@@ -154,62 +154,14 @@ def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, acco
     constant = table.constant
     thicker = thickening_mm(age, accommodation)
     lens_front = -(eye["chamber_depth_mm"] - FORWARD * thicker)
-    lens_back = -(eye["chamber_depth_mm"] + eye["lens_thickness_mm"] + (1.0 - FORWARD) * thicker)
-    front_radius = 1.0 / (1.0 / eye["lens_front_radius_mm"] + FRONT_PER_D * accommodation)
-    back_radius = 1.0 / (1.0 / eye["lens_back_radius_mm"] + BACK_PER_D * accommodation)
     stop_x = lens_front + _stop_gap(eye)
     limbus = eye["iris_diameter_mm"] / 2.0
-    place = [eye["lens_nasal_mm"], eye["lens_up_mm"]]
-    tilt = [0.0, eye["lens_tilt_y_deg"], eye["lens_tilt_z_deg"]]
     direction = np.radians(eye["pupil_shift_direction_deg"])
     slope = eye["pupil_shift_mm_per_mm"]
     return {
         "name": name,
-        "cornea": [
-            {
-                "name": "anterior cornea",
-                **_toric(eye["flat_mm"], eye["steep_mm"], eye["flat_axis_deg"], eye["corneal_asphericity"]),
-                "medium": {"cauchy": list(CORNEA)},
-            },
-            {
-                "name": "posterior cornea",
-                **_toric(
-                    eye["posterior_flat_mm"],
-                    eye["posterior_steep_mm"],
-                    eye["posterior_flat_axis_deg"],
-                    eye["posterior_asphericity"],
-                ),
-                "position_mm": [-eye["corneal_thickness_mm"], 0.0, 0.0],
-                "medium": {"cauchy": list(AQUEOUS)},
-            },
-        ],
-        "lens": {
-            "kind": "surfaces",
-            "surfaces": [
-                {
-                    "name": "lens front",
-                    "shape": {
-                        "kind": "conic",
-                        "radius_mm": front_radius,
-                        "conic_constant": constant("lens_front_asphericity") + FRONT_Q_PER_D * accommodation,
-                    },
-                    "position_mm": [lens_front, *place],
-                    "tilt_deg": tilt,
-                    "medium": {"cauchy": [eye["lens_c0"], *LENS]},
-                },
-                {
-                    "name": "lens back",
-                    "shape": {
-                        "kind": "conic",
-                        "radius_mm": -back_radius,
-                        "conic_constant": constant("lens_back_asphericity"),
-                    },
-                    "position_mm": [lens_back, *place],
-                    "tilt_deg": tilt,
-                    "medium": {"cauchy": list(VITREOUS)},
-                },
-            ],
-        },
+        "cornea": _cornea(eye),
+        "lens": {"kind": "surfaces", "surfaces": _lens(eye, table, age, accommodation)},
         "retina": {
             "shape": {
                 "kind": "ellipsoid",
@@ -232,6 +184,63 @@ def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, acco
         },
         "fovea": {},
     }
+
+
+def _cornea(eye: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Front and back of the cornea."""
+    return [
+        {
+            "name": "anterior cornea",
+            **_toric(eye["flat_mm"], eye["steep_mm"], eye["flat_axis_deg"], eye["corneal_asphericity"]),
+            "medium": {"cauchy": list(CORNEA)},
+        },
+        {
+            "name": "posterior cornea",
+            **_toric(
+                eye["posterior_flat_mm"],
+                eye["posterior_steep_mm"],
+                eye["posterior_flat_axis_deg"],
+                eye["posterior_asphericity"],
+            ),
+            "position_mm": [-eye["corneal_thickness_mm"], 0.0, 0.0],
+            "medium": {"cauchy": list(AQUEOUS)},
+        },
+    ]
+
+
+def _lens(eye: Mapping[str, float], table: Table, age: float, accommodation: float) -> list[dict[str, Any]]:
+    """Front and back of the lens."""
+    thicker = thickening_mm(age, accommodation)
+    front_radius = 1.0 / (1.0 / eye["lens_front_radius_mm"] + FRONT_PER_D * accommodation)
+    back_radius = 1.0 / (1.0 / eye["lens_back_radius_mm"] + BACK_PER_D * accommodation)
+    lens_front = -(eye["chamber_depth_mm"] - FORWARD * thicker)
+    lens_back = -(eye["chamber_depth_mm"] + eye["lens_thickness_mm"] + (1.0 - FORWARD) * thicker)
+    place = [eye["lens_nasal_mm"], eye["lens_up_mm"]]
+    tilt = [0.0, eye["lens_tilt_y_deg"], eye["lens_tilt_z_deg"]]
+    return [
+        {
+            "name": "lens front",
+            "shape": {
+                "kind": "conic",
+                "radius_mm": front_radius,
+                "conic_constant": table.constant("lens_front_asphericity") + FRONT_Q_PER_D * accommodation,
+            },
+            "position_mm": [lens_front, *place],
+            "tilt_deg": tilt,
+            "medium": {"cauchy": [eye["lens_c0"], *LENS]},
+        },
+        {
+            "name": "lens back",
+            "shape": {
+                "kind": "conic",
+                "radius_mm": -back_radius,
+                "conic_constant": table.constant("lens_back_asphericity"),
+            },
+            "position_mm": [lens_back, *place],
+            "tilt_deg": tilt,
+            "medium": {"cauchy": list(VITREOUS)},
+        },
+    ]
 
 
 def _fovea(eye: Mapping[str, float], relaxed: dict[str, Any], wavelength_nm: float) -> dict[str, Any]:
