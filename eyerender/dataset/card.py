@@ -20,7 +20,9 @@ _LABELS = """\
   (`hidden_by`).
 - `labels.lid_margins_px`: landmarks along the lid margins, if the scene has lids.
 - `labels.space`: centres of globe, corneal curvature and pupil, corneal apex, optic axis, line of sight and target, in
-  the world frame and the camera frame (mm; unit vectors). The centres of rotation in azimuth and elevation are fixed in
+  the world frame and the camera frame (mm; unit vectors from the eye outwards; the camera's x is right, y down, z
+  away from it). Gaze for training is `camera.line_of_sight`; yaw = atan2(-x, -z) and pitch = asin(-y) are 0 towards
+  the camera. The centres of rotation in azimuth and elevation are fixed in
   the head; `head` has them without the head position.
 - `labels.pose`: x_world = rotation x_eye + translation. `labels.camera`: K, R, t, distortion (OpenCV). `lights_mm`.
 - `mask_file_name`: {mask}.{more}

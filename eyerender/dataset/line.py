@@ -6,7 +6,9 @@ import json
 from typing import Any
 
 from ..observation import EYES, RECORD
+from ..population.table import default_table
 from ..rig.camera import Window
+from ..scene import Scene
 from .realise import Realised
 
 
@@ -58,10 +60,20 @@ def image_line(
             "draws": sample.draws,
             "spectacles": None,
             "contact_lens": None,
-            **scene.person_numbers(side),
+            **_person(scene, side),
             # They are stored as text, because their nested keys may differ between samples, which columns must not.
             "scene_json": json.dumps(sample.scene, sort_keys=True),
             "eye_json": json.dumps({k: v for k, v in eye.items() if k != "sources"}, sort_keys=True),
         },
     }
     return image_name(turn.sample, frame, frames, side), line
+
+
+def _person(scene: Scene, side: str) -> dict[str, Any]:
+    """`person` of a line; the entrance pupil is that of the table's luminance, not of the image."""
+    found: dict[str, Any] = scene.person_numbers(side)
+    if "entrance_pupil_mm" not in found.get("person", {}):
+        return found
+    luminance = default_table().constant("luminance_cd_m2")
+    named = {"entrance_pupil_mm": f"entrance_pupil_at_{luminance:g}_cd_m2_mm"}
+    return {"person": {named.get(key, key): value for key, value in found["person"].items()}}

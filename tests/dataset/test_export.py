@@ -21,6 +21,7 @@ from eyerender.cli.main import run
 from eyerender.dataset.columns import type_first
 from eyerender.dataset.export import FORMATS, export, parquet
 from eyerender.dataset.export.coco import run_lengths
+from eyerender.dataset.export.gaze import yaw_pitch_deg
 from eyerender.dataset.export.video import LosslessVideo
 from eyerender.errors import InputError
 from eyerender.folders.imagefile import read_image, write_png
@@ -117,6 +118,28 @@ def test_coco_masks_come_back(tiny, exported, lines):
             assert glints == 2
 
 
+def test_coco_images_have_their_gaze(exported, lines):
+    for path in sorted((exported("coco") / "annotations").glob("instances_*.json")):
+        for image in json.loads(path.read_text())["images"]:
+            labels = lines[Path(image["file_name"]).stem]["labels"]
+            space = labels["space"]["camera"]
+            assert image["line_of_sight"] == space["line_of_sight"]
+            assert image["optic_axis"] == space["optic_axis"]
+            assert image["pupil_entrance_diameter_mm"] == labels["pupil"]["entrance_diameter_mm"]
+            # Towards the camera: the angle between gaze and the camera's axis is small, and so are yaw and pitch.
+            yaw, pitch = (np.radians(image[f"line_of_sight_{angle}_deg"]) for angle in ("yaw", "pitch"))
+            assert np.cos(pitch) * np.cos(yaw) == pytest.approx(-space["line_of_sight"][2], abs=1e-12)
+
+
+def test_yaw_and_pitch_are_zero_towards_the_camera_and_positive_to_the_left_and_up():
+    """In the camera's frame x is right and y is down, so a gaze to the image's left and up has negative x and y."""
+    s = np.sin(np.radians(30))
+    c = np.cos(np.radians(30))
+    assert yaw_pitch_deg([0, 0, -1]) == (0, 0)
+    assert yaw_pitch_deg([-s, 0, -c]) == pytest.approx((30, 0))
+    assert yaw_pitch_deg([0, -s, -c]) == pytest.approx((0, 30))
+
+
 def test_run_lengths_of_corners():
     assert run_lengths(np.zeros((2, 3), bool)) == [6]
     assert run_lengths(np.ones((2, 3), bool)) == [0, 6]
@@ -140,6 +163,17 @@ def test_csv_rows(tiny, exported, lines):
         assert [float(row["pupil_amodal_x_px"]), float(row["pupil_amodal_y_px"])] == centre.tolist()
         assert float(row["camera_target_mm_z"]) == line["labels"]["space"]["camera"]["target_mm"][2]
         assert int(row["subject"]) == line["subject"]
+        for name in ("line_of_sight", "optic_axis"):
+            yaw, pitch = (np.radians(float(row[f"{name}_{angle}_deg"])) for angle in ("yaw", "pitch"))
+            # The inverse that MPIIGaze's code has.
+            vector = [-np.cos(pitch) * np.sin(yaw), -np.sin(pitch), -np.cos(pitch) * np.cos(yaw)]
+            np.testing.assert_allclose([float(row[f"camera_{name}_{axis}"]) for axis in "xyz"], vector, atol=1e-12)
+        pupil = line["labels"]["pupil"]
+        assert float(row["pupil_entrance_diameter_mm"]) == pupil["entrance_diameter_mm"]
+        assert float(row["pupil_stop_diameter_mm"]) == pupil["stop_diameter_mm"] == float(row["pupil_diameter_mm"])
+    card = (folder / "README.md").read_text()
+    assert "atan2(-x, -z)" in card
+    assert "camera_line_of_sight_x" in card
 
 
 def test_hugging_face_reads_parquet_and_its_card(tiny, exported, lines, tmp_path, monkeypatch):

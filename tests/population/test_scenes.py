@@ -135,6 +135,9 @@ def test_a_dataset_draws_its_subjects():
         assert told["axial_length_mm"] == people["axial_length_mm"][index // 2, row]
         assert told["skin_albedo"] == people["skin.albedo"][index // 2]
         assert told["subject"] == index // 2
+        # The person's own number is at the table's luminance, so its name says so.
+        assert told["entrance_pupil_at_20_cd_m2_mm"] == people["entrance_pupil_mm"][index // 2]
+        assert "entrance_pupil_mm" not in told
         eye = er.EyeSpec.from_mapping(json.loads(line["parameters"]["eye_json"]))
         assert eye.stop.diameter_mm == line["parameters"]["pupil_diameter_mm"]
         assert eye == found.scene.eye_file(("right", "left")[row])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..reading import WEBDATASET, WHOLE
+from . import gaze
 from .encoding import LARGEST_GAIN, LEVEL, SAMPLED, SHARE, Encoding
 
 _GAINS = {
@@ -14,6 +15,13 @@ It was measured on {SAMPLED} images spread evenly over the dataset (on all image
 Glints may be clipped.""",
     "given": "It was set explicitly.",
     "none": "The brightness of the images is that of the dataset.",
+}
+
+_COLUMNS = " Their columns are `camera_line_of_sight_x`, `_y`, `_z` and `camera_optic_axis_x`, `_y`, `_z`."
+_GAZE = {
+    "csv": gaze.CARD.format(columns=_COLUMNS),
+    "parquet": gaze.CARD.format(columns=_COLUMNS),
+    "coco": gaze.CARD.format(columns=" They are keys of each image."),
 }
 
 
@@ -36,7 +44,7 @@ README.md of the dataset explains how they were made and what the labels mean.
 
 ## Files
 {layout.strip()}
-
+{_GAZE.get(done["format"], "")}
 ## Values of the images
 The images have {encoding.bits} bits, encoding `{encoding.curve}`, and one exposure gain of {encoding.gain:g}.
 {_GAINS[encoding.gain_from]}

@@ -1,5 +1,6 @@
 """COCO: SPLIT/*.png (8 bits) and annotations/instances_SPLIT.json; pupil, iris and sclera as run-length masks.
 
+Each image has its gaze (`line_of_sight`, `optic_axis`, ...) and the diameters of its pupil.
 Glints are instances of their own with one keypoint each: [x, y, v], v 2 visible, 1 hidden.
 """
 
@@ -17,6 +18,7 @@ import numpy as np
 from ...arrays import Bools
 from ...folders.imagefile import write_png
 from ...geometry.ellipse import Ellipse
+from .gaze import DIRECTIONS, gaze_of, pupil_of
 from .item import Items
 
 # Except for the glints, a category's id is the part's value in the mask.
@@ -38,7 +40,9 @@ def write(items: Items, out: Path) -> None:
             write_png(out / item.split / f"{item.name}.png", item.encoded)
             h, w = mask.shape
             size = {"width": w, "height": h}
-            file.add_image({"id": number, "file_name": f"{item.name}.png", **size, "subject": line["subject"]})
+            file.add_image(
+                {"id": number, "file_name": f"{item.name}.png", **size, "subject": line["subject"], **_gaze(line)}
+            )
             for value, part in ((1, "sclera"), (2, "iris"), (3, "pupil")):
                 inside = mask == value
                 if inside.any():
@@ -46,6 +50,12 @@ def write(items: Items, out: Path) -> None:
                     file.add_mark(number, _instance(value, inside, ellipse))
             for light, x, y, visible in item.glints():
                 file.add_mark(number, _glint(light, x, y, visible))
+
+
+def _gaze(line: dict[str, Any]) -> dict[str, Any]:
+    """Keys of an image: unit vectors in the camera's frame, their angles, and the diameters of the pupil."""
+    space = line["labels"]["space"]["camera"]
+    return {**{name: space[name] for name in DIRECTIONS}, **gaze_of(line), **pupil_of(line)}
 
 
 class _Annotations:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...storage.files import read_bytes, write_bytes
+from .gaze import gaze_of, pupil_of
 from .item import Item, Items
 
 _COLUMNS = (
@@ -65,4 +66,5 @@ def row_of(item: Item, lights: int) -> dict[str, Any]:
             for axis, number in zip("xyz", value or [None] * 3, strict=True):
                 row[f"{frame}_{name}_{axis}"] = number
     row["pupil_diameter_mm"] = line["parameters"]["pupil_diameter_mm"]
+    row |= pupil_of(line) | gaze_of(line)
     return row

@@ -1,0 +1,50 @@
+"""Gaze of an image in the camera's frame, for training on appearance: unit vectors, yaw and pitch.
+
+    yaw = atan2(-x, -z),   pitch = asin(-y)       x right, y down, z away from the camera
+
+Both are 0 for gaze towards the camera; yaw is positive to the image's left, pitch is positive up. This is the
+convention of MPIIGaze and ETH-XGaze.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+DIRECTIONS = ("line_of_sight", "optic_axis")
+CARD = """
+## Gaze
+`line_of_sight` is the direction from the eye to what it fixates; `optic_axis` is the axis of the eye's optics, about 5
+degrees temporal of it. Both are unit vectors in the camera's frame (x right, y down, z away from the camera), from the
+eye outwards.{columns}
+`*_yaw_deg` = atan2(-x, -z) and `*_pitch_deg` = asin(-y), in degrees: both are 0 for gaze parallel to the camera's axis,
+towards the camera; yaw is positive to the image's left, and pitch is positive up (as in MPIIGaze and ETH-XGaze). Lens
+distortion, the position of the eye and the roll of the head are not removed.
+
+`pupil_entrance_diameter_mm` is the entrance pupil, as seen through the cornea on the optic axis;
+`pupil_stop_diameter_mm` is the anatomical pupil (also in `pupil_diameter_mm`).
+"""
+
+
+def yaw_pitch_deg(direction: Sequence[float]) -> tuple[float, float]:
+    """Yaw and pitch of a unit vector in the camera's frame."""
+    x, y, z = direction
+    return float(np.degrees(np.arctan2(-x, -z))), float(np.degrees(np.arcsin(np.clip(-y, -1.0, 1.0))))
+
+
+def gaze_of(line: dict[str, Any]) -> dict[str, float]:
+    """Yaw and pitch of both directions, by column."""
+    space = line["labels"]["space"]["camera"]
+    return {
+        f"{name}_{angle}_deg": value
+        for name in DIRECTIONS
+        for angle, value in zip(("yaw", "pitch"), yaw_pitch_deg(space[name]), strict=True)
+    }
+
+
+def pupil_of(line: dict[str, Any]) -> dict[str, float | None]:
+    """Diameters of the pupil, by column; None in datasets of versions before 4."""
+    pupil = line["labels"]["pupil"]
+    return {f"pupil_{name}": pupil.get(name) for name in ("entrance_diameter_mm", "stop_diameter_mm")}
