@@ -130,9 +130,9 @@ def run(
             if "error" in departures and rig.screen is not None:
                 # The software assumes that the screen's centre is straight ahead of the origin.
                 eye = eye + rig.screen.centre_mm * np.array([0.0, 1.0, 1.0])
-            error = angular_error_deg(gaze.point_mm, index.target_mm, eye)
+            errors = angular_error_deg(gaze.point_mm, index.target_mm, eye)
             out.append(
-                Outcome(function, name, error, None, error_vectors_deg(gaze.point_mm - eye, index.target_mm - eye))
+                Outcome(function, name, errors, None, error_vectors_deg(gaze.point_mm - eye, index.target_mm - eye))
             )
     return out
 

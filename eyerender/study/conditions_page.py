@@ -120,8 +120,7 @@ def page(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found: S
         "values": [(f.id, f.rule, f"{f.value:.4f}", f.detail) for f in found],
         "rows": [
             (r.eye_model, r.variant or "", number(r.mean_deg), number(r.sd_deg), str(r.n), str(r.missing))
-            for p in (*parts, *people)
-            for r in p.rows
+            for r in [*(r for p in parts for r in p.rows), *(r for p in people for r in p.rows)]
         ],
     }
     return Report("conditions.html.j2", values)

@@ -19,7 +19,7 @@ def page(
         "reach": {"azimuth_deg": f"{max(h.AZIMUTHS_DEG):g}", "elevation_deg": f"{max(h.ELEVATIONS_DEG):g}"},
         "centres": _centres(apart[0]),
         "budget": budget_values(made_of, tuple(h.FEATURES)),
-        "observers": observers_values(apart, h.FEATURES),
+        "observers": observers_values(apart, tuple(h.FEATURES)),
         "rows": [
             (r.eye_model, r.observer, r.variant or "", number(r.mean_deg), number(r.sd_deg), str(r.n), str(r.missing))
             for part in parts

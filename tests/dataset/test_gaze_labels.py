@@ -100,7 +100,7 @@ def test_lines_of_version_3_are_exported_without_the_new_diameters():
 def test_rotation_centres_stay_in_the_head_and_do_not_move_when_the_eye_turns(who):
     """A pure turn in azimuth leaves the azimuth centre where it is; one in elevation the elevation centre."""
     scene = scene_of(**who)
-    head = {}
+    head: dict[tuple[int, str], list[float]] = {}
     for frames, row, labels in labels_of(scene):
         space, side = labels["space"], int(frames.index.eye[row])
         for name in ("azimuth_centre_mm", "elevation_centre_mm"):
@@ -135,7 +135,7 @@ def test_entrance_diameter_is_what_the_analytic_observer_sees_on_the_axis(who):
             focal_length_px=1000.0 * distance,
             resolution_px=(8000, 8000),
         )
-        rig = er.Rig(cameras=[camera], lights=scene.spec.rig.lights)
+        rig = er.Rig(cameras=(camera,), lights=scene.spec.rig.lights)
         seen = scene.with_({"subject.head_positions_mm": [[0, 0, 0]]}, gaze_deg=(0, 0), rig=rig)
         observed = er.trace(seen.frames(), boundary_points=180)
         row = int(np.flatnonzero(observed.index.eye == ("right", "left").index(side))[0])

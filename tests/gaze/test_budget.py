@@ -20,7 +20,7 @@ DEG_PER_PX = 0.05
 
 def scene_of(eyes=("right",), targets=TARGETS, model="E2"):
     camera = er.Camera.looking_at((0, 0, 0), position_mm=(600, 0, -200), focal_length_px=4000, size_px=(1280, 800))
-    rig = er.Rig(cameras=[camera], lights=[er.Led((600, 150, -200))], screen=er.Screen((600, 0, 0), (500, 300)))
+    rig = er.Rig(cameras=(camera,), lights=(er.Led((600, 150, -200)),), screen=er.Screen((600, 0, 0), (500, 300)))
     return er.Scene(er.Subject(er.Eye(model), eyes=list(eyes)), rig, targets=er.Targets(grid=targets))
 
 
@@ -179,7 +179,9 @@ def test_parts_are_those_of_an_analysis_of_variance():
 def test_error_vectors_are_angles_to_the_right_and_up():
     wanted = np.array([[1.0, 0, 0], [2.0, 0, 0], [1.0, 1, 0]])
     turned = np.array([[np.cos(0.1), -np.sin(0.1), 0], [np.cos(0.2), 0, np.sin(0.2)], [1.0, 1.0, 0.0]])
-    np.testing.assert_allclose(error_vectors_deg(turned, wanted), np.degrees([[0.1, 0], [0, 0.2], [0, 0]]), atol=1e-9)
+    np.testing.assert_allclose(
+        error_vectors_deg(turned, wanted), np.degrees(np.array([[0.1, 0], [0, 0.2], [0, 0]])), atol=1e-9
+    )
 
 
 def test_steps_of_other_frames_are_refused():
