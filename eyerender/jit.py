@@ -130,6 +130,7 @@ def _compile_missing(program: Program) -> None:
             one = subprocess.Popen([*command, str(k)], env=environment, stdin=null, stdout=null, stderr=null)
             workers.enter_context(one)  # it waits for the process at the end
         compile_share(Path(claims), 0, program)
+    with suppress(OSError):
         Path(FOLDER, program.complete).touch()
 
 

@@ -294,12 +294,13 @@ def _share_above(values: Floats, limit: float) -> float:
 @inlined
 def _deviation(values: Floats) -> float:
     """Standard deviation of values (n,)."""
-    mean = square = 0.0
+    total = square = 0.0
     for i in range(values.size):
-        mean += values[i] / values.size
+        total += values[i]
+    mean = total / values.size
     for i in range(values.size):
-        square += (values[i] - mean) * (values[i] - mean) / values.size
-    return math.sqrt(square)
+        square += (values[i] - mean) * (values[i] - mean)
+    return math.sqrt(square / values.size)
 
 
 @inlined
