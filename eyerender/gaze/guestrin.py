@@ -60,7 +60,19 @@ class GuestrinEizenman:
 
     def with_parameters(self, parameters: Mapping[int, EyeParameters]) -> Self:
         """Make an estimator with given parameters by eye (0 right, 1 left), without a calibration."""
-        known = {k: Calibration(p, p, "given", 0.0, 0, True, "given", ()) for k, p in parameters.items()}
+        known = {
+            k: Calibration(
+                parameters=p,
+                start=p,
+                objective="given",
+                cost=0.0,
+                evaluations=0,
+                converged=True,
+                message="given",
+                at_bound=(),
+            )
+            for k, p in parameters.items()
+        }
         return replace(self, calibrations=known)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
@@ -175,7 +187,7 @@ class GuestrinEizenman:
         return out
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Goals:
     """Targets (n) as points of planes.
 
@@ -203,14 +215,20 @@ class _Goals:
             wanted = targets_on_screen(observations, screen)
             # Targets that are farther off have been projected.
             off = np.where(np.abs(off) <= OFF_PLANE_MM * (1 + 1e-9), off, 0.0 * off)
-            return cls(screen.centre_mm, axes, wanted, off, None)
+            return cls(origin_mm=screen.centre_mm, axes=axes, wanted=wanted, off_plane=off, weight=None)
         line = targets - index.eye_position_mm - index.head_mm
         ahead = unit(line)
         right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
         axes = np.stack([right, np.cross(right, ahead), -ahead], axis=-1)
         distance = np.linalg.norm(line, axis=1, keepdims=True)
         weight = np.nanmean(distance) / distance
-        return cls(targets, axes, np.zeros((len(targets), 2)), 0.0 * distance[:, 0], weight)
+        return cls(
+            origin_mm=targets,
+            axes=axes,
+            wanted=np.zeros((len(targets), 2)),
+            off_plane=0.0 * distance[:, 0],
+            weight=weight,
+        )
 
     @property
     def known(self) -> Bools:
@@ -221,11 +239,11 @@ class _Goals:
         """Select rows."""
         of_screen = self.weight is None
         return _Goals(
-            self.origin_mm if of_screen else self.origin_mm[rows],
-            self.axes if of_screen else self.axes[rows],
-            self.wanted[rows],
-            self.off_plane[rows],
-            None if self.weight is None else self.weight[rows],
+            origin_mm=self.origin_mm if of_screen else self.origin_mm[rows],
+            axes=self.axes if of_screen else self.axes[rows],
+            wanted=self.wanted[rows],
+            off_plane=self.off_plane[rows],
+            weight=None if self.weight is None else self.weight[rows],
         )
 
     def local(self, vectors: Floats) -> Floats:

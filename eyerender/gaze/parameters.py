@@ -79,7 +79,7 @@ class ParameterBounds:
 HUMAN_BOUNDS = ParameterBounds()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
     """Calibrated parameters of one eye, and how the search ended.
 

@@ -459,7 +459,7 @@ def _restored(estimator: BuiltIn, eyes: dict[int, Any]) -> BuiltIn:
         for e, state in eyes.items():
             values = state.to_mapping()
             parameters, start = EyeParameters(**values.pop("parameters")), EyeParameters(**values.pop("start"))
-            found[e] = Calibration(parameters, start, **{**values, "at_bound": state.at_bound})
+            found[e] = Calibration(parameters=parameters, start=start, **{**values, "at_bound": state.at_bound})
         return replace(estimator, calibrations=found)
     if estimator.recalibration != "none":
         return replace(estimator, correction=Recalibration(estimator.recalibration, arrays("coefficients")))

@@ -78,7 +78,7 @@ PARAMETERS: tuple[tuple[str, str, float, str], ...] = (
 )
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class ConditionsPart:
     """Results of one eye model; errors in degrees.
 
@@ -140,7 +140,7 @@ class _Tracker:
 
 def conditions_part(eye: str) -> ConditionsPart:
     """Compute all conditions for one eye model."""
-    out = ConditionsPart(eye)
+    out = ConditionsPart(eye_model=eye)
     for name in TRACKERS:
         tracker, seen = _calibrated(_scene(name, eye))
         errors = tracker.errors_deg(seen)

@@ -151,7 +151,7 @@ class _Blignaut:
         return [m for m in wanted if m in self.error]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Test:
     """A tested statement of [29]."""
 
@@ -170,7 +170,15 @@ NEGLIGIBLE_DEG, ALIKE_DEG, ACCEPTABLE_DEG = 0.01, 0.05, 1.0
 
 
 def _test(id: str, rule: str, value: float, threshold: str, verdict: bool, detail: str, key: str = "") -> _Test:
-    return _Test(id, rule, value, threshold, verdict, detail, lit.SENTENCES[key or id])
+    return _Test(
+        id=id,
+        rule=rule,
+        value=value,
+        threshold=threshold,
+        verdict=verdict,
+        detail=detail,
+        sentence=lit.SENTENCES[key or id],
+    )
 
 
 def _mean(outcome: Outcome | None) -> float:

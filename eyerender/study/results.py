@@ -21,7 +21,7 @@ SUMMARY_SCHEMA = "eyerender/study-summary/1"
 FINDINGS_SCHEMA = "eyerender/study-findings/2"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
     """One mean error; keys that do not apply are None.
 
