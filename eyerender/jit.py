@@ -97,7 +97,7 @@ class Program(NamedTuple):
 EXTRACTOR = Program("the extractor", ABOUT_S, ("eyerender.extraction",), "eyerender.extraction.compile", "complete")
 RAYS = Program(
     "the ray optics",
-    10,
+    15,
     ("eyerender.geometry", "eyerender.optics", "eyerender.eye", "eyerender.analytic"),
     "eyerender.analytic.compile",
     "complete-rays",
