@@ -181,7 +181,7 @@ def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> 
         raise InputError("must be different numbers from 1 to 4", path="purkinje")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _View:
     """View of one camera on a chunk of turned eyes: x_cam = R x_eye + t for each, and the camera in the eye frame."""
 
@@ -197,18 +197,24 @@ class _View:
         whole = shift + position_mm
         rotation, translation, at = np.empty(turn.shape), np.empty(shift.shape), np.empty(shift.shape[::-1])
         see_all(turn, whole, np.array(camera.R), np.array(camera.t), rotation, translation, at)
-        return cls(rotation, translation, (at[0], at[1], at[2]), (turn, whole), camera)
+        return cls(
+            rotation=rotation,
+            translation=translation,
+            camera_mm=(at[0], at[1], at[2]),
+            motion=(turn, whole),
+            camera=camera,
+        )
 
     def rows(self, part: slice) -> _View:
         """View of some of the eyes."""
         x, y, z = self.camera_mm
         turn, shift = self.motion
         return _View(
-            self.rotation[part],
-            self.translation[part],
-            (x[part], y[part], z[part]),
-            (turn[part], shift[part]),
-            self.camera,
+            rotation=self.rotation[part],
+            translation=self.translation[part],
+            camera_mm=(x[part], y[part], z[part]),
+            motion=(turn[part], shift[part]),
+            camera=self.camera,
         )
 
     def into_eye(self, points_mm: Floats) -> Xyz:

@@ -39,7 +39,7 @@ RANKED_SUBJECTS = 1_000_000
 _LOOKED_AT = 16  # samples that `Plan.warnings` checks for probable mistakes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sample:
     """One sample as drawn.
 
@@ -90,7 +90,7 @@ class Sample:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """A dataset spec with the eyes it names, and checksums of the files that it names, including eye files.
 
@@ -165,7 +165,7 @@ class Plan:
                 raise
         folder = (Path.cwd() if base is None else base).resolve()
         sums |= sums_of_files(spec.scene, folder)
-        plan = cls(spec, eyes, dict(sorted(sums.items())), folder, source)
+        plan = cls(spec=spec, eyes=eyes, files=dict(sorted(sums.items())), base=folder, source=source)
         for name in spec.eye_parameters:
             if name not in eyes:
                 raise InputError("no sample uses this eye", source=source, path=f"eye_parameters.{name}")
@@ -199,7 +199,9 @@ class Plan:
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any], base: Path) -> Plan:
         """Make the plan of another process, its files relative to `base`."""
-        return cls(DatasetSpec.from_mapping(data["spec"]), data["eyes"], data.get("files", {}), base)
+        return cls(
+            spec=DatasetSpec.from_mapping(data["spec"]), eyes=data["eyes"], files=data.get("files", {}), base=base
+        )
 
     def warnings(self) -> list[InputWarning]:
         """Probable mistakes in the scenes of some samples, spread over the dataset; each is reported once."""
@@ -299,7 +301,15 @@ class Plan:
         if "seed" not in tree:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
         eye, eye_drawn, modified = self._eye_of(tree, turn)
-        return Sample(turn, self.split_of(subject), tree, eye, modified, drawn | eye_drawn, self.base)
+        return Sample(
+            turn=turn,
+            split=self.split_of(subject),
+            scene=tree,
+            eye=eye,
+            modified=modified,
+            draws=drawn | eye_drawn,
+            base=self.base,
+        )
 
     def _scene_of(self, turn: Turn) -> tuple[dict[str, Any], dict[str, Any]]:
         tree, drawn = self.scene_template.values(turn)

@@ -41,7 +41,7 @@ class Events(Protocol):
         """Report that a shard's worker ended, and that the shard is tried again."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Worker:
     process: BaseProcess
     pipe: Connection
@@ -133,7 +133,7 @@ class LocalPool:
         with _environment(self.job.threads), signals_held(), caller_hidden():
             process.start()
         theirs.close()
-        self._workers.append(_Worker(process, ours, f"{process.pid}", time.monotonic()))
+        self._workers.append(_Worker(process=process, pipe=ours, name=f"{process.pid}", heard=time.monotonic()))
 
     def _listen(self, worker: _Worker, events: Events) -> str | None:
         """Receive a worker's messages; return the reason why it must be ended, if there is one."""

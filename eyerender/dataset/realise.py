@@ -32,7 +32,7 @@ class Rejection:
     of: str = "sample"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Realised:
     """A sample with its analytic observations; `sample` is None where it was given up."""
 
@@ -130,7 +130,13 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
     try:
         reasons = plan.identity(subject)[1]
     except InputError as error:
-        return Realised(index, None, None, None, (Rejection(index, 0, str(error), "subject"),))
+        return Realised(
+            index=index,
+            sample=None,
+            frames=None,
+            observations=None,
+            rejections=(Rejection(index, 0, str(error), "subject"),),
+        )
     if sequence == 0:
         rejections += [Rejection(index, k, reason, "subject") for k, reason in enumerate(reasons)]
     last = None
@@ -153,8 +159,8 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
             reason = f"{error.path}: {error.reason}" if error.path else error.reason
             rejections.append(Rejection(index, attempt, reason))
             continue
-        return Realised(index, sample, posed, found, tuple(rejections))
-    return Realised(index, None, None, None, tuple(rejections))
+        return Realised(index=index, sample=sample, frames=posed, observations=found, rejections=tuple(rejections))
+    return Realised(index=index, sample=None, frames=None, observations=None, rejections=tuple(rejections))
 
 
 def frames_of(plan: Plan) -> int:

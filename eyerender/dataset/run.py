@@ -117,7 +117,7 @@ def _generate(
         with run_lock(folder, part, say):
             if options.overwrite and n == 1:
                 clear(folder)
-            run = _Run(plan, folder, options, part, frames, progress, say)
+            run = _Run(plan=plan, folder=folder, options=options, part=part, frames=frames, progress=progress, say=say)
             with final_lock(folder, say):
                 resumed = begin(folder, plan, run.repaired)
             try:
@@ -154,7 +154,7 @@ def worker_count(options: RunOptions, shards: int) -> tuple[int, int]:
     return workers, max(1, cpus // workers)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Run:
     """One run, which also receives the engine's reports."""
 

@@ -20,7 +20,7 @@ FAILURES: dict[str, type[EyerenderError]] = {"backend": BackendError, "input": I
 """What the parent raises for each kind of failure; one of another kind may be tried again."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
     """What every worker of a run is told.
 
@@ -38,7 +38,14 @@ class Job:
     @classmethod
     def of(cls, plan: Plan, frames: int, folder: Path, backend: str, threads: int) -> Job:
         """Make the job of a plan."""
-        return cls(plan.to_mapping(), str(plan.base), frames, str(folder.resolve()), backend, threads)
+        return cls(
+            plan=plan.to_mapping(),
+            base=str(plan.base),
+            frames=frames,
+            folder=str(folder.resolve()),
+            backend=backend,
+            threads=threads,
+        )
 
     def maker(self) -> Maker:
         """Make the worker's maker."""

@@ -47,7 +47,7 @@ WINDOW_POINTS = 6
 _STEPS = 20
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Fixations(ArrayValue):
     """A batch of fixations, leading axis n.
 
@@ -98,7 +98,13 @@ def fixations(
             angles[part] = np.stack([poses.azimuth_rad, poses.elevation_rad, poses.torsion_rad], axis=-1)
             residual[part], status[part] = found.residual_mm, found.status
             point[part], way[part] = found.line_of_sight_mm, found.line_of_sight_direction
-    return Fixations(Poses(*angles.T), frozen(residual), frozen(status, np.int8), frozen(point), frozen(way))
+    return Fixations(
+        poses=Poses(*angles.T),
+        residual_mm=frozen(residual),
+        status=frozen(status, np.int8),
+        line_of_sight_mm=frozen(point),
+        line_of_sight_direction=frozen(way),
+    )
 
 
 def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKind = "chief_ray") -> Fixations:
@@ -132,11 +138,11 @@ def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
     status[(status == Status.OK) & ~(ahead > 0.0)] = Status.TARGET_TOO_NEAR
     poses = Poses.listing(azimuth, elevation)
     return Fixations(
-        poses,
-        miss,
-        status,
-        np.broadcast_to(point, target_mm.shape),
-        np.broadcast_to(direction, target_mm.shape),
+        poses=poses,
+        residual_mm=miss,
+        status=status,
+        line_of_sight_mm=np.broadcast_to(point, target_mm.shape),
+        line_of_sight_direction=np.broadcast_to(direction, target_mm.shape),
     )
 
 
@@ -174,7 +180,13 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
         ok, _status(target_mm, azimuth=angles[:, 0], elevation=angles[:, 1], residual=residual), start.status
     ).astype(np.int8)
     status[ok & lost] = Status.NO_LINE_OF_SIGHT
-    return Fixations(Poses.listing(angles[:, 0], angles[:, 1]), residual, status, entry, way)
+    return Fixations(
+        poses=Poses.listing(angles[:, 0], angles[:, 1]),
+        residual_mm=residual,
+        status=status,
+        line_of_sight_mm=entry,
+        line_of_sight_direction=way,
+    )
 
 
 def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floats, Floats, Floats, Bools]:

@@ -63,7 +63,7 @@ class FundusLight(ArrayValue):
         return np.asarray((1 - t) * low + t * high)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
     """How the fundus returns light.
 

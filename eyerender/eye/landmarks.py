@@ -28,12 +28,12 @@ def path_to_retina(eye: EyeModel) -> tuple[Crossing, ...]:
     last = eye.back_indices[-1] if eye.back else eye.front_indices[-1]
     lens = zip(eye.back, eye.back_indices, eye.back_rims_mm, eye.back_passing, _through(eye, 1), strict=True)
     return (
-        *(Crossing(s, n) for s, n in zip(eye.front, eye.front_indices, strict=True)),
+        *(Crossing(surface=s, n_after=n) for s, n in zip(eye.front, eye.front_indices, strict=True)),
         *(
-            Crossing(s, n, rim_mm=rim, beyond_rim=None if passing else Status.MISSED, through=through)
+            Crossing(surface=s, n_after=n, rim_mm=rim, beyond_rim=None if passing else Status.MISSED, through=through)
             for s, n, rim, passing, through in lens
         ),
-        Crossing(eye.retina, last),
+        Crossing(surface=eye.retina, n_after=last),
     )
 
 
@@ -148,7 +148,12 @@ def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
     if eye.back:
         path = [
             Crossing(
-                surface, n, inward=False, rim_mm=rim, beyond_rim=None if passing else Status.MISSED, through=through
+                surface=surface,
+                n_after=n,
+                inward=False,
+                rim_mm=rim,
+                beyond_rim=None if passing else Status.MISSED,
+                through=through,
             )
             for surface, n, rim, passing, through in zip(
                 reversed(eye.back),

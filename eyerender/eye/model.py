@@ -141,7 +141,7 @@ class LineOfSight(ArrayValue):
     direction: Floats
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EyeModel(ArrayValue):
     """An eye in the eye frame, at one wavelength and with one pupil.
 

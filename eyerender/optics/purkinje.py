@@ -85,13 +85,29 @@ def purkinje_path(
     def crossing(k: int, n_after: FloatLike, inward: bool) -> Crossing:
         edge = Status.OUTSIDE_LIMBUS if k == 0 else Status.MISSED
         through = gradient if k == last - 1 and not inward else None
-        return Crossing(surfaces[k], n_after, inward, False, rims_mm[k], None if passing[k] else edge, through)
+        return Crossing(
+            surface=surfaces[k],
+            n_after=n_after,
+            inward=inward,
+            reflects=False,
+            rim_mm=rims_mm[k],
+            beyond_rim=None if passing[k] else edge,
+            through=through,
+        )
 
     last = len(surfaces) - 1
     before = [n_outside, *indices]
     return (
         *(crossing(k, indices[k], True) for k in range(last)),
-        Crossing(surfaces[last], 1.0, True, True, rims_mm[last], Status.NO_MIRROR_POINT, gradient),
+        Crossing(
+            surface=surfaces[last],
+            n_after=1.0,
+            inward=True,
+            reflects=True,
+            rim_mm=rims_mm[last],
+            beyond_rim=Status.NO_MIRROR_POINT,
+            through=gradient,
+        ),
         *(crossing(k, before[k], False) for k in reversed(range(last))),
     )
 

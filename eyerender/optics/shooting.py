@@ -386,13 +386,13 @@ def taken(crossing: Crossing, frame: Indices) -> Crossing:
     """Gather the per-eye parameters of a crossing for single rays."""
     n_after, rim = crossing.n_after, crossing.rim_mm
     return Crossing(
-        crossing.surface.take(frame),
-        n_after if np.ndim(n_after) == 0 else np.asarray(n_after)[frame],
-        crossing.inward,
-        crossing.reflects,
-        rim if np.ndim(rim) == 0 else np.asarray(rim)[frame],
-        crossing.beyond_rim,
-        None if crossing.through is None else crossing.through.take(frame),
+        surface=crossing.surface.take(frame),
+        n_after=n_after if np.ndim(n_after) == 0 else np.asarray(n_after)[frame],
+        inward=crossing.inward,
+        reflects=crossing.reflects,
+        rim_mm=rim if np.ndim(rim) == 0 else np.asarray(rim)[frame],
+        beyond_rim=crossing.beyond_rim,
+        through=None if crossing.through is None else crossing.through.take(frame),
     )
 
 

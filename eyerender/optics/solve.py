@@ -138,7 +138,7 @@ def refracted_rays(
 ) -> Rays:
     """Compute `apparent_points` on components."""
     path = [
-        Crossing(surface, index, rim_mm=rim_mm if k == 0 else np.inf, beyond_rim=Status.OUTSIDE_LIMBUS)
+        Crossing(surface=surface, n_after=index, rim_mm=rim_mm if k == 0 else np.inf, beyond_rim=Status.OUTSIDE_LIMBUS)
         for k, (surface, index) in enumerate(zip(surfaces, indices, strict=True))
     ]
     graphs = graphs_of(*surfaces)
@@ -154,7 +154,7 @@ def refracted_rays(
 
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
     """Compute `mirror_points` on components."""
-    path = (Crossing(surface, 1.0, reflects=True, rim_mm=rim_mm, beyond_rim=Status.OUTSIDE_LIMBUS),)
+    path = (Crossing(surface=surface, n_after=1.0, reflects=True, rim_mm=rim_mm, beyond_rim=Status.OUTSIDE_LIMBUS),)
     graphs = graphs_of(surface)
     if graphs is None:
         return _from_connection(connect(path, 1.0, viewpoint, source, components(apex_of(surface))))

@@ -15,7 +15,7 @@ from .gradient import GradientMedium
 from .interface import dot, moved, reflect, refract, unit
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Crossing:
     """How a ray crosses a surface.
 
@@ -61,7 +61,7 @@ class Traced(ArrayValue):
 
 def inward_path(surfaces: Sequence[Surface], indices: Sequence[FloatLike]) -> tuple[Crossing, ...]:
     """Refraction at `surfaces`, listed from outside in, with the index behind each."""
-    return tuple(Crossing(surface, index) for surface, index in zip(surfaces, indices, strict=True))
+    return tuple(Crossing(surface=surface, n_after=index) for surface, index in zip(surfaces, indices, strict=True))
 
 
 def outward_path(
@@ -69,7 +69,9 @@ def outward_path(
 ) -> tuple[Crossing, ...]:
     """Refraction at the same surfaces (listed from outside in) on the way out."""
     behind = [n_outside, *indices[:-1]]
-    return tuple(Crossing(s, n, inward=False) for s, n in zip(reversed(surfaces), reversed(behind), strict=True))
+    return tuple(
+        Crossing(surface=s, n_after=n, inward=False) for s, n in zip(reversed(surfaces), reversed(behind), strict=True)
+    )
 
 
 def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> Traced:

@@ -37,7 +37,7 @@ _FEW = 32
 _TAG = 0x9E0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Conditions:
     """Conditions, sorted by how they are met.
 

@@ -42,7 +42,7 @@ _NEWTON = 8
 Power = tuple[Floats, Floats, Floats]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Optics(ArrayValue):
     """What makes eyes have their refraction, (...,) each.
 
@@ -108,7 +108,15 @@ def solve(eyes: Biometry) -> Optics:
     front = (before[0] - at_cornea[0], before[1] - at_cornea[1], before[2] - at_cornea[2])
     flat, steep, axis = _principal(front, cornea - 1.0)
     p_flat, p_steep, p_axis = _principal(back, aqueous - cornea)
-    return Optics(steep, flat, axis, p_steep, p_flat, p_axis, _lens(eyes, behind))
+    return Optics(
+        steep_mm=steep,
+        flat_mm=flat,
+        flat_axis_deg=axis,
+        posterior_steep_mm=p_steep,
+        posterior_flat_mm=p_flat,
+        posterior_flat_axis_deg=p_axis,
+        lens_c0=_lens(eyes, behind),
+    )
 
 
 def _lens(eyes: Biometry, behind: Floats) -> Floats:

@@ -55,7 +55,7 @@ class Moments:
         return (self.mean - self.expected_mean) / self.mean_error, (self.sd - self.expected_sd) / self.sd_error
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PairStatistic:
     """Correlation of two quantities of the right eyes as drawn and as expected, with its source."""
 
@@ -73,7 +73,7 @@ class PairStatistic:
         return (self.r - self.expected) / self.error
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Survey:
     """Statistics of n people."""
 
@@ -143,7 +143,13 @@ def survey(population: PopulationSpec, n: int, seed: int = 0) -> Survey:
         )
         for k, name in enumerate(names)
     )  # fmt: skip
-    return Survey(n, moments, tuple(_pairs(model, names, correlation, n, plain)), names, correlation)
+    return Survey(
+        n=n,
+        moments=moments,
+        pairs=tuple(_pairs(model, names, correlation, n, plain)),
+        names=names,
+        correlation=correlation,
+    )
 
 
 def refusals(population: PopulationSpec, n: int, seed: int = 0, *, progress: Progress | None = None) -> Refusals:
@@ -191,4 +197,12 @@ def _pairs(model: Model, names: tuple[str, ...], correlation: Floats, n: int, pl
             i, j = (names.index(name) for name in pair.pair)
             expected = model.expected_correlation(*pair.pair) if plain else float(correlation[i, j])
             r = float(correlation[i, j])
-            yield PairStatistic(pair.pair, r, (1 - r * r) / np.sqrt(n - 1), expected, pair.r, pair.mark, pair.text)
+            yield PairStatistic(
+                pair=pair.pair,
+                r=r,
+                error=(1 - r * r) / np.sqrt(n - 1),
+                expected=expected,
+                told=pair.r,
+                mark=pair.mark,
+                text=pair.text,
+            )

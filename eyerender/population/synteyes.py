@@ -50,7 +50,7 @@ _EMMETROPIC_MM, _AZIMUTH_MM, _ELEVATION_MM, _PER_MM = 23.58, 14.7, 12.0, 0.5
 _ROOT_GAP_MM, _LIMBUS_GAP_MM = 0.1, 0.3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SyntEye(ArrayValue):
     """One drawn eye.
 
@@ -98,7 +98,7 @@ class SyntEye(ArrayValue):
         return float(real[np.argmin(np.abs(real - 1.42))]) if len(real) else float("nan")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SyntEyes(ArrayValue):
     """The statistical model.
 
@@ -143,14 +143,14 @@ class SyntEyes(ArrayValue):
         factors = np.stack([_factor(arrays[name]) for name in ("cov_orig0", "cov_orig1")])
         lens = arrays[_LENS_TERMS].reshape(-1)
         return cls(
-            read_only(weights / weights.sum()),
-            read_only(arrays["mu_orig"]),
-            read_only(factors),
-            read_only(arrays["conv_ec_orig"]),
-            read_only(arrays["avg_ec_orig"]),
-            read_only(lens[:28]),
-            read_only(arrays["mu_retina_radii"]),
-            read_only(arrays["cov_retina_radii"]),
+            weights=read_only(weights / weights.sum()),
+            means=read_only(arrays["mu_orig"]),
+            factors=read_only(factors),
+            corneas=read_only(arrays["conv_ec_orig"]),
+            mean_cornea=read_only(arrays["avg_ec_orig"]),
+            lens_mm=read_only(lens[:28]),
+            retina_mean=read_only(arrays["mu_retina_radii"]),
+            retina_covariance=read_only(arrays["cov_retina_radii"]),
         )
 
     def draw(self, subject: int, seed: int = 0, **keys: Any) -> tuple[SyntEye, EyeSpec]:

@@ -116,7 +116,7 @@ def test_single_rays_agree_with_the_reference():
         assert np.abs(both.directions[1] - ray["refract_dir"]).max() < 1e-12
         assert np.abs(both.points_mm[2] - np.array(ray["two_surface_inner_point"]) * 1e3).max() < 1e-9
         assert np.abs(both.directions[2] - ray["two_surface_dir"]).max() < 1e-12
-        mirror = trace([Crossing(outer, 1.0, reflects=True)], 1.0, start, ray["dir"])
+        mirror = trace([Crossing(surface=outer, n_after=1.0, reflects=True)], 1.0, start, ray["dir"])
         assert np.abs(mirror.directions[1] - ray["reflect_dir"]).max() < 1e-12
 
 

@@ -68,8 +68,8 @@ def test_the_optical_path_is_index_times_length(skew):
 def test_every_status_is_told_apart():
     cornea, stop = Quadric.conic(7.8, -0.25), Quadric.plane((-3.6, 0.0, 0.0))
     inward = (
-        Crossing(cornea, 1.3375, rim_mm=5.85, beyond_rim=Status.OUTSIDE_LIMBUS),
-        Crossing(stop, 1.3375, rim_mm=2.0, beyond_rim=Status.BEHIND_IRIS),
+        Crossing(surface=cornea, n_after=1.3375, rim_mm=5.85, beyond_rim=Status.OUTSIDE_LIMBUS),
+        Crossing(surface=stop, n_after=1.3375, rim_mm=2.0, beyond_rim=Status.BEHIND_IRIS),
     )
     start = np.array([[20.0, y, 0.0] for y in (0.5, 4.5, 6.5, 30.0)])
     traced = trace(inward, 1.0, start, np.broadcast_to([-1.0, 0.0, 0.0], start.shape))
@@ -86,7 +86,7 @@ def test_every_status_is_told_apart():
 
 
 def test_a_ray_passes_a_shell_that_it_does_not_reach():
-    shell = Crossing(Quadric.conic(8.0), 1.5, rim_mm=1.0, beyond_rim=None)
+    shell = Crossing(surface=Quadric.conic(8.0), n_after=1.5, rim_mm=1.0, beyond_rim=None)
     traced = trace([shell], 1.3, [[5.0, 0.5, 0.0], [5.0, 2.0, 0.0]], np.broadcast_to([-1.0, 0.0, 0.0], (2, 3)))
     assert (traced.status == Status.OK).all()
     assert np.array_equal(traced.directions[1, 1], [-1.0, 0.0, 0.0])

@@ -53,7 +53,9 @@ def test_pupil_has_the_return_factor_of_the_fundus(renderer, angle_deg):
     job = coaxial_job(angle_deg, alive, focus_dpt=1e3 / DISTANCE)
     eye = job.eye
     lamps = np.array([job.M.T @ (job.lights[0].position_mm - job.t)])
-    spread = Spread(0.115, 0.7, np.radians(1.2), np.radians(0.05), 1.0)
+    spread = Spread(
+        reflectance=0.115, halo_share=0.7, halo_rad=np.radians(1.2), blur_rad=np.radians(0.05), disc_gain=1.0
+    )
     camera = job.M.T @ (job.camera.nodal_point_mm - job.t)
     factor = fundus_light(eye, lamps, camera, 1e3 / DISTANCE, spread).at(0, np.zeros(1), np.zeros(1))[0]
     matte_level = pupil_level(renderer, coaxial_job(angle_deg, matte))

@@ -306,7 +306,7 @@ class GlintScene:
                 point=seen.point, normal=seen.normal, arrives=seen.arrives, leaves=seen.leaves,
                 cross_section=seen.cross_section, found=found, there=there,
             )  # fmt: skip
-        mirror = (Crossing(self.surface, 1.0, reflects=True),)
+        mirror = (Crossing(surface=self.surface, n_after=1.0, reflects=True),)
         J = ray_tube(mirror, 1.0, node, rays.way, lamp).cross_section_mm2_sr
         return _Reflections(
             point=y, normal=self.surface.normal(y), arrives=d, leaves=w, cross_section=J, found=found,
