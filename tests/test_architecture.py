@@ -175,6 +175,66 @@ def test_no_circle_of_imports_inside_packages():
     assert [c for c in circles(graph) if not all(m.startswith("eyerender.cli") for m in c)] == []
 
 
+# Why a function or a record may be larger than the limits of `test_functions_and_records_are_of_a_size_to_read`.
+LARGE = {
+    # Every option of a public call is a keyword, and the command line gives them by name.
+    "dataset.run.generate": "options of a run",
+    "torch.__init__": "options of a loader",
+    "analytic.features.features": "options of an observation",
+    # Kernels take arrays, not records.
+    "optics.fermat_kernels.refract_all": "a kernel",
+    "optics.mirror_kernels.mirror_all": "a kernel",
+    "analytic.view_kernels.project_all": "a kernel",
+    "report.eye_section._curve": "a curve and its style",
+    "report.overlay.eye_picture": "a picture and its style",
+    # Each is one list: of fields of a file, of findings, or of cases of a search.
+    "optics.shooting._shoot": "one search with its cases",
+    "population.synteyes.eye_file": "fields of an eye file",
+    "gaze.table._observations": "columns of a table",
+    "study.findings.guestrin": "a list of findings",
+}
+# Records that are rebuilt from a tuple of their fields (batches of surfaces, results of compiled functions), or whose
+# first fields users give in order.
+POSITIONAL = {
+    "Biconic", "Budget", "Descent", "EyeImage", "EyePicture", "FeatureDifference", "Finding", "GazeDifference",
+    "GradientMedium", "GridSurface", "GuestrinEizenman", "GuestrinPart", "LabelledImage", "LashPlan", "ModelResults",
+    "Moments", "Outcome", "Patch", "Pixels", "Place", "Quadric", "Reference", "Regression", "Scene", "Score", "Stop",
+    "Sums", "Surface", "Term", "Visible", "ZernikeSurface", "_Table",
+}  # fmt: skip
+
+
+def sizes(path: Path):
+    """(name, lines of the body without docstring, parameters) of every function."""
+    module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            body = node.body[1:] if ast.get_docstring(node) is not None else node.body
+            lines = body[-1].end_lineno - body[0].lineno + 1 if body else 0  # type: ignore[operator]
+            names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            yield f"{module}.{node.name}", lines, len(names) - (names[:1] in (["self"], ["cls"]))
+
+
+def positional_records(path: Path):
+    """Names of the dataclasses with more than four fields whose fields may be given in order."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ClassDef):
+            made = [ast.unparse(d) for d in node.decorator_list if ast.unparse(d).startswith("dataclass")]
+            fields = [
+                n for n in node.body if isinstance(n, ast.AnnAssign) and "ClassVar" not in ast.unparse(n.annotation)
+            ]
+            if made and len(fields) > 4 and "kw_only=True" not in made[0]:
+                yield node.name
+
+
+def test_functions_and_records_are_of_a_size_to_read():
+    """Bodies of at most 60 lines, at most 8 parameters (but for commands), and large records by keyword."""
+    found = [one for path in modules() for one in sizes(path)]
+    long = {name for name, lines, _ in found if lines > 60}
+    wide = {name for name, _, count in found if count > 8 and not name.startswith("cli.")}
+    assert long | wide == LARGE.keys()
+    assert {name for path in modules() for name in positional_records(path)} == POSITIONAL
+
+
 @pytest.mark.parametrize(
     ("libraries", "homes"),
     [
