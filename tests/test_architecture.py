@@ -209,7 +209,7 @@ def sizes(path: Path):
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             body = node.body[1:] if ast.get_docstring(node) is not None else node.body
-            lines = body[-1].end_lineno - body[0].lineno + 1 if body else 0  # type: ignore[operator]
+            lines = body[-1].end_lineno - body[0].lineno + 1 if body else 0
             names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
             yield f"{module}.{node.name}", lines, len(names) - (names[:1] in (["self"], ["cls"]))
 

@@ -7,7 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.support.quick import PLACE, listed
+
+pytestmark = pytest.mark.packaging
 
 TESTS = """
 import time
@@ -34,8 +38,6 @@ def test_marked(): burn(0.25)
 CONFTEST = """
 from pathlib import Path
 from tests.support.quick import Quick, Recorder, listed
-
-pytestmark = pytest.mark.packaging
 
 LIST = Path("list.txt")
 

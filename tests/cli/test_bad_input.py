@@ -131,7 +131,7 @@ TABLE = [
     (
         ["gaze", "fit", "f.json", "--estimator", "magic", "-o", "c.json"],
         2,
-        "--estimator: must be one of regression, homog",
+        "--estimator: must be one of regression, direction-regression, homog",
     ),
     (["gaze", "fit", "f.json", "--estimator", "a:b:c", "-o", "c.json"], 2, "or module:Class, not 'a:b:c'"),
     (
