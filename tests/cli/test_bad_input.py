@@ -358,6 +358,7 @@ def command(*argv, env=None, **keys):
     )
 
 
+@pytest.mark.packaging
 @pytest.mark.render
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_says_so_and_leaves_nothing(place, tmp_path_factory, number):
@@ -373,6 +374,7 @@ def test_an_interrupted_run_says_so_and_leaves_nothing(place, tmp_path_factory, 
     assert not Path("out").exists()
 
 
+@pytest.mark.packaging
 @pytest.mark.render
 def test_a_run_in_the_background_of_a_script_is_ended_with_sigterm(place, capsys):
     """A shell without job control lets what it starts with & ignore SIGINT."""
@@ -396,6 +398,7 @@ def test_a_run_in_the_background_of_a_script_is_ended_with_sigterm(place, capsys
     assert not [path for path in Path("out").rglob("*") if path.name.endswith(".part")]
 
 
+@pytest.mark.packaging
 @pytest.mark.render
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="mounting a tmpfs needs root")
 def test_a_full_disk_ends_with_one_line_and_nothing_written(place):

@@ -78,6 +78,7 @@ def dry_run(spec, capsys, *options):
     return text, json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.packaging
 def test_a_dry_run_uses_the_last_rate_of_the_spec(spec, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     text, found = dry_run(spec, capsys)

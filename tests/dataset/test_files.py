@@ -179,6 +179,7 @@ def made(tmp_path_factory):
     return place
 
 
+@pytest.mark.packaging
 @pytest.mark.render
 def test_paths_start_at_the_spec_wherever_the_command_and_its_workers_run(made, tmp_path):
     """From another folder, of a copy elsewhere, by two workers, in parts: the same bytes, the run's record included."""
@@ -271,6 +272,7 @@ def test_a_run_is_not_gone_on_with_when_a_file_has_changed(made, tmp_path, capsy
     assert tree(folder) == tree(made / "out")
 
 
+@pytest.mark.packaging
 @pytest.mark.render
 def test_a_file_that_changes_while_a_run_is_at_work_ends_it(made, tmp_path):
     """The shards that were finished before stay, and with the old content back the run ends as it would have."""
@@ -315,6 +317,7 @@ def test_eye_files_are_files_of_the_run(tmp_path, monkeypatch):
     assert Plan.load("dataset_quick").files == {}
 
 
+@pytest.mark.packaging
 @pytest.mark.render
 def test_an_eye_file_that_changes_while_a_run_is_at_work_ends_it(tmp_path, monkeypatch):
     load_eye("E2").dump(tmp_path / "mine.yaml")

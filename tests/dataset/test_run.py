@@ -170,6 +170,7 @@ def test_two_runs_exclude_each_other(tmp_path):
                 make(tmp_path, plan(), part=part)
 
 
+@pytest.mark.packaging
 def test_a_crashed_worker_is_replaced(tmp_path):
     listener = Listener(lambda pid: os.kill(pid, signal.SIGABRT))
     assert pool(tmp_path).run([0, 1], listener) == {}
@@ -226,6 +227,7 @@ class Troubled(LocalPool):
             self._workers[-1].process.kill()
 
 
+@pytest.mark.packaging
 def test_only_deaths_one_after_the_other_end_a_run(tmp_path):
     listener = Listener()
     assert Troubled(tmp_path, (1, 2, 4, 5)).run([0, 1], listener) == {}
@@ -267,6 +269,7 @@ def test_samples_given_up_are_recorded(tmp_path):
     assert all("cannot fixate" in f["reason"] for f in failures)
 
 
+@pytest.mark.packaging
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_an_interrupted_run_says_so_and_can_go_on(tiny, tmp_path, number):
     spec, folder = write(tmp_path / "tiny.yaml"), tmp_path / "out"
@@ -334,6 +337,7 @@ def kill_at_random(tmp_path: Path, kills: int, seed: int) -> Path:
     return folder
 
 
+@pytest.mark.packaging
 def test_a_killed_run_ends_with_the_same_bytes(tiny, tmp_path):
     folder = kill_at_random(tmp_path, 1, seed=1)
     assert tree(folder) == tree(tiny)

@@ -137,6 +137,7 @@ make_images("small", small_scenes(), Path({folder!r}), StudyOptions(workers=1))
 """
 
 
+@pytest.mark.packaging
 @pytest.mark.render
 def test_a_killed_run_goes_on_where_it_was(tmp_path):
     folder = tmp_path / "killed"
