@@ -84,7 +84,7 @@ def api_section(module: str, names: list[str]) -> str:
     lines = ["```{eval-rst}", f".. currentmodule:: {module}", "", ".. autosummary::", "", table, ""]
     for name in names:
         found = getattr(sys.modules[module], name)
-        kind = "class" if isinstance(found, type) else "function"
+        kind = "class" if isinstance(found, type) else "function" if callable(found) else "data"
         if isinstance(found, type) and issubclass(found, Exception):
             kind = "exception"
         lines += [f".. auto{kind}:: {name}", *(["   :members:"] if kind == "class" else []), ""]
@@ -100,4 +100,4 @@ def write(folder: Path) -> None:
 
 def names_on(text: str) -> set[str]:
     """The public names that a page of the API documents."""
-    return set(re.findall(r"^\.\. auto(?:class|function|exception):: (\w+)", text, re.MULTILINE))
+    return set(re.findall(r"^\.\. auto(?:class|function|exception|data):: (\w+)", text, re.MULTILINE))
