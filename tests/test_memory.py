@@ -172,7 +172,9 @@ folder = ImageFolder.load({path!r})
 assert sum(1 for entry in folder.entries if entry.window[2]) == {count}
 assert folder.entries[-1].name == "images/{last:07d}.png"
 """
-VALIDATE = """from eyerender.dataset.validate import validate
+VALIDATE = """import eyerender as er
+er.trace(er.load_scene("quickstart"))  # loads the compiled ray optics, whose size does not depend on the folder
+from eyerender.dataset.validate import validate
 
 report = validate({path!r}, quick=True)
 assert report["problem_count"] > {count}
