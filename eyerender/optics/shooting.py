@@ -25,20 +25,13 @@ import numpy as np
 from ..arrays import Bools, FloatLike, Floats, Indices, Statuses
 from ..geometry.surfaces import Xyz, fit
 from ..status import Status, mark
+from .fermat_kernels import FAR_MM, RESIDUAL_LIMIT_MM
 from .interface import dot, minus, moved, unit
 from .trace import BEHIND_MM, Crossing, inside_rim
 
 SETTLED_MM = 1e-12
 """Newton stops where a ray misses by no more than this and what one rounding of the direction makes at the target."""
 ROUNDING_RAD = 4e-16
-RESIDUAL_LIMIT_MM = 1e-9
-"""A ray that misses its end by more is no solution."""
-FAR_MM = 1000.0
-"""By how much a ray misses an end farther than this from the last surface is measured at this distance.
-
-One rounding of the direction moves a ray by 1e-7 mm at 1e9 mm. What counts is the direction: a residual of 1e-9 mm
-is 1e-12 rad for every end that is farther, up to infinity.
-"""
 
 _Nested = TypeVar("_Nested")
 _FAST_STEPS = 8

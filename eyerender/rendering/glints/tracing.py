@@ -28,8 +28,9 @@ from ...arrays import ArrayValue, Bools, Floats, frozen, remembered
 from ...eye.model import EyeModel
 from ...geometry.surfaces import Surface, components, join
 from ...geometry.transforms import normalize
+from ...optics.fermat_kernels import RESIDUAL_LIMIT_MM
 from ...optics.interface import fresnel
-from ...optics.shooting import RESIDUAL_LIMIT_MM, ray_tube
+from ...optics.shooting import ray_tube
 from ...optics.solve import mirrored_rays
 from ...optics.trace import Crossing
 from ...rig.camera import PinholeCamera
