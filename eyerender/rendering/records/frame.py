@@ -18,19 +18,7 @@ from numpy.typing import NDArray
 from ...arrays import Floats, Reals, Singles
 from .caches import Caches
 from .job import LampTable
-from .parameters import (
-    CameraParameters,
-    ImageParameters,
-    IrisParameters,
-    Kind,
-    LimbusParameters,
-    Parameters,
-    PoseParameters,
-    ScleraParameters,
-    StopParameters,
-    packed,
-    rebuilt,
-)
+from .parameters import FrameParameters, Kind, Parameters, packed, rebuilt
 from .recording import recorded, syntax
 from .surfaces import Surface
 
@@ -98,8 +86,8 @@ class Structure:
 
 
 @dataclass(kw_only=True)
-class Frame:
-    """A frame on the device: its parameters (see `parameters.Parameters`), and all that kernels read.
+class Frame(FrameParameters):
+    """A frame on the device: its parameters, and all that kernels read.
 
     Attributes:
         structure: chooses the kernels.
@@ -115,18 +103,6 @@ class Frame:
     structure: Structure
     boundary: PupilBoundary
     surfaces: tuple[Surface, ...]
-    inner_index: mi.Float
-    stop: StopParameters
-    iris: IrisParameters
-    limbus: LimbusParameters
-    sclera: ScleraParameters
-    image: ImageParameters
-    pose: PoseParameters
-    camera: CameraParameters
-    pupil_albedo: mi.Float
-    globe_reach: mi.Float
-    backdrop_x: mi.Float
-    ambient_irradiance: mi.Float
     caches: Caches
     lights: Any = None
     textures: Any = None

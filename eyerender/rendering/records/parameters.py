@@ -132,12 +132,11 @@ class ImageParameters:
     shift: Number
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Parameters:
-    """All parameters of a frame; eye frame and scene's frame are in mm.
+@dataclass(kw_only=True)
+class FrameParameters:
+    """Parameters that the host and the device share; eye frame and scene's frame are in mm.
 
     Attributes:
-        surfaces: the refracting surfaces in front of the iris, from outside inwards.
         inner_index: index of refraction of the medium before the iris.
         stop: the aperture stop.
         iris: the iris.
@@ -148,11 +147,10 @@ class Parameters:
         camera: the camera.
         pupil_albedo: share of the light that the pupil reflects back.
         globe_reach: radius (mm) of the sphere about the sclera's centre that contains the cornea too.
-        backdrop_x: the surround's plane, x in the scene's frame (mm).
+        backdrop_x: the background's plane, x in the scene's frame (mm).
         ambient_irradiance: even light from all sides, mW/mm^2.
     """
 
-    surfaces: tuple[SurfaceParameters, ...]
     inner_index: Number
     stop: StopParameters
     iris: IrisParameters
@@ -165,6 +163,17 @@ class Parameters:
     globe_reach: Number
     backdrop_x: Number
     ambient_irradiance: Number
+
+
+@dataclass(kw_only=True)
+class Parameters(FrameParameters):
+    """All parameters of a frame on the host.
+
+    Attributes:
+        surfaces: the refracting surfaces in front of the iris, from outside inwards.
+    """
+
+    surfaces: tuple[SurfaceParameters, ...]
 
 
 def packed(tree: Any) -> np.ndarray[Any, np.dtype[np.float32]]:
