@@ -36,7 +36,7 @@ from ...optics.trace import Crossing
 from ...rig.camera import PinholeCamera
 from ...rig.light import Lamp
 from ...status import Status
-from ..hits.meshes import SurfaceMesh
+from ..hits.meshes import MirrorPoints, SurfaceMesh
 from ..records.job import ring_radius_mm
 from .cutdiscs import POINT, Nodes, cut_nodes, quadrature, rim
 
@@ -324,25 +324,13 @@ class GlintScene:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Reflections:
-    """Points that mirror sources to viewpoints, one row each (eye frame).
+class _Reflections(MirrorPoints):
+    """Points that mirror sources to viewpoints; they are found on the cornea, or on a larger one.
 
     Attributes:
-        point: (k, 3) on the cornea.
-        normal: (k, 3) unit normals there.
-        arrives: (k, 3) direction of the light before it is mirrored.
-        leaves: (k, 3) the same after it.
-        cross_section: (k,) of the ray tube, mm^2 per sr.
-        found: (k,) whether the cornea mirrors the point, or a larger one would.
-        there: (k,) whether the cornea does.
+        there: (n,) whether they are on the cornea.
     """
 
-    point: Floats
-    normal: Floats
-    arrives: Floats
-    leaves: Floats
-    cross_section: Floats
-    found: Bools
     there: Bools
 
 

@@ -36,16 +36,16 @@ _PARALLEL = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Mirror:
-    """Mirror points of a mesh (n, 3), in the eye frame.
+class MirrorPoints:
+    """Points that mirror sources to viewpoints (n, 3), in the eye frame.
 
     Attributes:
-        point: on the mesh.
+        point: on the mirror.
         normal: unit normal there.
         arrives: unit direction of the light before it is reflected.
         leaves: unit direction after.
         cross_section: cross section of the ray tube at the source per solid angle at the viewpoint, (n,) mm^2/sr.
-        found: (n,).
+        found: (n,) whether there is such a point.
     """
 
     point: Floats
@@ -135,8 +135,8 @@ class SurfaceMesh:
         self.faces = np.asarray(patch.faces)
         self.geometry = MeshGeometry.of(patch.name, self.vertices, self.normals, self.faces)
 
-    def mirrored(self, start: Floats, source: Floats, viewpoint: Floats) -> Mirror:
-        """Mirror points of sources (n, 3) for viewpoints (n, 3), searched from points (n, 3) near them; eye frame."""
+    def mirrored(self, start: Floats, source: Floats, viewpoint: Floats) -> MirrorPoints:
+        """Find mirror points of sources (n, 3) for viewpoints (n, 3) from points (n, 3) near them; eye frame."""
         y, lamp, node = ((p - self.origin) @ self.rotation for p in (start, source, viewpoint))
         q = y[:, 1:].copy()
         found = np.ones(len(q), dtype=bool)
@@ -159,7 +159,7 @@ class SurfaceMesh:
         tube = _tube(out, x, N, n, normal_slope, lamp, node)
         point, normal, arrives, leaves = (p @ self.rotation.T for p in (x, N, arrive, -out))
         point = point + self.origin
-        return Mirror(
+        return MirrorPoints(
             point=point, normal=normal, arrives=arrives, leaves=leaves, cross_section=tube, found=found
         )  # fmt: skip
 
