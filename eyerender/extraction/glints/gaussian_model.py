@@ -236,7 +236,10 @@ def _progress(theta: Floats, middle: Floats, gram: Floats, cost: Floats) -> tupl
 def _dim(
     first: Indices, rows: Floats, gram: Floats, light: Floats, held: Floats, rest: Floats, better: Bools, noise: float
 ) -> None:
-    """Subtract the light (P,) of other spots, beyond that held, where a spot is better; changes the others in place."""
+    """Update the fit of each spot, in place, for the light (P,) of the other spots.
+
+    A spot that got `better` holds the other spots' light from now on; for the rest, nothing is subtracted.
+    """
     n, k = gram.shape[0], gram.shape[1] - 1
     for s in range(n):
         square = taken = 0.0

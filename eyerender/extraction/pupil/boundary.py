@@ -76,7 +76,7 @@ class PupilCandidate:
         return inside.darker_dn if abs(inside.darker_dn) > limit else 0.0
 
     def doubled(self, work: Prepared) -> PupilCandidate:
-        """The same in the pixels of an image of twice the scale."""
+        """Convert the candidate to the pixels of an image of twice the resolution."""
         edges, boundary = self.edges, self.boundary
         return PupilCandidate(
             image=work,

@@ -209,7 +209,10 @@ def _band(
     linear: Image, masked: Bools, corner: tuple[int, int], ellipse: tuple[float, ...],
     outer: tuple[float, float], inner: tuple[float, float],
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-    """Pixels (x, y, level) of a part of an image between two ellipses of these semi-axes about another one."""
+    """Select the pixels (x, y, level) between two ellipses around `ellipse`, given by their semi-axes.
+
+    corner: first pixel of `linear` in the whole image.
+    """
     cx, cy, _, _, angle = ellipse
     cos, sin, reach = math.cos(angle), math.sin(angle), outer[0] + 2.0
     left, top = corner

@@ -41,7 +41,7 @@ def water_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -
 
 
 def on_water(frame: Frame, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
-    """Replace what camera rays meet by menisci where these are in front of it."""
+    """Replace the surface that camera rays meet by a meniscus where one is in front of it."""
     if frame.region is None or frame.region.water is None:
         return si
     hit = water_hit(frame, o, d, si.distance)

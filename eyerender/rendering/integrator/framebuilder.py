@@ -51,7 +51,14 @@ class _Next:
 
 @dataclass(frozen=True, slots=True)
 class _GridSizes:
-    """Whether there is a grid over the iris; lamps that use it; nodes of the relief; points of lamps that light it."""
+    """Sizes of the grids behind the cornea.
+
+    Attributes:
+        gridded: whether there is a grid over the iris.
+        lamps: number of lamps whose light is on that grid.
+        nodes: number of nodes of the relief.
+        points: number of points on all lamps that light the relief.
+    """
 
     gridded: bool
     lamps: int

@@ -235,9 +235,10 @@ def irradiance_off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: 
 
 
 def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
-    """Whether points (eye frame) are behind a surface, or so far before it. No light comes to others through it.
+    """Tell whether points (eye frame) are behind a surface, or at most `ahead_mm` in front of it.
 
-    The end of an iris may not be: a cornea with a shallow chamber ends behind the plane of the iris.
+    Only such points receive light through the surface. The end of an iris may not: a cornea with a shallow chamber ends
+    behind the plane of the iris.
     """
     away = 8.0
     o = surface.point_in(x) + mi.Vector3f(away, 0, 0)

@@ -45,7 +45,7 @@ class RadiositySolver:
         self, frame: Frame, job: RenderJob, lamps: LampTable, panels: LampTable, globe: GlobePatches,
         place: Background | RegionScene,
     ) -> PendingField:  # fmt: skip
-        """Begin to gather what the patches of a frame receive straight from the lamps, and see of each other.
+        """Begin to gather the direct light on the patches of a frame, and the form factors between them.
 
         Args:
             frame: the frame, with the region and the ambient light.
@@ -125,7 +125,10 @@ class _Solution:
 
 
 def _ambient(patches: FramePatches, light: PatchLight) -> _Ambient:
-    """What arrives of the ambient light: rays tell what is hidden of its soft part, and shadows that of the rest."""
+    """Compute the ambient light that arrives at the patches.
+
+    Rays between patches give the visible share of its soft part, and shadow rays that of the rest.
+    """
     rays, outside = light.rays, patches.outside
     arriving = light.hard * share_of(light.hard_lit, light.hard_free)
     if not np.any(light.soft):
