@@ -58,6 +58,7 @@ default_role = "code"
 html_theme = "furo"
 html_title = "eyerender"
 html_static_path = ["static"]
+html_logo = html_favicon = "static/logo.svg"
 html_css_files = ["site.css"]
 html_theme_options = {"navigation_with_keys": True}
 copybutton_prompt_text = "$ "
