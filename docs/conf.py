@@ -39,6 +39,7 @@ exclude_patterns = [
     "tools",
     "data",
     "generated/validation_tables.md",
+    "generated/api_names.md",
     *(f"gallery/*.{kind}" for kind in ("ipynb", "py", "md5", "json", "zip")),
 ]
 suppress_warnings = ["config.cache"]  # the options of the gallery hold no functions, but Sphinx does not look

@@ -65,23 +65,31 @@ def homes() -> dict[str, str]:
 
 def pages() -> dict[str, str]:
     """The pages of the commands and of the API by their names."""
-    made = {"commands": commands()}
+    made = {"commands": commands(), "api_names": ""}
     where = homes()
     for page, (title, _) in GROUPS.items():
-        text = f"# {title}\n\n" + api_section("eyerender", [name for name, its in where.items() if its == page])
+        names = [name for name, its in where.items() if its == page]
+        text = f"# {title}\n\n" + api_section("eyerender", names)
+        made["api_names"] += f"## {title}\n\n" + summary("eyerender", names)
         if space := NAMESPACES.get(page):
             more = [name for name in getattr(er, space).__all__ if name not in er.__all__]
             text += f"\n## Also in `er.{space}`\n\n" + api_section(f"eyerender.{space}", more)
         made[page] = text
+    made["api_names"] += "## Gaze estimators, in `er.gaze`\n\n" + summary("eyerender.gaze", er.gaze.__all__)
     made["api_gaze"] = "# Gaze estimators\n\n" + api_section("eyerender.gaze", er.gaze.__all__)
     made["api_torch"] = TORCH
     return made
 
 
+def summary(module: str, names: list[str]) -> str:
+    """A table of names of one module, with a line for each."""
+    table = "\n".join(f"   {name}" for name in names)
+    return f"```{{eval-rst}}\n.. currentmodule:: {module}\n\n.. autosummary::\n   :nosignatures:\n\n{table}\n```\n\n"
+
+
 def api_section(module: str, names: list[str]) -> str:
     """Names of one module: a table of all, then the docstring of each."""
-    table = "\n".join(f"   {name}" for name in names)
-    lines = ["```{eval-rst}", f".. currentmodule:: {module}", "", ".. autosummary::", "", table, ""]
+    lines = [summary(module, names) + "```{eval-rst}", f".. currentmodule:: {module}", ""]
     for name in names:
         found = getattr(sys.modules[module], name)
         kind = "class" if isinstance(found, type) else "function" if callable(found) else "data"
