@@ -84,7 +84,7 @@ def test_every_command_is_in_the_reference(pages):
 
 
 def test_every_page_is_in_a_table_of_contents(pages):
-    listed = {"index", "generated/validation_tables"}  # the second is included, not a page
+    listed = {"index", "generated/validation_tables", "generated/api_names"}  # the last two are included, no pages
     for text in pages.values():
         for body in re.findall(r"```\{toctree\}\n(.*?)```", text, re.DOTALL):
             listed |= {line for line in body.splitlines() if line and not line.startswith(":")}
