@@ -8,7 +8,7 @@ subject, with +z up in the image.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -329,8 +329,8 @@ def in_window(window: Window, pixels: ArrayLike) -> Bools:
     return np.asarray((x >= x0 - 0.5) & (x <= x0 + w - 0.5) & (y >= y0 - 0.5) & (y <= y0 + h - 0.5))
 
 
-def distort(x: Floats, y: Floats, k: Floats) -> tuple[Floats, Floats]:
-    """Distort by Brown & Conrady's model as OpenCV defines it, in float64.
+def distort(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
+    """Distort by Brown & Conrady's model as OpenCV defines it; arrays of NumPy or of Dr.Jit.
 
     x'' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and alike for y
     """
@@ -343,21 +343,47 @@ def distort(x: Floats, y: Floats, k: Floats) -> tuple[Floats, Floats]:
     )
 
 
+def distortion_jacobian(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any, Any]:
+    """Jacobian of `distort` at undistorted coordinates: dx''/dx, dx''/dy = dy''/dx, dy''/dy.
+
+    Like `newton_step`, it takes arrays of NumPy and of Dr.Jit.
+    """
+    k1, k2, p1, p2, k3 = k
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
+    a = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    b = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    d = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return a, b, d
+
+
+def distorted_area(x: Any, y: Any, k: Sequence[Any] | Floats) -> Any:
+    """Area on the sensor per area without distortion: the determinant D of `distortion_jacobian`."""
+    a, b, d = distortion_jacobian(x, y, k)
+    return a * d - b * b
+
+
+def is_imaged(x: Any, y: Any, k: Sequence[Any] | Floats) -> Any:
+    """Whether the distortion has not folded the picture back: its Jacobian is positive definite."""
+    a, b, d = distortion_jacobian(x, y, k)
+    return (a > 0) & (a * d - b * b > 0)
+
+
+def newton_step(x: Any, y: Any, xd: Any, yd: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
+    """Newton's step from undistorted coordinates to those of (xd, yd), to be subtracted."""
+    fx, fy = distort(x, y, k)
+    ex, ey = fx - xd, fy - yd
+    a, b, d = distortion_jacobian(x, y, k)
+    det = a * d - b * b
+    return (d * ex - b * ey) / det, (a * ey - b * ex) / det
+
+
 def undistort(xd: Floats, yd: Floats, k: Floats, iterations: int = 50) -> tuple[Floats, Floats]:
     """Invert `distort` by Newton's method on its exact Jacobian; NaN where it does not converge."""
-    k1, k2, p1, p2, k3 = k
     x, y = xd.copy(), yd.copy()
     for _ in range(iterations):
-        fx, fy = distort(x, y, k)
-        ex, ey = fx - xd, fy - yd
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
-        a = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-        b = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-        d = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-        det = a * d - b * b
-        dx, dy = (d * ex - b * ey) / det, (a * ey - b * ex) / det
+        dx, dy = newton_step(x, y, xd, yd, k)
         x, y = x - dx, y - dy
         if np.nanmax(np.hypot(dx, dy), initial=0.0) < 1e-15:
             break

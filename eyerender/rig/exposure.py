@@ -23,9 +23,9 @@ FEW = 12.0  # below this mean the expansion of a Poisson quantile is too inaccur
 
 
 def radiance_to_irradiance(sensor: Sensor) -> float:
-    """Irradiance (W/m^2) of a pixel per radiance times cos^4 of the field angle (mW/mm^2/sr).
+    """Irradiance (W/m^2) of a pixel per radiance times cos^4(theta) / D (mW/mm^2/sr).
 
-    E = pi tau L cos^4(theta) / (4 N^2), N the working f-number.
+    E = pi tau L cos^4(theta) / (4 N^2 D), N the working f-number, D the area per area without lens distortion.
     """
     return 1e3 * np.pi * sensor.lens_transmission / (4 * sensor.f_number**2)
 

@@ -1,11 +1,12 @@
 """The image sensor and its lens, in the terms of EMVA 1288.
 
-    E = pi tau L cos^4(theta) / (4 N^2)                      irradiance of a pixel seeing radiance L, W/m^2
+    E = pi tau L cos^4(theta) / (4 N^2 D)                    irradiance of a pixel seeing radiance L, W/m^2
     mu_e = eta E A t lambda / (h c)                          photo-electrons of a pixel
     DN = clip(black + K (min(mu_e + shot, full well) + read))  rounded to whole numbers, 0 .. 2^bits - 1
 
-mu_e of a pixel varies by its photo-response non-uniformity, and its read-out has a fixed offset of its own. A pixel
-beyond the full well may spill into its neighbours. With a gamma g, codes are full scale (DN / full scale)^(1/g).
+D is the area on the sensor per area without lens distortion. mu_e of a pixel varies by its photo-response
+non-uniformity, and its read-out has a fixed offset of its own. A pixel beyond the full well may spill into its
+neighbours. With a gamma g, codes are full scale (DN / full scale)^(1/g).
 `exposure_ms` and the gain K belong to the scene; images are never normalised one by one.
 Source: EMVA Standard 1288 (release 4.0, 2021), linear model, equations 3-8.
 """

@@ -24,10 +24,11 @@ from ...optics.interface import fresnel
 from ...optics.purkinje import purkinje_path, purkinje_points
 from ...optics.shooting import ray_tube
 from ...optics.trace import Crossing, Traced, trace
+from ...rig.camera import is_imaged
 from ...rig.light import Lamp
 from ...status import Status
 from .cutdiscs import Nodes
-from .tracing import GlintScene, Image, disc_points, distortion_determinant
+from .tracing import GlintScene, Image, disc_points
 
 
 def purkinje_images(
@@ -58,7 +59,8 @@ def purkinje_images(
         ok &= cam[:, 2] > 0
         z = np.where(ok, cam[:, 2], 1.0)
         x, y = cam[:, 0] / z, cam[:, 1] / z
-        scale = camera.K[0, 0] * camera.K[1, 1] * distortion_determinant(camera, x, y) / z**3
+        ok &= is_imaged(x, y, camera.distortion)
+        scale = camera.K[0, 0] * camera.K[1, 1] / z**3
         energy = node.weight * float(lamp.intensity_mw_sr) * lobe * passed * scale / np.where(ok, tube, 1.0)
         entry, leave = traced.points_mm[-1] @ M.T + t, traced.points_mm[1] @ M.T + t
         images.append(

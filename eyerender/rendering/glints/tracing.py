@@ -4,9 +4,9 @@ The mirror point of each point of an LED comes from `optics.solve`, the ray tube
 `optics.shooting`. With the Fresnel reflectance F and the LED's radiant intensity I in the direction d of the ray:
 
     E = I(d) F / J                                          irradiance at the nodal point, for each point of the LED
-    e = E f_x f_y D / cos^3(theta)                          energy of the spot, in radiance times pixels
+    e = E f_x f_y / cos^3(theta)                            energy of the spot, in radiance times pixels
 
-theta is the angle to the optical axis, D the determinant of the Jacobian of the lens distortion. An LED of finite size
+theta is the angle to the optical axis. Lens distortion moves a spot and leaves its energy. An LED of finite size
 is integrated with Gauss-Legendre nodes in r^2 and equal angles, each with its own position and energy. The image of a
 near LED, which spans several pixels, is thus an energy-weighted disc. Where the limbus, the globe or something of the
 scene hides a part of an LED, the nodes are those of the visible part (`cut`).
@@ -33,7 +33,7 @@ from ...optics.interface import fresnel
 from ...optics.shooting import ray_tube
 from ...optics.solve import mirrored_rays
 from ...optics.trace import Crossing
-from ...rig.camera import PinholeCamera
+from ...rig.camera import PinholeCamera, is_imaged
 from ...rig.light import Lamp
 from ...status import Status
 from ..hits.meshes import MirrorPoints, SurfaceMesh
@@ -277,7 +277,8 @@ class GlintScene:
         found = r.found & (cam[:, 2] > 0)
         z = np.where(found, cam[:, 2], 1.0)
         x, v = cam[:, 0] / z, cam[:, 1] / z
-        scale = camera.K[0, 0] * camera.K[1, 1] * distortion_determinant(camera, x, v) / z**3
+        found &= is_imaged(x, v, camera.distortion)
+        scale = camera.K[0, 0] * camera.K[1, 1] / z**3
         y, strength = r.point, emitters.weights * emitters.strength[which]
         there = r.there & found & ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, self._eyepoint - y)
         energy = np.where(found, strength * lobe * F / np.where(found, r.cross_section, 1.0) * scale, 0.0)
@@ -432,18 +433,6 @@ def _terms(point: Floats) -> Floats:
     """Monomials (k, 15) up to order 4 of points (k, 2)."""
     a, b = point.T
     return np.stack([a**i * b ** (n - i) for n in range(5) for i in range(n + 1)], axis=1)
-
-
-def distortion_determinant(camera: PinholeCamera, x: Floats, y: Floats) -> Floats:
-    """Determinant of d(distorted) / d(undistorted) normalised coordinates."""
-    k1, k2, p1, p2, k3 = camera.distortion
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
-    a = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    b = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    c = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return np.asarray(a * c - b * b)
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

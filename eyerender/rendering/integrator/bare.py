@@ -130,9 +130,9 @@ def _shade_samples(
 ) -> tuple[list[mi.Float], mi.UInt32]:
     """What samples k of pixels show, and the number of failed light paths."""
     samples = Samples.of(*pixels.at(pixel), pattern)
-    o, d, cosine = samples.ray(frame, k)
+    o, d, root = samples.ray(frame, k)
     radiance, failures = shade(frame, o, d, *samples.pair(k, 0))
-    lanes = [radiance * cosine * cosine]
+    lanes = [radiance * root * root]
     if layered:
         si, _ = intersect(frame, o, d, True)
         near = si.nearness(frame, d)

@@ -62,7 +62,7 @@ class Film:
 
 
 def mean_radiance(bound: BoundFrame, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
-    """Mean radiance of each pixel times cos^4 of its field angle (mW/mm^2/sr), (height, width); failed light paths."""
+    """Mean radiance of each pixel times cos^4(theta) / D (mW/mm^2/sr), (height, width); failed light paths."""
     return start(bound, window, spp, seed, layered=False).means()
 
 

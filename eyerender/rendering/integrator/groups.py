@@ -100,9 +100,9 @@ class PixelGroup:
         return self.number * self.count + j
 
     def ray(self, frame: Frame, j: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
-        """Origin and direction (scene's frame) of sample j, and its weight, cos^4 of its field angle."""
-        o, d, cosine = self.samples.ray(frame, self.of_pixel(j))
-        return o, d, cosine * cosine
+        """Origin and direction (scene's frame) of sample j, and its weight, cos^4(theta) / D of `camera_ray`."""
+        o, d, root = self.samples.ray(frame, self.of_pixel(j))
+        return o, d, root * root
 
     @syntax
     def hit(self, frame: Frame, j: mi.UInt32) -> TriangleHit:

@@ -69,7 +69,8 @@ def shade_group(frame: Frame, group: PixelGroup) -> tuple[list[mi.Float], mi.UIn
         return [shade_region(frame, group, before, radiance, on_sheet=False)], globe.failures
     front = shade_region(frame, group, before, mi.Float(0), on_sheet=False)
     skin = shade_region(frame, group, sheet, mi.Float(0), on_sheet=True)
-    one = dr.rcp(group.ray(frame, mi.UInt32(0))[2])  # the weight of a sample hardly differs within a pixel
+    weight = group.ray(frame, mi.UInt32(0))[2]  # it hardly differs within a pixel
+    one = dr.select(weight > 0, dr.rcp(weight), 0)
     parts = ((front, before), (skin, sheet), (globe.radiance, globe))
     return [x for radiance, part in parts for x in (radiance, part.weight * one, part.near * one)], globe.failures
 

@@ -21,12 +21,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...rig.camera import Window
+from ...rig.camera import Window, distort, distorted_area, is_imaged, newton_step
 from ..records.frame import Frame
 
 _PHI = 1.324717957244746
 _ALPHA = tuple(round(_PHI ** -(k + 1) * 2**32) for k in range(2))
-_UNDISTORT_STEPS = 8
+_UNDISTORT_STEPS = 6
+_UNDISTORTED = 1e-4  # residual of what Newton's method has solved, in units of the focal length
 _CALLS = 3  # pairs of further numbers of a sample
 
 
@@ -139,27 +140,34 @@ class Samples:
         )
 
     def ray(self, frame: Frame, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
-        """Camera ray of sample `k` (scene's frame): origin, unit direction, squared cosine to the camera's axis."""
+        """Camera ray of sample `k`, as by `camera_ray`."""
         place = self.in_pixel(k)
-        o, d, cosine = camera_ray(frame, mi.Float(self.u) + (place.x - 0.5), mi.Float(self.v) + (place.y - 0.5))
-        return o, d, cosine * cosine
+        return camera_ray(frame, mi.Float(self.u) + (place.x - 0.5), mi.Float(self.v) + (place.y - 0.5))
 
 
 def camera_ray(frame: Frame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
-    """Ray of the scene's frame through pixel (u, v), centres at integers: origin, unit direction, cos to the axis."""
+    """Ray of the scene's frame through pixel (u, v), centres at integers.
+
+    Returns:
+        Origin, unit direction, and the root of the weight cos^4(theta) / D of its radiance: theta is the angle to the
+        camera's axis, D the area on the sensor per area without distortion. It is 0 where the lens images nothing.
+    """
     fx, fy = frame.camera.focal
     cx, cy = frame.camera.principal
     xd, yd = (u - cx) / fx, (v - cy) / fy
     x, y = mi.Float(xd), mi.Float(yd)
+    k = frame.camera.distortion
     if frame.structure.distorted:
-        k1, k2, p1, p2, k3 = frame.camera.distortion
         for _ in range(_UNDISTORT_STEPS):
-            r2 = x * x + y * y
-            radial = dr.rcp(1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
-            x, y = (
-                (xd - (2 * p1 * x * y + p2 * (r2 + 2 * x * x))) * radial,
-                (yd - (p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)) * radial,
-            )
+            dx, dy = newton_step(x, y, xd, yd, k)
+            x, y = x - dx, y - dy
+        residual_x, residual_y = distort(x, y, k)
+        area = distorted_area(x, y, k)
+        imaged = (dr.abs(residual_x - xd) + dr.abs(residual_y - yd) < _UNDISTORTED) & is_imaged(x, y, k)
+        x, y = dr.select(imaged, x, xd), dr.select(imaged, y, yd)
     d = frame.camera.right * x + frame.camera.down * y + frame.camera.forward
     inv = dr.rsqrt(dr.squared_norm(d))
-    return frame.camera.centre, d * inv, inv
+    weight = inv * inv
+    if frame.structure.distorted:
+        weight = dr.select(imaged, weight * dr.rsqrt(area), 0)
+    return frame.camera.centre, d * inv, weight
