@@ -17,6 +17,10 @@ MAX_MESSAGE, MAX_SOURCE, MAX_PATH, MAX_REASON = 2000, 600, 200, 400
 MAX_ERRORS = 20
 
 
+class UnfinishedRunWarning(UserWarning):
+    """A folder of an unfinished run is read: only its finished shards count."""
+
+
 class EyerenderError(Exception):
     """Base of every error that this package raises on purpose: the run failed (disk, worker, backend).
 

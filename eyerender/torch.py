@@ -37,7 +37,7 @@ from .dataset.realise import frames_of
 from .dataset.run import usable_cpus
 from .dataset.spec import DatasetSpec
 from .errors import InputError
-from .folders.imagefolder import METADATA, ImageFolder
+from .folders.imagefolder import ImageFolder
 
 if TYPE_CHECKING:
     from .dataset.maker import Maker
@@ -120,7 +120,7 @@ class FolderDataset(Dataset[Any]):
             "amodal_masks": entry.amodal_mask,
             "highlights": entry.highlight_mask,
         }
-        where = f"{self.folder.path / METADATA}: line {entry.number}"
+        where = f"{entry.source}: line {entry.number}"
         item = _item(self.parts, entry.line, lambda kind: pictures[kind](), where)
         return item if self.transform is None else self.transform(item)
 

@@ -6,14 +6,15 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import FrameType
 from typing import Any
 
 from cyclopts import CycloptsError, ValidationError
 
-from ..errors import MAX_MESSAGE, EyerenderError, InputError, one_line
+from ..errors import MAX_MESSAGE, EyerenderError, InputError, UnfinishedRunWarning, one_line
 
 # Importing them registers their commands.
 from . import (  # noqa: F401
@@ -51,7 +52,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     tokens = [t for t in tokens if t not in ("--debug", "--no-cache")]
     previous = _terminate_like_interrupt()
     try:
-        with nullcontext() if cached else _without_cache():
+        with nullcontext() if cached else _without_cache(), _one_line_warnings():
             code = _called(tokens)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
@@ -77,6 +78,23 @@ def _called(tokens: Sequence[str]) -> Any:
         raise InputError(error.reason, source=f"--{option_name(error.path)}") from None
     check_outputs(given.arguments)
     return command(*given.args, **given.kwargs)
+
+
+@contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    """Print what is said about unfinished runs as one line, like other warnings of a command."""
+    with warnings.catch_warnings():
+        before = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
+            if issubclass(category, UnfinishedRunWarning):
+                print(f"warning: {one_line(str(message), MAX_MESSAGE)}", file=sys.stderr)
+            else:
+                before(message, category, *place)
+
+        warnings.showwarning = show  # type: ignore[assignment]
+        warnings.simplefilter("always", UnfinishedRunWarning)
+        yield
 
 
 def _without_cache() -> AbstractContextManager[None]:

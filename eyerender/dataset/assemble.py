@@ -13,22 +13,27 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EyerenderError, InputError
-from ..folders.imagefolder import CONVENTIONS, DATASET, DATASET_SCHEMA, METADATA
+from ..folders.imagefolder import (
+    CONVENTIONS,
+    DATASET,
+    DATASET_SCHEMA,
+    LINES,
+    METADATA,
+    SHARDS,
+    finished,
+    shard_name,
+)
 from ..storage.files import MAX_FILE_BYTES, read_json, remove_parts, write_json, write_text, written
 from .card import data_card
 from .columns import type_first
 from .croissant import CROISSANT, croissant
 from .plan import Plan
 from .shard import (
-    LINES,
-    SHARDS,
     checksum,
     compare_sums,
-    finished,
     is_sums,
     read_done,
     run_versions,
-    shard_name,
     sum_of,
     verify,
 )
@@ -105,6 +110,12 @@ def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> I
         yield f"{DATASET}: checksums: do not have the format of this version"
     else:
         yield from compare_sums(folder, sums or {}, quick=quick)
+
+
+def verify_finished(folder: Path, digest: str | None) -> Iterator[str]:
+    """List what is wrong with the finished shards of an unfinished run."""
+    for shard in sorted(finished(folder)):
+        yield from verify(folder, shard, digest)
 
 
 def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import EyerenderError, InputError, Warn
-from ..folders.imagefolder import DATASET
+from ..folders.imagefolder import DATASET, finished
 from ..folders.outfolder import clear, refuse_non_empty
 from ..plausibility import saturation_warnings
 from ..progress import Progress, Say
@@ -30,7 +30,6 @@ from .shard import (
     Staged,
     commit,
     cpu_family,
-    finished,
     is_finished,
     read_done,
     remove_leftovers,

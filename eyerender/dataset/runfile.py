@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..folders.imagefolder import DATASET, METADATA, RUN, STAGE
+from ..folders.imagefolder import DATASET, METADATA, RUN, RUN_SCHEMA, SHARDS, STAGE, finished
 from ..folders.outfolder import MARKER, clear
 from ..progress import Say
 from ..storage.files import MAX_FILE_BYTES, PART, read_json, remove_parts, write_json
@@ -18,9 +18,8 @@ from ..storage.lock import LOCK
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
 from .plan import Plan
-from .shard import KINDS, SHARDS, finished, read_done, run_versions
+from .shard import KINDS, read_done, run_versions
 
-RUN_SCHEMA = "eyerender/run/1"
 LOG = "log.jsonl"
 _OWN = {RUN, LOG, SHARDS, *KINDS, METADATA, FAILURES, CARD, CROISSANT, DATASET}
 _ELSE = "choose another folder or give --overwrite"

@@ -22,7 +22,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..folders.imagefile import Writer
-from ..folders.imagefolder import IMAGE_SCHEMA, STAGE, versions
+from ..folders.imagefolder import DONE, IMAGE_SCHEMA, LINES, SHARDS, STAGE, shard_name, versions
 from ..storage.files import (
     MAX_FILE_BYTES,
     inside,
@@ -37,9 +37,6 @@ from ..versions import package_version
 from .maker import MadeImage, Maker
 
 SHARD_SCHEMA = "eyerender/shard/1"
-DONE, SHARDS = "done.json", "shards"
-# The file is not called metadata.jsonl, because loaders of image folders would read it besides the dataset's own.
-LINES = "lines.jsonl"
 # Kind of image -> key of its file in a line of metadata.
 KINDS = {
     "images": "file_name",
@@ -80,11 +77,6 @@ _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
     "given_up": lambda v: _are(v, _is_count),
     "files": is_sums,
 }
-
-
-def shard_name(shard: int) -> str:
-    """Name of a shard's folders."""
-    return f"{shard:05d}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,14 +187,6 @@ def commit(folder: Path, staged: Staged) -> None:
 def is_finished(folder: Path, shard: int) -> bool:
     """Whether a shard has a done.json."""
     return (folder / SHARDS / shard_name(shard) / DONE).is_file()
-
-
-def finished(folder: Path) -> set[int]:
-    """Shards that have a done.json."""
-    place = folder / SHARDS
-    if not place.is_dir():
-        return set()
-    return {int(p.name) for p in place.iterdir() if p.name.isdigit() and (p / DONE).is_file()}
 
 
 def read_done(folder: Path, shard: int) -> dict[str, Any]:

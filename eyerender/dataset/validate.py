@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..folders.imagefolder import FILE_KEYS, METADATA, Entries, ImageEntry, ImageFolder
+from ..folders.imagefolder import FILE_KEYS, Entries, ImageEntry, ImageFolder
 from ..progress import Progress
 from .validation.images import Tally, check_images
 from .validation.lines import Lines, check_records
 from .validation.problems import WRONG, Problems
-from .validation.shards import check_shards, compare_lines
+from .validation.shards import check_run
 from .validation.truth import Again, DatasetTruth, NoTruth, SceneTruth, truth_of
 
 SAMPLE = 64
@@ -39,20 +39,19 @@ def validate(
         progress: called with the amount done, the total, and the kind.
 
     Raises:
-        InputError: it is not a folder of images, or its run is not finished.
+        InputError: it is not a folder of images.
     """
     path = Path(path)
     folder = ImageFolder.load(path)
     step = progress or (lambda *_: None)
-    problems, tally, notes = Problems(), Tally(), []
+    problems, tally, notes = Problems(), Tally(), [folder.unfinished] if folder.unfinished else []
     truth: DatasetTruth | SceneTruth | None = None
     try:
         truth = truth_of(folder, problems)
     except NoTruth as reason:
         notes.append(f"nothing is computed again: {reason}")
     if folder.dataset.get("kind") == "dataset":
-        check_shards(path, folder.dataset, quick, problems, step)
-        compare_lines(path, problems)
+        check_run(folder, quick, problems, step)
     total = len(folder.entries)
     rows = range(total) if deep else sampled(total, str(folder.dataset.get("digest")))
     if truth is not None and truth.stale is not None:
@@ -63,7 +62,7 @@ def validate(
     for start, batch in _batches(folder.entries, problems):
         records = check_records([entry.line for entry in batch])
         for k, (entry, wrong) in enumerate(zip(batch, records, strict=True), start):
-            where = f"{METADATA} line {k + 1}"
+            where = f"{entry.source.relative_to(path).as_posix()} line {entry.number}"
             named = str(entry.line["file_name"])
             used = truth if able and (deep or k in chosen) else None
             try:

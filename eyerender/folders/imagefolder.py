@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bytes
-from ..errors import InputError, Refuse
+from ..errors import InputError, Refuse, UnfinishedRunWarning
 from ..observation import EYES, Observations, concatenate, count_heads
 from ..rig.camera import Window
-from ..storage.files import inside, is_plain, read_json, shown, write_json
-from ..storage.jsonlines import JsonLines
+from ..storage.files import MAX_FILE_BYTES, inside, is_plain, read_json, shown, write_json
+from ..storage.jsonlines import JsonLines, LineFiles
 from ..versions import package_version
 from .imagefile import read_image
 
@@ -30,6 +31,9 @@ IMAGE_SCHEMAS = (IMAGE_SCHEMA, RENDERED_SCHEMA, "eyerender/image/2", "eyerender/
 DATASET_SCHEMA = "eyerender/dataset/1"
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
 RUN = "run.json"  # in a folder that `generate` fills, from its start
+RUN_SCHEMA = "eyerender/run/1"
+# Files of a finished shard. LINES is not called metadata.jsonl, because loaders of image folders would read it, too.
+SHARDS, DONE, LINES = "shards", "done.json", "lines.jsonl"
 STAGE = ".partial-"
 _BATCH = 1024  # number of lines whose records are in memory at a time
 _MAX_PX = 2**31
@@ -59,12 +63,19 @@ FILE_KEYS = (
 class ImageEntry:
     """One image of a folder: its files, its window (x0, y0, width, height) and its line of metadata.
 
-    `number` counts the lines of metadata from 1; it is 0 where it is unknown.
+    `number` counts the lines of the file `listed` from 1; it is 0 where it is unknown. `listed` is metadata.jsonl by
+    default; in an unfinished run it is the file of a shard.
     """
 
     folder: Path
     line: dict[str, Any]
     number: int = 0
+    listed: Path | None = None
+
+    @property
+    def source(self) -> Path:
+        """File that holds the line."""
+        return self.listed or self.folder / METADATA
 
     @property
     def name(self) -> str:
@@ -76,7 +87,7 @@ class ImageEntry:
         """Path of the image file; raises `InputError` as `file` does."""
         found = self.file("file_name")
         if found is None:
-            raise InputError("missing", source=str(self.folder / METADATA), path=self._where("file_name"))
+            raise InputError("missing", source=str(self.source), path=self._where("file_name"))
         return found
 
     @property
@@ -93,7 +104,7 @@ class ImageEntry:
         name = self.line.get(key)
         if name is None:
             return None
-        return inside(self.folder, name, source=str(self.folder / METADATA), path=self._where(key))
+        return inside(self.folder, name, source=str(self.source), path=self._where(key))
 
     @property
     def gamma(self) -> float:
@@ -155,7 +166,7 @@ class ImageEntry:
         if found is None:
             return {}
         if not isinstance(found, dict):
-            raise InputError("must be a mapping", source=str(self.folder / METADATA), path=self._where("labels"))
+            raise InputError("must be a mapping", source=str(self.source), path=self._where("labels"))
         return found
 
     def _picture(self, path: Path) -> NDArray[Any]:
@@ -184,7 +195,7 @@ class ImageEntry:
         try:
             return Observations.from_records(self.records, complete=True)
         except InputError as error:
-            source, line = str(self.folder / METADATA), f"line {self.number}" if self.number else ""
+            source, line = str(self.source), f"line {self.number}" if self.number else ""
             raise error.placed(source=source, under=line) from None
 
     def _where(self, key: str) -> str:
@@ -202,7 +213,7 @@ class Entries(Sequence[ImageEntry]):
     """
 
     folder: Path
-    lines: JsonLines
+    lines: LineFiles
     rows: range
 
     def __len__(self) -> int:
@@ -219,26 +230,29 @@ class Entries(Sequence[ImageEntry]):
         return next(iter(Entries(self.folder, self.lines, range(row, row + 1))))
 
     def __iter__(self) -> Iterator[ImageEntry]:
-        source = str(self.lines.path)
-        for row, line in zip(self.rows, self.lines.read(self.rows), strict=True):
-            _check_line(line, source, f"line {row + 1}")
-            yield ImageEntry(self.folder, line, row + 1)
+        for path, number, line in self.lines.read(self.rows):
+            _check_line(line, str(path), f"line {number}")
+            yield ImageEntry(self.folder, line, number, path)
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFolder:
-    """A complete folder of images; iteration yields an `ImageEntry` for each.
+    """A folder of images; iteration yields an `ImageEntry` for each.
 
-    The lines of metadata are read when their entries are requested, and never all kept.
+    The lines of metadata are read when their entries are requested, and never all kept. Of an unfinished run, the
+    images of the finished shards are there; `unfinished` then says how many, and is empty otherwise.
     """
 
     path: Path
     dataset: dict[str, Any]
     entries: Entries
+    unfinished: str = ""
 
     @classmethod
     def load(cls, path: str | Path) -> ImageFolder:
         """Open a folder: read dataset.json, find the lines of metadata.jsonl and check the first one.
+
+        A folder of an unfinished run gives an `UnfinishedRunWarning`.
 
         Raises:
             InputError: naming the file, and the line and key where there is one. A later wrong line is reported when it
@@ -248,7 +262,7 @@ class ImageFolder:
         if not os.path.isdir(folder):
             raise InputError("no such folder", source=str(path))
         if (folder / RUN).is_file() and not (folder / DATASET).is_file():
-            raise InputError("holds an unfinished run; start generate again on the folder", source=str(path))
+            return cls._of_run(folder)
         if not (folder / METADATA).exists():
             raise InputError(
                 f"holds no {METADATA}, so it is not a folder of images written by this package", source=str(path)
@@ -260,12 +274,35 @@ class ImageFolder:
                 source=str(folder / DATASET),
                 path="schema",
             )
-        lines = JsonLines.index(folder / METADATA)
-        if not len(lines):
+        entries = _entries(folder, [folder / METADATA])
+        if not len(entries):
             raise InputError("holds no images", source=str(folder / METADATA))
-        entries = Entries(folder, lines, range(len(lines)))
         _ = entries[0]
         return cls(folder, dataset, entries)
+
+    @classmethod
+    def _of_run(cls, folder: Path) -> ImageFolder:
+        """Open the folder of an unfinished run, whose finished shards hold the lines."""
+        run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
+        if run.get("schema") != RUN_SCHEMA:
+            raise InputError("does not describe a run of this version", source=str(folder / RUN))
+        shards = sorted(finished(folder))
+        entries = _entries(folder, [folder / SHARDS / shard_name(shard) / LINES for shard in shards])
+        if not len(entries):
+            raise InputError(
+                "holds an unfinished run without a finished shard; start generate again on the folder",
+                source=str(folder),
+            )
+        _ = entries[0]
+        spec = run.get("spec")
+        planned = spec.get("count") if isinstance(spec, dict) else None
+        text = (
+            f"the run is unfinished: {len(entries)} images of {len(shards)} finished shards are read, "
+            f"{shown(planned)} samples are planned"
+        )
+        warnings.warn(f"{folder}: {text}", UnfinishedRunWarning, stacklevel=3)
+        dataset = {**run, "schema": DATASET_SCHEMA, "kind": "dataset", "conventions": CONVENTIONS}
+        return cls(folder, dataset, entries, text)
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -291,6 +328,24 @@ class ImageFolder:
         found = concatenate(parts)
         # Head positions are counted over all images.
         return replace(found, index=replace(found.index, head=count_heads(found.index.head_mm)))
+
+
+def shard_name(shard: int) -> str:
+    """Name of a shard's folders."""
+    return f"{shard:05d}"
+
+
+def finished(folder: Path) -> set[int]:
+    """Shards that have a done.json."""
+    place = folder / SHARDS
+    if not place.is_dir():
+        return set()
+    return {int(p.name) for p in place.iterdir() if p.name.isdigit() and (p / DONE).is_file()}
+
+
+def _entries(folder: Path, files: list[Path]) -> Entries:
+    lines = LineFiles.of(JsonLines.index(file) for file in files)
+    return Entries(folder, lines, range(len(lines)))
 
 
 def _check_line(line: dict[str, Any], source: str, where: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -86,6 +86,43 @@ class JsonLines:
                 if not isinstance(value, dict):
                     raise InputError("must be a JSON object", source=source, path=where)
                 yield value
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineFiles:
+    """Several files of JSON lines, read as one; `ends` (n,) counts the lines up to the end of each file."""
+
+    files: tuple[JsonLines, ...]
+    ends: Ints
+
+    @classmethod
+    def of(cls, files: Iterable[JsonLines]) -> LineFiles:
+        """Join files in their order."""
+        parts = tuple(files)
+        return cls(parts, np.cumsum([len(part) for part in parts], dtype=np.int64))
+
+    def __len__(self) -> int:
+        return int(self.ends[-1]) if len(self.ends) else 0
+
+    def read(self, rows: range) -> Iterator[tuple[Path, int, dict[str, Any]]]:
+        """Read the objects of some lines, counted from 0 over all files: the file, the line's number in it, the object.
+
+        `rows` may have any step; lines in increasing order are read fastest. Numbers of lines count from 1.
+
+        Raises:
+            InputError: as `JsonLines.read`.
+        """
+        at = 0
+        while at < len(rows):
+            file = int(np.searchsorted(self.ends, rows[at], side="right"))
+            first = int(self.ends[file - 1]) if file else 0
+            stop = at + 1
+            while stop < len(rows) and first <= rows[stop] < int(self.ends[file]):
+                stop += 1
+            own = range(rows[at] - first, rows[stop - 1] - first + (1 if rows.step > 0 else -1), rows.step)
+            for row, value in zip(own, self.files[file].read(own), strict=True):
+                yield self.files[file].path, row + 1, value
+            at = stop
 
 
 def _state(file: BinaryIO) -> tuple[int, int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from typing import Any
@@ -10,10 +11,11 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
+from eyerender.cli.main import run
 from eyerender.dataset.export import export
 from eyerender.dataset.validate import validate
 from eyerender.dataset.validation.truth import SceneTruth
-from eyerender.errors import InputError
+from eyerender.errors import InputError, UnfinishedRunWarning
 from eyerender.folders.imagefile import read_image, write_png
 from eyerender.imaging.labels import EyeInWindow
 from eyerender.scene import load_scene
@@ -111,12 +113,41 @@ def test_wrong_lines_are_found(copy, change, words):
     assert any(words in p for p in problems(copy))
 
 
-def test_what_is_no_finished_dataset_is_refused(copy, tmp_path):
+def test_what_is_finished_of_a_run_is_validated_and_exported(copy, tmp_path, capsys):
     (copy / "dataset.json").unlink()
-    with pytest.raises(InputError, match="unfinished"):
-        validate(copy)
-    with pytest.raises(InputError, match="unfinished"):
+    (copy / "metadata.jsonl").write_text("of an earlier run\n")
+    for shard in (2, 5):
+        (copy / "shards" / f"{shard:05d}" / "done.json").unlink()
+    words = "the run is unfinished: 18 images of 6 finished shards are read, 24 samples are planned"
+    with pytest.warns(UnfinishedRunWarning, match=words):
+        report = validate(copy)
+    assert report["ok"], report["problems"]
+    assert (report["images"], report["recomputed"]) == (18, 18)
+    assert report["notes"] == [words]
+    assert run(["export-dataset", str(copy), "-o", str(tmp_path / "out"), "--format", "csv"]) == 0
+    assert capsys.readouterr().err.splitlines()[0] == f"warning: {copy}: {words}"
+    with open(tmp_path / "out" / "labels.csv", newline="") as file:
+        samples = [int(row["sample"]) for row in csv.DictReader(file)]
+    assert samples == [k for k in range(24) if k // 3 not in (2, 5)]
+    assert json.loads((tmp_path / "out" / "export.json").read_text())["unfinished"] is True
+
+
+def test_damage_of_an_unfinished_run_is_found(copy, tmp_path):
+    (copy / "dataset.json").unlink()
+    edit(copy, 4, lambda line: line["records"][0].pop("pose"))
+    with pytest.warns(UnfinishedRunWarning):
+        found = validate(copy)["problems"]
+    assert any("shards/00001/lines.jsonl: " in problem for problem in found)
+    assert any("pose.azimuth_deg: missing" in problem for problem in found)
+    with pytest.warns(UnfinishedRunWarning), pytest.raises(InputError, match=r"shards/00001/lines\.jsonl: has"):
         export(copy, "csv", tmp_path / "out")
+
+
+def test_what_is_no_dataset_is_refused(copy, tmp_path):
+    (copy / "dataset.json").unlink()
+    shutil.rmtree(copy / "shards")
+    with pytest.raises(InputError, match="an unfinished run without a finished shard"):
+        validate(copy)
     with pytest.raises(InputError, match="no such folder"):
         validate(tmp_path / "nowhere")
 

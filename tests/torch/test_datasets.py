@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 import subprocess
 import sys
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.errors import InputError
+from eyerender.errors import InputError, UnfinishedRunWarning
 from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import plan
 from tests.support.paths import ROOT
@@ -46,6 +47,20 @@ def numbers(loader):
 
 def without_files(lines):
     return [{k: v for k, v in line.items() if k != "schema" and not k.endswith("file_name")} for line in lines]
+
+
+def test_what_is_finished_of_a_run_can_be_trained_on(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    (copy / "dataset.json").unlink()
+    shards = sorted((copy / "shards").iterdir())
+    (shards[1] / "done.json").unlink()
+    lost = {json.loads(line)["sample"] for line in (shards[1] / "lines.jsonl").read_text().splitlines()}
+    with pytest.warns(UnfinishedRunWarning, match="the run is unfinished"):
+        data = FolderDataset(copy, parts=("image", "mask", "line"))
+    whole = {item["sample"]: item for item in FolderDataset(folder, parts=("image", "mask", "line"))}
+    assert [item["sample"] for item in data] == sorted(whole.keys() - lost)
+    for item in data:
+        same(item, whole[item["sample"]])
 
 
 def test_a_folder_gives_its_pictures_and_labels(folder):

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...folders.imagefolder import DATASET, METADATA, ImageFolder
+from ...folders.imagefolder import DATASET, ImageFolder
 from ...folders.outfolder import staged
 from ...progress import Progress
 from ...storage.files import write_json, write_text
-from ..assemble import verify_dataset
+from ..assemble import verify_dataset, verify_finished
 from ..validation.problems import WRONG
 from . import coco, ellseg, openeds, parquet, table, teyed, webdataset
 from .card import export_card
@@ -79,7 +79,8 @@ def export(
     folder = ImageFolder.load(path)
     if folder.dataset.get("kind") != "dataset":
         raise InputError("is not a generated dataset (its kind is not 'dataset')", source=str(Path(path) / DATASET))
-    for problem in verify_dataset(folder.path):
+    digest = folder.dataset.get("digest")
+    for problem in verify_finished(folder.path, digest) if folder.unfinished else verify_dataset(folder.path):
         raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(path))
     total = len(folder.entries)
 
@@ -98,6 +99,7 @@ def export(
             "format": format,
             "dataset": items.name,
             "images": total,
+            "unfinished": bool(folder.unfinished),
             "images_by_split": items.images_by_split,
             "source_bit_depths": sorted(items.bit_depths),
             "image": items.encoding.to_mapping(),
@@ -124,8 +126,8 @@ def _labels_as_made(items: Items) -> Iterator[None]:
         yield
     except WRONG as error:
         reason = f"cannot be exported, for it is not as this version writes it ({type(error).__name__}: {error})"
-        source = str(items.folder.path / METADATA)
-        raise InputError(reason, source=source, path=f"line {items.row + 1}") from error
+        source, number = items.place
+        raise InputError(reason, source=str(source), path=f"line {number}") from error
 
 
 __all__ = ["FORMATS", "Encoding", "Item", "Items", "export"]

@@ -52,7 +52,7 @@ class Item:
         """
         depth = self.line.get("bit_depth")
         if not isinstance(depth, int) or isinstance(depth, bool) or not 1 <= depth <= 16:
-            raise InputError("must be 1 to 16", source=str(self.entry.folder / METADATA), path=self._where("bit_depth"))
+            raise InputError("must be 1 to 16", source=str(self.entry.source), path=self._where("bit_depth"))
         return depth
 
     @cached_property
@@ -158,7 +158,7 @@ class Items:
         sizes: (width, height) of the images.
         lights: the largest number of reflections in a line.
         file_name_bytes: length of the longest name of an image, in UTF-8.
-        row: the row that is being read, for messages.
+        place: file and number of the line that is being read, for messages.
     """
 
     def __init__(self, folder: ImageFolder, step: Callable[[int], None]) -> None:
@@ -168,7 +168,8 @@ class Items:
         self.images_by_split: dict[str, int] = {}
         self.bit_depths: set[int] = set()
         self.sizes: set[tuple[int, int]] = set()
-        self.lights = self.file_name_bytes = self.row = 0
+        self.lights = self.file_name_bytes = 0
+        self.place = folder.path / METADATA, 0
 
     def survey(self) -> None:
         """Read all lines once.
@@ -180,7 +181,7 @@ class Items:
         samples = np.empty(len(self), dtype=np.int64)
         names = np.empty(len(self), dtype=np.int64)
         for row, entry in enumerate(self.folder.entries):
-            self.row, item = row, Item(entry)
+            self.place, item = (entry.source, entry.number), Item(entry)
             samples[row], names[row] = entry.line["sample"], hash(item.name)
             splits[item.split] += 1
             self.bit_depths.add(item.bit_depth)
@@ -200,7 +201,7 @@ class Items:
         # Consecutive rows of the file are read together.
         for rows in np.split(self.order, np.flatnonzero(np.diff(self.order) != 1) + 1):
             for entry in self.folder.entries[int(rows[0]) : int(rows[-1]) + 1]:
-                self.row = entry.number - 1
+                self.place = entry.source, entry.number
                 yield Item(entry, self.encoding)
                 done += 1
                 self.step(done)
@@ -208,8 +209,9 @@ class Items:
     def sample(self, count: int) -> Iterator[Item]:
         """Yield at most `count` images, spread evenly over the samples."""
         for at in np.unique(np.linspace(0, len(self), min(count, len(self)), endpoint=False, dtype=np.int64)):
-            self.row = int(self.order[at])
-            yield Item(self.folder.entries[self.row])
+            entry = self.folder.entries[int(self.order[at])]
+            self.place = entry.source, entry.number
+            yield Item(entry)
 
     @property
     def splits(self) -> list[str]:

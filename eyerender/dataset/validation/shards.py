@@ -18,24 +18,34 @@ from numpy.typing import NDArray
 
 from ...arrays import Ints
 from ...errors import InputError
-from ...folders.imagefolder import METADATA
+from ...folders.imagefolder import LINES, METADATA, SHARDS, ImageFolder, finished, shard_name
 from ...progress import Progress
 from ...storage.files import opened, parse_json, shown
 from ...storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
 from ..assemble import damage, shards_of
-from ..shard import LINES, SHARDS, finished, shard_name, verify
+from ..shard import verify
 from .problems import SHOWN, Problems, differences
 
 _EXACT_INTEGER = 2**53
 
 
-def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: Problems, step: Progress) -> None:
+def check_run(images: ImageFolder, quick: bool, problems: Problems, step: Progress) -> None:
+    """Check the shards of a dataset, and metadata.jsonl against their lines where the run is finished."""
+    check_shards(images, quick, problems, step)
+    if not images.unfinished:
+        compare_lines(images.path, problems)
+
+
+def check_shards(images: ImageFolder, quick: bool, problems: Problems, step: Progress) -> None:
     """Check every shard that dataset.json lists, and the files that were put together from the shards.
 
-    A shard must exist and belong to the plan. Its files must have the stated sizes and, unless `quick`, checksums.
+    A shard must exist, unless the run is unfinished, and belong to the plan. Its files must have the stated sizes and,
+    unless `quick`, checksums.
     """
-    # Where dataset.json has no checksums, as older versions wrote it, `compare_lines` checks metadata.jsonl.
-    problems.extend(damage(folder, quick=quick or dataset.get("checksums") is None))
+    folder, dataset = images.path, images.dataset
+    if not images.unfinished:
+        # Where dataset.json has no checksums, as older versions wrote it, `compare_lines` checks metadata.jsonl.
+        problems.extend(damage(folder, quick=quick or dataset.get("checksums") is None))
     there = sorted(finished(folder))
     digest = dataset.get("digest")
     for k, shard in enumerate(there):
@@ -45,9 +55,11 @@ def check_shards(folder: Path, dataset: dict[str, Any], quick: bool, problems: P
     if asked is None:
         return  # then the plan cannot be read either
     known = frozenset(there)
-    missing = len(asked) - sum(shard in asked for shard in there)
-    problems.extend(f"{SHARDS}/{shard_name(s)}: missing" for s in islice((s for s in asked if s not in known), SHOWN))
-    problems.count += max(missing - SHOWN, 0)
+    if not images.unfinished:
+        missing = len(asked) - sum(shard in asked for shard in there)
+        absent = (s for s in asked if s not in known)
+        problems.extend(f"{SHARDS}/{shard_name(s)}: missing" for s in islice(absent, SHOWN))
+        problems.count += max(missing - SHOWN, 0)
     problems.extend(f"{SHARDS}/{shard_name(s)}: dataset.json has no such shard" for s in there if s not in asked)
 
 

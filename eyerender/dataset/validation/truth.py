@@ -18,7 +18,7 @@ import numpy as np
 from ...analytic.observer import trace
 from ...arrays import Bools, Floats
 from ...errors import InputError
-from ...folders.imagefolder import DATASET, RESULTS, ImageFolder, versions
+from ...folders.imagefolder import DATASET, RESULTS, ImageFolder, shard_name, versions
 from ...imaging.labels import EyeInWindow, known_labels, limbus_px
 from ...observation import EYES, Observations, version_of
 from ...region.mesh import lid_margins
@@ -31,7 +31,7 @@ from ...storage.files import parse_json, shown
 from ..line import image_line, image_name
 from ..plan import Plan
 from ..realise import Realised, frames_of, realise
-from ..shard import KINDS, shard_name
+from ..shard import KINDS
 from .problems import WRONG, Problems, differences
 
 # Rays are traced to 1e-9 mm, and other machines' mathematical functions change the last digits: 1e-8 px at the sharpest
