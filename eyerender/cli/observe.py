@@ -144,6 +144,7 @@ def compare(
     *,
     estimator: str = "regression",
     function: str = "R3",
+    strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Compare the features found in a folder's images with its analytic ones.
@@ -156,13 +157,15 @@ def compare(
         function: regression: the function, R1 to R12.
     """
     from ..applications.quickstart import compare_folder
+    from ..gaze.determined import undetermined_to
     from ..gaze.store import choose_estimator
 
     chosen = choose_estimator(estimator, function=function)
     name = f"regression {function}" if estimator == "regression" else estimator
-    with progress("extracting") as steps:
+    heed = Heed(strict)
+    with progress("extracting") as steps, undetermined_to(heed, str(folder)):
         result = compare_folder(folder, estimator=chosen, name=name, progress=steps)
-    emit(result.to_mapping(), result.to_text(), json)
+    emit(result.to_mapping(), result.to_text(), json, heed)
     return 0
 
 

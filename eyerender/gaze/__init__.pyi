@@ -4,6 +4,7 @@ from .budget import ErrorBudget as ErrorBudget
 from .budget import budget as budget
 from .columns import CsvColumns as CsvColumns
 from .crossratio import CrossRatio as CrossRatio
+from .determined import UndeterminedWarning as UndeterminedWarning
 from .directions import DirectionRegression as DirectionRegression
 from .estimate import GazeEstimator as GazeEstimator
 from .estimate import GazePoints as GazePoints

@@ -18,10 +18,11 @@ from ..arrays import Floats, Objects
 from ..errors import InputError
 from ..observation import Observations
 from ..rig.rig import RigLike
+from .determined import Terms, monomials
 from .estimate import GazePoints, GazeRays
 from .rays import camera_of, chosen_lights, glints_of, screen_of, target_directions
 from .recalibration import angles_of, direction_of
-from .regression import EyeFit, Regression, Terms, monomials
+from .regression import EyeFit, Regression
 
 Feature = Literal["pupil-glint", "pupil"]
 

@@ -8,6 +8,7 @@ fitted by least squares for each eye.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -18,11 +19,13 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..observation import EYES, Observations
 from ..rig.rig import RigLike
+from .determined import UndeterminedWarning, shortfall
 from .estimate import GazePoints, GazeRays
 from .rays import screen_of, targets_on_screen, unit
 
 RecalibrationKind = Literal["none", "screen", "angle"]
-TERMS = 6
+EXPONENTS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
+TERMS = len(EXPONENTS)
 _ANGLE = "use recalibration='angle' without one"
 
 
@@ -64,6 +67,9 @@ class Recalibration:
             solution, _, rank, _ = np.linalg.lstsq(design / scale, wanted[rows], rcond=1e-10)
             if rank < TERMS:
                 raise InputError(f"{name} eye: the calibration targets do not determine the correction (rank {rank})")
+            why = shortfall(measured[rows], [EXPONENTS], "the correction")
+            if why is not None:
+                warnings.warn(f"{name} eye: {why}; calibrate without it (none)", UndeterminedWarning, stacklevel=3)
             out[int(eye)] = (solution / scale[:, None]).T
         return Recalibration(self.kind, out)
 

@@ -8,6 +8,7 @@ vector is that of one eye alone (Morimoto & Mimica, CVIU 98, 2005).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
@@ -18,10 +19,9 @@ from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
 from ..observation import Observations
 from ..rig.rig import RigLike
+from .determined import Terms, UndeterminedWarning, is_determined, monomials, shortfall
 from .estimate import GazePoints
 from .rays import glints_of, screen_of, targets_on_screen
-
-Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
 
 
 def _terms(text: str) -> Terms:
@@ -64,6 +64,7 @@ FUNCTIONS: dict[str, tuple[str, str]] = {
     "R11": (_X11, "x + x2 + y + xy + x2y + 1"),
     "R12": (_X11, _Y10),
 }
+_TABLE = {name: (_terms(x), _terms(y)) for name, (x, y) in FUNCTIONS.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,21 +127,24 @@ class Regression:
         """Fit the coefficients of one eye: vectors (n, 2) to points on the screen (n, 2) mm.
 
         The polynomial is of scaled vectors, which does not change the function. A subclass may solve differently.
+        Warns with `UndeterminedWarning` where there are enough vectors, but too few distinct columns or rows of them.
 
         Raises:
             InputError: as for `fit`.
         """
         x_terms, y_terms = self.terms
         need = max(len(x_terms), len(y_terms))
+        origin = vectors.mean(axis=0) if self.centred and len(vectors) else np.zeros(2)
         if len(vectors) < need:
-            raise InputError(
-                f"{name} eye: {len(vectors)} usable calibration targets, but {self.function} has {need} terms"
-            )
-        origin = vectors.mean(axis=0) if self.centred else np.zeros(2)
+            reason = f"{len(vectors)} usable calibration targets, but {self.function} has {need} terms"
+            raise InputError(f"{name} eye: {reason}{_instead(vectors - origin)}")
         scale = np.maximum(np.abs(vectors - origin).max(axis=0), 1e-300)
         u = (vectors - origin) / scale
         a = self._solve(monomials(u, x_terms), wanted[:, 0], name)
         b = self._solve(monomials(u, y_terms), wanted[:, 1], name)
+        why = shortfall(vectors - origin, self.terms, str(self.function))
+        if why is not None:
+            warnings.warn(f"{name} eye: {why}{_instead(vectors - origin)}", UndeterminedWarning, stacklevel=3)
         return EyeFit(origin, scale, a, b)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
@@ -166,6 +170,19 @@ class Regression:
         if rank < design.shape[1]:
             raise InputError(f"{eye} eye: the calibration targets do not determine {self.function} (rank {rank})")
         return np.asarray(solution)
+
+
+def highest_determined(vectors: Floats) -> str | None:
+    """The function of Table 2 with the most terms that calibration vectors (n, 2) determine; None if there is none."""
+    if not len(vectors):
+        return None
+    by_terms = sorted(_TABLE, key=lambda name: sum(map(len, _TABLE[name])), reverse=True)
+    return next((name for name in by_terms if is_determined(vectors, _TABLE[name])), None)
+
+
+def _instead(vectors: Floats) -> str:
+    better = highest_determined(vectors)
+    return f"; {better} is the function with the most terms that they determine" if better else ""
 
 
 def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: bool = True) -> tuple[Floats, Objects]:
@@ -200,8 +217,3 @@ def _partners(frame: Ints, eye: Ints) -> Ints:
     at = np.minimum(np.searchsorted(key[order], key ^ 1), len(key) - 1)
     found = (key[order][at] == (key ^ 1)) & (eye >= 0)
     return np.where(found, order[at], -1)
-
-
-def monomials(v: Floats, terms: Terms) -> Floats:
-    """Design matrix (n, m) of vectors (n, 2): x^i y^j for each of the m terms (i, j)."""
-    return np.stack([v[:, 0] ** i * v[:, 1] ** j for i, j in terms], axis=1)

@@ -20,6 +20,7 @@ from ..spec import Positive, Spec
 from ..status import Status
 from ..storage.files import read_json, shown, write_json
 from .crossratio import CrossRatio
+from .determined import undetermined_to
 from .directions import DirectionRegression, Feature
 from .estimate import GazeEstimator, RayEstimator, angular_error_deg, binocular_average, ray_errors_deg
 from .guestrin import GuestrinEizenman
@@ -158,7 +159,7 @@ def fit_estimator(
         rig: their rig.
         fixations: fixations for the calibration, counted from 0; None: all.
         source: name of the observations in messages.
-        warn: called for targets off the screen before anything is calibrated; it may raise.
+        warn: called for targets off the screen and for an estimator that the targets do not determine; it may raise.
 
     Raises:
         InputError: there are no targets, a fixation is unknown, or the estimator itself refuses.
@@ -178,7 +179,7 @@ def fit_estimator(
     if warn is not None:
         warn(target_warnings(used.index.target_mm, rig.screen, source))
     try:
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"), undetermined_to(warn, source):
             fitted = estimator.fit(used, rig)
     except InputError as error:
         raise error.placed(source=source) from None

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import ArrayValue, Bools, Floats, Objects
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..observation import Observations
 from ..rig.rig import RigLike
+from .determined import UndeterminedWarning, undetermined_to
 from .estimate import GazeEstimator, GazePoints, angular_error_deg, binocular_average
 
 
@@ -65,12 +67,17 @@ def leave_one_target_out(estimator: GazeEstimator, observations: Observations, r
         )
     points = np.full((len(observations), 3), np.nan)
     reason = np.full(len(observations), None, dtype=object)
-    for fixation in np.unique(observations.index.fixation):
-        held_out = observations.index.fixation == fixation
-        fitted = estimator.fit(observations.take(~held_out), rig)
-        gaze = fitted.predict(observations.take(held_out), rig)
-        points[held_out] = gaze.point_mm
-        reason[held_out] = gaze.reason
+    undetermined: list[InputWarning] = []
+    with undetermined_to(undetermined.extend, ""):
+        for fixation in np.unique(observations.index.fixation):
+            held_out = observations.index.fixation == fixation
+            fitted = estimator.fit(observations.take(~held_out), rig)
+            gaze = fitted.predict(observations.take(held_out), rig)
+            points[held_out] = gaze.point_mm
+            reason[held_out] = gaze.reason
+    if undetermined:
+        text = f"without one of the targets, {undetermined[0].reason}"
+        warnings.warn(text, UndeterminedWarning, stacklevel=2)
     return gaze_errors(observations, GazePoints.of(points, reason))
 
 

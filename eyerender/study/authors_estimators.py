@@ -11,9 +11,10 @@ from scipy.optimize import minimize
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..gaze.determined import monomials
 from ..gaze.guestrin import GuestrinEizenman
 from ..gaze.parameters import Calibration, EyeParameters
-from ..gaze.regression import EyeFit, Regression, monomials
+from ..gaze.regression import EyeFit, Regression
 from ..gaze.search import MOST_ITERATIONS, FreeParameters, Misses
 
 # A slots dataclass is a new class, which super() without arguments does not find, so base classes are named.

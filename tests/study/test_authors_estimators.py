@@ -11,9 +11,10 @@ from scipy.optimize import minimize
 from eyerender.analytic.observer import trace
 from eyerender.arrays import frozen
 from eyerender.errors import InputError
+from eyerender.gaze.determined import monomials
 from eyerender.gaze.guestrin import GuestrinEizenman
 from eyerender.gaze.parameters import EyeParameters
-from eyerender.gaze.regression import Regression, monomials, pupil_glint_vectors
+from eyerender.gaze.regression import Regression, pupil_glint_vectors
 from eyerender.scene import load_scene
 from eyerender.study.authors_estimators import AuthorsGuestrinEizenman, MinimumNormRegression
 
