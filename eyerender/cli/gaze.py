@@ -15,8 +15,21 @@ from .output import Heed, emit
 if TYPE_CHECKING:
     from ..scene import Scene
 
+UNITS = ["mm", "px", "deg"]
+PLACES = {
+    "given": "as the records have it",
+    "rays": "estimated as the origin of the estimator's gaze rays",
+    "glints": "estimated from the glints, with an average cornea",
+}
+"""Where the place of the eye is from, in words."""
+
 gaze = App(name="gaze", help="Estimate gaze from records of features, also from real images.")
 app.command(gaze)
+
+
+def _positive(_type: Any, value: tuple[float, float] | None) -> None:
+    if value is not None and not all(0 < side <= 1e6 for side in value):
+        raise ValueError("must be two numbers > 0")
 
 
 @gaze.command(name="fit")
@@ -91,10 +104,11 @@ def fit(
     fitted, summary = fit_estimator(chosen, observations, built, targets, source=str(records), warn=heed)
     save_estimator(output, fitted, built)
     summary = {**summary, "path": str(output)}
-    mean = summary["calibration_error_deg"]["mean_deg"]
     text = f"{estimator}: calibrated on {summary['calibration_observations']} observations, written to {output}"
-    if mean is not None:
-        text += f"\nerror on them (not a test): mean {mean:.4f} deg over {summary['calibration_error_deg']['n']}"
+    for unit in ("deg", "mm"):
+        error = summary[f"calibration_error_{unit}"]
+        if error["n"]:
+            text += f"\nerror on them (not a test): mean {error[f'mean_{unit}']:.4f} {unit} over {error['n']}"
     emit(summary, text, json, heed)
     return 0
 
@@ -109,12 +123,15 @@ def predict(
     scene: str | None = None,
     rig: str | None = None,
     columns: Path | None = None,
+    screen_px: Annotated[tuple[float, float] | None, Parameter(validator=_positive)] = None,
     strict: Strict = False,
     json: Result = None,
 ) -> int:
     """Estimate gaze points, or rays if the rig has no screen, with a calibration written by `gaze fit`.
 
-    Where the targets are known, the errors are reported too.
+    Where the targets are known, the errors are reported too: on the screen in mm and px, and in degrees at the eye. The
+    place of the eye is the records' own, or it is estimated. A summary has mean, median and 95th percentile of the
+    errors, and the data loss: the share of samples without an estimate.
 
     Args:
         records: Records as `features` or `extract` write them (JSON), one record per line (JSONL), or a table (CSV).
@@ -124,8 +141,10 @@ def predict(
         rig: A rig file or a scene file, for its rig.
         columns: A YAML file that says what the columns of a table are (default: as their names say).
     """
+    from ..gaze.columns import CsvColumns
+    from ..gaze.predictions import predictions
     from ..gaze.records import load_observations
-    from ..gaze.store import load_calibration, predictions
+    from ..gaze.store import load_calibration
     from ..plausibility import rig_warnings
 
     heed = Heed(strict)
@@ -133,7 +152,9 @@ def predict(
     observations, built = load_observations(records, _scene(scene, heed), rig=rig, columns=columns)
     if calibrated is not None:
         heed(rig_warnings(built, calibrated, scene or rig or str(records)))
-    data = predictions(fitted, observations, built)
+    if screen_px is None and columns is not None:
+        screen_px = CsvColumns.load(columns).screen_px
+    data = predictions(fitted, observations, built, screen_px)
     emit(data, _gaze_table(data), json, heed)
     return 0
 
@@ -163,19 +184,33 @@ def fixation_list(text: str | None) -> list[int] | None:
 
 
 def _gaze_table(data: dict[str, Any]) -> str:
-    from ..gaze.store import RAYS_SCHEMA
+    from ..gaze.predictions import RAYS_SCHEMA
 
-    key = "direction" if data["schema"] == RAYS_SCHEMA else "point_mm"
-    title = "gaze point mm" if key == "point_mm" else "gaze direction"
-    lines = [f"{'frame':>6} {'eye':<6} {title:>32} {'error deg':>10}"]
-    for entry in data["gaze"]:
+    rays = data["schema"] == RAYS_SCHEMA
+    key, title, units = ("direction", "gaze direction", ["deg"]) if rays else ("point_mm", "gaze point mm", UNITS)
+    lines = [f"{'frame':>6} {'eye':<6} {title:>33}" + "".join(f"{f'error {unit}':>11}" for unit in units)]
+    both = [{**entry, "eye": "both"} for entry in data["binocular"] if entry["point_mm"] is not None]
+    for entry in [*data["gaze"], *both]:
         point = entry[key]
         where = f"missing: {entry['reason']}" if point is None else "".join(f"{v:>11.3f}" for v in point)
-        error = "-" if entry["error_deg"] is None else f"{entry['error_deg']:.4f}"
-        lines.append(f"{entry['frame']:>6} {entry['eye'] or '-':<6} {where:>32} {error:>10}")
-    for entry in data["binocular"]:
-        if entry["point_mm"] is not None:
-            where = "".join(f"{v:>11.3f}" for v in entry["point_mm"])
-            error = "-" if entry["error_deg"] is None else f"{entry['error_deg']:.4f}"
-            lines.append(f"{entry['frame']:>6} {'both':<6} {where:>32} {error:>10}")
+        errors = "".join(_cell(entry[f"error_{unit}"], ".3f") for unit in units)
+        lines.append(f"{entry['frame']:>6} {entry['eye'] or '-':<6} {where:>33}{errors}")
+    lines += ["", f"{'eye':<6} {'samples':>8} {'data loss':>10}  {'error':<6}{'mean':>11}{'median':>11}{'95 %':>11}"]
+    for entry in data["summary"]:
+        start = f"{entry['eye'] or '-':<6} {entry['samples']:>8} {entry['data_loss']:>10.1%}"
+        known = [unit for unit in units if entry[f"error_{unit}"] is not None]
+        for unit in known or ["-"]:
+            figures = entry.get(f"error_{unit}") or {}
+            numbers = "".join(_cell(figures.get(name), ".3f") for name in ("mean", "median", "p95"))
+            lines.append(f"{start}  {unit:<6}{numbers}")
+            start = " " * len(start)
+    lines += [f"degrees: place of the eye {PLACES[place]}" for place in PLACES if _uses(data, place)]
     return "\n".join(lines)
+
+
+def _cell(value: float | None, form: str) -> str:
+    return f"{'-' if value is None else format(value, form):>11}"
+
+
+def _uses(data: dict[str, Any], place: str) -> bool:
+    return any(place in entry["eye_place"] and entry["error_deg"] is not None for entry in data["summary"])

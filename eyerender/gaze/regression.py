@@ -17,7 +17,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError
-from ..observation import Observations
+from ..observation import EYES, Observations
 from ..rig.rig import RigLike
 from .determined import Terms, UndeterminedWarning, is_determined, monomials, shortfall
 from .estimate import GazePoints
@@ -115,11 +115,16 @@ class Regression:
         """
         wanted = targets_on_screen(observations, screen_of(rig.build()))
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
+        if self.normalised and (_partners(observations.index.frame, observations.index.eye) < 0).all():
+            raise InputError(
+                "no frame has both a right and a left eye, whose distance is the unit of the pupil-glint vector; "
+                "for one eye give --monocular (in Python: Regression(normalised=False))"
+            )
         usable = np.array([r is None for r in reason], dtype=bool) & np.isfinite(wanted).all(axis=1)
         fits = {}
         for eye in np.unique(observations.index.eye):
             rows = usable & (observations.index.eye == eye)
-            name = "right" if eye == 0 else "left"
+            name = EYES[int(eye)] if eye >= 0 else "unknown"
             fits[int(eye)] = self.fit_eye(v[rows], wanted[rows], name)
         return replace(self, fits=fits)
 

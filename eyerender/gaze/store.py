@@ -17,17 +17,17 @@ from ..plausibility import target_warnings
 from ..references import is_reference
 from ..rig.rig import RigGeometry, RigLike
 from ..spec import Positive, Spec
-from ..status import Status
 from ..storage.files import read_json, shown, write_json
 from .crossratio import CrossRatio
 from .determined import undetermined_to
 from .directions import DirectionRegression, Feature
-from .estimate import GazeEstimator, RayEstimator, angular_error_deg, binocular_average, ray_errors_deg
+from .estimate import GazeEstimator
 from .guestrin import GuestrinEizenman
 from .hennessey import Hennessey
 from .homography import Homography
 from .own import OwnEstimator
 from .parameters import MEAN_EYE, Calibration, EyeParameters
+from .predictions import predictions
 from .recalibration import Recalibration
 from .records import rig_from_mapping
 from .regression import EyeFit, Regression
@@ -36,9 +36,7 @@ from .twocamera import ShihWuLiu
 CALIBRATION_SCHEMA = "eyerender/gaze-calibration/4"
 # Still read: 1 to 3 have no regression of directions, 1 has no rig, 1 and 2 have no user's own estimators.
 _SCHEMAS = (CALIBRATION_SCHEMA, *(f"eyerender/gaze-calibration/{version}" for version in (3, 2, 1)))
-FIT_SCHEMA = "eyerender/gaze-fit/1"
-PREDICT_SCHEMA, RAYS_SCHEMA = "eyerender/gaze/1", "eyerender/gaze/2"
-"""Schemas of gaze points on a screen, and of gaze rays of a rig without one."""
+FIT_SCHEMA = "eyerender/gaze-fit/2"
 
 
 EstimatorName = Literal[
@@ -151,7 +149,7 @@ def fit_estimator(
     source: str = "",
     warn: Warn | None = None,
 ) -> tuple[GazeEstimator, dict[str, Any]]:
-    """Calibrate an estimator and summarise it (schema eyerender/gaze-fit/1).
+    """Calibrate an estimator and summarise it (schema eyerender/gaze-fit/2).
 
     Args:
         estimator: the estimator, not calibrated.
@@ -186,88 +184,23 @@ def fit_estimator(
     except np.linalg.LinAlgError:
         raise InputError("the records do not determine a calibration", source=source) from None
     gaze = predictions(fitted, used, rig)
-    errors = [g["error_deg"] for g in gaze["gaze"] if g["error_deg"] is not None]
     return fitted, {
         "schema": FIT_SCHEMA,
         "estimator": _described(estimator),
         "calibration_observations": len(used),
-        "calibration_error_deg": {
-            "mean_deg": float(np.mean(errors)) if errors else None,
-            "max_deg": float(np.max(errors)) if errors else None,
-            "n": len(errors),
-        },
+        "eye_place": sorted({place for one in gaze["summary"] for place in one["eye_place"]}),
+        "calibration_error_deg": _mean_and_max(gaze["gaze"], "deg"),
+        "calibration_error_mm": _mean_and_max(gaze["gaze"], "mm"),
     }
 
 
-def predictions(estimator: GazeEstimator, observations: Observations, rig: RigGeometry) -> dict[str, Any]:
-    """Estimate gaze of every observation and of every frame with two eyes.
-
-    Schema eyerender/gaze/1 holds gaze points. Errors are angles at the place of the eye, or between both eyes; null
-    without a target or a place. For a rig without a screen, schema eyerender/gaze/2 holds the rays of an estimator of
-    rays. Their errors are angles at their origins, and there are no binocular estimates.
-    """
-    if rig.screen is None and isinstance(estimator, RayEstimator):
-        return _ray_predictions(estimator, observations, rig)
-    index = observations.index
-    with np.errstate(all="ignore"):
-        gaze = estimator.predict(observations, rig)
-        at_eye = angular_error_deg(gaze.point_mm, index.target_mm, index.eye_position_mm + index.head_mm)
-    single = [
-        {
-            **_identity(observations, i),
-            "status": Status(gaze.status[i]).label,
-            "reason": gaze.reason[i],
-            "point_mm": gaze.point_mm[i].tolist() if gaze.ok[i] else None,
-            "target_mm": _numbers(index.target_mm[i]),
-            "error_deg": _number(at_eye[i]),
-        }
-        for i in range(len(observations))
-    ]
-    binocular = []
-    if len(np.unique(index.eye[index.eye >= 0])) == 2:
-        frames, both = binocular_average(observations, gaze)
-        at_middle = angular_error_deg(both.point_mm, frames.index.target_mm, frames.index.head_mm)
-        binocular = [
-            {
-                "frame": int(frames.index.frame[i]),
-                "status": Status(both.status[i]).label,
-                "reason": both.reason[i],
-                "point_mm": both.point_mm[i].tolist() if both.ok[i] else None,
-                "error_deg": _number(at_middle[i]),
-            }
-            for i in range(len(both))
-        ]
-    return {"schema": PREDICT_SCHEMA, "gaze": single, "binocular": binocular}
-
-
-def _ray_predictions(estimator: RayEstimator, observations: Observations, rig: RigGeometry) -> dict[str, Any]:
-    with np.errstate(all="ignore"):
-        rays = estimator.predict_rays(observations, rig)
-        errors = ray_errors_deg(observations, rays)
-    status = np.where(rays.ok, Status.OK, Status.NO_ESTIMATE)
-    entries = [
-        {
-            **_identity(observations, i),
-            "status": Status(int(status[i])).label,
-            "reason": rays.reason[i],
-            "origin_mm": _numbers(rays.origin_mm[i]),
-            "direction": _numbers(rays.direction[i]),
-            "target_mm": _numbers(observations.index.target_mm[i]),
-            "error_deg": _number(errors[i]),
-        }
-        for i in range(len(observations))
-    ]
-    return {"schema": RAYS_SCHEMA, "gaze": entries, "binocular": []}
-
-
-def _identity(observations: Observations, i: int) -> dict[str, Any]:
-    """Keys that say which observation row `i` is."""
-    index = observations.index
+def _mean_and_max(gaze: list[dict[str, Any]], unit: str) -> dict[str, Any]:
+    """Mean and largest error of the entries of `predictions`."""
+    errors = [one[f"error_{unit}"] for one in gaze if one.get(f"error_{unit}") is not None]
     return {
-        "frame": int(index.frame[i]),
-        "fixation": int(index.fixation[i]) if index.fixation[i] >= 0 else None,
-        "camera": int(index.camera[i]) if index.camera[i] >= 0 else None,
-        "eye": EYES[int(index.eye[i])] if index.eye[i] >= 0 else None,
+        f"mean_{unit}": float(np.mean(errors)) if errors else None,
+        f"max_{unit}": float(np.max(errors)) if errors else None,
+        "n": len(errors),
     }
 
 
@@ -465,11 +398,3 @@ def _restored(estimator: BuiltIn, eyes: dict[int, Any]) -> BuiltIn:
     if estimator.recalibration != "none":
         return replace(estimator, correction=Recalibration(estimator.recalibration, arrays("coefficients")))
     return estimator
-
-
-def _numbers(values: Floats) -> list[float] | None:
-    return [float(v) for v in values] if np.isfinite(values).all() else None
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -136,7 +136,7 @@ def test_the_commands_work_without_a_screen(head_mounted, tmp_path, monkeypatch,
     assert run(["gaze", "predict", "f.json", "-c", "c.json", "--json", "p.json"]) == 0
     assert "gaze direction" in capsys.readouterr().out
     found = json.loads((tmp_path / "p.json").read_text())
-    assert found["schema"] == "eyerender/gaze/2"
+    assert found["schema"] == "eyerender/gaze/4"
     own = er.gaze.DirectionRegression("R3", "pupil").fit(seen.take(learnt), scene.rig).predict_rays(seen, scene.rig)
     np.testing.assert_allclose([g["direction"] for g in found["gaze"]], own.direction, atol=1e-12)
     assert run(["budget", "head_mounted", "--estimator", "direction-regression", "--no-images"]) == 2  # no targets

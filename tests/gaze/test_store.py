@@ -52,7 +52,7 @@ def test_fit_and_predict_on_the_command_line(guestrin, tmp_path, capsys, name):
     assert run(["gaze", "predict", str(guestrin), "-c", str(calibration), "--json", str(out)]) == 0
     capsys.readouterr()
     data = json.loads(out.read_text())
-    assert data["schema"] == "eyerender/gaze/1"
+    assert data["schema"] == "eyerender/gaze/3"
     assert len(data["gaze"]) == 90
     assert len(data["binocular"]) == 45
     seen, rig = load_observations(guestrin)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from functools import cache
 from random import Random
 from typing import Any
@@ -216,17 +217,81 @@ def test_the_gaze_is_that_of_the_records(tmp_path, monkeypatch, capsys):
     assert {g["status"] for g in predictions(fitted, again, built)["gaze"]} == {"ok"}
 
 
-def test_errors_in_degrees_need_the_eyes_places(tmp_path):
+def test_errors_in_degrees_are_seen_from_the_eyes_places(tmp_path):
     seen, rig = recording()
     table = long_table(tmp_path / "t.csv")
     place = {"eye_position_mm": {"right": [0, -31.5, 0], "left": [0, 31.5, 0]}}
-    fitted, without = fit_estimator(choose_estimator("regression"), observations_from_csv(table), rig)
-    assert without["calibration_error_deg"]["n"] == 0
-    _, full = fit_estimator(choose_estimator("regression"), observations_from_csv(table, place), rig)
-    _, wanted = fit_estimator(choose_estimator("regression"), seen, rig)
+    chosen = choose_estimator("regression")
+    fitted, full = fit_estimator(chosen, observations_from_csv(table, place), rig)
+    _, wanted = fit_estimator(chosen, seen, rig)
     assert full["calibration_error_deg"] == pytest.approx(wanted["calibration_error_deg"], rel=1e-12)
+    assert full["eye_place"] == ["given"]
     both = predictions(fitted, observations_from_csv(table, place), rig)["binocular"]
     assert all(b["error_deg"] is not None for b in both)
+    # The centre of corneal curvature is some 8 mm behind the apex, 1.4 % of the distance to the screen, and an average
+    # radius puts it wrong by less.
+    _, without = fit_estimator(chosen, observations_from_csv(table), rig)
+    assert without["eye_place"] == ["glints"]
+    assert without["calibration_error_deg"]["n"] == len(seen)
+    for key in ("mean_deg", "max_deg"):
+        assert without["calibration_error_deg"][key] == pytest.approx(full["calibration_error_deg"][key], rel=0.03)
+    one = replace(rig, lights=rig.lights[:1])
+    _, blind = fit_estimator(chosen, observations_from_csv(table), one)
+    assert blind["calibration_error_deg"]["n"] == 0
+    assert blind["calibration_error_mm"] == full["calibration_error_mm"]
+
+
+def test_errors_on_the_screen_and_their_summary(tmp_path, monkeypatch, capsys):
+    """Errors of a table in mm and px, against the points themselves; a lost sample counts as data loss."""
+    monkeypatch.chdir(tmp_path)
+    seen, rig = recording()
+    long_table(tmp_path / "t.csv")
+    rows = (tmp_path / "t.csv").read_text().splitlines()
+    cells = rows[-1].split(",")
+    cells[rows[0].split(",").index("pupil_x")] = cells[rows[0].split(",").index("pupil_y")] = ""
+    (tmp_path / "t.csv").write_text("\n".join([*rows[:-1], ",".join(cells)]) + "\n")
+    rig_file = {"format": 1, **er.load_scene("guestrin2006").spec.rig.to_mapping()}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig_file), encoding="utf-8")
+    fit = ["gaze", "fit", "t.csv", "--rig", "rig.yaml", "--estimator", "regression", "--monocular", "-o", "c.json"]
+    assert run(fit) == 0
+    predict = ["gaze", "predict", "t.csv", "--rig", "rig.yaml", "-c", "c.json", "--json", "p.json"]
+    assert run([*predict, "--screen-px", "1000", "2000"]) == 0
+    printed = capsys.readouterr().out
+    assert "place of the eye estimated from the glints" in printed
+    data = json.loads((tmp_path / "p.json").read_text())
+    assert data["schema"] == "eyerender/gaze/3"
+    known = [one for one in data["gaze"] if one["status"] == "ok"]
+    miss = np.array([one["point_mm"] for one in known]) - [one["target_mm"] for one in known]
+    np.testing.assert_allclose([one["error_mm"] for one in known], np.linalg.norm(miss, axis=1), rtol=1e-9)
+    # The screen faces the subject: its sides are along y and z.
+    pixels = np.linalg.norm(miss[:, 1:] * np.array([1000, 2000]) / rig.screen.size_mm, axis=1)
+    np.testing.assert_allclose([one["error_px"] for one in known], pixels, rtol=1e-9)
+    for name, eye in (("right", 0), ("left", 1)):
+        summary = next(one for one in data["summary"] if one["eye"] == name)
+        errors = [one["error_mm"] for one in known if one["eye"] == name]
+        assert summary["samples"] == np.count_nonzero(seen.index.eye == eye)
+        assert summary["data_loss"] == pytest.approx(1 - len(errors) / summary["samples"])
+        assert summary["error_mm"]["median"] == pytest.approx(sorted(errors)[len(errors) // 2], rel=0.5)
+        assert summary["error_mm"]["mean"] == pytest.approx(np.mean(errors))
+        assert min(errors) <= summary["error_mm"]["p95"] <= max(errors)
+    assert sum(one["data_loss"] > 0 for one in data["summary"]) == 2  # one eye, and therefore both eyes
+    assert run([*predict, "--screen-px", "0", "5"]) == 2
+    assert "--screen-px" in capsys.readouterr().err
+
+
+def test_a_table_of_one_eye_names_monocular(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    long_table(tmp_path / "t.csv")
+    header, *rows = [line.split(",") for line in (tmp_path / "t.csv").read_text().splitlines()]
+    k = header.index("eye")
+    kept = [header, *(row for row in rows if row[k] == "right")]
+    (tmp_path / "one.csv").write_text("\n".join(",".join(row[:k] + row[k + 1 :]) for row in kept) + "\n")
+    fit = ["gaze", "fit", "one.csv", "--rig", "guestrin2006", "--estimator", "regression", "-o", "c.json"]
+    assert run(fit) == 2
+    assert "one.csv: no frame has both a right and a left eye" in (printed := capsys.readouterr().err)
+    assert "--monocular" in printed
+    assert run([*fit, "--monocular"]) == 0
+    assert run(["gaze", "predict", "one.csv", "--rig", "guestrin2006", "-c", "c.json"]) == 0
 
 
 P = "pupil_x pupil_y"
