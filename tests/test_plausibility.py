@@ -265,3 +265,13 @@ def test_a_dataset_run_counts_its_saturated_images(scene_file, capsys):
     assert run(["generate", "dataset.yaml", "out", "--strict"]) == 2
     assert f"error: {words}" in capsys.readouterr().err
     assert run(["validate", "out"]) == 0
+
+
+def test_a_lamp_below_the_skin_is_in_the_face():
+    scene = load_scene("headset")
+    assert not [warning for warning in scene.warnings() if warning.code == "in-face"]
+    eye = scene.eye_position_mm("right")
+    inside = scene.with_(rig=scene.spec.rig.with_light(0, position_mm=(eye + np.array([-12.0, -8.0, -25.0])).tolist()))
+    (warning,) = [one for one in inside.warnings() if one.code == "in-face"]
+    assert warning.path == "rig.lights.0.position_mm"
+    assert "below the skin by the right eye" in warning.reason

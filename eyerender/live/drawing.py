@@ -17,10 +17,11 @@ from ..rig.camera import PinholeCamera, Window
 from ..rig.light import Lamp
 from ..scene import Frames, Scene
 
-LIGHT, SIGHT, SCREEN, GLOBE, LIMBUS, AXIS = "#E69F00", "#CC79A7", "#777777", "#B9B9B9", "#8A6D4B", "#555555"
+LIGHT, SIGHT, SCREEN, GLOBE, LIMBUS = "#E69F00", "#CC79A7", "#7A7A7A", "#B9B9B9", "#8A6D4B"
+CAMERA, AXIS = "#5B3A8C", "#009E73"
 PUPIL = "#1c1c1c"
 LEGEND = (
-    ("camera and its window", ANALYTIC),
+    ("camera and its window", CAMERA),
     ("pupil's ray", ANALYTIC),
     ("LED", LIGHT),
     ("light to glint to camera", IMAGE),
@@ -114,15 +115,15 @@ def _camera(
     distance = float(np.linalg.norm(apex_mm(frames, row) - origin))
     field_mm = _corners(camera, (0, 0, width, height), 0.2 * distance)
     thick = 1.8 if shown else 1.0
-    _pyramid(out, origin, field_mm, ANALYTIC, thick)
-    out.line([0.5 * (field_mm[0] + field_mm[1]), origin + (field_mm[0] + field_mm[1] - 2 * origin) * 0.56], ANALYTIC, 3)
-    out.label(f"camera {number}", origin, ANALYTIC)
+    _pyramid(out, origin, field_mm, CAMERA, thick)
+    out.line([0.5 * (field_mm[0] + field_mm[1]), origin + (field_mm[0] + field_mm[1] - 2 * origin) * 0.56], CAMERA, 3)
+    out.label(f"camera {number}", origin, CAMERA)
     if shown:
         index = frames.index
         window = scene.window(number, 0, int(index.eye[row]))
         depth = float((apex_mm(frames, row) - origin) @ camera.axis)
         if depth > 0:
-            _pyramid(out, origin, _corners(camera, window, depth), "#9CC3DD", 1.0)
+            _pyramid(out, origin, _corners(camera, window, depth), "#B7A6D6", 1.0)
 
 
 def _corners(camera: PinholeCamera, window: Window, depth_mm: float) -> Floats:

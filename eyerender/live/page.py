@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import html
 import secrets
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -16,18 +18,22 @@ from fastapi import Request, Response
 from nicegui import Client, app, ui
 
 from ..analytic.observer import trace
-from ..errors import EyerenderError, one_line
+from ..errors import EyerenderError, InputError, one_line
+from ..gaze.regression import Regression
 from ..observation import Observations
 from ..report.overlay import feature_marks
 from ..report.style import ANALYTIC, IMAGE
 from ..scene import Frames, Scene
 from .drawing import LEGEND, Strokes, apex_mm, strokes
 from .painter import GOAL_SPP, MAX_REASON, Order, Painter, Shown, line_of
-from .readout import feature_table
+from .readout import calibrated, feature_table, gaze_line
 from .rig_view import RigView
 from .setup import Setup, directions, named
 from .source import python_source
 
+MAX_UNDO = 50
+SETTLED_S = 0.8
+"""Changes that follow each other faster, as of a slider that is dragged, are undone as one."""
 MAX_TABS = 20
 """Pages at a time, those included whose WebSocket has not connected yet. Each takes some megabytes."""
 STYLE = Path(__file__).with_name("page.css")
@@ -150,6 +156,9 @@ class Tab:
         self._setup = Setup.of(studio.scene)
         self._orders = 0
         self._light = self._lens = 0  # the light and the camera that the knobs move
+        self._before: deque[Setup] = deque(maxlen=MAX_UNDO)
+        self._changed = 0.0
+        self._estimator: Regression | None = None
         self._frames: Frames
         self._truth: Observations
         self._row = 0
@@ -194,6 +203,7 @@ class Tab:
             with ui.element("div").classes("buttons"):
                 _button("Save YAML", self._save_yaml)
                 _button("Save Python", self._save_python)
+                self._undo_button = _button("Undo", self._undo)
                 _button("Start again", lambda: self._apply(lambda _: Setup.of(self._studio.scene), refresh=True))
         with ui.element("div").classes("desk"):
             with ui.element("section").classes("picture"):
@@ -204,7 +214,7 @@ class Tab:
                 self._build_knobs()
 
     def _build_picture(self) -> None:
-        with ui.element("div").classes("frame"):
+        with ui.element("div").classes("frame") as self._frame:
             self._image = ui.interactive_image(events=[]).classes("image")
             self._wait = ui.label("The first picture takes some seconds.").classes("wait")
         self._status = ui.label("").classes("status").props('role="status"')
@@ -214,6 +224,7 @@ class Tab:
             self._analytic.props("dense").style(f"--q-primary: {ANALYTIC}; color: {ANALYTIC}")
             self._found = ui.checkbox("extracted from the picture", value=True, on_change=lambda: self._order())
             self._found.props("dense").style(f"--q-primary: {IMAGE}; color: {IMAGE}")
+        self._gaze = ui.label("").classes("gaze")
         self._table = ui.html("", sanitize=False).classes("features")
 
     def _build_rig(self) -> None:
@@ -234,7 +245,7 @@ class Tab:
             self._camera = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), lambda v: self._show(camera=v))
             heads = {k: f"{k}" for k in range(len(spec.subject.head_positions_mm))}
             self._head = _choice("Head", heads, lambda v: self._apply(lambda s: s.with_head(v), refresh=True))
-        group.set_visibility(any(box.visible for box in (self._eye, self._camera, self._head)))
+        self._choices = group
         with _group("Gaze"):
             name = "target" if spec.targets is not None else "pose"
             choices = {-1: "set by hand", **{k: f"{name} {k + 1}" for k in range(min(self._setup.fixations, 500))}}
@@ -242,21 +253,33 @@ class Tab:
             self._azimuth = Knob("Azimuth, to the subject's left", "°", 0.5, lambda _: self._turn(), digits=2)
             self._elevation = Knob("Elevation, up", "°", 0.5, lambda _: self._turn(), digits=2)
         with _group("Eye"):
-            self._pupil = Knob(
-                "Pupil", "mm", 0.1, lambda v: self._apply(lambda s: s.changed({"eye.pupil_diameter_mm": v})), digits=2
-            )
+            self._pupil = Knob("Pupil", "mm", 0.1, lambda v: self._change("eye.pupil_diameter_mm", v), digits=2)
             self._lid = Knob("Lid opening", "%", 1, lambda v: self._apply(lambda s: s.with_opening(v / 100)))
         with _group("LED"):
             count = len(self._setup.scene.rig.lights)
-            self._lamp = _choice("LED", {k: str(k) for k in range(count)}, self._choose_light)
+            self._lamp = _choice("LED", _numbers(count), self._choose_light)
             self._lamp_place = [Knob(axis, "mm", 0.5, lambda _: self._move_light()) for axis in AXES]
             self._power = Knob("Intensity", "mW/sr", None, lambda _: self._move_light(), digits=3)
+            with ui.element("div").classes("line"):
+                _button("Add an LED", lambda: self._apply(lambda s: s.with_light_added(self._light), refresh=True))
+                _button("Remove it", lambda: self._apply(lambda s: s.without_light(self._light), refresh=True))
         with _group("Camera"):
             self._chosen = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), self._choose_camera)
             self._camera_place = [Knob(axis, "mm", 0.5, lambda _: self._move_camera()) for axis in AXES]
-            self._aim = _button(
-                "Aim at the eye", lambda: self._apply(lambda s: s.with_camera_aimed(self._lens), refresh=True)
+            self._focal = Knob(
+                "Focal length", "mm or px", None, lambda v: self._apply(lambda s: s.with_focal_length(self._lens, v))
             )
+            with ui.element("div").classes("line"):
+                self._aim = _button(
+                    "Aim at the eye", lambda: self._apply(lambda s: s.with_camera_aimed(self._lens), refresh=True)
+                )
+                _button("Add a camera", lambda: self._apply(lambda s: s.with_camera_added(self._lens), refresh=True))
+                _button("Remove it", lambda: self._apply(lambda s: s.without_camera(self._lens), refresh=True))
+        with _group("Exposure, all cameras"):
+            self._exposure = Knob(
+                "Exposure time", "ms", None, lambda v: self._change("sensor.exposure_ms", v), digits=3
+            )
+            self._aperture = Knob("f-number", "f/", None, lambda v: self._change("sensor.f_number", v), digits=2)
 
     # What the knobs do
 
@@ -270,19 +293,41 @@ class Tab:
             row = setup.row(frames)
             truth = trace(frames)
             drawn = strokes(frames, truth, row)
+            estimator = calibrated(setup)
         except EyerenderError as error:
-            self._complain(f"Not applied: {line_of(error)}")
+            self._complain(f"Not applied: {line_of(_unplaced(error))}")
             return
         except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
             self._complain(f"Not applied: no ray can be traced ({one_line(str(error), MAX_REASON)})")
             return
+        self._remember(setup)
         self._setup, self._frames, self._truth, self._row, self._drawn = setup, frames, truth, row, drawn
+        self._estimator = estimator
         warnings = [str(warning.at("")) for warning in setup.scene.warnings()]
         self._complain(one_line("; ".join(warnings), MAX_REASON))
         self._rig.show(drawn)
         self._order()
         if refresh:
             self._refresh()
+
+    def _remember(self, setup: Setup) -> None:
+        """Keep the present setup for `_undo`, unless it has been there for less than `SETTLED_S` or stays."""
+        now = time.monotonic()
+        if setup is not self._setup and now - self._changed > SETTLED_S:
+            self._before.append(self._setup)
+        self._changed = now
+        self._undo_button.set_enabled(bool(self._before))
+
+    def _undo(self) -> None:
+        """Go back to the setup before the last change; a slider's way is one change."""
+        if self._before:
+            last = self._before.pop()
+            self._changed = time.monotonic()  # so that going back is not remembered
+            self._apply(lambda _: last, refresh=True)
+
+    def _change(self, path: str, value: float) -> None:
+        """Change a key of the scene."""
+        self._apply(lambda setup: setup.changed({path: value}))
 
     def _show(self, **fields: Any) -> None:
         """Show another eye, or the picture of another camera."""
@@ -340,7 +385,17 @@ class Tab:
     def _refresh(self) -> None:
         """Show the values of the setup on the knobs."""
         setup, scene = self._setup, self._setup.scene
+        self._light = min(self._light, len(scene.rig.lights) - 1)
+        self._lens = min(self._lens, len(scene.rig.cameras) - 1)
         with self._silence():
+            cameras = dict(enumerate(named(scene.spec.rig.cameras)))
+            for box, choices in (
+                (self._lamp, _numbers(len(scene.rig.lights))),
+                (self._camera, cameras),
+                (self._chosen, cameras),
+            ):
+                _offer(box, choices)
+            self._choices.set_visibility(any(box.visible for box in (self._eye, self._camera, self._head)))
             self._eye.set_value(setup.eye)
             self._camera.set_value(setup.camera)
             self._head.set_value(setup.head)
@@ -358,6 +413,15 @@ class Tab:
         apex = apex_mm(self._frames, self._row)
         _set_place(self._camera_place, scene.rig.cameras[self._lens].nodal_point_mm, apex)
         self._aim.set_enabled(scene.spec.rig.cameras[self._lens].calibration is None)
+        _, focal = setup.focal_length(self._lens)
+        self._focal.enable(focal is not None)
+        for knob, value in (
+            (self._focal, focal),
+            (self._exposure, scene.spec.sensor.exposure_ms),
+            (self._aperture, scene.spec.sensor.f_number),
+        ):
+            if value is not None:
+                knob.set(value, value / 3, 3 * value)
 
     def _refresh_light(self) -> None:
         lamp = self._setup.scene.rig.lights[self._light]
@@ -372,6 +436,7 @@ class Tab:
 
     def _order(self) -> None:
         self._orders += 1
+        self._frame.classes(add="busy")
         frame = self._frames.take([self._row])
         self._studio.painter.ask(self.key, Order(self._orders, frame, extract=bool(self._found.value)))
 
@@ -380,6 +445,8 @@ class Tab:
         if not self._awake:
             return
         self._wait.set_visibility(False)
+        if shown.number == self._orders:
+            self._frame.classes(remove="busy")
         if shown.problem:
             self._complain(shown.problem)
             return
@@ -411,7 +478,9 @@ class Tab:
         self._image.set_content(marks)
         waits = self._found.value and shown.found is None  # what was found comes a moment after the picture
         if current and not waits:
-            self._table.set_content(feature_table(truth, shown.found if self._found.value else None, shown.hidden))
+            found = shown.found if self._found.value else None
+            self._table.set_content(feature_table(truth, found, shown.hidden))
+            self._gaze.set_text(gaze_line(self._setup, self._estimator, truth, found))
 
     def _complain(self, text: str) -> None:
         self._problem.set_text(text)
@@ -432,6 +501,22 @@ def _set_place(knobs: list[Knob], place_mm: Any, apex: Any) -> None:
     reach = _round_up(max(10.0, float(np.linalg.norm(place_mm - apex)) / 3))
     for knob, value in zip(knobs, place_mm, strict=True):
         knob.set(float(value), float(np.floor(value - reach)), float(np.ceil(value + reach)))
+
+
+def _unplaced(error: EyerenderError) -> EyerenderError:
+    """The error without the file of the scene, which says nothing of what a knob set."""
+    return InputError(error.reason, path=error.path) if isinstance(error, InputError) else error
+
+
+def _numbers(count: int) -> dict[Any, str]:
+    return {k: str(k) for k in range(count)}
+
+
+def _offer(box: ui.select, choices: dict[Any, str]) -> None:
+    """Offer other choices; a box with one is not shown."""
+    if box.options != choices:
+        box.set_options(choices)
+        box.set_visibility(len(choices) > 1)
 
 
 def _button(text: str, act: Callable[[], None]) -> ui.button:

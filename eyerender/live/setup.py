@@ -13,6 +13,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..observation import EYES
 from ..rig.camera import Camera
+from ..rig.rig import Rig
 from ..scene import Frames, Scene
 from ..scene.scene import demand_d
 from ..scene.spec import MOST_ACCOMMODATION_D, EyeDirection, SceneSpec
@@ -105,8 +106,40 @@ class Setup:
 
     def with_light(self, light: int, **changes: Any) -> Self:
         """Change a light. LEDs of rings become LEDs of their own (`Rig.with_light`)."""
-        rig = self.scene.spec.rig.with_light(light, **changes)
-        return replace(self, scene=self.scene.with_(rig=rig))
+        return self._with_rig(self.scene.spec.rig.with_light(light, **changes))
+
+    def with_light_added(self, light: int) -> Self:
+        """Add a copy of a light, a twelfth of its distance to the eye beside it."""
+        place = self.scene.rig.lights[light].position_mm
+        aside = np.cross(place - self.apex_mm, [0.0, 0.0, 1.0])
+        if not aside.any():
+            aside = np.array([0.0, np.linalg.norm(place - self.apex_mm), 0.0])
+        return self._with_rig(self.scene.spec.rig.with_light_copied(light, np.round(aside / 12, 3)))
+
+    def without_light(self, light: int) -> Self:
+        """Remove a light."""
+        return self._with_rig(self.scene.spec.rig.without_light(light))
+
+    def with_camera_added(self, camera: int) -> Self:
+        """Add a copy of a camera at the same place, with another name, to be moved from there."""
+        cameras = self.scene.spec.rig.cameras
+        copy = {**cameras[camera].to_mapping(), "name": f"camera {len(cameras)}"}
+        return self.changed({"rig.cameras": [*(one.to_mapping() for one in cameras), copy]})
+
+    def without_camera(self, camera: int) -> Self:
+        """Remove a camera; the picture is then that of the first one."""
+        return replace(self._with_rig(self.scene.spec.rig.without_camera(camera)), camera=0)
+
+    def with_focal_length(self, camera: int, focal_length: float) -> Self:
+        """Change a camera's focal length, in the unit in which the scene gives it (mm or px)."""
+        key, _ = self.focal_length(camera)
+        return self.changed({f"rig.cameras.{camera}.{key}": focal_length})
+
+    def focal_length(self, camera: int) -> tuple[str, float | None]:
+        """Key and value of a camera's focal length; the value is None where a calibration gives the lens."""
+        spec = self.scene.spec.rig.cameras[camera]
+        key = "focal_length_px" if spec.focal_length_mm is None else "focal_length_mm"
+        return key, getattr(spec, key)
 
     def with_camera_at(self, camera: int, position_mm: ArrayLike) -> Self:
         """Move a camera. One that looks at a point goes on looking at it; others keep their direction."""
@@ -147,12 +180,20 @@ class Setup:
             data["eye"]["model"] = str((self.scene.base / model).resolve())
         return SceneSpec.from_mapping(data)
 
-    def _targets(self) -> Any:
-        """Targets of the loaded scene on the present screen, (f, 3); None where it gives poses."""
+    def with_all_targets(self) -> Scene | None:
+        """The scene with all targets of the loaded one, on the present screen; None where that gives poses."""
         if self.origin.targets is None:
             return None
         spec = self.scene.spec.model_copy(update={"targets": self.origin.targets, "poses": None})
-        return self.scene.replaced(spec, rig=self.scene.rig).targets_mm
+        return self.scene.replaced(spec, rig=self.scene.rig)
+
+    def _with_rig(self, rig: Rig) -> Self:
+        return replace(self, scene=self.scene.with_(rig=rig))
+
+    def _targets(self) -> Any:
+        """Targets of the loaded scene on the present screen, (f, 3); None where it gives poses."""
+        scene = self.with_all_targets()
+        return None if scene is None else scene.targets_mm
 
 
 def named(cameras: tuple[Camera, ...]) -> list[str]:

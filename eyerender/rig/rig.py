@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Protocol, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from ..arrays import ArrayValue
@@ -57,6 +58,48 @@ class Rig(Spec):
         Raises:
             InputError: there is no such light, or a value does not fit.
         """
+        leds = self._single_leds(number)
+        moved = np.asarray(changes.pop("moved_mm", (0.0, 0.0, 0.0)), dtype=float)
+        leds[number] = {**leds[number], **changes}
+        leds[number]["position_mm"] = np.asarray(leds[number]["position_mm"], dtype=float) + moved
+        return self._with_leds(leds)
+
+    def with_light_copied(self, number: int, moved_mm: ArrayLike) -> Self:
+        """Add a copy of a light beside it, as the last one; LEDs of rings become LEDs of their own.
+
+        Args:
+            number: which light, from 0, each LED of a ring counted.
+            moved_mm: (3,) from that light to the copy.
+
+        Raises:
+            InputError: there is no such light, or there are too many.
+        """
+        leds = self._single_leds(number)
+        place = np.asarray(leds[number]["position_mm"], dtype=float) + np.asarray(moved_mm, dtype=float)
+        return self._with_leds([*leds, {**leds[number], "position_mm": place.tolist()}])
+
+    def without_light(self, number: int) -> Self:
+        """Remove a light; LEDs of rings become LEDs of their own.
+
+        Raises:
+            InputError: there is no such light, or no other.
+        """
+        leds = self._single_leds(number)
+        return self._with_leds([*leds[:number], *leds[number + 1 :]])
+
+    def without_camera(self, number: int) -> Self:
+        """Remove a camera; LEDs of rings become LEDs of their own, and stay.
+
+        Raises:
+            InputError: there is no such camera, or no other.
+        """
+        if not 0 <= number < len(self.cameras):
+            raise InputError(f"there is no camera {number}, only {len(self.cameras)}", path="cameras")
+        cameras = [*self.cameras[:number], *self.cameras[number + 1 :]]
+        return self._with_leds(self._single_leds(0), cameras=cameras)
+
+    def _single_leds(self, number: int) -> list[dict[str, Any]]:
+        """Fields of all LEDs, those of rings one by one, after a look whether there is light `number`."""
         if not 0 <= number < self.light_count:
             raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
         geometry, leds = self.build(), []
@@ -67,10 +110,10 @@ class Rig(Spec):
             same = {key: value for key, value in led.to_mapping().items() if key != "ring"}
             places = [light.position_mm for light in geometry.lights[len(leds) : len(leds) + led.ring.count]]
             leds += [{**same, "position_mm": place.tolist()} for place in places]
-        moved = np.asarray(changes.pop("moved_mm", (0.0, 0.0, 0.0)), dtype=float)
-        leds[number] = {**leds[number], **changes}
-        leds[number]["position_mm"] = np.asarray(leds[number]["position_mm"], dtype=float) + moved
-        return type(self).from_mapping({"cameras": self.cameras, "lights": leds, "screen": self.screen})
+        return leds
+
+    def _with_leds(self, leds: list[dict[str, Any]], **fields: Any) -> Self:
+        return type(self).from_mapping({"cameras": self.cameras, "lights": leds, "screen": self.screen, **fields})
 
     def resolved(self, base: Path | None = None) -> Self:
         """The rig with the numbers of its cameras' calibration files, which are relative to `base`.

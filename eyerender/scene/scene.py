@@ -35,12 +35,17 @@ from ..population.people import Person
 from ..population.response import REFERENCE_AGE, responding
 from ..population.table import default_table
 from ..region.anatomy import Region
-from ..rig.camera import Window
+from ..region.face import face_depth
+from ..rig.camera import PinholeCamera, Window
 from ..rig.imaging import Ambient
+from ..rig.light import Lamp
 from ..rig.rig import Rig, RigGeometry, RigLike
 from ..spec import Spec, file_digest
 from ..status import Status
 from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
+
+# Things fixed to a face may press the skin a little. Farther than 45 mm from an eye the face is only a guess.
+_BELOW_SKIN_MM, _FACE_MM = 2.0, 45.0
 
 EYE_WINDOW_MM = (32.0, 24.0)
 """What a window shows about each of two eyes, where a scene says nothing else: both lids and the corners."""
@@ -332,9 +337,30 @@ class Scene:
             *pupil_warnings(self.pupil_diameter_mm, pupil),
             *length_warnings(spec.to_mapping()),
             *place_warnings(rig, eyes, heads, cameras, lights),
+            *self._face_warnings([*zip(cameras, rig.cameras, strict=True)], [*zip(lights, rig.lights, strict=True)]),
             *view_warnings(rig, views, [f"rig.cameras.{i}" for i in range(len(rig.cameras))]),
         ]
         return [warning.at(self.source) for warning in found]
+
+    def _face_warnings(
+        self, cameras: list[tuple[str, PinholeCamera]], lights: list[tuple[str, Lamp]]
+    ) -> list[InputWarning]:
+        """Warn of cameras and lamps, with their paths, that are below the skin of the first head position."""
+        region, found = self.spec.region, {}
+        if region is None or region.head is not None:
+            return []
+        places = [(path, "camera", camera.nodal_point_mm) for path, camera in cameras]
+        places += [(path, "lamp", lamp.position_mm) for path, lamp in lights]
+        head = np.array(self.spec.subject.head_positions_mm[0])
+        for side in self.spec.subject.eyes:
+            for path, what, place in places:
+                x, y, z = place - self.eye_position_mm(side) - head
+                nasal = y if side == "right" else -y
+                below = float(face_depth(region.face, np.array(nasal), np.array(z))) - x
+                if np.hypot(y, z) < _FACE_MM and _BELOW_SKIN_MM < below < _FACE_MM:
+                    reason = f"the {what} is in the face, {below:.3g} mm below the skin by the {side} eye"
+                    found.setdefault(path, InputWarning(code="in-face", reason=reason, path=path))
+        return list(found.values())
 
     def digest(self) -> str:
         """SHA-256 of everything on which the scene's images depend, including the content of the eye file."""
