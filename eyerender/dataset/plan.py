@@ -25,7 +25,6 @@ from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
 from ..eye.topography import topography_files
 from ..observation import EYES
-from ..population.model import SIDES
 from ..population.people import PersonChoice, choice_of
 from ..scene import Scene
 from ..scene.spec import SceneSpec
@@ -336,9 +335,8 @@ class Plan:
             tree = {} if self.spec.population is not None else self._scene_of(turn)[0]
             try:
                 if self.spec.population is not None:
-                    person = self.person_of(subject, attempt).chosen()
-                    for side in SIDES:
-                        person.eye(side).build()
+                    # The distance of the eyes needs both of them.
+                    _ = self.person_of(subject, attempt).chosen().apex_distance_mm
                 else:
                     eye, _, modified = self._eye_of(tree, turn)
                     if modified:

@@ -33,7 +33,7 @@ from ..status import Status
 from .batch import CHUNK_POINTS, chunks, groups
 from .landmarks import path_to_retina
 from .model import EyeModel
-from .pose import Poses, Turning, centres_of, into_eye, split
+from .pose import Poses, Turning, centres_of, into_eye, rigid_motion, split
 from .pose_kernels import SETTLED_MM, turn_all
 
 LineOfSightKind = Literal["chief_ray", "entrance_window"]
@@ -126,6 +126,18 @@ def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKi
     if line_of_sight == "entrance_window":
         return _by_entrance_window(eye, target)
     raise InputError(f"must be chief_ray or entrance_window, not {line_of_sight!r}", path="line_of_sight")
+
+
+def far_sight_mm(eye: EyeModel) -> Floats:
+    """Place (y, z) in mm, in the eye frame, of the line of sight of an eye that looks along +x into the distance.
+
+    The line of sight by the chief ray has a direction d in the eye. The torsion-free rotation that turns d to +x is
+    that of Listing's law for the gaze (d_x, -d_y, -d_z).
+    """
+    x, y, z = eye.chief_ray.direction
+    pose = Poses.listing(np.arctan2(-y, x), np.arcsin(-z))
+    turn, shift = rigid_motion(pose, eye)
+    return np.asarray((turn[0] @ eye.chief_ray.point_mm + shift[0])[1:])
 
 
 def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:

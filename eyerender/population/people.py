@@ -14,7 +14,9 @@ from pydantic import Field, model_validator
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..eye.fixation import far_sight_mm
 from ..eye.parts import Side
+from ..eye.refraction import at_cornea_d
 from ..eye.spec import EyeSpec
 from ..region.anatomy import Region
 from ..region.look import Look
@@ -128,8 +130,26 @@ class Person(Spec):
 
     @property
     def ipd_mm(self) -> float:
-        """Distance between the pupils."""
+        """Far pupil distance; scenes count from the corneal apexes instead, see `apex_distance_mm`."""
         return self.number("ipd_mm")
+
+    @property
+    def apex_distance_mm(self) -> float:
+        """Distance of the corneal apexes of the unrotated eyes, at which the far pupil distance is `ipd_mm`.
+
+        A pupillometer lets each eye look into the distance and sees its entrance pupil from the front, so it measures
+        the horizontal distance of the parallel lines of sight, which lead through the centres of the entrance pupils.
+        It holds as the person looks far away without glasses, in the table's light, at 850 nm.
+
+        Raises:
+            InputError: an eye cannot exist.
+        """
+        return _apex_distance_mm(self.to_json())
+
+    @property
+    def mean_refraction_d(self) -> float:
+        """Mean refraction of both eyes at the cornea; hyperopes have to accommodate by it to see far away."""
+        return float(np.mean([at_cornea_d(self.number("refraction_d", side)) for side in SIDES]))
 
     def draw_seed(self, purpose: str) -> int:
         """A seed of 31 bits for something that has no quantity of the table, such as hairs."""
@@ -207,6 +227,15 @@ class Person(Spec):
 
     def _under(self, prefix: str) -> dict[str, float]:
         return {name[len(prefix) :]: self.number(name) for name in self.numbers if name.startswith(prefix)}
+
+
+@lru_cache(maxsize=64)
+def _apex_distance_mm(text: str) -> float:
+    """`apex_distance_mm` of a person from its JSON, solved once for all frames."""
+    person = Person.from_mapping(json.loads(text))
+    eyes = (person.eye(side, demand_d=max(person.mean_refraction_d, 0.0)).build() for side in SIDES)
+    # Eye files are written as right eyes, so +y is nasal in both.
+    return person.ipd_mm + float(sum(far_sight_mm(eye)[0] for eye in eyes))
 
 
 class PersonChoice(PopulationSpec):

@@ -25,7 +25,6 @@ from ..eye.fixation import fixations
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.pose import listing_torsion
-from ..eye.refraction import at_cornea_d
 from ..eye.spec import EyeSpec
 from ..observation import EYES, Index, PoseTruth
 from ..plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
@@ -584,7 +583,7 @@ def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
     distance = np.linalg.norm(targets_mm - np.array(spec.subject.head_positions_mm[0]), axis=-1)
     vergence = float(np.mean(1000.0 / np.maximum(distance, 1.0)))
     if spec.person is not None:
-        vergence += float(np.mean([at_cornea_d(spec.person.number("refraction_d", side)) for side in SIDES]))
+        vergence += spec.person.mean_refraction_d
     return max(vergence, 0.0)
 
 

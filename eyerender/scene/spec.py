@@ -108,7 +108,11 @@ class SubjectSpec(Spec):
     eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = Field(
         default=("right", "left"), description="the eyes that are observed"
     )
-    ipd_mm: Positive = Field(default=63.0, description="interpupillary distance")
+    ipd_mm: Positive = Field(
+        default=63.0,
+        description="distance of the corneal apexes of the unrotated eyes, which the paper calls interpupillary "
+        "distance; default of a drawn person: the one at which its far pupil distance is the drawn one",
+    )
     head_positions_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] = Field(
         default=((0.0, 0.0, 0.0),), description="displacements of the head in the world; each has frames of its own"
     )
@@ -355,13 +359,22 @@ def with_person(data: Mapping[str, Any], person: Person) -> dict[str, Any]:
     """A scene's mapping with a person, whose distance of the pupils, look and region hold where the scene has none."""
     subject = data.get("subject") or {}
     subject = subject.to_mapping() if isinstance(subject, Spec) else subject
-    out = {**data, "person": person.to_mapping(), "subject": {"ipd_mm": person.ipd_mm, **subject}}
+    if "ipd_mm" not in subject:
+        subject = {"ipd_mm": _apex_distance_mm(person), **subject}
+    out = {**data, "person": person.to_mapping(), "subject": subject}
     for key, own in (("look", person.look()), ("region", person.region())):
         given = data.get(key, {})
         given = given.to_mapping() if isinstance(given, Spec) else given
         if isinstance(given, Mapping) and not (key == "region" and given.get("head") is not None):
             out[key] = _merged(own.to_mapping(), given)
     return out
+
+
+def _apex_distance_mm(person: Person) -> float:
+    try:
+        return person.apex_distance_mm
+    except InputError as error:
+        raise error.placed(under="person") from None
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

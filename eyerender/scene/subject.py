@@ -35,8 +35,13 @@ class Subject(SubjectSpec):
         Args:
             person: the person.
             fields: further fields, such as `eyes` or `luminance_cd_m2`.
+
+        Raises:
+            InputError: an eye cannot exist, or a value does not fit.
         """
-        own = {"ipd_mm": person.ipd_mm, "look": person.look(), "region": person.region()}
+        own: dict[str, Any] = {"look": person.look(), "region": person.region()}
+        if "ipd_mm" not in fields:
+            own["ipd_mm"] = person.apex_distance_mm
         return cls(person=person, **{**own, **fields})
 
     def fixating(self, targets_mm: ArrayLike, rig: Rig, **scene: Any) -> Frames:

@@ -103,7 +103,7 @@ def test_entrance_pupil_is_what_a_distant_camera_sees(people):
     person = people.person(5)
     subject = people.subject(5, eyes=["right"])
     away = 20_000.0
-    y = -person.ipd_mm / 2
+    y = -subject.ipd_mm / 2
     camera = er.Camera(
         position_mm=(away, y, 0.0), look_at_mm=(0.0, y, 0.0), focal_length_px=1e6, resolution_px=(400, 400)
     )

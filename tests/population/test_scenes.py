@@ -12,7 +12,9 @@ from eyerender.dataset.line import image_line
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import realise, windows_of
 from eyerender.eye.entrance import entrance_pupil_mm
+from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.eye.refraction import at_cornea_d
+from eyerender.optics.solve import apparent_points
 from eyerender.scene.scene import demand_d
 
 RIG = {
@@ -46,7 +48,7 @@ def test_a_scene_has_the_person_of_the_draw(scene):
     drawn = er.Population("adults").draw(3, 3, first=6)
     person = drawn.person(1)
     assert scene.spec.person == person
-    assert scene.spec.subject.ipd_mm == person.ipd_mm
+    assert scene.spec.subject.ipd_mm == person.apex_distance_mm
     assert scene.spec.region == person.region()
     same = er.Scene(drawn.subject(1), scene.spec.rig, name="x", targets=scene.spec.targets)
     assert same.spec == scene.spec
@@ -100,6 +102,37 @@ def test_light_and_distance_set_pupil_and_lens(scene):
     assert near.stop_diameter_mm("right") <= scene.stop_diameter_mm("right")
     relaxed = scene.with_({"subject.accommodation_d": 0.0})
     assert relaxed.eye_spec.lens == person.eye("right").lens
+
+
+def seen_pupil_distance_mm(subject):
+    """Distance of the middles of both stops as an observer far ahead sees them, while the eyes look at it."""
+    far = np.array([1e8, 0.0, 0.0])
+    scene = er.Scene(subject, er.Rig.from_mapping(RIG), targets=er.Targets.at(far))
+    frames = scene.frames()
+    seen = []
+    for row, side in enumerate(("right", "left")):
+        eye, one = scene.eye(side), frames.pose.take([row])
+        poses = Poses(one.azimuth_rad, one.elevation_rad, one.torsion_rad)
+        turn, shift = rigid_motion(poses, eye)
+        observer = turn[0].T @ (far - scene.eye_position_mm(side) - shift[0])
+        indices = tuple(float(n) for n in eye.front_indices)
+        found = apparent_points(eye.front, indices, eye.stop.centre_mm[None], observer)
+        seen.append(turn[0] @ found.exit_points_mm[0] + shift[0] + scene.eye_position_mm(side))
+    return seen[1][1] - seen[0][1]
+
+
+@pytest.mark.parametrize("n", [12, pytest.param(500, marks=pytest.mark.slow)])
+def test_the_far_pupil_distance_is_the_drawn_one(n):
+    """Rays from an observer through the cornea to the stop know nothing of the chief ray that is solved for."""
+    people = er.Population("adults").draw(n, 9)
+    off = [seen_pupil_distance_mm(people.subject(row)) - people["ipd_mm"][row] for row in range(n)]
+    assert np.abs(off).max() < 1e-3
+
+
+def test_the_distance_of_the_apexes_depends_on_the_person_alone(scene):
+    """Near targets and light change pupil and lens, not the skull."""
+    for changes in ({"subject.luminance_cd_m2": 0.1}, {"subject.accommodation_d": 2.0}):
+        assert scene.with_(changes).spec.subject.ipd_mm == scene.spec.person.apex_distance_mm
 
 
 def test_with_another_population(scene):
