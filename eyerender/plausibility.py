@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from .arrays import Floats
 from .errors import InputWarning
 from .rig.camera import PinholeCamera, Window
+from .rig.light import Lamp
 from .rig.rig import RigGeometry
 from .rig.screen import ScreenPlane
 from .rig.sensor import Sensor
@@ -46,6 +47,8 @@ _LIMBUS_MM = np.array([[0, 0, 0], [-3, 6, 0], [-3, -6, 0], [-3, 0, 6], [-3, 0, -
 # A camera that is farther than this from an eye's axis sees no cornea, whatever the pose of the eye.
 _FURTHEST_RAD = np.radians(140.0)
 
+# A lamp that sends less of the intensity on its axis to the nearest eye is probably not aimed.
+_LEAST_AIMED = 0.8
 # Largest distance of a target from the screen's plane: screens are not flat to less.
 _OFF_PLANE_MM = 1.0
 # An image counts as saturated if more than this share of its pixels is.
@@ -85,6 +88,8 @@ def place_warnings(
 ) -> list[InputWarning]:
     """Warn of impossible places: cameras and lamps in a face, in a head or behind the screen, and a screen in a face.
 
+    A lamp that is nowhere of these is told if its axis points past the nearest eye.
+
     Args:
         rig: the rig.
         eyes_mm: corneal apexes (3,) in the world by their name in a message.
@@ -101,6 +106,9 @@ def place_warnings(
         code, reason = _misplaced(place, what, rig.screen, eyes_mm, heads_mm) or (None, None)
         if code is not None and reason is not None:
             found.setdefault(path, InputWarning(code=code, reason=reason, path=path))
+    for path, lamp in zip(light_paths, rig.lights, strict=True):
+        if (reason := _unaimed(lamp, eyes_mm)) is not None:
+            found.setdefault(path, InputWarning(code="aim", reason=reason, path=path))
     if rig.screen is not None and np.linalg.norm(rig.screen.centre_mm) < _LEAST_DISTANCE_MM:
         path = "rig.screen.centre_mm"
         found[path] = InputWarning(
@@ -209,6 +217,15 @@ def _misplaced(
             if ok and np.all(np.abs(on_screen) < np.array(screen.size_mm) / 2):
                 return "behind-screen", f"the {what} is behind the screen, as the {name} sees it"
     return None
+
+
+def _unaimed(lamp: Lamp, eyes_mm: Mapping[str, Floats]) -> str | None:
+    """Reason of a warning about a lamp that points past the nearest eye, if it does."""
+    ways = {name: eye - lamp.position_mm for name, eye in eyes_mm.items()}
+    name = min(ways, key=lambda eye: float(np.linalg.norm(ways[eye])))
+    cosine = float(lamp.axis @ ways[name] / max(np.linalg.norm(ways[name]), 1e-9))
+    share = max(cosine, 0.0) ** lamp.lobe_exponent
+    return None if share >= _LEAST_AIMED else f"sends {share:.0%} of its axial intensity to the {name}; set aim_mm"
 
 
 def _in_view(camera: PinholeCamera, window: Window, apex: Floats) -> bool:

@@ -55,6 +55,7 @@ def test_shipped_datasets_give_no_warning(name):
 
 
 CAMERA, LAMP = "rig__cameras__0__position_mm", "rig__lights__0__position_mm"
+AIM = "rig__lights__0__aim_mm"
 SCREEN = {"centre_mm": [650, 0, 0], "size_mm": [377, 301]}
 
 
@@ -86,8 +87,11 @@ SCREEN = {"centre_mm": [650, 0, 0], "size_mm": [377, 301]}
         ({LAMP: [0.5, 31.5, 0], "subject__head_positions_mm": [[0, 0, 0]]}, [("in-eye", "rig.lights.0.position_mm")]),
         ({LAMP: [-60, 0, 0]}, [("in-head", "rig.lights.0.position_mm")]),
         ({LAMP: [-60, 0, 0], "subject__head_positions_mm": [[0, 0, 0], [-300, 0, 0]]}, None),
-        ({LAMP: [20, 31.5, 15]}, []),
-        ({LAMP: [-15, 75, 5]}, []),
+        ({LAMP: [20, 31.5, 15], AIM: [0, 31.5, 0]}, []),
+        ({LAMP: [-15, 75, 5], AIM: [0, 31.5, 0]}, []),
+        # Without an aim, a lamp beside an eye points to the bridge of the nose; one alike in all directions has none.
+        ({LAMP: [20, 31.5, 15]}, [("aim", "rig.lights.0.position_mm")]),
+        ({LAMP: [20, 31.5, 15], "rig__lights__0__lobe_exponent": 0.0}, []),
         (
             {"rig__lights__0": {"ring": {"radius_mm": 12, "count": 6}}, CAMERA: [-40, 0, 10]},
             [
