@@ -223,6 +223,9 @@ class Person(Spec):
     def look(self) -> Look:
         """Albedos and textures of the eyes; numbers outside the range of a key are moved to its end."""
         mine = {key: _within(Look.model_fields[key], value) for key, value in self._under("look.").items()}
+        if "limbus_albedo" in mine:
+            passed = mine.get("limbus_transmittance", Look.model_fields["limbus_transmittance"].default)
+            mine["limbus_albedo"] = min(mine["limbus_albedo"], 1 - passed)
         return Look.from_mapping({"iris_seed": self.draw_seed("iris"), **mine})
 
     def _under(self, prefix: str) -> dict[str, float]:

@@ -22,12 +22,12 @@ adults. Sources, by the name used in the descriptions; "chosen" marks values tha
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from ..spec import Spec
+from ..spec import KeyProblem, Spec
 from .headspec import Head
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -138,6 +138,15 @@ class Skin(Spec):
     )
     sheen: Share = Field(default=0.5, description="strength of the rough specular reflection of oily skin (chosen)")
     wet_albedo: float = _number(0.40, 0.25, 0.55, "albedo of the lid margins and the caruncle (chosen)")
+    map: Literal["off"] | None = Field(
+        default=None,
+        description="`off` for photometry: skin, margins and caruncle are smooth and matte, with `albedo` everywhere",
+    )
+
+    @field_validator("map", mode="before")
+    @classmethod
+    def _off(cls, value: object) -> object:
+        return {False: "off", True: None}[value] if isinstance(value, bool) else value  # YAML reads `off` as false
 
 
 class TearFilm(Spec):
@@ -172,6 +181,8 @@ class Region(Spec):
                 raise ValueError(
                     f"{name}: cannot be combined with a head mesh, which does not move and has its own shape"
                 )
+        if self.head is not None and self.skin.map is not None:
+            raise KeyProblem("skin.map", "cannot be combined with a head mesh, which has its own texture")
         return self
 
     def of_side(self, side: str) -> Self:
@@ -194,7 +205,7 @@ class Region(Spec):
 
 def _draw(kind: type[Spec], key: tuple[int, ...], spread: float) -> dict[str, object]:
     out: dict[str, object] = {}
-    fields = [(name, field) for name, field in sorted(kind.model_fields.items()) if name != "head"]
+    fields = [(name, field) for name, field in sorted(kind.model_fields.items()) if name not in ("head", "map")]
     for i, (name, field) in enumerate(fields):
         if isinstance(field.annotation, type) and issubclass(field.annotation, Spec):
             out[name] = _draw(field.annotation, (*key, i), spread)

@@ -54,14 +54,14 @@ class LashPlan(ArrayValue):
 
 
 @lru_cache(maxsize=16)
-def plan(spec: Lashes, seed: int) -> LashPlan:
-    """Plan the lashes of a subject; upper ones first."""
-    parts = [_lid(spec, seed, True), _lid(spec, seed, False)]
+def plan(spec: Lashes, seed: int, left: bool = False) -> LashPlan:
+    """Plan the lashes of a subject's right or left eye, each drawn on its own; upper ones first."""
+    parts = [_lid(spec, (seed, int(upper), *([1] if left else [])), upper) for upper in (True, False)]
     return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(8)))
 
 
-def _lid(spec: Lashes, seed: int, upper: bool) -> tuple[Floats, ...]:
-    rng = np.random.default_rng((0x1A5, seed, int(upper)))
+def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
+    rng = np.random.default_rng((0x1A5, *key))
     count = spec.upper_count if upper else spec.lower_count
     # The margins have no lashes between the lacrimal puncta and the nose.
     low, high = (-0.955, 0.62) if upper else (-0.93, 0.58)
@@ -123,7 +123,7 @@ def _means(values: Floats, tuft: Ints) -> Floats:
 
 def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     """Make the lashes of a posed sheet."""
-    p = plan(spec.lashes, spec.seed)
+    p = plan(spec.lashes, spec.seed, globe.mirrored)
     c = sheet.contour
     frames = np.concatenate([c.point, sheet.lash_line, c.normal, c.away, c.along_lid], axis=1)
     inner, outer, n, m, t = np.split(_at(p.angle, frames), 5, axis=1)

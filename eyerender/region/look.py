@@ -11,11 +11,11 @@ black level.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
-from ..spec import NonNegative, Spec
+from ..spec import KeyProblem, NonNegative, Spec
 from .iris import IrisPattern
 
 Albedo = Annotated[float, Field(ge=0, le=0.95)]
@@ -107,7 +107,8 @@ class Look(Spec):
     limbus_transmittance: Annotated[float, Field(ge=0, le=0.9)] = Field(
         default=0.4,
         description="share of the light on the limbal tissue that it lets through into the eye (Vogel et al. "
-        "1991, Lasers Surg. Med. 11, 331: sclera of full thickness 35 % at 804 nm and 53 % at 1064 nm)",
+        "1991, Lasers Surg. Med. 11, 331: sclera of full thickness 35 % at 804 nm and 53 % at 1064 nm); "
+        "with `limbus_albedo` at most 1",
     )
     limbal_ring: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.0, description="darkening of the iris at its root, the limbal ring that some irises have"
@@ -130,3 +131,9 @@ class Look(Spec):
     @classmethod
     def _off(cls, value: object) -> object:
         return None if value is False or value == "off" else value  # YAML reads `off` as false
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.limbus_albedo + self.limbus_transmittance > 1 + 1e-9:
+            raise KeyProblem("limbus_transmittance", "must be at most 1 - limbus_albedo; the limbus would make light")
+        return self

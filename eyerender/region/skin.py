@@ -78,13 +78,31 @@ def skin_map(spec: Region) -> Singles:
     rest = sheet(reference, Globe.sphere()).vertices
     rows = np.interp(np.arange(SHEET_ROWS), _texels(), np.arange(ROWS))
     columns = np.arange(_COLUMNS) * (rest.shape[1] / _COLUMNS)
+    out = np.zeros((SHEET_ROWS + BANDS, _COLUMNS, 4), np.float32)
+    if spec.skin.map == "off":
+        out[:SHEET_ROWS, :, 0] = spec.skin.albedo
+    else:
+        _draw_sheet(spec, rest, rows, columns, out)
+    for which, (a, g) in enumerate(((spec.lashes.albedo, _HAIR_GLOSS), (spec.brow.albedo, _HAIR_GLOSS), (0.0, _WET))):
+        middle = SHEET_ROWS + BANDS * (which + 1) / 4
+        band_rows = slice(int(middle - BANDS / 8), int(middle + BANDS / 8))
+        out[band_rows] = (a, 0, 0, g)
+        if which == LASH:
+            out[band_rows, :, 0], out[band_rows, :, 3] = lash_band(spec)
+        if which == TEAR:
+            out[band_rows, :, 1:3] = waves(spec, _COLUMNS)[:, None] * _along_lids(rest)
+    out.flags.writeable = False
+    return out
+
+
+def _draw_sheet(spec: Region, rest: Floats, rows: Floats, columns: Floats, out: Singles) -> None:
+    """Write albedo, slopes and gloss of the sheet at rest, at its `rows` and `columns`, into a map."""
     closed = np.concatenate([rest, rest[:, :1]], axis=1)
     y, z, out_mm = (_over_grid(v, rows, columns) for v in (closed[..., 1], closed[..., 2], _from_line(rest)))
     turn = 2 * np.pi * columns / rest.shape[1]
     tiles, spots = _Tiles(spec), _spots(spec.seed, y, z)
     some = slice(None, None, _SLOW)
     slow = _Slow(tiles, y[some, some], z[some, some], out_mm[some, some], np.sin(turn[some]) > 0)
-    out = np.zeros((SHEET_ROWS + BANDS, _COLUMNS, 4), np.float32)
     height = np.empty((SHEET_ROWS, _COLUMNS), np.float32)
     for first in range(0, SHEET_ROWS, _STRIP):
         k = slice(first, first + _STRIP)
@@ -101,16 +119,6 @@ def skin_map(spec: Region) -> Singles:
         out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k])
     _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
     _normalise(out[:SHEET_ROWS, :, 0], y, z, rows, spec.skin.albedo)
-    for which, (a, g) in enumerate(((spec.lashes.albedo, _HAIR_GLOSS), (spec.brow.albedo, _HAIR_GLOSS), (0.0, _WET))):
-        middle = SHEET_ROWS + BANDS * (which + 1) / 4
-        band_rows = slice(int(middle - BANDS / 8), int(middle + BANDS / 8))
-        out[band_rows] = (a, 0, 0, g)
-        if which == LASH:
-            out[band_rows, :, 0], out[band_rows, :, 3] = lash_band(spec)
-        if which == TEAR:
-            out[band_rows, :, 1:3] = waves(spec, _COLUMNS)[:, None] * _along_lids(rest)
-    out.flags.writeable = False
-    return out
 
 
 def _along_lids(rest: Floats) -> Singles:

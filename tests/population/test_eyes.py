@@ -154,9 +154,11 @@ def test_accommodation_moves_lens_and_pupil():
 
 def test_numbers_outside_a_key_are_moved_into_its_range():
     person = er.Population("elderly").person(0, 1)
-    wild = person.model_copy(update={"numbers": {**person.numbers, "skin.wrinkles": 3.0, "brow.count": 9000.4}})
+    numbers = {"skin.wrinkles": 3.0, "brow.count": 9000.4, "look.limbus_albedo": 0.8}
+    wild = person.model_copy(update={"numbers": {**person.numbers, **numbers}})
     assert wild.region().skin.wrinkles == 1.0
     assert wild.region().brow.count == 700
+    assert wild.look().limbus_albedo + wild.look().limbus_transmittance == pytest.approx(1)
     assert person.region() == person.region()
     assert person.look() != er.Population("elderly").person(1, 1).look()
 

@@ -277,3 +277,18 @@ def test_brows_of_the_two_eyes_may_differ():
     right, left = spec.of_side("right"), spec.of_side("left")
     assert left.brow.height_mm - right.brow.height_mm == pytest.approx(2.0)
     assert Region().of_side("left") == Region()
+
+
+def test_the_lashes_of_both_eyes_are_drawn_apart():
+    spec = Region(seed=4)
+    right, left = (region_mesh(spec, posed("E2", (0.0, 0.0), side)[1]) for side in ("right", "left"))
+    mirror = np.array([1.0, -1.0, 1.0])
+    skin = len(right.part("skin").vertices)
+    np.testing.assert_allclose(left.vertices[:skin] * mirror, right.vertices[:skin], atol=1e-9)
+    roots = [np.asarray(mesh.part("lashes").vertices) for mesh in (right, left)]
+    assert len(roots[0]) == len(roots[1])  # as many hairs
+    assert np.median(np.linalg.norm(roots[0] - roots[1] * mirror, axis=1)) > 0.3  # mm
+    # Of the same kind: density along the lid, length and direction.
+    for name in ("angle", "length_mm", "fan", "start", "curl"):
+        a, b = (getattr(plan(spec.lashes, 4, side), name) for side in (False, True))
+        assert abs(a.mean() - b.mean()) < 4 * a.std() * np.sqrt(2 / len(a))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import yaml
 
 from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
@@ -76,3 +77,15 @@ def test_the_map_is_its_specs_and_strengths_darken_their_own_places():
     assert 0.8 < far.mean() < 0.995  # pores: pits between plateaus
     assert np.median(far) > 0.97
     assert far.min() < 0.9
+
+
+def test_a_skin_without_a_map_is_even_and_matte():
+    data = yaml.safe_load("{seed: 6, skin: {map: off, albedo: 0.47}}")  # YAML reads `off` as false
+    even = Region.from_mapping(data)
+    sheet_of_map = skin_map(even)[:SHEET_ROWS]
+    assert np.all(sheet_of_map[..., 0] == np.float32(0.47))
+    assert not sheet_of_map[..., 1:].any()
+    assert Region.from_mapping(even.to_mapping()) == even
+    # The key appears only where it is used, so files and digests of other scenes stay as they are.
+    assert "map" not in Region.from_mapping({"skin": {"map": True}}).to_mapping()["skin"]
+    np.testing.assert_array_equal(skin_map(even)[SHEET_ROWS:], skin_map(Region(seed=6))[SHEET_ROWS:])  # hairs, tears
