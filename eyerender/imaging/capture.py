@@ -39,7 +39,7 @@ class EyeImage:
         row: index of that row among the rendered frames.
         window: (x0, y0, width, height) of the window in full-sensor pixels.
         counts: what the sensor stores, (height, width) uint8 or uint16 DN.
-        irradiance: on the sensor before noise and quantisation, (height, width) mW/mm^2.
+        irradiance: on the sensor before noise and quantisation, (height, width) W/m^2.
         parts: part of the picture at each pixel's centre, (height, width) uint8 (docs/formats.md).
         eye: the eye's model, placed in the world by x_world = M x + t.
         M: (3, 3) rotation of that motion.

@@ -141,3 +141,34 @@ def test_even_light_adds_its_share_everywhere(renderer):
     assert extra.min() > 0
     # The sclera mirrors nothing: its gain over its albedo is the surround's over its own.
     assert np.median(extra[dark.parts == 3]) < 0.3 * np.median(extra[dark.parts == 2])
+
+
+def test_irradiance_is_in_watts_per_square_metre(renderer):
+    """Photons by hand: counts follow from it with the photon's energy, the pixel's area and the time."""
+    image = shot(renderer)
+    sensor, photon_j = image.scene.spec.sensor, 6.62607015e-34 * 299792458 / 850e-9
+    charge = image.irradiance.astype(float) * (5e-6) ** 2 * sensor.exposure_ms * 1e-3 / photon_j
+    counts = charge * sensor.quantum_efficiency * sensor.gain + sensor.black_dn
+    inside = (counts > 0) & (charge * sensor.quantum_efficiency < sensor.full_well_e)
+    assert np.ptp(image.counts[inside].astype(float)) > 20
+    np.testing.assert_allclose(image.counts[inside], counts[inside], atol=0.51)
+
+
+def exr_attributes(data: bytes) -> dict[str, bytes]:
+    """Attributes of the header of an OpenEXR file: name, type, size, value (the format's specification)."""
+    at, found = 8, {}
+    while data[at]:
+        name, kind, rest = data[at:].split(b"\0", 2)
+        at += len(name) + len(kind) + 6
+        size = int.from_bytes(rest[:4], "little")
+        found[name.decode()] = data[at : at + size]
+        at += size
+    return found
+
+
+def test_exr_files_say_what_they_hold(renderer, tmp_path):
+    from eyerender.rendering.scene.exr import write_exr
+
+    write_exr(tmp_path / "a.exr", np.ones((3, 4), np.float32))
+    said = exr_attributes((tmp_path / "a.exr").read_bytes())
+    assert (said["quantity"], said["unit"]) == (b"irradiance", b"W/m^2")

@@ -29,7 +29,7 @@ def second_thread() -> Iterator[None]:
 
 
 def write_exr(path: Path, image: Singles) -> None:
-    """Write (h, w) float32 as a one-channel EXR.
+    """Write irradiance (h, w), W/m^2, as an EXR of one channel; its header has the attributes `quantity` and `unit`.
 
     Raises:
         EyerenderError: the disk refuses it.
@@ -39,6 +39,9 @@ def write_exr(path: Path, image: Singles) -> None:
     try:
         # Mitsuba accepts no read-only array, so this is a copy.
         with second_thread():
-            mi.Bitmap(np.array(image, dtype=np.float32)[..., None]).write(str(path))
+            bitmap = mi.Bitmap(np.array(image, dtype=np.float32)[..., None])
+            header = bitmap.metadata()
+            header["quantity"], header["unit"] = "irradiance", "W/m^2"
+            bitmap.write(str(path))
     except RuntimeError as error:
         raise EyerenderError(f"{path}: cannot be written ({str(error).splitlines()[0]})") from None
