@@ -22,6 +22,8 @@ from .rig.sensor import Sensor
 
 # Human pupils are about 2 to 8 mm wide (Watson and Yellott 2012, J. Vision 12(10):12); drugs extend the range slightly.
 PUPIL_MM = (1.0, 9.0)
+# Quantum efficiency, albedos and reflectances are those at 850 nm; silicon loses half of its efficiency by 940 nm.
+WAVELENGTHS_NM = (830.0, 870.0)
 # Lengths of a scene below these values were probably written in metres: 2 mm is a screen or an interpupillary distance
 # of 2 m, 0.02 mm an LED of 20 mm.
 _LEAST_MM = {
@@ -65,6 +67,18 @@ def pupil_warnings(diameter_mm: float, path: str) -> list[InputWarning]:
             code="pupil", reason=f"is {diameter_mm:g} mm; human pupils are {low:g} to {high:g} mm wide", path=path
         )
     ]
+
+
+def wavelength_warnings(wavelength_nm: float) -> list[InputWarning]:
+    """Warn of a wavelength for which quantum efficiency and albedos do not hold."""
+    low, high = WAVELENGTHS_NM
+    if low <= wavelength_nm <= high:
+        return []
+    reason = (
+        f"is {wavelength_nm:g} nm; quantum efficiency and albedos are for 850 nm (good from {low:g} to {high:g}), "
+        "so levels of pictures are wrong"
+    )
+    return [InputWarning(code="wavelength", reason=reason, path="wavelength_nm")]
 
 
 def length_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:

@@ -67,6 +67,11 @@ SCREEN = {"centre_mm": [650, 0, 0], "size_mm": [377, 301]}
         ({"eye__pupil_diameter_mm": 9.5}, [("pupil", "eye.pupil_diameter_mm")]),
         ({"eye__pupil_diameter_mm": 1.0}, []),
         ({"eye__pupil_diameter_mm": 9.0}, []),
+        # Levels are those of 850 nm.
+        ({"wavelength_nm": 829.0}, [("wavelength", "wavelength_nm")]),
+        ({"wavelength_nm": 940.0}, [("wavelength", "wavelength_nm")]),
+        ({"wavelength_nm": 830.0}, []),
+        ({"wavelength_nm": 870.0}, []),
         # Metres.
         ({"rig__screen": {**SCREEN, "size_mm": [0.377, 0.301]}}, [("metres", "rig.screen.size_mm")]),
         ({"rig__screen": {**SCREEN, "centre_mm": [0.65, 0, 0]}, "targets": {"world_mm": [[650, 0, 0]]}}, None),

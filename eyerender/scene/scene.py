@@ -27,7 +27,7 @@ from ..eye.model import EyeModel
 from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
 from ..observation import EYES, Index, PoseTruth
-from ..plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings
+from ..plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings, wavelength_warnings
 from ..population.eyes import amplitude_d
 from ..population.model import SIDES
 from ..population.people import Person
@@ -334,6 +334,7 @@ class Scene:
         pupil = "eye.pupil_diameter_mm" if spec.eye.pupil_diameter_mm is not None else "eye.model"
         found = [
             *pupil_warnings(self.pupil_diameter_mm, pupil),
+            *wavelength_warnings(spec.wavelength_nm),
             *length_warnings(spec.to_mapping()),
             *place_warnings(rig, eyes, heads, cameras, lights),
             *self._face_warnings([*zip(cameras, rig.cameras, strict=True)], [*zip(lights, rig.lights, strict=True)]),

@@ -241,7 +241,9 @@ class SceneSpec(FileSpec):
         default=None, description="directions of the optic axes, one frame each; give this or `targets`"
     )
     wavelength_nm: Annotated[float, Field(ge=350, le=1100)] = Field(
-        default=850.0, description="wavelength of the lights, at which the eye's refractive indices hold"
+        default=850.0,
+        description="wavelength of the lights, at which the eye's refractive indices hold; "
+        "quantum efficiency and albedos are for 850 nm",
     )
     image: Picture = Field(default=Picture(), description="the part of the sensor that is rendered, and its samples")
     sensor: Sensor = Field(default=Sensor(), description="aperture, exposure and sensor of all cameras")
