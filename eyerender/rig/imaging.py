@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
+from ..arrays import Floats
 from ..spec import NonNegative, Positive, Spec, Vec2, Vec3
 
 
@@ -81,11 +83,32 @@ class Motion(Spec):
 
 
 class Panel(Spec):
-    """A rectangle that emits evenly to its front, like a screen or a window; the cornea reflects it."""
+    """A rectangle that emits evenly to its front, like a screen or a window; the cornea reflects it.
+
+    It stands still in the world: its orientation is the same for both eyes and all head positions.
+    """
 
     centre_mm: Vec3 = Field(description="centre in the world")
     size_mm: tuple[Positive, Positive] = Field(description="width (horizontal) and height")
     radiance_w_m2_sr: NonNegative = Field(description="radiance within the camera's filter")
+    aim_mm: Vec3 = Field(
+        default=(0, 0, 0), description="world point that its front faces; the default is midway between the eyes"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if np.allclose(self.centre_mm, self.aim_mm, atol=1e-6):
+            raise ValueError("aim_mm is the panel's own centre")
+        return self
+
+    def axes(self) -> tuple[Floats, Floats, Floats]:
+        """Unit vectors (3,) of the world: normal of its front, and along its width and height; its width is level."""
+        normal = np.subtract(self.aim_mm, self.centre_mm)
+        normal /= np.linalg.norm(normal)
+        right = np.cross((0.0, 0.0, 1.0), normal)
+        size = np.linalg.norm(right)
+        right = right / size if size > 1e-9 else np.array([0.0, 1.0, 0.0])
+        return normal, right, np.cross(normal, right)
 
 
 class RadianceMap(Spec):
@@ -151,7 +174,7 @@ class Sun(Spec):
 
 
 class Ambient(Spec):
-    """Light other than that of the lamps: even light, surroundings, the sun, and panels that face the head."""
+    """Light other than that of the lamps: even light, surroundings, the sun, and panels."""
 
     irradiance_w_m2: NonNegative = Field(
         default=0.0, description="even light from all sides: irradiance of a matte surface, within the camera's filter"

@@ -187,6 +187,29 @@ def test_a_panels_irradiance_against_the_integral(renderer, point, normal):
     assert seen == pytest.approx(expected, rel=2e-3, abs=1e-9)
 
 
+def test_a_panel_is_the_same_rectangle_for_both_eyes():
+    from eyerender.rendering.records.job import panel_lamps, panel_table
+
+    near = Panel(centre_mm=(40.0, 0.0, 30.0), size_mm=(50.0, 20.0), radiance_w_m2_sr=2.0)
+    wall = near.model_copy(update={"aim_mm": (40.0, -100.0, 30.0)})
+    ambient = Ambient(panels=(near, wall))
+    anchors = [np.array([0.0, y, 5.0]) for y in (-31.5, 31.5)]
+    (one, other), lamps = ([f(ambient, a) for a in anchors] for f in (panel_table, panel_lamps))
+    np.testing.assert_allclose(one[:, :3] + anchors[0], other[:, :3] + anchors[1])
+    np.testing.assert_array_equal(one[:, 3:], other[:, 3:])
+    np.testing.assert_allclose(one[:, 3:6], [[-0.8, 0, -0.6], [0, -1, 0]], atol=1e-12)
+    np.testing.assert_allclose(one[1, 9:12], [0, 0, 1 / 10])  # upright, 20 mm high
+    np.testing.assert_allclose([a.position_mm for a in lamps[0]], [b.position_mm for b in lamps[1]])
+    # Straight below there is no level direction but a chosen one; on its own aim there is no panel.
+    assert np.all(
+        np.isfinite(
+            panel_table(Ambient(panels=(Panel(centre_mm=(0, 0, -40), size_mm=(9, 9), radiance_w_m2_sr=1),)), anchors[0])
+        )
+    )
+    with pytest.raises(InputError, match="aim_mm is the panel's own centre"):
+        Panel(centre_mm=(0, 0, 0), size_mm=(1, 1), radiance_w_m2_sr=1)
+
+
 def test_maps_strength_and_turn_compile_nothing_and_send_nothing_anew(renderer, tmp_path):
     import drjit as dr
 

@@ -253,18 +253,11 @@ def boundary_waves(eye: EyeModel) -> Floats:
 
 
 def panel_table(ambient: Ambient, anchor: Floats) -> Floats:
-    """Panels in the scene's frame, (n, 13): centre, normal to the origin, right, up (over half sizes), radiance.
-
-    A panel faces the origin; its width is level.
-    """
+    """Panels in the scene's frame, (n, 13): centre, normal, right, up (over half sizes), radiance."""
     rows = []
     for panel in ambient.panels:
         centre = np.asarray(panel.centre_mm, dtype=float) - anchor
-        normal = -centre / np.linalg.norm(centre)
-        right = np.cross([0.0, 0.0, 1.0], normal)
-        size = np.linalg.norm(right)
-        right = right / size if size > 1e-9 else np.array([0.0, 1.0, 0.0])
-        up = np.cross(normal, right)
+        normal, right, up = panel.axes()
         w, h = panel.size_mm
         rows.append([*centre, *normal, *(2 / w * right), *(2 / h * up), panel.radiance_w_m2_sr * 1e-3])
     return np.reshape(rows, (-1, 13))
