@@ -33,7 +33,7 @@ def generate(
     """Make a labelled dataset, or resume an interrupted one.
 
     When started again on the same folder, the command makes only what is missing. Ctrl-C or SIGTERM (`kill PID`) ends
-    it and keeps the finished shards. In the background of a shell script only SIGTERM does, because the shell lets the
+    it and keeps what is finished. In the background of a shell script only SIGTERM does, because the shell lets the
     command ignore Ctrl-C there.
 
     Args:

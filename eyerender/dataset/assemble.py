@@ -27,16 +27,9 @@ from ..storage.files import MAX_FILE_BYTES, read_json, remove_parts, write_json,
 from .card import data_card
 from .columns import type_first
 from .croissant import CROISSANT, croissant
+from .done import checksum, compare_sums, is_sums, read_done, run_versions, sum_of
 from .plan import Plan
-from .shard import (
-    checksum,
-    compare_sums,
-    is_sums,
-    read_done,
-    run_versions,
-    sum_of,
-    verify,
-)
+from .shard import verify
 from .spec import MAX_COUNT
 
 FAILURES, CARD = "failures.jsonl", "README.md"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from ..folders.imagefolder import CONVENTIONS
+from .done import run_versions
 from .plan import RANKED_SUBJECTS, Plan
 from .reading import IMAGEFOLDER, WHOLE
-from .shard import run_versions
 
 _LABELS = """\
 - `records`: the record of the analytic observer: pose, target, apparent pupil (ellipse and boundary points), glints.

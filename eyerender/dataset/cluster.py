@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EyerenderError, InputError
+from .done import cpu_family
 from .pool import RECYCLE_IMAGES, TRIES, Events, caller_hidden, end_of, signals_held
-from .shard import Staged, cpu_family, write_shard
+from .shard import Staged, write_shard
 from .worker import FAILURES, Job, failure
 
 # These variables locate a libLLVM or a GPU's driver on the driver's machine, and so on the others, installed alike.

@@ -22,6 +22,7 @@ from .worker import FAILURES, Job, work
 TRIES = 3
 HOPELESS = 3  # if so many shards are given up before any is made, the others would fail too
 RECYCLE_IMAGES = 2000
+GRACE_S = 20.0  # batch systems wait 30 s between SIGTERM and SIGKILL
 NO_SHARD = -1  # the shard of a worker that ends without one
 
 
@@ -107,12 +108,20 @@ class LocalPool:
             self.close()
 
     def close(self) -> None:
-        """End all workers."""
+        """End all workers; those at work finish their samples and make a checkpoint.
+
+        A second interrupt, or the end of `GRACE_S`, ends them at once.
+        """
         for worker in self._workers:
             with suppress(OSError, ValueError):
                 worker.process.terminate()
-        for worker in list(self._workers):
-            self._end(worker)
+        deadline = time.monotonic() + GRACE_S
+        try:
+            for worker in self._workers:
+                worker.process.join(max(deadline - time.monotonic(), 0.0))
+        finally:
+            for worker in list(self._workers):
+                self._end(worker)
 
     def _busy(self) -> int:
         return sum(w.shard is not None for w in self._workers)

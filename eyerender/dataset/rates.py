@@ -19,8 +19,8 @@ from ..errors import EyerenderError
 from ..spec import Positive, Spec
 from ..storage.cachefolder import cache_folder
 from ..storage.files import read_json, write_json
+from .done import cpu_family
 from .plan import Plan
-from .shard import cpu_family
 
 _BYTES = 2**16
 _Count = Annotated[float, Field(ge=0, le=1e15)]

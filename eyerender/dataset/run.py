@@ -20,21 +20,15 @@ from ..progress import Progress, Say
 from ..storage.files import make_folder, remove_file
 from ..storage.lock import LOCK, final_lock, run_lock
 from .assemble import assemble, damage
+from .done import cpu_family, read_done
 from .options import RunOptions
+from .partial import checkpoints
 from .plan import Plan
 from .pool import NO_SHARD, LocalPool
 from .rates import Rate, keep_rate, now
 from .realise import frames_of
 from .runfile import LOG, begin, refuse_taken
-from .shard import (
-    Staged,
-    commit,
-    cpu_family,
-    is_finished,
-    read_done,
-    remove_leftovers,
-    withdraw_damaged,
-)
+from .shard import Staged, commit, is_finished, remove_leftovers, withdraw_damaged
 from .spec import DatasetSpec
 from .worker import Job
 
@@ -129,7 +123,12 @@ def _generate(
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
     except KeyboardInterrupt:
-        say(f"{len(finished(folder))} of {plan.spec.shard_count} shards are finished; start again on {path} to resume")
+        begun = sum(checkpoints(folder).values())
+        others = f", and {begun} images of others" if begun else ""
+        say(
+            f"{len(finished(folder))} of {plan.spec.shard_count} shards are finished{others}; "
+            f"start again on {path} to resume"
+        )
         raise
     finally:
         if created and folder.is_dir() and all(p.name.startswith(LOCK) for p in folder.iterdir()):
@@ -165,7 +164,8 @@ class _Run:
     progress: Progress
     say: Say
     start: float = field(default_factory=time.monotonic)
-    made: dict[int, int] = field(default_factory=dict)  # samples by shard, of this run
+    made: dict[int, int] = field(default_factory=dict)  # samples by shard, with those that were kept
+    kept: int = 0  # samples of `made` that earlier runs made
     images: int = 0
     rejected: int = 0
     given_up: int = 0
@@ -289,7 +289,9 @@ class _Run:
         self._mixed({"backend": backend, "cpu": cpu_family() if self.options.engine == "local" else None})
 
     def sample(self, shard: int, samples: int, images: int) -> None:
-        """Record that a sample of a shard is made."""
+        """Record that a sample of a shard is made, or that `samples` of it are kept from an earlier worker."""
+        if shard not in self.made:
+            self.kept += samples - 1 if images else samples
         self._count(shard, samples)
         self.images += images
         self._show()
@@ -332,7 +334,8 @@ class _Run:
     def _show(self) -> None:
         samples, seconds = self.samples, time.monotonic() - self.start
         rate = self.images / seconds if seconds > 0 else 0.0
-        left = (self.total - samples) * seconds / samples if samples else 0.0
+        new = samples - self.kept
+        left = (self.total - samples) * seconds / new if new > 0 else 0.0
         note = f"samples, {rate:.2f} images/s, {_clock(left)} left"
         if self.rejected:
             note += f", {self.rejected} attempts redrawn, {self.given_up} samples given up"

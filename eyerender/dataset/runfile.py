@@ -17,8 +17,8 @@ from ..storage.files import MAX_FILE_BYTES, PART, read_json, remove_parts, write
 from ..storage.lock import LOCK
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
+from .done import KINDS, read_done, run_versions
 from .plan import Plan
-from .shard import KINDS, read_done, run_versions
 
 LOG = "log.jsonl"
 _OWN = {RUN, LOG, SHARDS, *KINDS, METADATA, FAILURES, CARD, CROISSANT, DATASET}

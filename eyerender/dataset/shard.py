@@ -3,80 +3,28 @@
     images/00003/*.png   masks/00003/*.png   shards/00003/lines.jsonl, done.json
 
 `done.json` is put in place last, after everything else is in its place and synced. A shard that has one is therefore
-complete, even after a power cut, and its checksums show whether it still is. All other remains of an ended run are
-removed.
+complete, even after a power cut, and its checksums show whether it still is. Of an ended run, the checkpoints of
+partial shards remain as well.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import shutil
-import time
-import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ..errors import InputError
-from ..folders.imagefile import Writer
-from ..folders.imagefolder import DONE, IMAGE_SCHEMA, LINES, SHARDS, STAGE, shard_name, versions
-from ..storage.files import (
-    MAX_FILE_BYTES,
-    inside,
-    make_folder,
-    read_json,
-    remove_file,
-    sync_folder,
-    sync_tree,
-    write_json,
-)
-from ..versions import package_version
-from .maker import MadeImage, Maker
-
-SHARD_SCHEMA = "eyerender/shard/1"
-# Kind of image -> key of its file in a line of metadata.
-KINDS = {
-    "images": "file_name",
-    "masks": "mask_file_name",
-    "amodal_masks": "amodal_mask_file_name",
-    "noiseless": "noiseless_file_name",
-    "highlights": "highlight_mask_file_name",
-}
+from ..folders.imagefolder import DONE, LINES, SHARDS, shard_name
+from ..storage.files import make_folder, remove_file, sync_folder
+from .done import KINDS, compare_sums, read_done
+from .maker import Maker
+from .partial import PartialShard, remove_stages, take_back
 
 
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
-def _are(value: object, fits: Callable[[Any], bool]) -> bool:
-    return isinstance(value, list) and all(map(fits, value))
-
-
-def is_sums(value: object) -> bool:
-    """Whether a value from a file maps names to sizes and SHA-256, as `compare_sums` requires."""
-    return isinstance(value, Mapping) and all(
-        isinstance(entry, Mapping) and _is_count(entry.get("bytes")) and isinstance(entry.get("sha256"), str)
-        for entry in value.values()
-    )
-
-
-# Test for the value of each key of done.json.
-_DONE_KEYS: dict[str, Callable[[Any], bool]] = {
-    "shard": _is_count,
-    "samples": lambda v: _are(v, _is_count) and len(v) == 2,
-    "images": _is_count,
-    "images_saturated": lambda v: v is None or _is_count(v),  # older versions did not count saturated images
-    "digest": lambda v: isinstance(v, str),
-    "versions": lambda v: isinstance(v, Mapping),
-    "backend": lambda v: isinstance(v, Mapping) and all(isinstance(v.get(key), str) for key in ("name", "device")),
-    "cpu": lambda v: isinstance(v, str),
-    "rejections": lambda v: _are(v, lambda entry: isinstance(entry, Mapping)),
-    "given_up": lambda v: _are(v, _is_count),
-    "files": is_sums,
-}
+class Stopped(Exception):
+    """A shard was left unfinished, with a checkpoint, because its worker has to end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,76 +40,58 @@ class Staged:
     bytes: int  # final size on disk; metadata is stored in the shard and in the assembled file
 
 
-def write_shard(maker: Maker, folder: Path, shard: int, on_sample: Callable[[int, int], None]) -> Staged:
-    """Make a shard's samples in a new temporary folder; `on_sample` is called with counts of samples and images.
+def write_shard(
+    maker: Maker,
+    folder: Path,
+    shard: int,
+    on_sample: Callable[[int, int], None],
+    stop: Callable[[], bool] = lambda: False,
+) -> Staged:
+    """Make a shard's samples in a temporary folder, or those that an earlier worker has not finished.
+
+    Args:
+        maker: what makes the samples.
+        folder: the dataset.
+        shard: number of the shard.
+        on_sample: called with the number of samples that are finished and of images of the last one.
+        stop: asked before each sample; once it says so, the samples at work are finished and no other is begun.
 
     Raises:
+        Stopped: `stop` said so.
         OSError: the disk is full or not writable.
         EyerenderError: the same.
         InputError: a file that the scenes name cannot be used, or has changed since the plan was made.
     """
-    start = time.monotonic()
-    stage = folder / f"{STAGE}{shard_name(shard)}-{uuid.uuid4().hex[:12]}"
-    try:
-        maker.plan.check_files()
-        samples = maker.plan.spec.shard_samples(shard)
-        kinds = maker.plan.spec.labels.pictures
-        for kind in kinds:
-            (stage / kind).mkdir(parents=True)
-        (stage / "shard").mkdir()
-        count, saturated, rejections, given_up = 0, 0, [], []
-        with open(stage / "shard" / LINES, "w", encoding="utf-8") as lines, Writer() as writer:
-            for k, made in enumerate(maker.make_all(samples)):
-                rejections += [asdict(r) for r in made.rejections]
-                if not made.images:
-                    given_up.append(made.index)
-                for image in made.images:
-                    names = _write_image(writer, stage, shard, image)
-                    lines.write(json.dumps({"schema": IMAGE_SCHEMA, **names, **image.line}, allow_nan=False) + "\n")
-                count += len(made.images)
-                saturated += sum(image.saturated for image in made.images)
-                on_sample(k + 1, len(made.images))
-        maker.plan.check_files()  # all samples of a shard must use the same files
-        seconds = time.monotonic() - start
-        files = _checksums(stage, shard, kinds)
-        done = {
-            "schema": SHARD_SCHEMA,
-            "shard": shard,
-            "samples": [samples.start, samples.stop],
-            "images": count,
-            "images_saturated": saturated,
-            "digest": maker.plan.digest,
-            "versions": run_versions(),
-            "backend": maker.backend,
-            "cpu": cpu_family(),
-            "rejections": rejections,
-            "given_up": given_up,
-            "seconds": round(seconds, 3),
-            "files": files,
-        }
-        size = sum(entry["bytes"] for entry in files.values()) + files[_place(SHARDS, shard, LINES)]["bytes"]
-        write_json(stage / DONE, done, sync=False)
-        sync_tree(stage)
-    except BaseException:
-        shutil.rmtree(stage, ignore_errors=True)
-        raise
+    maker.plan.check_files()
+    samples = maker.plan.spec.shard_samples(shard)
+    with PartialShard(maker.plan, maker.backend, folder, shard) as partial:
+        if partial.made:
+            on_sample(len(partial.made), 0)
+        todo = [sample for sample in samples if sample not in partial.made]
+        for made in maker.make_all(_until(stop, todo)):
+            partial.add(made)
+            on_sample(len(partial.made), len(made.images))
+        if len(partial.made) < len(samples):
+            partial.checkpoint()
+            raise Stopped
+        done = partial.finish()
+        seconds = partial.seconds
     return Staged(
         shard=shard,
-        stage=str(stage),
-        images=count,
-        rejected=len(rejections),
-        given_up=len(given_up),
+        stage=str(partial.stage),
+        images=done["images"],
+        rejected=len(done["rejections"]),
+        given_up=len(done["given_up"]),
         seconds=seconds,
-        bytes=size,
+        bytes=sum(entry["bytes"] * (1 + name.endswith(LINES)) for name, entry in done["files"].items()),
     )
 
 
-def _write_image(writer: Writer, stage: Path, shard: int, image: MadeImage) -> dict[str, str]:
-    """Write an image's files and return their names in the dataset."""
-    file = f"{image.name}.png"
-    for kind, picture in image.pictures.items():
-        writer.png(stage / kind / file, picture)
-    return {KINDS[kind]: _place(kind, shard, file) for kind in image.pictures}
+def _until(stop: Callable[[], bool], samples: Iterable[int]) -> Iterator[int]:
+    for sample in samples:
+        if stop():
+            return
+        yield sample
 
 
 def commit(folder: Path, staged: Staged) -> None:
@@ -189,22 +119,6 @@ def is_finished(folder: Path, shard: int) -> bool:
     return (folder / SHARDS / shard_name(shard) / DONE).is_file()
 
 
-def read_done(folder: Path, shard: int) -> dict[str, Any]:
-    """Read a finished shard's done.json and check the type of every key.
-
-    Raises:
-        InputError: it is not valid.
-    """
-    path = folder / SHARDS / shard_name(shard) / DONE
-    data = read_json(path, limit=MAX_FILE_BYTES, follow=False)
-    if data.get("schema") != SHARD_SCHEMA:
-        raise InputError(f"must have the schema {SHARD_SCHEMA!r}", source=str(path))
-    for key, fits in _DONE_KEYS.items():
-        if not fits(data.get(key)):
-            raise InputError("is missing, or not in the format of this version", source=str(path), path=key)
-    return data
-
-
 def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
     """List what is wrong with a finished shard: its done.json, and the sizes and SHA-256 of its files.
 
@@ -230,22 +144,6 @@ def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool =
     yield from compare_sums(folder, done["files"], quick=quick)
 
 
-def compare_sums(folder: Path, sums: Mapping[str, Mapping[str, Any]], *, quick: bool = False) -> Iterator[str]:
-    """List files of a folder whose sizes or SHA-256 differ from those given by name; `quick` compares sizes only."""
-    for name, entry in sums.items():
-        try:
-            path = inside(folder, name)
-            size = path.stat().st_size
-            if size != entry["bytes"]:
-                yield f"{name}: has {size} bytes, not {entry['bytes']}"
-            elif not quick and checksum(path) != entry["sha256"]:
-                yield f"{name}: its checksum differs"
-        except InputError as error:
-            yield error.reason
-        except OSError as error:
-            yield f"{name}: cannot be read ({error.strerror or error})"
-
-
 def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[int, str]:
     """Verify finished shards, and remove the done.json of those that are damaged or of another plan.
 
@@ -267,53 +165,11 @@ def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[i
 
 
 def remove_leftovers(folder: Path, mine: set[int], done: set[int]) -> None:
-    """Remove what earlier runs left of shards that this run makes."""
-    for stage in folder.glob(f"{STAGE}*"):
-        number = stage.name.removeprefix(STAGE).split("-")[0]
-        if number.isdigit() and int(number) in mine:
-            shutil.rmtree(stage, ignore_errors=True)
+    """Remove what earlier runs left of shards that this run makes, except checkpoints of shards that are not done."""
+    take_back(folder, mine - done)
+    remove_stages(folder, mine, done)
     for kind in (*KINDS, SHARDS):
         if (folder / kind).is_dir():
             for place in (folder / kind).iterdir():
                 if place.name.isdigit() and int(place.name) in mine - done:
                     shutil.rmtree(place, ignore_errors=True)
-
-
-def checksum(path: Path) -> str:
-    """SHA-256 of a file."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def sum_of(path: Path) -> dict[str, Any]:
-    """Size and SHA-256 of a file."""
-    return {"bytes": path.stat().st_size, "sha256": checksum(path)}
-
-
-def run_versions() -> dict[str, str]:
-    """Versions that affect a dataset's bytes."""
-    found = versions()
-    del found["opencv-python-headless"]  # nothing here uses it
-    return {**found, "pillow": package_version("pillow")}
-
-
-def cpu_family() -> str:
-    """Name of the processor, or its architecture."""
-    from ..backends.probe import cpu_name
-
-    return cpu_name()
-
-
-def _place(kind: str, shard: int, file: str) -> str:
-    return f"{kind}/{shard_name(shard)}/{file}"
-
-
-def _checksums(stage: Path, shard: int, kinds: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Map the final name of every file of a staged shard to its size and SHA-256."""
-    out = {}
-    for kind in kinds:
-        for path in sorted((stage / kind).iterdir()):
-            out[_place(kind, shard, path.name)] = sum_of(path)
-    path = stage / "shard" / LINES
-    out[_place(SHARDS, shard, LINES)] = sum_of(path)
-    return out

@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from ..errors import BackendError, EyerenderError, InputError
@@ -60,6 +63,7 @@ def work(pipe: Connection, job: Job) -> None:
     reason), where kind is backend, input, disk or error. It receives the number of a shard, or None to end.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group, and the parent decides
+    ending = _Ending()
     threading.Thread(target=_die_with_parent, daemon=True).start()
     try:
         maker = job.maker()
@@ -80,9 +84,32 @@ def work(pipe: Connection, job: Job) -> None:
             pipe.send(("sample", shard, samples, images))
 
         try:
-            pipe.send(("done", asdict(write_shard(maker, folder, shard, alive))))
+            with ending.deferred():
+                staged = write_shard(maker, folder, shard, alive, lambda: ending.is_asked)
+            pipe.send(("done", asdict(staged)))
         except Exception as error:
             pipe.send(("failed", *failure(error, folder)))
+
+
+class _Ending:
+    """SIGTERM ends a worker: at once where it is idle, after its samples and a checkpoint where it is at work."""
+
+    def __init__(self) -> None:
+        self.is_asked = False
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Only note SIGTERM in `is_asked` while the block runs, and end this process after it."""
+        signal.signal(signal.SIGTERM, self._note)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            if self.is_asked:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    def _note(self, _number: int, _frame: FrameType | None) -> None:
+        self.is_asked = True
 
 
 def failure(error: Exception, folder: Path) -> tuple[str, str]:

@@ -80,6 +80,11 @@ class Writer:
         finally:
             self._thread.shutdown(wait=True, cancel_futures=True)
 
+    def flush(self) -> None:
+        """Wait until every image is written; raises the error of a write."""
+        while self._waiting:
+            self._waiting.popleft().result()
+
     def png(self, path: Path, image: NDArray[Any]) -> None:
         """Write an image like `write_png`, later."""
         while len(self._waiting) >= _WAITING:

@@ -14,7 +14,7 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from io import BufferedReader
@@ -191,6 +191,17 @@ def remove_parts(path: str | Path) -> None:
     path = Path(path)
     for part in path.parent.glob(f".{glob.escape(path.name)}.*{PART}"):
         part.unlink(missing_ok=True)
+
+
+def sync_files(paths: Sequence[Path]) -> None:
+    """Make the content of files durable; several threads sync them, as in `sync_tree`.
+
+    Raises:
+        OSError: one cannot be synced.
+    """
+    with ThreadPoolExecutor(8) as threads:
+        for _ in threads.map(sync_file, paths):
+            pass
 
 
 def sync_tree(path: str | Path) -> None:

@@ -199,7 +199,7 @@ def in_sequence(values: Sequence[Any]) -> Any:
 
 def read_images(folder: Path) -> StudyImages | None:
     """Images of a finished dataset that this version made; None where there is none."""
-    from ..dataset.shard import run_versions
+    from ..dataset.done import run_versions
 
     try:
         dataset = read_json(folder / DATASET)
@@ -225,7 +225,7 @@ def read_images(folder: Path) -> StudyImages | None:
 
 def _begun(folder: Path, plan: Any) -> bool:
     """Whether a folder holds a run of this very plan and version, or nothing yet."""
-    from ..dataset.shard import run_versions
+    from ..dataset.done import run_versions
 
     if not folder.exists():
         return True

@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
+from eyerender.dataset.done import sum_of
 from eyerender.dataset.export import FORMATS, export
-from eyerender.dataset.shard import sum_of
 from eyerender.errors import InputError
 from tests.support.fabricated import SHARD, fabricate, peak_bytes
 

@@ -21,9 +21,10 @@ from eyerender.dataset.assemble import verify_dataset
 from eyerender.dataset.export import FORMATS
 from eyerender.dataset.maker import MadeSample, Maker
 from eyerender.dataset.pool import Events
-from eyerender.dataset.shard import finished, verify, write_shard
+from eyerender.dataset.shard import verify, write_shard
 from eyerender.dataset.worker import Job
 from eyerender.errors import EyerenderError
+from eyerender.folders.imagefolder import finished
 from eyerender.imaging.capture import render_windows
 from eyerender.scene import load_scene
 from tests.support.dataset_specs import mapping, tree

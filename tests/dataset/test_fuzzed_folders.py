@@ -17,13 +17,14 @@ from hypothesis import given
 
 from eyerender.applications.quickstart import compare_folder
 from eyerender.dataset.assemble import assemble
+from eyerender.dataset.done import sum_of
 from eyerender.dataset.export import FORMATS, export
 from eyerender.dataset.runfile import begin
-from eyerender.dataset.shard import finished, sum_of, withdraw_damaged
+from eyerender.dataset.shard import withdraw_damaged
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
 from eyerender.folders.imagefile import read_image
-from eyerender.folders.imagefolder import ImageFolder
+from eyerender.folders.imagefolder import ImageFolder, finished
 from eyerender.gaze.records import load_observations
 from eyerender.imaging.imageobserver import scene_of
 from tests.support.dataset_specs import make, plan

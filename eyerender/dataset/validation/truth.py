@@ -28,10 +28,10 @@ from ...rendering.records.job import film_index, globe_of
 from ...scene import Frames, Scene
 from ...scene.spec import SceneSpec
 from ...storage.files import parse_json, shown
+from ..done import KINDS
 from ..line import image_line, image_name
 from ..plan import Plan
 from ..realise import Realised, frames_of, realise
-from ..shard import KINDS
 from .problems import WRONG, Problems, differences
 
 # Rays are traced to 1e-9 mm, and other machines' mathematical functions change the last digits: 1e-8 px at the sharpest

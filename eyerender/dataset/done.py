@@ -1,0 +1,116 @@
+"""The record of a shard, done.json: what it holds, the checksums of its files, and what made them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..folders.imagefolder import DONE, SHARDS, shard_name, versions
+from ..storage.files import MAX_FILE_BYTES, inside, read_json
+from ..versions import package_version
+
+SHARD_SCHEMA = "eyerender/shard/1"
+# Kind of image -> key of its file in a line of metadata.
+KINDS = {
+    "images": "file_name",
+    "masks": "mask_file_name",
+    "amodal_masks": "amodal_mask_file_name",
+    "noiseless": "noiseless_file_name",
+    "highlights": "highlight_mask_file_name",
+}
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _are(value: object, fits: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and all(map(fits, value))
+
+
+def is_sums(value: object) -> bool:
+    """Whether a value from a file maps names to sizes and SHA-256, as `compare_sums` requires."""
+    return isinstance(value, Mapping) and all(
+        isinstance(entry, Mapping) and _is_count(entry.get("bytes")) and isinstance(entry.get("sha256"), str)
+        for entry in value.values()
+    )
+
+
+# Test for the value of each key of done.json.
+_DONE_KEYS: dict[str, Callable[[Any], bool]] = {
+    "shard": _is_count,
+    "samples": lambda v: _are(v, _is_count) and len(v) == 2,
+    "images": _is_count,
+    "images_saturated": lambda v: v is None or _is_count(v),  # older versions did not count saturated images
+    "digest": lambda v: isinstance(v, str),
+    "versions": lambda v: isinstance(v, Mapping),
+    "backend": lambda v: isinstance(v, Mapping) and all(isinstance(v.get(key), str) for key in ("name", "device")),
+    "cpu": lambda v: isinstance(v, str),
+    "rejections": lambda v: _are(v, lambda entry: isinstance(entry, Mapping)),
+    "given_up": lambda v: _are(v, _is_count),
+    "files": is_sums,
+}
+
+
+def read_done(folder: Path, shard: int) -> dict[str, Any]:
+    """Read a finished shard's done.json and check the type of every key.
+
+    Raises:
+        InputError: it is not valid.
+    """
+    return read_done_file(folder / SHARDS / shard_name(shard) / DONE)
+
+
+def read_done_file(path: Path) -> dict[str, Any]:
+    """Read a done.json or the checkpoint of a partial shard, as `read_done`."""
+    data = read_json(path, limit=MAX_FILE_BYTES, follow=False)
+    if data.get("schema") != SHARD_SCHEMA:
+        raise InputError(f"must have the schema {SHARD_SCHEMA!r}", source=str(path))
+    for key, fits in _DONE_KEYS.items():
+        if not fits(data.get(key)):
+            raise InputError("is missing, or not in the format of this version", source=str(path), path=key)
+    return data
+
+
+def compare_sums(folder: Path, sums: Mapping[str, Mapping[str, Any]], *, quick: bool = False) -> Iterator[str]:
+    """List files of a folder whose sizes or SHA-256 differ from those given by name; `quick` compares sizes only."""
+    for name, entry in sums.items():
+        try:
+            path = inside(folder, name)
+            size = path.stat().st_size
+            if size != entry["bytes"]:
+                yield f"{name}: has {size} bytes, not {entry['bytes']}"
+            elif not quick and checksum(path) != entry["sha256"]:
+                yield f"{name}: its checksum differs"
+        except InputError as error:
+            yield error.reason
+        except OSError as error:
+            yield f"{name}: cannot be read ({error.strerror or error})"
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sum_of(path: Path) -> dict[str, Any]:
+    """Size and SHA-256 of a file."""
+    return {"bytes": path.stat().st_size, "sha256": checksum(path)}
+
+
+def run_versions() -> dict[str, str]:
+    """Versions that affect a dataset's bytes."""
+    found = versions()
+    del found["opencv-python-headless"]  # nothing here uses it
+    return {**found, "pillow": package_version("pillow")}
+
+
+def cpu_family() -> str:
+    """Name of the processor, or its architecture."""
+    from ..backends.probe import cpu_name
+
+    return cpu_name()

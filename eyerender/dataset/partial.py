@@ -1,0 +1,292 @@
+"""Shards at work: samples are appended one by one, and checkpoints keep what is finished when the worker is stopped.
+
+    .partial-00003-<id>/images/*.png   masks/*.png   shard/lines.jsonl   done.json
+
+`done.json` in this folder is the last checkpoint: it has the keys of a finished shard's `done.json` and lists the files
+of the samples that are finished. It is written after they are synced. What came after it is made again.
+
+The next worker takes the folder over by renaming it, and writes the lines to a new file. So a worker that hangs, and
+wakes up when its shard was given to another one, harms nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+from ..errors import InputError
+from ..folders.imagefile import Writer
+from ..folders.imagefolder import DONE, IMAGE_SCHEMA, LINES, SHARDS, STAGE, shard_name
+from ..storage.files import inside, make_folder, opened, parse_json, remove_file, sync_files, sync_folder, write_json
+from .done import KINDS, SHARD_SCHEMA, cpu_family, read_done_file, run_versions, sum_of
+from .maker import MadeSample
+from .plan import Plan
+
+CHECKPOINT_S = 10.0
+"""At most so much work is lost when a worker is killed."""
+_SHARD = "shard"  # folder of the lines
+
+
+class PartialShard:
+    """A shard whose samples are being made; a context manager, which resumes what an earlier worker has finished.
+
+    Attributes:
+        made: samples that are finished, also those that were given up.
+        images: number of their images.
+    """
+
+    def __init__(self, plan: Plan, backend: dict[str, Any], folder: Path, shard: int) -> None:
+        self.plan, self.shard, self.folder = plan, shard, folder
+        self.made: set[int] = set()
+        self.images = 0
+        self._start = self._checkpoint = self._last = time.monotonic()  # of this worker, the checkpoint, the sample
+        self._before = 0.0  # seconds of earlier workers
+        self._made_by = {"digest": plan.digest, "versions": run_versions(), "backend": backend, "cpu": cpu_family()}
+        self._rejections: list[dict[str, Any]] = []
+        self._given_up: list[int] = []
+        self._saturated: list[int] = []  # the sample of each saturated image
+        self._files: dict[str, dict[str, Any]] = {}
+        self._new: list[str] = []  # pictures since the last checkpoint
+        self._places: list[tuple[int, int, int]] = []  # sample, first byte and length of each line
+        self._hash = hashlib.sha256()
+        self._size = 0
+        self._writer = Writer()
+        self.stage = folder / f"{STAGE}{shard_name(shard)}-{uuid.uuid4().hex[:12]}"
+        found = _claimed(folder, shard, self.stage)
+        for kind in (*plan.spec.labels.pictures, _SHARD):
+            make_folder(self.stage / kind)
+        self._lines = self._new_lines()
+        if found is not None:
+            self._resume(found)
+        self._publish_lines()
+        if found is not None and found["images"] != self.images:
+            self.checkpoint()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        """Keep what is finished; where there is no checkpoint, nothing is left."""
+        self._writer.__exit__(kind, *rest)
+        self._lines.close()
+        if kind is not None and not (self.stage / DONE).is_file():
+            shutil.rmtree(self.stage, ignore_errors=True)
+
+    def add(self, sample: MadeSample) -> None:
+        """Write a sample's images and lines; make a checkpoint when it is time.
+
+        Raises:
+            OSError: the disk is full or not writable.
+            EyerenderError: the same.
+            InputError: a file that the scenes name has changed since the plan was made.
+        """
+        self._rejections += [asdict(r) for r in sample.rejections]
+        if not sample.images:
+            self._given_up.append(sample.index)
+        for image in sample.images:
+            file = f"{image.name}.png"
+            for kind, picture in image.pictures.items():
+                self._writer.png(self.stage / kind / file, picture)
+                self._new.append(f"{kind}/{file}")
+            names = {KINDS[kind]: self._place(kind, file) for kind in image.pictures}
+            line = {"schema": IMAGE_SCHEMA, **names, **image.line}
+            self._add_line(sample.index, (json.dumps(line, allow_nan=False) + "\n").encode())
+            self._saturated += [sample.index] * image.saturated
+        self.made.add(sample.index)
+        # The next sample is thought to take as long as this one, and would be lost, too.
+        now, before = time.monotonic(), self._last
+        self._last = now
+        if now - self._checkpoint + (now - before) > CHECKPOINT_S:
+            self.checkpoint()
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Make durable what is finished, and return the content of done.json; raises as `add`."""
+        self.plan.check_files()  # all samples of a shard must use the same files
+        self._writer.flush()
+        self._lines.flush()
+        sync_files([self.stage / name for name in self._new])
+        os.fsync(self._lines.fileno())
+        for name in self._new:
+            kind, file = name.split("/")
+            self._files[self._place(kind, file)] = sum_of(self.stage / name)
+        self._new = []
+        for kind in (*self.plan.spec.labels.pictures, _SHARD, "."):
+            sync_folder(self.stage / kind)
+        sync_folder(self.folder)
+        own = {"bytes": self._size, "sha256": self._hash.hexdigest()}
+        samples = self.plan.spec.shard_samples(self.shard)
+        done = {
+            "schema": SHARD_SCHEMA,
+            "shard": self.shard,
+            "samples": [samples.start, samples.stop],
+            "images": self.images,
+            "images_saturated": len(self._saturated),
+            **self._made_by,
+            "rejections": sorted(self._rejections, key=lambda r: int(r["sample"])),
+            "given_up": sorted(self._given_up),
+            "saturated": sorted(self._saturated),
+            "seconds": round(self.seconds, 3),
+            "files": dict(sorted(self._files.items())) | {self._place(SHARDS, LINES): own},
+        }
+        write_json(self.stage / DONE, done)
+        self._checkpoint = time.monotonic()
+        return done
+
+    def finish(self) -> dict[str, Any]:
+        """Order the lines by their samples, and make a last checkpoint; the shard may then be put in place."""
+        if self._places != sorted(self._places):
+            self._sort_lines()
+        return self.checkpoint()
+
+    @property
+    def seconds(self) -> float:
+        """Time that the samples took, by all workers."""
+        return self._before + time.monotonic() - self._start
+
+    def _place(self, kind: str, file: str) -> str:
+        return f"{kind}/{shard_name(self.shard)}/{file}"
+
+    def _add_line(self, sample: int, line: bytes) -> None:
+        self._lines.write(line)
+        self._hash.update(line)
+        self._places.append((sample, self._size, len(line)))
+        self._size += len(line)
+        self.images += 1
+
+    def _new_lines(self) -> BinaryIO:
+        """Open a new file of lines, which takes the place of the old one when it is published."""
+        path = self.stage / _SHARD / f"{LINES}.new"
+        path.unlink(missing_ok=True)
+        return open(path, "xb")
+
+    def _publish_lines(self) -> None:
+        self._lines.flush()
+        os.fsync(self._lines.fileno())
+        os.replace(self.stage / _SHARD / f"{LINES}.new", self.stage / _SHARD / LINES)
+
+    def _sort_lines(self) -> None:
+        self._lines.close()
+        places = sorted(self._places)
+        self._places, self._hash, self._size, self.images = [], hashlib.sha256(), 0, 0
+        with open(self.stage / _SHARD / LINES, "rb") as file:
+            self._lines = self._new_lines()
+            for sample, first, length in places:
+                file.seek(first)
+                self._add_line(sample, file.read(length))
+        self._publish_lines()
+
+    def _resume(self, done: dict[str, Any]) -> None:
+        """Take over what an earlier worker has finished, as far as it is intact, of this plan and of our kind."""
+        try:
+            if any(_comparable(done[key]) != _comparable(value) for key, value in self._made_by.items()):
+                raise InputError("was made by another plan, version or processor")
+            lines = list(self._intact_lines(done))
+            wanted = set(self.plan.spec.shard_samples(self.shard))
+            kept = [(line, raw) for line, raw in lines if line["sample"] in wanted]
+            names = {str(line[key]) for line, _ in kept for key in KINDS.values() if key in line}
+            self._files = {name: done["files"][name] for name in names}
+        except (InputError, KeyError, TypeError, ValueError, OSError):
+            kept, done = [], {"rejections": [], "given_up": [], "saturated": [], "seconds": 0.0}
+            remove_file(self.stage / DONE)
+            wanted = set()
+        for line, raw in kept:
+            self._add_line(line["sample"], raw)
+        self._rejections = [r for r in done["rejections"] if r["sample"] in wanted]
+        self._given_up = [k for k in done["given_up"] if k in wanted]
+        self._saturated = [k for k in done["saturated"] if k in wanted]
+        self._before = float(done["seconds"])
+        self.made = {line["sample"] for line, _ in kept} | set(self._given_up)
+        for kind in self.plan.spec.labels.pictures:
+            for path in (self.stage / kind).iterdir():
+                if self._place(kind, path.name) not in self._files:
+                    path.unlink()
+
+    def _intact_lines(self, done: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], bytes]]:
+        """Lines of a checkpoint, whose files are compared with their checksums.
+
+        Raises:
+            InputError: something differs.
+        """
+        own = self._place(SHARDS, LINES)
+        for name, entry in done["files"].items():
+            kind, _, file = name.split("/")
+            if name != own and sum_of(inside(self.stage, f"{kind}/{file}")) != entry:
+                raise InputError(f"{name}: its checksum differs")
+        with opened(self.stage / _SHARD / LINES, follow=False) as file:
+            data = file.read(done["files"][own]["bytes"])
+        if hashlib.sha256(data).hexdigest() != done["files"][own]["sha256"]:
+            raise InputError("its lines differ")
+        for raw in data.splitlines(keepends=True):
+            line = parse_json(raw)
+            if not isinstance(line["sample"], int):
+                raise InputError("has no sample")
+            yield line, raw
+
+
+def checkpoints(folder: Path) -> dict[int, int]:
+    """Number of finished images of each partial shard of a run."""
+    found: dict[int, int] = {}
+    for shard, stage in stages(folder):
+        with suppress(InputError):
+            found[shard] = max(found.get(shard, 0), int(read_done_file(stage / DONE)["images"]))
+    return found
+
+
+def stages(folder: Path) -> Iterator[tuple[int, Path]]:
+    """Shards at work in a folder, with their temporary folders."""
+    for stage in sorted(folder.glob(f"{STAGE}*-*")):
+        number = stage.name.removeprefix(STAGE).split("-")[0]
+        if number.isdigit() and stage.is_dir() and not stage.is_symlink():
+            yield int(number), stage
+
+
+def take_back(folder: Path, shards: Iterable[int]) -> None:
+    """Move what was being put in place when its run was killed back into the partial shard.
+
+    Raises:
+        OSError: a file cannot be moved.
+    """
+    wanted = set(shards)
+    for shard, stage in stages(folder):
+        if shard in wanted and (stage / DONE).is_file():
+            for place, own in ((SHARDS, _SHARD), *((kind, kind) for kind in KINDS)):
+                source = folder / place / shard_name(shard)
+                if source.is_dir() and not (stage / own).exists():
+                    os.rename(source, stage / own)
+
+
+def remove_stages(folder: Path, shards: Iterable[int], finished: set[int]) -> None:
+    """Remove what ended workers left of some shards, except what later ones can go on with."""
+    own = set(shards)
+    for shard, stage in stages(folder):
+        if shard in own and (shard in finished or not (stage / DONE).is_file()):
+            shutil.rmtree(stage, ignore_errors=True)
+
+
+def _claimed(folder: Path, shard: int, stage: Path) -> dict[str, Any] | None:
+    """Rename the partial shard with the most images to `stage`, and return its checkpoint; None if there is none."""
+    found = []
+    for number, place in stages(folder):
+        if number == shard:
+            with suppress(InputError):
+                found.append((read_done_file(place / DONE), place))
+    for done, place in sorted(found, key=lambda pair: -int(pair[0]["images"])):
+        with suppress(OSError):
+            os.rename(place, stage)
+            return done
+    return None
+
+
+def _comparable(value: Any) -> Any:
+    """Value of done.json without what affects no byte."""
+    ignored = ("threads", "python")
+    return {k: v for k, v in value.items() if k not in ignored} if isinstance(value, Mapping) else value

@@ -1,0 +1,161 @@
+"""Partial shards: what is finished survives the end of a worker, and the bytes are those of an undisturbed run."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import subprocess
+import time
+
+import pytest
+
+from eyerender.dataset import partial
+from eyerender.dataset.maker import Maker
+from eyerender.dataset.realise import frames_of
+from eyerender.dataset.shard import Stopped, commit, write_shard
+from tests.support.dataset_specs import command, make, plan, tree, write
+
+pytestmark = pytest.mark.render
+SHARD = 12
+LARGE = {"shard_size": SHARD}
+
+
+class Counted(Maker):
+    """A maker that knows which samples it made."""
+
+    def make_all(self, indices):
+        for sample in super().make_all(indices):
+            self.made.append(sample.index)
+            yield sample
+
+
+@pytest.fixture(scope="module")
+def maker():
+    made = plan(**LARGE)
+    found = Counted(made, frames_of(made), threads=1)
+    found.made = []
+    return found
+
+
+@pytest.fixture(scope="module")
+def whole(maker, tmp_path_factory):
+    """The first shard, made without an interruption."""
+    folder = tmp_path_factory.mktemp("whole")
+    commit(folder, write_shard(maker, folder, 0, lambda *_: None))
+    return folder
+
+
+@pytest.fixture
+def fresh(maker):
+    maker.made = []
+    return maker
+
+
+def stopped(maker, folder, after):
+    """Make a shard until `after` samples are begun; returns the checkpoint."""
+    asked = []
+
+    def stop():
+        asked.append(1)
+        return len(asked) > after
+
+    with pytest.raises(Stopped):
+        write_shard(maker, folder, 0, lambda *_: None, stop)
+    (stage,) = folder.glob(".partial-00000-*")
+    return stage, json.loads((stage / "done.json").read_text())
+
+
+def test_a_stopped_shard_goes_on_where_it_was(fresh, whole, tmp_path):
+    stage, done = stopped(fresh, tmp_path, 3)
+    assert done["images"] == 3  # what was begun is finished
+    assert len(done["files"]) == 7
+    (stage / "images" / "000007_right.png").write_bytes(b"after the checkpoint")
+    with open(stage / "shard" / "lines.jsonl", "a") as file:
+        file.write('{"sample": 7, "cut')
+    seen = []
+    commit(tmp_path, write_shard(fresh, tmp_path, 0, lambda *numbers: seen.append(numbers)))
+    assert fresh.made == list(range(SHARD))
+    assert seen == [(3, 0), *((k, 1) for k in range(4, SHARD + 1))]
+    assert tree(tmp_path) == tree(whole)
+    assert [p.name for p in tmp_path.glob(".partial-*")] == []
+    own, other = (json.loads((f / "shards" / "00000" / "done.json").read_text()) for f in (tmp_path, whole))
+    for found in (own, other):
+        del found["seconds"]
+    assert own == other
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        pytest.param(lambda stage: next((stage / "images").iterdir()).write_bytes(b""), id="picture"),
+        pytest.param(lambda stage: next((stage / "masks").iterdir()).unlink(), id="missing"),
+        pytest.param(lambda stage: (stage / "shard" / "lines.jsonl").write_bytes(b"{}\n"), id="lines"),
+        pytest.param(lambda stage: (stage / "done.json").write_bytes(b"{"), id="checkpoint"),
+        pytest.param(
+            lambda stage: (stage / "done.json").write_text(
+                (stage / "done.json").read_text().replace('"llvm"', '"cuda"').replace('"digest": "', '"digest": "0')
+            ),
+            id="other",
+        ),
+    ],
+)
+def test_a_damaged_checkpoint_or_another_plans_is_not_used(fresh, whole, tmp_path, harm):
+    stage, _ = stopped(fresh, tmp_path, 2)
+    harm(stage)
+    commit(tmp_path, write_shard(fresh, tmp_path, 0, lambda *_: None))
+    assert fresh.made == [0, 1, *range(SHARD)]
+    partial.remove_stages(tmp_path, [0], {0})
+    assert tree(tmp_path) == tree(whole)
+
+
+def test_a_killed_worker_loses_what_came_after_the_checkpoint(fresh, whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(partial, "CHECKPOINT_S", 0.0)
+
+    class Killed(BaseException):
+        pass
+
+    def sample(samples, _images):
+        monkeypatch.setattr(partial, "CHECKPOINT_S", 100.0 if samples >= 5 else 0.0)
+        if samples == 8:
+            raise Killed
+
+    with pytest.raises(Killed):
+        write_shard(fresh, tmp_path, 0, sample)
+    assert partial.checkpoints(tmp_path) == {0: 5}
+    commit(tmp_path, write_shard(fresh, tmp_path, 0, lambda *_: None))
+    assert fresh.made == [*range(8), *range(5, SHARD)]
+    assert tree(tmp_path) == tree(whole)
+
+
+def ended(process: subprocess.Popen[str], number: int, seconds: float) -> int | None:
+    """Send a signal after a while; returns the exit code, None where the process ended by itself before."""
+    try:
+        process.communicate(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        process.send_signal(number)
+        process.communicate(timeout=60)
+        return process.returncode
+    assert process.returncode == 0
+    return None
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_run_that_never_lives_as_long_as_a_shard_gets_finished(tmp_path, number):
+    big = {"count": 200, "shard_size": 100, "subjects": 4, "scene.image.spp": 64}
+    spec, folder = write(tmp_path / "tiny.yaml", **big), tmp_path / "out"
+    draws, rounds = random.Random(1), []
+    while True:
+        process = command("generate", str(spec), str(folder), "--workers", "2", start_new_session=True)
+        code = ended(process, number, draws.uniform(12.0, 20.0))
+        if code is None:
+            break
+        assert code == (130 if number == signal.SIGTERM else -signal.SIGKILL)
+        time.sleep(1.0)  # workers notice that their parent is gone
+        rounds.append(sum(partial.checkpoints(folder).values()))
+        assert len(rounds) < 60
+    assert len(rounds) > 1
+    make(tmp_path / "undisturbed", plan(**big), workers=2, threads=2)
+    assert tree(folder) == tree(tmp_path / "undisturbed")
