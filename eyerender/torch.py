@@ -30,7 +30,6 @@ import torch.distributed
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
-from .arrays import Ints
 from .backends.choose import BackendChoice
 from .dataset.plan import Plan
 from .dataset.realise import frames_of
@@ -285,17 +284,15 @@ def _checked(parts: Sequence[str]) -> tuple[str, ...]:
     return tuple(parts)
 
 
-def _samples(plan: Plan, split: str | None) -> range | Ints:
+def _samples(plan: Plan, split: str | None) -> Sequence[int]:
     """Numbers of the samples of a split."""
     spec = plan.spec
     if split is None:
-        return range(spec.count)
+        return spec.selection.samples
     if split not in spec.splits:
         raise InputError(f"must be one of {', '.join(spec.splits)}, not {split!r}", path="split")
-    firsts = (range(plan.first_of(s), min(plan.first_of(s + 1), spec.count)) for s in range(spec.subject_count))
-    return np.array(
-        [i for s, own in enumerate(firsts) if own and plan.split_of(s) == split for i in own], dtype=np.int64
-    )
+    own = {s for s in range(spec.selection.subject_count) if plan.split_of(s) == split}
+    return [i for i in spec.selection.samples if spec.selection.subject_of(i) in own]
 
 
 def _range(low: float, high: float) -> str:

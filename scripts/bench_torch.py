@@ -36,7 +36,7 @@ def generated(count: int, backend: str) -> float:
     with tempfile.TemporaryDirectory() as folder:
         clock = Clock(WORKERS)
         job = Job.of(made, frames_of(made), Path(folder), backend, 1)
-        lost = LocalPool(job, WORKERS).run(range(made.spec.shard_count), clock)
+        lost = LocalPool(job, WORKERS).run(made.spec.shards, clock)
         if lost:
             raise RuntimeError(str(lost))
     return clock.rate

@@ -43,7 +43,8 @@ def generate(
             to one folder.
         dry_run: Only estimate the time and the disk space, from the last measured rate of this spec on this machine.
         measure: With --dry-run, make a few samples to measure the rate.
-        count: Make the first COUNT samples of the spec's plan. A count above the spec's own plans a larger dataset.
+        count: Make COUNT samples of the spec's plan, spread over its subjects. Beyond the plan, new subjects are added.
+            A folder that holds more or fewer samples keeps those that are wanted.
     """
     part = _part(shard)
     if measure and not dry_run:

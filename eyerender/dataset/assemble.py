@@ -8,7 +8,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from .croissant import CROISSANT, croissant
 from .done import checksum, compare_sums, is_sums, read_done, run_versions, sum_of
 from .plan import Plan
 from .shard import verify
-from .spec import MAX_COUNT
+from .spec import MAX_COUNT, DatasetSpec
 
 FAILURES, CARD = "failures.jsonl", "README.md"
 
@@ -47,7 +48,7 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
     for name in (FAILURES, METADATA, CROISSANT, CARD, DATASET):
         remove_parts(folder / name)
     statistics = Statistics()
-    shards = range(plan.spec.shard_count)
+    shards = plan.spec.shards
     with written(folder / FAILURES) as file:
         for shard in shards:
             done = read_done(folder, shard)
@@ -131,9 +132,13 @@ def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
         yield from verify(folder, shard, dataset.get("digest"), quick=quick)
 
 
-def shards_of(dataset: Mapping[str, Any]) -> range | None:
+def shards_of(dataset: Mapping[str, Any]) -> Sequence[int] | None:
     """Shards that the spec in a dataset.json asks for; None where it does not say."""
     spec = dataset.get("spec")
+    if isinstance(spec, dict) and spec.get("choice") == "spread":
+        with suppress(InputError):
+            return DatasetSpec.from_mapping(spec).shards
+        return None
     count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
     if isinstance(count, int) and isinstance(size, int) and 0 < count <= MAX_COUNT and size > 0:
         return range(-(-count // size))
@@ -182,7 +187,8 @@ class Statistics:
         """Count a shard's done.json."""
         backend = done["backend"]
         self.backends.add(f"{backend['name']} ({backend['device']}; {done['cpu']})")
-        self.samples += done["samples"][1] - done["samples"][0]
+        chosen = done.get("chosen")
+        self.samples += done["samples"][1] - done["samples"][0] if chosen is None else len(chosen)
         self.saturated += done.get("images_saturated") or 0
         self.rejected += len(done["rejections"])
         self.given_up += len(done["given_up"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,17 @@ def _are(value: object, fits: Callable[[Any], bool]) -> bool:
     return isinstance(value, list) and all(map(fits, value))
 
 
+def samples_of(done: Mapping[str, Any]) -> tuple[list[int], list[int] | None]:
+    """Which samples a shard holds: first and end, and the samples where some between are left out."""
+    return list(done["samples"]), done.get("chosen")
+
+
+def described(samples: Sequence[int]) -> tuple[list[int], list[int] | None]:
+    """Samples of a shard as `samples_of` tells them."""
+    whole = isinstance(samples, range)
+    return [samples[0], samples[-1] + 1], None if whole else list(samples)
+
+
 def is_sums(value: object) -> bool:
     """Whether a value from a file maps names to sizes and SHA-256, as `compare_sums` requires."""
     return isinstance(value, Mapping) and all(
@@ -43,6 +54,7 @@ def is_sums(value: object) -> bool:
 _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
     "shard": _is_count,
     "samples": lambda v: _are(v, _is_count) and len(v) == 2,
+    "chosen": lambda v: v is None or _are(v, _is_count),  # the samples where some between are left out
     "images": _is_count,
     "images_saturated": lambda v: v is None or _is_count(v),  # older versions did not count saturated images
     "digest": lambda v: isinstance(v, str),

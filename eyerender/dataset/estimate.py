@@ -59,7 +59,7 @@ def estimate(
     plan = Plan.load(spec, eye=eye, seed=seed, count=count)
     if warn is not None:
         warn(plan.warnings())
-    samples, shards = plan.spec.count, plan.spec.shard_count
+    samples, shards = plan.spec.count, len(plan.spec.shards)
     processes, each = worker_count(options, shards)
     frames = frames_of(plan)
     if measure:
@@ -68,7 +68,7 @@ def estimate(
         rate = last_rate(plan, options.backend)
     seconds = None
     if rate is not None:
-        subjects = plan.subject_of(samples - 1)[0] + 1
+        subjects = plan.spec.selection.subject_count
         seconds = (samples * rate.seconds + subjects * rate.subject_seconds) / min(processes, shards)
         images = rate.images
     else:
@@ -93,7 +93,7 @@ def measured_rate(plan: Plan, maker: Maker) -> Rate:
     A subject's first sample includes the time for its eye and its textures.
     """
     spec = plan.spec
-    subjects = plan.subject_of(spec.count - 1)[0] + 1
+    subjects = spec.selection.subject_count
     starts = [plan.first_of(s) for s in sorted({int(s) for s in np.linspace(0, subjects - 1, _SUBJECTS)})]
     maker.make(starts[0])  # kernels are compiled once per worker
     first: list[float] = []
@@ -101,7 +101,7 @@ def measured_rate(plan: Plan, maker: Maker) -> Rate:
     sizes: list[int] = []
     images: list[int] = []
     for start in starts:
-        second = start + 1 if start + 1 < spec.count and plan.subject_of(start + 1)[1] == 1 else None
+        second = start + 1 if start + 1 < spec.selection.end and plan.subject_of(start + 1)[1] == 1 else None
         for sample, times in ((start, first), (second, again)):
             if sample is None:
                 continue

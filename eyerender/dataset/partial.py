@@ -17,7 +17,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -27,7 +27,7 @@ from ..errors import InputError
 from ..folders.imagefile import Writer
 from ..folders.imagefolder import DONE, IMAGE_SCHEMA, LINES, SHARDS, STAGE, shard_name
 from ..storage.files import inside, make_folder, opened, parse_json, remove_file, sync_files, sync_folder, write_json
-from .done import KINDS, SHARD_SCHEMA, cpu_family, read_done_file, run_versions, sum_of
+from .done import KINDS, SHARD_SCHEMA, cpu_family, described, read_done_file, run_versions, sum_of
 from .maker import MadeSample
 from .plan import Plan
 
@@ -123,11 +123,12 @@ class PartialShard:
             sync_folder(self.stage / kind)
         sync_folder(self.folder)
         own = {"bytes": self._size, "sha256": self._hash.hexdigest()}
-        samples = self.plan.spec.shard_samples(self.shard)
+        samples, chosen = described(self.plan.spec.shard_samples(self.shard))
         done = {
             "schema": SHARD_SCHEMA,
             "shard": self.shard,
-            "samples": [samples.start, samples.stop],
+            "samples": samples,
+            **({} if chosen is None else {"chosen": chosen}),
             "images": self.images,
             "images_saturated": len(self._saturated),
             **self._made_by,
@@ -247,6 +248,25 @@ def stages(folder: Path) -> Iterator[tuple[int, Path]]:
         number = stage.name.removeprefix(STAGE).split("-")[0]
         if number.isdigit() and stage.is_dir() and not stage.is_symlink():
             yield int(number), stage
+
+
+def reopen(folder: Path, shard: int, kinds: Sequence[str]) -> None:
+    """Turn a finished shard into a partial one, from which `PartialShard` goes on with more or fewer samples.
+
+    After a kill between the moves, `take_back` does the rest.
+
+    Raises:
+        OSError: a file cannot be moved.
+    """
+    name = shard_name(shard)
+    stage = folder / f"{STAGE}{name}-{uuid.uuid4().hex[:12]}"
+    stage.mkdir()
+    os.rename(folder / SHARDS / name / DONE, stage / DONE)
+    for place, own in ((SHARDS, _SHARD), *((kind, kind) for kind in kinds)):
+        os.rename(folder / place / name, stage / own)
+        sync_folder(folder / place)
+    sync_folder(stage)
+    sync_folder(folder)
 
 
 def take_back(folder: Path, shards: Iterable[int]) -> None:

@@ -1,7 +1,8 @@
 """The plan of a dataset, which defines sample i as a pure function of (spec, i).
 
 Sample i belongs to subject floor(i S / N) for N planned samples and S subjects. A subject's frames are therefore
-consecutive, and their numbers differ by one at most. A hash of the subject determines its split (`Plan.split_of`). The
+consecutive, and their numbers differ by one at most. Beyond N the plan is continued in blocks of N samples and S new
+subjects (`Selection`). A hash of the subject determines its split (`Plan.split_of`). The
 memory of a plan does not grow with the number of samples.
 """
 
@@ -115,7 +116,7 @@ class Plan:
         """Load a plan from a file, the bare name of a shipped dataset, or a spec; a plan is returned as it is.
 
         `eye` and `seed` replace those of the spec; parameters of other eye models are then dropped. `count` requests
-        the first samples of the plan, or a larger plan (see `DatasetSpec.first`).
+        so many samples of the plan, or of its continuation (see `DatasetSpec.first`).
 
         Raises:
             InputError: with one line.
@@ -186,9 +187,8 @@ class Plan:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the spec and of the content of every file it names."""
-        text = json.dumps(self.to_mapping(), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+        """SHA-256 of the spec and of the content of every file it names; of any number of samples of one plan."""
+        return plan_digest(self.to_mapping())
 
     def to_mapping(self) -> dict[str, Any]:
         """Convert to the mapping that `from_mapping` reads, without the eye files; `files` only where there are any."""
@@ -206,7 +206,7 @@ class Plan:
         """Probable mistakes in the scenes of some samples, spread over the dataset; each is reported once."""
         found: dict[tuple[str, str], InputWarning] = {}
         count = min(self.spec.count, _LOOKED_AT)
-        for sample in (k * self.spec.count // count for k in range(count)):
+        for sample in self.spread(count):
             try:
                 warnings = self.draw(sample).build().warnings()
             except InputError:
@@ -218,6 +218,12 @@ class Plan:
                 )
         return list(found.values())
 
+    def spread(self, count: int) -> list[int]:
+        """At most `count` of the samples that are made, spread evenly over them."""
+        samples = self.spec.selection.samples
+        count = min(count, len(samples))
+        return [samples[k * len(samples) // count] for k in range(count)]
+
     def check_files(self) -> None:
         """Check that the files that the spec names are unchanged since the plan was made.
 
@@ -227,10 +233,19 @@ class Plan:
         check_files(self.files, self.base)
 
     @cached_property
-    def _ranked(self) -> NDArray[np.int32]:
-        """Index of each subject's split in the order of their names, from the rank of its number u."""
+    def _ranked(self) -> dict[int, NDArray[np.int32]]:
+        return {}
+
+    def _ranks(self, block: int) -> NDArray[np.int32]:
+        """Index of the split of each subject of a block in the order of their names, from the rank of its u."""
+        if block not in self._ranked:
+            self._ranked[block] = self._rank(block)
+        return self._ranked[block]
+
+    def _rank(self, block: int) -> NDArray[np.int32]:
         n = self.spec.subject_count
-        order = np.argsort(np.fromiter(map(self._split_number, range(n)), float, n), kind="stable")
+        numbers = map(self._split_number, range(block * n, (block + 1) * n))
+        order = np.argsort(np.fromiter(numbers, float, n), kind="stable")
         out = np.zeros(n, dtype=np.int32)
         start = 0
         for k, share in enumerate(self._shares):
@@ -258,26 +273,27 @@ class Plan:
     def split_of(self, subject: int) -> str:
         """Split of a subject.
 
-        It follows from a number u in (0, 1) of each subject. Up to `RANKED_SUBJECTS` subjects are sorted by u and cut
-        at the cumulative shares, so counts are exact. More subjects are not sorted: u itself is compared with the
-        shares, so counts are those of a random draw.
+        It follows from a number u in (0, 1) of each subject. Up to `RANKED_SUBJECTS` subjects of a block are sorted by
+        u and cut at the cumulative shares, so counts are exact. More subjects are not sorted: u itself is compared
+        with the shares, so counts are those of a random draw.
         """
         names = sorted(self.spec.splits)
         if len(names) == 1:
             return names[0]
         if self.spec.subject_count <= RANKED_SUBJECTS:
-            return names[int(self._ranked[subject])]
+            block, k = divmod(subject, self.spec.subject_count)
+            return names[int(self._ranks(block)[k])]
         u = self._split_number(subject)
         return next((name for name, share in zip(names, self._shares, strict=True) if u < share), names[-1])
 
     def subject_of(self, sample: int) -> tuple[int, int]:
         """Subject of a sample, and the sample's place in the subject's sequence."""
-        subject = sample * self.spec.subject_count // self.spec.planned_count
+        subject = self.spec.selection.subject_of(sample)
         return subject, sample - self.first_of(subject)
 
     def first_of(self, subject: int) -> int:
         """First sample of a subject."""
-        return -(-subject * self.spec.planned_count // self.spec.subject_count)
+        return self.spec.selection.first_of(subject)
 
     def draw(self, sample: int, attempt: int = 0) -> Sample:
         """Draw sample `sample` at an attempt.
@@ -287,8 +303,8 @@ class Plan:
                 is no scene.
         """
         spec = self.spec
-        if not 0 <= sample < spec.count:
-            raise InputError(f"must be 0 to {spec.count - 1}", source=str(sample))
+        if not 0 <= sample < spec.selection.end:
+            raise InputError(f"must be 0 to {spec.selection.end - 1}", source=str(sample))
         subject, sequence = self.subject_of(sample)
         subject_attempt = self.identity(subject)[0]
         turn = Turn(sample=sample, subject=subject, sequence=sequence, attempt=attempt, subject_attempt=subject_attempt)
@@ -373,6 +389,21 @@ class Plan:
         # Parameters of other eyes were not used.
         asked = {k: v if k.startswith(f"eye_parameters.{model}.") else None for k, v in drawn.items()}
         return eye, asked, bool(mine)
+
+
+def plan_digest(mapping: Mapping[str, Any]) -> str:
+    """SHA-256 of a plan's mapping, whatever number of its samples is made."""
+    spec = dict(mapping["spec"])
+    spec["planned"] = spec.get("planned") or spec["count"]
+    del spec["count"]
+    spec.pop("choice", None)
+    return mapping_digest({**mapping, "spec": spec})
+
+
+def mapping_digest(mapping: Mapping[str, Any]) -> str:
+    """SHA-256 of a mapping's canonical JSON."""
+    text = json.dumps(mapping, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _eye_names(spec: DatasetSpec, source: str) -> list[str]:

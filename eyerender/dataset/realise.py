@@ -106,10 +106,11 @@ def sample(
         InputError: there is no such sample, or it was given up.
     """
     plan = Plan.load(spec, eye=eye, seed=seed)
-    if not 0 <= index < plan.spec.count:
+    end = plan.spec.selection.end
+    if not 0 <= index < end:
         name = spec if isinstance(spec, str | Path) else plan.spec.name
         raise InputError(
-            f"must be 0 to {plan.spec.count - 1}, not {index}: {name} has {plan.spec.count} samples; "
+            f"must be 0 to {end - 1}, not {index}: {name} has {end} samples; "
             "choose one of them, or raise 'count' in the spec",
             source="I",
         )

@@ -20,14 +20,15 @@ from ..progress import Progress, Say
 from ..storage.files import make_folder, remove_file
 from ..storage.lock import LOCK, final_lock, run_lock
 from .assemble import assemble, damage
-from .done import cpu_family, read_done
+from .done import cpu_family, described, read_done, samples_of
 from .options import RunOptions
-from .partial import checkpoints
+from .partial import checkpoints, reopen
 from .plan import Plan
 from .pool import NO_SHARD, LocalPool
 from .rates import Rate, keep_rate, now
 from .realise import frames_of
-from .runfile import LOG, begin, refuse_taken
+from .runfile import LOG, begin, refuse_another_count, refuse_taken
+from .selection import in_spread_order
 from .shard import Staged, commit, is_finished, remove_leftovers, withdraw_damaged
 from .spec import DatasetSpec
 from .worker import Job
@@ -62,7 +63,8 @@ def generate(
         options: workers, engine, backend and the like.
         eye: replaces the eye model of the spec: a name of the catalogue or an eye file.
         seed: replaces the seed of the spec.
-        count: makes the first `count` samples of the spec's plan, or plans a larger dataset.
+        count: makes so many samples of the spec's plan, spread over its subjects, or continues the plan with new
+            subjects. In a folder that holds another number of them, those that are wanted are kept.
         part: (k, n) makes only every n-th shard, starting with the k-th; for array jobs that write to one folder.
         progress: called with (images done, images in all, note).
         say: called with lines for the log.
@@ -123,10 +125,11 @@ def _generate(
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
     except KeyboardInterrupt:
-        begun = sum(checkpoints(folder).values())
+        shards = frozenset(plan.spec.shards)
+        begun = sum(images for shard, images in checkpoints(folder).items() if shard in shards)
         others = f", and {begun} images of others" if begun else ""
         say(
-            f"{len(finished(folder))} of {plan.spec.shard_count} shards are finished{others}; "
+            f"{len(finished(folder) & shards)} of {len(shards)} shards are finished{others}; "
             f"start again on {path} to resume"
         )
         raise
@@ -183,11 +186,13 @@ class _Run:
     def make(self, resumed: bool) -> dict[str, Any]:
         """Make this part's missing shards, and assemble the dataset when none is missing."""
         spec, (k, n) = self.plan.spec, self.part
-        mine = set(range(k - 1, spec.shard_count, n))
+        mine = set(spec.shards[k - 1 :: n])
         done = finished(self.folder)
         self._withdraw(done & mine)
+        self._reopen(mine | {shard for shard in done - set(spec.shards) if shard % n == k - 1})
         done = finished(self.folder)
-        todo = sorted(mine - done)
+        # The first images of a run come from subjects that are far apart.
+        todo = in_spread_order(sorted(mine - done))
         if resumed:
             remove_leftovers(self.folder, mine, done)
             problem = next(damage(self.folder, self.plan.digest), None)
@@ -218,9 +223,10 @@ class _Run:
         if not missing:
             with final_lock(self.folder, self.say):
                 # These are the shards of other parts; this run has verified or made its own.
-                self._withdraw(set(range(spec.shard_count)) - self.verified)
+                self._withdraw(set(spec.shards) - self.verified)
                 missing = self._missing()
                 if not missing:
+                    refuse_another_count(self.folder, self.plan)
                     statistics = assemble(self.plan, self.folder)
                 else:
                     remove_file(self.folder / DATASET)
@@ -245,7 +251,7 @@ class _Run:
         self._log("repair", what=what)
 
     def _missing(self) -> set[int]:
-        return set(range(self.plan.spec.shard_count)) - finished(self.folder)
+        return set(self.plan.spec.shards) - finished(self.folder)
 
     def _withdraw(self, shards: set[int]) -> None:
         """Verify finished shards, so that damaged ones are made again."""
@@ -253,6 +259,22 @@ class _Run:
         for shard, problem in damaged.items():
             self.repaired(f"shard {shard} is made again: {problem}")
         self.verified |= shards - damaged.keys()
+
+    def _reopen(self, shards: set[int]) -> None:
+        """Turn finished shards that hold other samples than this number of samples needs into partial ones."""
+        wanted = set(self.plan.spec.shards)
+        reopened, aside = 0, 0
+        for shard in sorted(finished(self.folder) & shards):
+            if shard not in wanted:
+                aside += 1
+            elif samples_of(read_done(self.folder, shard)) == described(self.plan.spec.shard_samples(shard)):
+                continue
+            else:
+                reopened += 1
+            reopen(self.folder, shard, self.plan.spec.labels.pictures)
+        if reopened or aside:
+            self.say(f"{reopened} finished shards get more or fewer samples; {aside} are set aside")
+            self._log("resize", reopened=reopened, aside=aside)
 
     def _engine(self, shards: int) -> LocalPool | RayEngine:
         options = self.options

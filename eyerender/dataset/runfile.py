@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..folders.imagefolder import DATASET, METADATA, RUN, RUN_SCHEMA, SHARDS, STAGE, finished
 from ..folders.outfolder import MARKER, clear
 from ..progress import Say
-from ..storage.files import MAX_FILE_BYTES, PART, read_json, remove_parts, write_json
+from ..storage.files import MAX_FILE_BYTES, PART, read_json, remove_file, remove_parts, write_json
 from ..storage.lock import LOCK
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
@@ -61,6 +61,9 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
     found, reason = _read(path)
     if found is not None:
         _refuse_another(folder, found, mine, plan.files)
+        if _count_of(found) != _count_of(mine):
+            remove_file(folder / DATASET)  # it is that of another number of samples
+            write_json(path, mine)
         return True
     refuse_taken(folder)
     remove_parts(path)
@@ -82,6 +85,31 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
     return False
 
 
+def refuse_another_count(folder: Path, plan: Plan) -> None:
+    """Check that no other run has changed the number of samples of a folder in the meantime.
+
+    Raises:
+        InputError: it has.
+    """
+    found, _ = _read(folder / RUN)
+    if found is not None and _count_of(found) != _count_of(plan.to_mapping()):
+        raise InputError("another run has changed the number of samples", source=str(folder))
+
+
+def _count_of(run: Mapping[str, Any]) -> tuple[Any, ...]:
+    spec = run.get("spec")
+    return tuple(spec.get(key) for key in ("count", "planned", "choice")) if isinstance(spec, Mapping) else ()
+
+
+def _of_any_count(run: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Content of run.json without the number of samples that are made of the plan."""
+    spec = run.get("spec")
+    if not isinstance(spec, Mapping):
+        return run
+    kept = {key: value for key, value in spec.items() if key not in ("count", "choice")}
+    return {**run, "spec": {**kept, "planned": spec.get("planned") or spec.get("count")}}
+
+
 def _read(path: Path) -> tuple[dict[str, Any] | None, str]:
     """Content of run.json, or None and the reason why it cannot be used.
 
@@ -101,7 +129,8 @@ def _refuse_another(folder: Path, found: Mapping[str, Any], mine: Mapping[str, A
     """Raise an error with the differences where a folder is of another spec or other versions."""
     # Python's own version affects no byte and may differ between machines.
     skip = ("versions.python:", "digest:", "files.", "files:")
-    changes = [c for c in differences(found, json.loads(json.dumps(mine))) if not c.startswith(skip)]
+    old_plan, plan = _of_any_count(found), _of_any_count(json.loads(json.dumps(mine)))
+    changes = [c for c in differences(old_plan, plan) if not c.startswith(skip)]
     old = found.get("files")
     old = old if isinstance(old, Mapping) else {}
     changes = [f"{name}: other content" for name, content in files.items() if old.get(name) != content] + changes

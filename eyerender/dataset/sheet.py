@@ -114,14 +114,14 @@ def contact_sheet(tiles: list[Tile]) -> Image.Image:
 
 def _of_plan(plan: Plan, backend: BackendChoice, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:
     maker = Maker(plan, frames_of(plan), backend=backend, threads=threads)
-    count = min(TILES, plan.spec.count)
-    for k in range(count):
-        made = maker.make(k * plan.spec.count // count)
+    chosen = plan.spread(TILES)
+    for sample in chosen:
+        made = maker.make(sample)
         if not made.images:
             raise InputError(f"sample {made.index} cannot be made: {made.rejections[-1].reason}", source=plan.source)
         image = made.images[0]
         caption = f"{image.line['split']} sample {made.index} subject {image.line['subject']}"
-        yield count, _tile(image.pictures["images"], image.line, caption), image.saturated
+        yield len(chosen), _tile(image.pictures["images"], image.line, caption), image.saturated
 
 
 def _of_scene(scene: Scene, backend: BackendChoice, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:

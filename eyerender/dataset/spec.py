@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -15,9 +16,11 @@ from ..population.people import PopulationSpec
 from ..scene import is_shipped_dataset, refuse_folder, shipped_files
 from ..scene.spec import DATASET_KIND, NOT_A_DATASET
 from ..spec import FileSpec, Positive, Spec
+from .selection import Selection
 
 # Largest number of samples of a run; a Sobol sequence has no more points.
 MAX_COUNT = 10**9
+_LEAST_SHARDS = 16
 _SPLIT = re.compile(r"[a-z][a-z0-9]*")
 
 
@@ -54,9 +57,17 @@ class DatasetSpec(FileSpec):
     count: Annotated[int, Field(ge=1, le=MAX_COUNT)] = Field(description="number of samples")
     planned: Annotated[int, Field(ge=1, le=MAX_COUNT)] | None = Field(
         default=None,
-        description="number of samples of the whole plan, of which the first `count` are made; default: count",
+        description="number of samples of the whole plan, of which `count` are made; beyond it the plan is continued "
+        "with new subjects; default: count",
     )
-    shard_size: Annotated[int, Field(ge=1, le=100_000)] = Field(default=64, description="samples in a shard")
+    choice: Literal["first", "spread"] | None = Field(
+        default=None,
+        description="which samples are made where not all planned ones are: the first ones, or (as with --count) the "
+        "first ones of each subject in turn; default: first",
+    )
+    shard_size: Annotated[int, Field(ge=1, le=100_000)] = Field(
+        default=64, description="samples in a shard; default: 64, fewer in a small plan, so that it has 16 shards"
+    )
     subjects: Annotated[int, Field(ge=1, le=MAX_COUNT)] | None = Field(
         default=None, description="number of identities; each has a run of consecutive samples; default: one per sample"
     )
@@ -88,11 +99,16 @@ class DatasetSpec(FileSpec):
     )
 
     @model_validator(mode="after")
+    def _divide(self) -> Self:
+        """Divide a small plan into enough shards for several workers."""
+        if "shard_size" not in self.model_fields_set:
+            object.__setattr__(self, "shard_size", min(self.shard_size, -(-self.planned_count // _LEAST_SHARDS)))
+        return self
+
+    @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.planned is not None and self.planned < self.count:
-            raise ValueError("planned: must be >= count")
         if self.subjects is not None and self.subjects > self.planned_count:
-            raise ValueError("subjects: must be <= count")
+            raise ValueError("subjects: must be <= the number of planned samples")
         if self.population is not None and self.eye_parameters:
             raise ValueError("eye_parameters: cannot stand beside a population; use its 'replace'")
         for key in ("population", "person"):
@@ -128,18 +144,29 @@ class DatasetSpec(FileSpec):
         return self.subjects or self.planned_count
 
     def first(self, count: int) -> Self:
-        """Spec of the first `count` samples of the same plan, or of a larger plan where it has fewer."""
-        planned = self.planned_count if count < self.planned_count else None
-        return self.replaced("--count", {"count": count, "planned": planned})
+        """Spec of `count` samples of the same plan, spread over its subjects, or of its continuation."""
+        planned = self.planned_count
+        changes = {"count": count, "planned": None if count == planned else planned}
+        return self.replaced("--count", {**changes, "choice": "spread" if count % planned else None})
 
     @property
-    def shard_count(self) -> int:
-        """Number of shards."""
-        return -(-self.count // self.shard_size)
+    def selection(self) -> Selection:
+        """Which samples are made."""
+        return _selection(self.count, self.planned_count, self.subject_count, self.shard_size, self.choice == "spread")
 
-    def shard_samples(self, shard: int) -> range:
+    @property
+    def shards(self) -> Sequence[int]:
+        """Numbers of the shards."""
+        return self.selection.shards
+
+    def shard_samples(self, shard: int) -> Sequence[int]:
         """Samples of a shard."""
-        return range(shard * self.shard_size, min((shard + 1) * self.shard_size, self.count))
+        return self.selection.shard_samples(shard)
+
+
+@lru_cache(maxsize=16)
+def _selection(count: int, planned: int, subjects: int, shard_size: int, spread: bool) -> Selection:
+    return Selection(count, planned, subjects, shard_size, spread and count % planned > 0)
 
 
 def shipped_datasets() -> dict[str, Path]:

@@ -12,7 +12,7 @@ from PIL import Image
 from eyerender.cli.main import run
 from eyerender.folders.imagefolder import ImageFolder
 from eyerender.imaging.imageobserver import scene_of
-from tests.support.dataset_specs import write
+from tests.support.dataset_specs import tree, write
 
 pytestmark = pytest.mark.render
 
@@ -38,16 +38,20 @@ def test_a_sample_written_as_a_scene_has_the_datasets_features(tiny, spec, capsy
 
 
 def test_a_count_makes_the_same_bytes_as_the_whole_dataset(tiny, spec, capsys):
-    assert run(["generate", spec, "part", "--count", "2", "--workers", "1", "--threads", "1"]) == 0
-    assert "2 images in part: validation 2;" in capsys.readouterr().out
-    assert Path("part/metadata.jsonl").read_text() == "".join((tiny / "metadata.jsonl").open().readlines()[:2])
+    # The samples are spread over the subjects, and so over shards.
+    assert run(["generate", spec, "part", "--count", "5", "--workers", "1", "--threads", "1"]) == 0
+    assert "5 images in part: test 1, train 2, validation 2;" in capsys.readouterr().out
+    lines = (tiny / "metadata.jsonl").open().readlines()
+    assert Path("part/metadata.jsonl").read_text() == "".join(lines[k] for k in (0, 1, 6, 12, 18))
     made = sorted(p.relative_to("part") for p in Path("part").rglob("*.png"))
-    assert len(made) == 4
+    assert len(made) == 10
     for name in made:
         assert ("part" / name).read_bytes() == (tiny / name).read_bytes()
-    # The rest is another run.
-    assert run(["generate", spec, "part"]) == 2
-    assert "spec.count: 2 -> 24" in capsys.readouterr().err
+    assert run(["validate", "part"]) == 0
+    # The rest is made without making these again.
+    assert run(["generate", spec, "part", "--workers", "1", "--threads", "1"]) == 0
+    assert "19 images made" in capsys.readouterr().out
+    assert tree(Path("part")) == tree(tiny)
 
 
 def test_a_dataset_without_several_targets_says_what_gaze_needs(tiny, capsys):

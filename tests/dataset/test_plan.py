@@ -14,11 +14,12 @@ import yaml
 from eyerender.dataset.draws import unit_number
 from eyerender.dataset.plan import RANKED_SUBJECTS, Plan
 from eyerender.dataset.realise import frames_of, realise
+from eyerender.dataset.selection import Selection, in_spread_order
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene.spec import SceneSpec
-from tests.support.dataset_specs import plan, write
+from tests.support.dataset_specs import mapping, plan, write
 
 PEOPLE = ("people_eyelink", "people_nvgaze", "people_openeds", "people_pupil_core")
 
@@ -30,40 +31,77 @@ def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
         spec.dump(tmp_path / "copy.yaml")
         assert DatasetSpec.load(tmp_path / "copy.yaml") == spec
         made = Plan.load(name)
-        assert spec.shard_count >= 8
-        assert realise(made, spec.count - 1, frames_of(made)).sample is not None
+        assert len(spec.shards) >= 8
+        assert realise(made, spec.selection.samples[-1], frames_of(made)).sample is not None
 
 
-def test_a_smaller_count_makes_the_first_samples_of_the_same_plan(tmp_path):
+def test_a_smaller_count_makes_samples_of_the_same_plan(tmp_path):
     # Subjects and splits are parts of the whole plan, so nothing of a sample may depend on how many are made.
     for changes in ({}, {"subjects": None}):
         file = write(tmp_path / "spec.yaml", **changes)
         whole, part = Plan.load(file), Plan.load(file, count=5)
-        assert part.spec.count == 5
-        assert part.spec.shard_count == 2
-        assert part.spec.subject_count == whole.spec.subject_count
-        assert [part.draw(i).to_mapping() for i in range(5)] == [whole.draw(i).to_mapping() for i in range(5)]
-        with pytest.raises(InputError, match="must be 0 to 4"):
-            part.draw(5)
+        assert part.spec.count == len(part.spec.selection.samples) == 5
+        assert part.digest == whole.digest
+        assert [part.draw(i).to_mapping() for i in range(24)] == [whole.draw(i).to_mapping() for i in range(24)]
+        with pytest.raises(InputError, match="must be 0 to 23"):
+            part.draw(24)
         # A part of a part; the whole again is the plan itself.
         part.spec.dump(tmp_path / "part.yaml")
         assert Plan.load(tmp_path / "part.yaml", count=2).spec == whole.spec.first(2)
-        assert Plan.load(tmp_path / "part.yaml", count=24).digest == whole.digest
+        assert Plan.load(tmp_path / "part.yaml", count=24).spec == whole.spec
     # Fewer samples than subjects are planned are made too.
     assert Plan.load("dataset_quick", count=2).draw(1).to_mapping() == Plan.load("dataset_quick").draw(1).to_mapping()
 
 
-def test_a_larger_count_plans_a_larger_dataset(tmp_path):
-    larger = Plan.load(write(tmp_path / "spec.yaml"), count=48)
-    assert larger.spec.planned is None
-    assert [larger.subject_of(i)[0] for i in (0, 11, 12, 47)] == [0, 0, 1, 3]
+def test_a_larger_count_continues_the_plan_with_new_subjects(tmp_path):
+    own = Plan.load(write(tmp_path / "spec.yaml"))
+    larger = Plan.load(tmp_path / "spec.yaml", count=60)
+    assert larger.spec.planned == 24
+    assert [larger.subject_of(i) for i in (0, 5, 6, 23, 24, 29, 47)] == [
+        *((0, 0), (0, 5), (1, 0), (3, 5)),
+        *((4, 0), (4, 5), (7, 5)),
+    ]
+    for i in range(24):
+        assert larger.draw(i).to_mapping() == own.draw(i).to_mapping()
+    for block in range(3):
+        splits = Counter(larger.split_of(s) for s in range(4 * block, 4 * block + 4))
+        assert splits == {"train": 2, "validation": 1, "test": 1}
+    assert list(larger.spec.selection.samples) == [*range(48), *(48 + 6 * s + k for s in range(4) for k in range(3))]
+
+
+@pytest.mark.parametrize("planned", [24, 23, 7, 30])
+@pytest.mark.parametrize("subjects", [1, 4, 7])
+def test_a_choice_goes_through_the_subjects_in_rounds(planned, subjects):
+    for count in range(1, 2 * planned + 1):
+        whole = [i for block in range(count // planned) for i in range(block * planned, (block + 1) * planned)]
+        found = Selection(count, planned, subjects, 5, count % planned > 0)
+        block = range(len(whole), len(whole) + planned)
+        order = sorted(block, key=lambda i: (i - found.first_of(found.subject_of(i)), found.subject_of(i)))
+        expected = sorted(whole + order[: count - len(whole)])
+        assert list(found.samples) == expected
+        assert [i for shard in found.shards for i in found.shard_samples(shard)] == expected
+        assert all(found.shard_samples(shard) for shard in found.shards)
+        assert found.subject_count == len({found.subject_of(i) for i in expected})
+
+
+def test_a_small_plan_has_shards_for_several_workers():
+    data = mapping()
+    del data["shard_size"]
+    assert DatasetSpec.from_mapping(data).shard_size == 2
+    assert DatasetSpec.from_mapping({**data, "count": 16 * 64}).shard_size == 64
+    assert DatasetSpec.from_mapping({**data, "count": 10**6}).shard_size == 64
+
+
+def test_neighbours_of_a_spread_order_are_far_apart():
+    assert in_spread_order(range(8)) == [0, 4, 2, 6, 1, 5, 3, 7]
+    assert sorted(in_spread_order(range(13))) == list(range(13))
+    assert in_spread_order([]) == []
 
 
 def test_a_plan_has_at_least_the_samples_and_the_subjects_that_are_asked_for():
     for changes, words in (
-        ({"planned": 23}, "planned: must be >= count"),
         ({"planned": 0}, "planned: must be >= 1"),
-        ({"planned": 30, "subjects": 31}, "subjects: must be <= count"),
+        ({"planned": 30, "subjects": 31}, "subjects: must be <= the number of planned samples"),
     ):
         with pytest.raises(InputError, match=words):
             plan(**changes)

@@ -117,7 +117,7 @@ def test_a_finished_shard_is_never_made_again(tiny, tmp_path):
     [
         ({"scene.image.spp": 3}, "spec.scene.image.spp: 2 -> 3"),
         ({"seed": 6}, "spec.seed: 5 -> 6"),
-        ({"count": 30}, "spec.count: 24 -> 30"),
+        ({"count": 30}, "spec.planned: 24 -> 30"),
     ],
 )
 def test_another_spec_is_refused_with_the_difference(tiny, changes, words):

@@ -55,12 +55,13 @@ def check_shards(images: ImageFolder, quick: bool, problems: Problems, step: Pro
     if asked is None:
         return  # then the plan cannot be read either
     known = frozenset(there)
+    asked_for = asked if isinstance(asked, range) else frozenset(asked)
     if not images.unfinished:
-        missing = len(asked) - sum(shard in asked for shard in there)
+        missing = len(asked) - sum(shard in asked_for for shard in there)
         absent = (s for s in asked if s not in known)
         problems.extend(f"{SHARDS}/{shard_name(s)}: missing" for s in islice(absent, SHOWN))
         problems.count += max(missing - SHOWN, 0)
-    problems.extend(f"{SHARDS}/{shard_name(s)}: dataset.json has no such shard" for s in there if s not in asked)
+    problems.extend(f"{SHARDS}/{shard_name(s)}: dataset.json has no such shard" for s in there if s not in asked_for)
 
 
 def compare_lines(folder: Path, problems: Problems) -> None:

@@ -1,0 +1,135 @@
+"""Which samples of a plan are made: all of them, the first ones, or the first ones of each subject in turn.
+
+A plan of N samples and S subjects is continued in blocks: samples b N to (b + 1) N - 1 belong to the subjects b S to
+(b + 1) S - 1, divided as in the first block. So a dataset can grow beyond its plan, and no sample changes its subject.
+
+Of a block that is not made as a whole, `spread` takes the samples in rounds: the first one of each subject, then the
+second ones, and so on. More samples therefore always include fewer, and each subject's sequence is begun at its start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import overload
+
+import numpy as np
+
+from ..arrays import Bools, Ints
+
+_CHUNK = 2**20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Joined(Sequence[int]):
+    """A range from 0, followed by larger numbers."""
+
+    head: range
+    tail: Ints
+
+    def __len__(self) -> int:
+        return len(self.head) + len(self.tail)
+
+    @overload
+    def __getitem__(self, at: int) -> int: ...
+    @overload
+    def __getitem__(self, at: slice) -> list[int]: ...
+    def __getitem__(self, at: int | slice) -> int | list[int]:
+        if isinstance(at, slice):
+            return [self[k] for k in range(*at.indices(len(self)))]
+        k = range(len(self))[at]
+        return self.head[k] if k < len(self.head) else int(self.tail[k - len(self.head)])
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The `count` samples that are made of a plan of `planned` samples and `subjects` subjects, in shards of a size."""
+
+    count: int
+    planned: int
+    subjects: int
+    shard_size: int
+    spread: bool
+
+    def subject_of(self, sample: int) -> int:
+        """Subject of a sample."""
+        block, k = divmod(sample, self.planned)
+        return block * self.subjects + k * self.subjects // self.planned
+
+    def first_of(self, subject: int) -> int:
+        """First sample of a subject."""
+        block, k = divmod(subject, self.subjects)
+        return block * self.planned - (-k * self.planned // self.subjects)
+
+    @property
+    def subject_count(self) -> int:
+        """Number of subjects that have a sample, which are the first ones of the plan."""
+        blocks, left = divmod(self.count, self.planned)
+        if self.spread:
+            return blocks * self.subjects + min(left, self.subjects)
+        return self.subject_of(self.count - 1) + 1
+
+    @property
+    def end(self) -> int:
+        """No sample from this one on is made."""
+        return -(-self.count // self.planned) * self.planned if self.spread else self.count
+
+    def are_made(self, samples: Ints) -> Bools:
+        """Whether samples are made, (n,)."""
+        if not self.spread:
+            return np.asarray(samples < self.count)
+        block, k = np.divmod(samples, self.planned)
+        whole, left = divmod(self.count, self.planned)
+        rounds, rest = divmod(left, self.subjects)
+        shortest = self.planned // self.subjects  # some subjects have one more
+        if rounds >= shortest:
+            rounds, rest = shortest, left - shortest * self.subjects
+        subject = k * self.subjects // self.planned
+        first = -(-subject * self.planned // self.subjects)
+        # Rank of a subject among those that have a sample in the last round.
+        rank = first - subject * shortest if rounds == shortest else subject
+        sequence = k - first
+        chosen = (sequence < rounds) | ((sequence == rounds) & (rank < rest))
+        return np.asarray((block < whole) | ((block == whole) & chosen))
+
+    @cached_property
+    def shards(self) -> Sequence[int]:
+        """Shards that hold a sample, in order."""
+        size = self.shard_size
+        if not self.spread:
+            return range(-(-self.count // size))
+        head = self._whole // size
+        parts = [np.unique(chunk // size) for chunk in self._chunks(head * size)]
+        return Joined(range(head), np.unique(np.concatenate(parts)))
+
+    def shard_samples(self, shard: int) -> Sequence[int]:
+        """Samples of a shard, in order; a range where none is left out."""
+        samples = range(shard * self.shard_size, min((shard + 1) * self.shard_size, self.end))
+        made = self.are_made(np.arange(samples.start, samples.stop, dtype=np.int64))
+        if made.all():
+            return samples
+        return (np.flatnonzero(made) + samples.start).tolist()
+
+    @cached_property
+    def samples(self) -> Sequence[int]:
+        """All samples, in order, with 8 bytes of memory for each one of the last block."""
+        if not self.spread:
+            return range(self.count)
+        return Joined(range(self._whole), np.concatenate(list(self._chunks(self._whole))))
+
+    @property
+    def _whole(self) -> int:
+        """Number of samples of blocks that are made as a whole."""
+        return self.count // self.planned * self.planned
+
+    def _chunks(self, first: int) -> Iterator[Ints]:
+        for start in range(first, self.end, _CHUNK):
+            samples = np.arange(start, min(start + _CHUNK, self.end), dtype=np.int64)
+            yield samples[self.are_made(samples)]
+
+
+def in_spread_order(items: Sequence[int]) -> list[int]:
+    """Order sorted items so that those at the front are far apart: by the reversed bits of their places."""
+    bits = max(len(items) - 1, 1).bit_length()
+    return [items[k] for k in sorted(range(len(items)), key=lambda k: int(f"{k:0{bits}b}"[::-1], 2))]
