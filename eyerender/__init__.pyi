@@ -16,6 +16,11 @@ from .dataset.run import generate as generate
 from .dataset.sheet import preview as preview
 from .dataset.spec import DatasetSpec as DatasetSpec
 from .dataset.validate import validate as validate
+from .design.information import Information as Information
+from .design.information import information as information
+from .design.noise import FeatureNoise as FeatureNoise
+from .design.noise import sensor_noise as sensor_noise
+from .design.unknowns import Unknowns as Unknowns
 from .errors import BackendError as BackendError
 from .errors import EyerenderError as EyerenderError
 from .errors import InputError as InputError

@@ -16,6 +16,7 @@ GROUPS = {
     "api_scenes": ("Scenes, frames and subjects", ("scene", "imaging.capture", "imaging.images")),
     "api_eyes": ("Eyes and the eye region", ("eye", "region")),
     "api_rigs": ("Rigs: cameras, lights, screens, sensors", ("rig",)),
+    "api_design": ("Rig design: information, noise, fits of eyes", ("design",)),
     "api_observers": ("Observers, observations and comparison", ("",)),
     "api_datasets": ("Datasets and folders of images", ("dataset", "folders", "benchmark")),
 }

@@ -124,7 +124,7 @@ def features(
             camera = cameras[number]
             for block, turned in chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // max(m, 4))):
                 pose = Poses(poses.azimuth_rad[block], poses.elevation_rad[block], poses.torsion_rad[block])
-                view = _View.of(turned, pose, position[block], camera)
+                view = View.of(turned, pose, position[block], camera)
                 for j, order in enumerate(purkinje if m else ()):
                     exits, residual, status = glint_exits(turned, order, view.into_eye(lights), view.camera_mm)
                     pixels, status = view.project(exits, status)
@@ -182,7 +182,7 @@ def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> 
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class _View:
+class View:
     """View of one camera on a chunk of turned eyes: x_cam = R x_eye + t for each, and the camera in the eye frame."""
 
     rotation: Floats
@@ -192,7 +192,7 @@ class _View:
     camera: PinholeCamera
 
     @classmethod
-    def of(cls, eye: EyeModel, poses: Poses, position_mm: Floats, camera: PinholeCamera) -> _View:
+    def of(cls, eye: EyeModel, poses: Poses, position_mm: Floats, camera: PinholeCamera) -> View:
         turn, shift = rigid_motion(poses, eye)
         whole = shift + position_mm
         rotation, translation, at = np.empty(turn.shape), np.empty(shift.shape), np.empty(shift.shape[::-1])
@@ -205,11 +205,11 @@ class _View:
             camera=camera,
         )
 
-    def rows(self, part: slice) -> _View:
+    def rows(self, part: slice) -> View:
         """View of some of the eyes."""
         x, y, z = self.camera_mm
         turn, shift = self.motion
-        return _View(
+        return View(
             rotation=self.rotation[part],
             translation=self.translation[part],
             camera_mm=(x[part], y[part], z[part]),

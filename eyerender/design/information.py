@@ -1,0 +1,354 @@
+"""Fisher information of what a rig observes, and the covariance of gaze and of every parameter that follows.
+
+    I = sum_j (l_j / s^2) (n_j . dp_j) (n_j . dp_j)^T + sum_g dg^T dg / s_g^2 + sum_t dm^T dm / f^2 + P^-1      (3)
+
+with points p_j of the pupil's outline, their normals n_j and lengths l_j of outline, the noise s of one px of outline,
+glints g with noise s_g, the angles m between line of sight and target with the noise of fixation f for frames of a
+calibration, and the covariance P of priors. All derivatives are by the unknowns (`unknowns.py`). The inverse of I is
+the Cramer-Rao bound: no unbiased estimator on these features has less variance. It counts noise alone. What an
+estimator assumes wrongly about the eye comes on top of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..arrays import ArrayValue, Bools, Floats, Ints
+from ..errors import InputError
+from ..observation import EYES
+from ..rig.rig import RigLike
+from ..scene import Frames
+from .noise import FeatureNoise, sensor_noise
+from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, NAMES, PERSON, PUPIL, Unknowns
+from .varied import Slopes, Views, diameters_mm, gaze_slopes, lines_of_sight, slopes_of, stacked_eyes, target_slopes
+
+UNSEEN = 1e-11
+"""Eigenvalues of the information, scaled to a unit diagonal, below which a direction counts as not seen."""
+_VIRTUAL_MM = 1000.0
+_ROWS = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Case:
+    """Views with their instants: what all analyses of a rig start from.
+
+    Attributes:
+        views: n views.
+        instant: (n,) the instant of each view, 0 to i - 1.
+        instants: i views, one of each instant, for what does not depend on the camera.
+        theta: (i, 15) the true unknowns.
+        target_mm: (i, 3) what is looked at; NaN where nothing is.
+    """
+
+    views: Views
+    instant: Ints
+    instants: Views
+    theta: Floats
+    target_mm: Floats
+
+
+def case_of(frames: Frames, rig: RigLike | None = None) -> tuple[Case, Ints]:
+    """Make a case of frames, and the first row of each instant.
+
+    Raises:
+        InputError: the rig has another number of cameras, or a cornea has no radius.
+    """
+    frames = frames.seen_by(rig)
+    scene, index, pose = frames.scene, frames.index, frames.pose
+    built, which = scene.eyes_of(index)
+    eyes = stacked_eyes(built)
+    keys = np.stack([index.head, index.fixation, index.eye], axis=-1)
+    _, rows, instant = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    views = Views(
+        eyes=eyes,
+        person=np.asarray(which),
+        position_mm=index.eye_position_mm + index.head_mm,
+        camera=np.asarray(index.camera),
+        rig=scene.rig,
+    )
+    theta = np.zeros((len(rows), COUNT))
+    theta[:, AZIMUTH], theta[:, ELEVATION] = pose.azimuth_rad[rows], pose.elevation_rad[rows]
+    instants = views.take(rows)
+    theta[:, PUPIL] = diameters_mm(eyes)[instants.person]
+    target = np.array(index.target_mm[rows])
+    case = Case(views=views, instant=instant.reshape(-1), instants=instants, theta=theta, target_mm=target)
+    return case, rows
+
+
+def outline_normals(points_px: Floats, ok: Bools) -> tuple[Floats, Floats]:
+    """Unit normals (n, k, 2) and lengths (n, k) of outline at points (n, k, 2) evenly spaced in its parameter.
+
+    The derivative by the parameter is (p_(j+1) - p_(j-1)) / (2 sin h) for a spacing h, which is exact for an ellipse.
+    Points without both neighbours have length 0.
+    """
+    spacing = 2.0 * np.pi / points_px.shape[1]
+    after, before = np.roll(points_px, -1, axis=1), np.roll(points_px, 1, axis=1)
+    along = (after - before) / (2.0 * np.sin(spacing))
+    usable = ok & np.roll(ok, 1, axis=1) & np.roll(ok, -1, axis=1)
+    speed = np.linalg.norm(along, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal = np.stack([along[..., 1], -along[..., 0]], axis=-1) / speed[..., None]
+    return np.where(usable[..., None], normal, 0.0), np.where(usable, speed * spacing, 0.0)
+
+
+def information_of_views(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> Floats:
+    """Information (n, 15, 15) of outline and glints in each view, the first two sums of equation (3)."""
+    normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
+    weight = length / noise.outline_px[camera][:, None] ** 2
+    across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * np.sqrt(weight)[..., None]
+    size = np.where(slopes.glint_ok, 1.0 / noise.glint_px[camera], 0.0)
+    glints = slopes.glints * size[..., None, None]
+    rows = np.concatenate([across, glints.reshape(len(camera), -1, COUNT)], axis=1)
+    return np.asarray(np.swapaxes(rows, 1, 2) @ rows)
+
+
+def information_of_instants(case: Case, noise: FeatureNoise, boundary_points: int) -> Floats:
+    """Information (i, 15, 15) of all views of each instant."""
+    out = np.zeros((len(case.theta), COUNT, COUNT))
+    for first in range(0, len(case.views), _ROWS):
+        rows = np.arange(first, min(first + _ROWS, len(case.views)))
+        views = case.views.take(rows)
+        slopes = slopes_of(views, case.theta[case.instant[rows]], boundary_points)
+        np.add.at(out, case.instant[rows], information_of_views(slopes, noise, views.camera))
+    return out
+
+
+def target_information(case: Case, noise: FeatureNoise, rows: Ints) -> Floats:
+    """Information (r, 15, 15) of the known targets of some instants, the third sum of equation (3).
+
+    An instant without a target looks at a point one metre away on its line of sight.
+    """
+    views, theta = case.instants.take(rows), case.theta[rows]
+    point, way = lines_of_sight(views, theta)
+    given = case.target_mm[rows]
+    target = np.where(np.isfinite(given), given, point + _VIRTUAL_MM * way)
+    slopes = target_slopes(views, theta, target) / np.radians(noise.fixation_deg)
+    return np.asarray(np.swapaxes(slopes, 1, 2) @ slopes)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class EyeInformation(ArrayValue):
+    """What a rig knows about one eye in i instants.
+
+    Attributes:
+        eye: right or left.
+        fixation: (i,) fixation of each instant.
+        head: (i,) head position.
+        gaze_covariance_deg2: (i, 2, 2) of the line of sight, to the subject's left and up; inf where it is not seen.
+        axis_covariance_deg2: (i, 2, 2) of the optic axis' azimuth and elevation.
+        frame_deviation: (i, 6) of what belongs to a frame (`unknowns.FRAME`), rad and mm; 0 known, inf not seen.
+        person_deviation: (9,) of what belongs to the person (`unknowns.PERSON`).
+        person_covariance: (9, 9) of these, rad and mm; inf on the diagonal of what is not seen.
+        matrix: the information on all that is not known.
+        names: what its rows are.
+        unseen: combinations that the rig does not see, in words.
+    """
+
+    eye: str
+    fixation: Ints
+    head: Ints
+    gaze_covariance_deg2: Floats
+    axis_covariance_deg2: Floats
+    frame_deviation: Floats
+    person_deviation: Floats
+    person_covariance: Floats
+    matrix: Floats
+    names: tuple[str, ...]
+    unseen: tuple[str, ...]
+
+    @property
+    def gaze_deg(self) -> Floats:
+        """Standard deviation (i,) of the line of sight: sqrt of the sum of both variances, degrees."""
+        return np.asarray(np.sqrt(np.trace(self.gaze_covariance_deg2, axis1=1, axis2=2)))
+
+    @property
+    def axis_deg(self) -> Floats:
+        """The same of the optic axis."""
+        return np.asarray(np.sqrt(np.trace(self.axis_covariance_deg2, axis1=1, axis2=2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Information(ArrayValue):
+    """What a rig knows about each eye: `information["right"].gaze_deg`. All of it is noise alone."""
+
+    eyes: tuple[EyeInformation, ...]
+    note: str = field(default="noise only: what an estimator assumes wrongly comes on top")
+
+    def __getitem__(self, eye: str) -> EyeInformation:
+        for one in self.eyes:
+            if one.eye == eye:
+                return one
+        raise InputError(f"there is no {eye} eye", path="eye")
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Convert to plain values: standard deviations in degrees and mm, null where nothing is seen."""
+        return {"schema": "eyerender/information/1", "note": self.note, "eyes": [_mapping(one) for one in self.eyes]}
+
+
+def information(
+    frames: Frames,
+    rig: RigLike | None = None,
+    *,
+    unknowns: Unknowns | None = None,
+    noise: FeatureNoise | None = None,
+    calibration: Sequence[int] = (),
+    boundary_points: int = 30,
+) -> Information:
+    """Compute what a rig can know of gaze and of the eye: Fisher information and its inverse, equation (3).
+
+    Args:
+        frames: the frames; all cameras at one fixation and head position are one instant.
+        rig: replaces the rig of the frames.
+        unknowns: what is known beforehand; default: `Unknowns()`, all but gaze and pupil.
+        noise: of the features; default: of the scene's sensor.
+        calibration: fixations whose targets are known, but for the noise of fixation. The others profit from what is
+            learned there.
+        boundary_points: points of each outline.
+
+    Raises:
+        InputError: there is no such fixation, or a cornea has no radius to vary.
+    """
+    unknowns = Unknowns() if unknowns is None else unknowns
+    case, first = case_of(frames, rig)
+    index = frames.index.take(first)
+    unknown = sorted(set(calibration) - set(index.fixation.tolist()))
+    if unknown:
+        raise InputError(f"there is no fixation {unknown[0]}", path="calibration")
+    scene = frames.scene if rig is None else frames.seen_by(rig).scene
+    noise = sensor_noise(scene) if noise is None else noise
+    matrices = information_of_instants(case, noise, boundary_points)
+    calibrated = np.flatnonzero(np.isin(index.fixation, list(calibration)))
+    matrices[calibrated] += target_information(case, noise, calibrated)
+    slopes = gaze_slopes(case.instants, case.theta)
+    found = []
+    for person in np.unique(case.instants.person):
+        rows = np.flatnonzero(case.instants.person == person)
+        at = index.take(rows)
+        found.append(_of_person(EYES[int(at.eye[0])], (at.fixation, at.head), matrices[rows], slopes[rows], unknowns))
+    return Information(tuple(found))
+
+
+def joint_matrix(matrices: Floats, unknowns: Unknowns) -> tuple[Floats, Bools]:
+    """Information on the unknowns of i instants (6 each) and of their person (9), and which of them are free.
+
+    Args:
+        matrices: (i, 15, 15) information of each instant, without priors.
+        unknowns: adds the priors.
+    """
+    count, own = len(matrices), LOCAL * len(matrices)
+    prior, free = unknowns.precision(), unknowns.free()
+    out = np.zeros((own + COUNT - LOCAL, own + COUNT - LOCAL))
+    for k, matrix in enumerate(matrices):
+        at = slice(LOCAL * k, LOCAL * (k + 1))
+        out[at, at] = matrix[:LOCAL, :LOCAL]
+        out[at, own:], out[own:, at] = matrix[:LOCAL, LOCAL:], matrix[LOCAL:, :LOCAL]
+        out[own:, own:] += matrix[LOCAL:, LOCAL:]
+    every = np.concatenate([np.tile(prior[:LOCAL], count), prior[LOCAL:]])
+    out[np.diag_indices_from(out)] += every
+    return out, np.concatenate([np.tile(free[:LOCAL], count), free[LOCAL:]])
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Inverse:
+    """Covariance of the seen combinations, and a basis (n, u) of what is not seen."""
+
+    covariance: Floats
+    unseen: Floats
+
+    def variance_of(self, slopes: Floats) -> Floats:
+        """Covariance (q, q) of q linear functions (q, n); inf on the diagonal where one depends on what is not seen."""
+        out = slopes @ self.covariance @ slopes.T
+        if self.unseen.shape[1]:
+            size = np.maximum(np.linalg.norm(slopes, axis=1), 1e-300)
+            lost = np.linalg.norm(slopes @ self.unseen, axis=1) / size > 1e-4
+            out[np.diag_indices_from(out)] = np.where(lost, np.inf, np.diag(out))
+        return np.asarray(out)
+
+
+def inverse(matrix: Floats) -> Inverse:
+    """Invert an information, scaled to a unit diagonal; directions with a singular value below `UNSEEN` are set apart.
+
+    The unseen basis is in the units of the unknowns, each divided by its scale.
+    """
+    diagonal = np.sqrt(np.diag(matrix))
+    scale = np.where(diagonal > 0, 1.0 / np.where(diagonal > 0, diagonal, 1.0), 1.0)
+    values, vectors = np.linalg.eigh(matrix * scale[:, None] * scale)
+    seen = values > UNSEEN
+    good = vectors[:, seen] * scale[:, None]
+    covariance = (good / values[seen]) @ good.T
+    lost = vectors[:, ~seen] * scale[:, None]
+    basis = np.linalg.qr(lost)[0] if lost.shape[1] else lost
+    return Inverse(covariance=covariance, unseen=basis)
+
+
+def _of_person(eye: str, at: tuple[Ints, Ints], matrices: Floats, gaze: Floats, unknowns: Unknowns) -> EyeInformation:
+    """Covariances of one eye from the information of its instants."""
+    count = len(matrices)
+    joint, free = joint_matrix(matrices, unknowns)
+    found = inverse(joint[np.ix_(free, free)])
+    size, own = len(free), LOCAL * count
+
+    def functions(rows: Floats) -> Floats:
+        """Covariance of linear functions (q, all unknowns)."""
+        return found.variance_of(rows[:, free])
+
+    lines, axes = np.empty((count, 2, 2)), np.empty((count, 2, 2))
+    for k in range(count):
+        whole = np.zeros((2, size))
+        whole[:, LOCAL * k : LOCAL * (k + 1)], whole[:, own:] = gaze[k, :, :LOCAL], gaze[k, :, LOCAL:]
+        lines[k] = functions(whole)
+        axes[k] = functions(np.eye(2, size, LOCAL * k))
+    deviation = np.zeros(size)
+    deviation[free] = [np.sqrt(functions(np.eye(1, size, int(c)))[0, 0]) for c in np.flatnonzero(free)]
+    names = [f"{name} of instant {k}" for k in range(count) for name in NAMES[:LOCAL]] + list(PERSON)
+    names = [name for name, is_free in zip(names, free, strict=True) if is_free]
+    square = np.degrees(1.0) ** 2
+    return EyeInformation(
+        eye=eye,
+        fixation=at[0],
+        head=at[1],
+        gaze_covariance_deg2=lines * square,
+        axis_covariance_deg2=axes * square,
+        frame_deviation=deviation[:own].reshape(count, LOCAL),
+        person_deviation=deviation[own:],
+        person_covariance=functions(np.eye(size)[own:]),
+        matrix=joint[np.ix_(free, free)],
+        names=tuple(names),
+        unseen=described(found.unseen, names),
+    )
+
+
+def described(unseen: Floats, names: Sequence[str]) -> tuple[str, ...]:
+    """Name the unknowns that take part in combinations that are not seen, the largest share first."""
+    if not unseen.shape[1]:
+        return ()
+    share: dict[str, float] = {}
+    for name, part in zip(names, np.sum(unseen**2, axis=1), strict=True):
+        kind = name.split(" of instant")[0]
+        share[kind] = share.get(kind, 0.0) + float(part)
+    order = sorted((name for name, part in share.items() if part > 1e-6), key=lambda name: -share[name])
+    return tuple(order)
+
+
+def _mapping(one: EyeInformation) -> dict[str, Any]:
+    degrees = np.where(ANGLES, np.degrees(1.0), 1.0)
+
+    def number(value: float) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    person = one.person_deviation * degrees[LOCAL:]
+    frame = one.frame_deviation * degrees[:LOCAL]
+    return {
+        "eye": one.eye,
+        "fixation": one.fixation.tolist(),
+        "head": one.head.tolist(),
+        "gaze_deg": [number(v) for v in one.gaze_deg],
+        "axis_deg": [number(v) for v in one.axis_deg],
+        "frame": {name: [number(v) for v in frame[:, k]] for k, name in enumerate(NAMES[:LOCAL])},
+        "person": {name: number(v) for name, v in zip(PERSON, person, strict=True)},
+        "unseen": list(one.unseen),
+    }

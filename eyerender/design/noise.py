@@ -1,0 +1,177 @@
+"""Noise of features from the sensor: how well a pixel's width of outline, and a glint, can be located.
+
+An edge between two levels of electrons, blurred to mu(x) (slope mu'), carries the information
+
+    J = integral mu'(x)^2 / (mu(x) + r^2) dx            per px of outline and px^2 of shift along the normal     (1)
+
+with the read noise r (quantisation included). With constant noise s, a step of height d and a blur b this is (d / s)^2
+/ (2 sqrt(pi) b). A glint mu(x, y) carries the same integral over its pixels in each direction,
+
+    1 / sigma_g^2 = integral (d mu / dx)^2 / (mu + background + r^2) dx dy                                         (2)
+
+which for constant noise s and a peak A is pi A^2 / (2 s^2). Saturated pixels carry nothing, so a saturated glint loses
+its core.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import ArrayValue, Floats, frozen
+from ..errors import InputError
+from ..rig.camera import PinholeCamera
+from ..rig.exposure import electrons, radiance_to_irradiance
+from ..rig.light import Lamp
+from ..rig.rig import RigGeometry
+from ..rig.sensor import Sensor
+from ..scene import Scene
+
+FIXATION_DEG = 0.3
+"""Noise of fixation per axis while a target is looked at (chosen)."""
+PUPIL_SHARE = 0.1
+"""Light of the dark pupil as a share of the iris' (chosen)."""
+CORNEAL_RADIUS_MM, CORNEAL_INDEX = 7.8, 1.376
+_CORNEAL_TRANSMITTANCE = 0.96
+_SAMPLES, _REACH = 400, 6.0
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class FeatureNoise(ArrayValue):
+    """Standard deviations of features.
+
+    Attributes:
+        outline_px: (cameras,) of one px of outline along its normal; l px of outline have outline_px / sqrt(l).
+        glint_px: (cameras, lights) of a glint along each axis; inf where it cannot be located.
+        fixation_deg: of fixation per axis while a target is looked at.
+    """
+
+    outline_px: Floats
+    glint_px: Floats
+    fixation_deg: float = FIXATION_DEG
+
+    @classmethod
+    def of(
+        cls, outline_px: ArrayLike, glint_px: ArrayLike, *, rig: RigGeometry, fixation_deg: float = FIXATION_DEG
+    ) -> FeatureNoise:
+        """The same noise for all cameras and lights of a rig, or given for each.
+
+        Raises:
+            InputError: a value is not > 0, or the shapes do not fit the rig.
+        """
+        cameras, lights = len(rig.cameras), len(rig.lights)
+        try:
+            outline = np.broadcast_to(np.asarray(outline_px, dtype=float), (cameras,))
+            glint = np.broadcast_to(np.asarray(glint_px, dtype=float), (cameras, lights))
+        except ValueError:
+            raise InputError(f"must fit {cameras} cameras and {lights} lights", path="noise") from None
+        if not ((outline > 0).all() and (glint > 0).all() and fixation_deg > 0):
+            raise InputError("must be > 0", path="noise")
+        return cls(outline_px=frozen(outline), glint_px=frozen(glint), fixation_deg=fixation_deg)
+
+
+def sensor_noise(scene: Scene, *, fixation_deg: float = FIXATION_DEG) -> FeatureNoise:
+    """Noise of the features of a scene: its lamps, its sensor, the albedo of its iris, no rendering.
+
+    The levels are those of the first eye at its reference position, looking straight ahead.
+    """
+    rig, sensor = scene.rig, scene.spec.sensor
+    side = scene.spec.subject.eyes[0]
+    eye_mm = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
+    irradiance = sum(corneal_irradiance_mw_mm2(lamp, eye_mm) for lamp in rig.lights)
+    radiance = scene.spec.look.iris_albedo / np.pi * irradiance * _CORNEAL_TRANSMITTANCE**2
+    blur = float(np.hypot(sensor.psf_sigma_px, 1.0 / np.sqrt(12.0)))
+    read = read_noise_e(sensor)
+    outline, glint = np.empty(len(rig.cameras)), np.empty((len(rig.cameras), len(rig.lights)))
+    for k, camera in enumerate(rig.cameras):
+        iris = float(electrons(sensor, radiance_to_irradiance(sensor) * np.asarray(radiance), scene.spec.wavelength_nm))
+        dark = PUPIL_SHARE * iris
+        outline[k] = 1.0 / np.sqrt(edge_information(dark, iris, blur, read, sensor.full_well_e))
+        for j, lamp in enumerate(rig.lights):
+            energy, size = glint_energy(lamp, camera, eye_mm, sensor, scene.spec.wavelength_nm)
+            spread = float(np.hypot(blur, size))
+            glint[k, j] = glint_deviation(energy, spread, dark, read, sensor.full_well_e)
+    return FeatureNoise(outline_px=frozen(outline), glint_px=frozen(glint), fixation_deg=fixation_deg)
+
+
+def read_noise_e(sensor: Sensor) -> float:
+    """Noise of a dark pixel in electrons: read-out and rounding to whole codes (1/12 of a code squared)."""
+    return float(np.sqrt(sensor.read_noise_e**2 + 1.0 / (12.0 * sensor.gain**2)))
+
+
+def edge_information(low_e: float, high_e: float, blur_px: float, read_e: float, well_e: float = np.inf) -> float:
+    """Information of one px of an edge on its shift along the normal, equation (1), per px^2.
+
+    Args:
+        low_e: electrons of a pixel on the dark side.
+        high_e: on the bright side.
+        blur_px: standard deviation of the blur, the pixel's area included.
+        read_e: noise of a dark pixel.
+        well_e: electrons from which a pixel is saturated.
+    """
+    x = np.linspace(-_REACH, _REACH, 2 * _SAMPLES + 1)
+    density = np.exp(-(x**2) / 2.0) / np.sqrt(2.0 * np.pi)
+    step = x[1] - x[0]
+    share = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2.0 * step)])
+    level = low_e + (high_e - low_e) * share / share[-1]
+    slope = (high_e - low_e) * density / blur_px
+    use = level < well_e
+    return float(np.sum(np.where(use, slope**2 / (level + read_e**2), 0.0)) * step * blur_px)
+
+
+def glint_deviation(energy_e: float, spread_px: float, background_e: float, read_e: float, well_e: float) -> float:
+    """Standard deviation (px) of a Gaussian glint along each axis, equation (2), over its unsaturated pixels.
+
+    Args:
+        energy_e: electrons of the whole glint.
+        spread_px: its standard deviation, blur and pixel included.
+        background_e: electrons of a pixel beside it.
+        read_e: noise of a dark pixel.
+        well_e: electrons from which a pixel is saturated.
+    """
+    r = (np.arange(_SAMPLES) + 0.5) * (_REACH / _SAMPLES)
+    level = energy_e / (2.0 * np.pi * spread_px**2) * np.exp(-(r**2) / 2.0)
+    total = level + background_e
+    density = np.where(total < well_e, (level * r) ** 2 / (total + read_e**2), 0.0)
+    # Half of the squared radial slope lies along each axis, and the spread cancels: slope r / spread, area spread^2.
+    information = np.pi * np.sum(density * r) * (_REACH / _SAMPLES)
+    return float(1.0 / np.sqrt(information)) if information > 0 else np.inf
+
+
+def corneal_irradiance_mw_mm2(lamp: Lamp, point_mm: Floats) -> float:
+    """Irradiance (mW/mm^2) of a lamp on a surface that faces it: I / d^2."""
+    intensity, distance = _towards(lamp, point_mm)
+    return intensity / distance**2
+
+
+def glint_energy(
+    lamp: Lamp, camera: PinholeCamera, eye_mm: Floats, sensor: Sensor, wavelength_nm: float
+) -> tuple[float, float]:
+    """Electrons of a lamp's glint and the standard deviation (px) of its image, by the cornea as a convex mirror.
+
+    The mirror image is m = f / (d + f) times as large (f = R / 2), so it has m^2 F of the lamp's intensity, with
+    Fresnel's reflectance F.
+    """
+    intensity, distance = _towards(lamp, eye_mm)
+    focal = CORNEAL_RADIUS_MM / 2.0
+    scale = focal / (distance + focal)
+    reflectance = ((CORNEAL_INDEX - 1.0) / (CORNEAL_INDEX + 1.0)) ** 2
+    away = float(np.linalg.norm(camera.nodal_point_mm - eye_mm))
+    pitch_mm = sensor.pixel_pitch_um * 1e-3
+    focal_px = float(camera.K[0, 0])
+    aperture_mm2 = np.pi * (focal_px * pitch_mm / (2.0 * sensor.f_number)) ** 2
+    power_w = 1e-3 * intensity * reflectance * scale**2 * aperture_mm2 / away**2 * sensor.lens_transmission
+    irradiance = power_w / (pitch_mm * 1e-3) ** 2
+    radius_px = lamp.radius_mm * scale * focal_px / away
+    return float(electrons(sensor, np.asarray(irradiance), wavelength_nm)), radius_px / 2.0
+
+
+def _towards(lamp: Lamp, point_mm: Floats) -> tuple[float, float]:
+    """Radiant intensity (mW/sr) of a lamp towards a point, and its distance (mm)."""
+    gap = point_mm - lamp.position_mm
+    distance = float(np.linalg.norm(gap))
+    cosine = max(float(gap @ lamp.axis) / distance, 0.0)
+    lobe = 1.0 if lamp.lobe_exponent == 0 else cosine**lamp.lobe_exponent
+    return lamp.intensity_mw_sr * lobe, distance

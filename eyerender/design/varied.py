@@ -1,0 +1,316 @@
+"""Features of eyes as functions of the unknowns, and their derivatives, in one batch of traces.
+
+Derivatives are central differences of the analytic observer. Two kinds need no trace of their own: a position of the
+person acts as slippage does, and the depth of the rotation centre moves the turned eye by (M - I) e_x per millimetre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..analytic.features import View
+from ..analytic.rays import glint_exits, pupil_exits
+from ..arrays import Bools, Floats, Ints, Statuses
+from ..errors import InputError
+from ..eye.batch import CHUNK_POINTS, slices, stack_eyes, structure_of, take_eyes
+from ..eye.model import EyeModel, RotationCentres
+from ..eye.pose import Poses, rigid_motion
+from ..geometry.surfaces import Surface
+from ..geometry.surfaces_biconic import Biconic
+from ..geometry.surfaces_quadric import Quadric
+from ..geometry.transforms import normalize
+from ..rig.rig import RigGeometry
+from ..status import Status
+from .unknowns import (
+    ASPHERICITY,
+    AZIMUTH,
+    COUNT,
+    DEPTH,
+    ELEVATION,
+    KAPPA,
+    POSITION,
+    PUPIL,
+    RADIUS,
+    ROTATION,
+    SLIPPAGE,
+)
+
+STEPS = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3])
+"""Steps of the central differences: angles in rad, lengths in mm, Q."""
+TRACED = np.array([AZIMUTH, ELEVATION, PUPIL, 3, 4, 5, RADIUS, ASPHERICITY, DEPTH])
+_RAY_STEP = 1e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Views:
+    """What a rig sees: n views, each of one eye at one instant by one camera.
+
+    Attributes:
+        eyes: p eyes of one structure, stacked.
+        person: (n,) the eye of each view.
+        position_mm: (n, 3) apex of the unrotated eye in the world, before slippage.
+        camera: (n,) the camera.
+        rig: the rig.
+    """
+
+    eyes: EyeModel
+    person: Ints
+    position_mm: Floats
+    camera: Ints
+    rig: RigGeometry
+
+    def __len__(self) -> int:
+        return len(self.person)
+
+    def take(self, rows: Ints | slice) -> Views:
+        """Some of the views."""
+        return replace(self, person=self.person[rows], position_mm=self.position_mm[rows], camera=self.camera[rows])
+
+    @property
+    def lights_mm(self) -> Floats:
+        """Places of the lights, (m, 3)."""
+        return np.array([light.position_mm for light in self.rig.lights]).reshape(-1, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Images:
+    """Features of n views: outline (n, k, 2) px and glints (n, m, 2) px, with what there is and is on the sensor."""
+
+    outline_px: Floats
+    outline_ok: Bools
+    glints_px: Floats
+    glint_ok: Bools
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Slopes:
+    """Features of n views with their derivatives by the 15 unknowns.
+
+    Attributes:
+        images: the features.
+        outline: (n, k, 2, 15) px per rad or mm.
+        glints: (n, m, 2, 15).
+        outline_ok: (n, k) whether a point and its derivatives exist.
+        glint_ok: (n, m).
+    """
+
+    images: Images
+    outline: Floats
+    glints: Floats
+    outline_ok: Bools
+    glint_ok: Bools
+
+
+def stacked_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
+    """Stack eyes whose corneas have a radius and an asphericity.
+
+    Raises:
+        InputError: the eyes differ in structure, or a cornea is measured or tilted in a way that has neither.
+    """
+    if any(structure_of(eye) != structure_of(eyes[0]) for eye in eyes):
+        raise InputError("are of different structures", path="eyes")
+    stack = stack_eyes(eyes)
+    for surface in stack.front:
+        _ = radius_of(surface)
+    return stack
+
+
+def radius_of(surface: Surface) -> Floats:
+    """Mean apex radius (n,) of corneal surfaces.
+
+    Raises:
+        InputError: the surface is neither a sphere, a conic nor a biconic.
+    """
+    if isinstance(surface, Biconic):
+        return np.asarray(np.mean(surface.radii_mm, axis=-1))
+    if isinstance(surface, Quadric):
+        m, v = surface.matrix, surface.vector
+        conic = np.all(m[..., 1, 1] == 1.0) and np.all(m[..., 2, 2] == 1.0) and np.all(surface.constant == 0.0)
+        if conic and np.all(v[..., 0] > 0.0) and not np.any(v[..., 1:]):
+            return np.asarray(v[..., 0])
+    raise InputError("the cornea is no sphere, conic or biconic, so it has no radius to vary", path="cornea")
+
+
+def _scaled(surface: Surface, factor: Floats) -> Surface:
+    """The surface with its radii multiplied by a factor (n,)."""
+    if isinstance(surface, Biconic):
+        return replace(surface, radii_mm=surface.radii_mm * factor[:, None])
+    assert isinstance(surface, Quadric)
+    return replace(surface, vector=surface.vector * factor[:, None])
+
+
+def _flattened(surface: Surface, change: Floats) -> Surface:
+    """The surface with its conic constants raised by (n,)."""
+    if isinstance(surface, Biconic):
+        return replace(surface, conic_constants=surface.conic_constants + change[:, None])
+    assert isinstance(surface, Quadric)
+    matrix = np.array(surface.matrix)
+    matrix[:, 0, 0] += change
+    return replace(surface, matrix=matrix)
+
+
+def varied_eyes(eye: EyeModel, theta: Floats) -> EyeModel:
+    """Eyes (a batch of n) with the unknowns (n, 15) applied; line of sight, lens and fovea stay.
+
+    The front of the cornea gets the radius R + dR and the surfaces behind it keep their ratio to it.
+    """
+    radius = radius_of(eye.front[0])
+    factor = (radius + theta[:, RADIUS]) / radius
+    front = tuple(_scaled(surface, factor) for surface in eye.front)
+    front = (_flattened(front[0], theta[:, ASPHERICITY]), *front[1:])
+    centre = np.array(eye.stop.centre_mm)
+    centre[:, 0] -= theta[:, DEPTH]
+    axes = eye.stop.semi_axes_mm
+    wanted = theta[:, PUPIL] / (2.0 * np.sqrt(np.prod(axes, axis=-1)))
+    shift = np.zeros_like(centre)
+    shift[:, 0] = theta[:, ROTATION]
+    turns = eye.rotation
+    return replace(
+        eye,
+        front=front,
+        stop=replace(eye.stop, centre_mm=centre, semi_axes_mm=axes * wanted[:, None]),
+        rotation=RotationCentres(
+            turns.azimuth_centre_mm - shift, turns.elevation_centre_mm - shift, turns.torsion_centre_mm
+        ),
+    )
+
+
+def diameters_mm(eyes: EyeModel) -> Floats:
+    """Diameter (p,) of the circle of the pupil's area, of p eyes."""
+    return np.asarray(2.0 * np.sqrt(np.prod(eyes.stop.semi_axes_mm, axis=-1)))
+
+
+def images_of(views: Views, theta: Floats, boundary_points: int) -> Images:
+    """Trace the features of views with unknowns (n, 15)."""
+    n, m, k = len(views), len(views.rig.lights), boundary_points
+    outline, glints = np.full((n, k, 2), np.nan), np.full((n, m, 2), np.nan)
+    outline_ok, glint_ok = np.zeros((n, k), dtype=bool), np.zeros((n, m), dtype=bool)
+    for number in np.unique(views.camera):
+        rows = np.flatnonzero(views.camera == number)
+        for part in slices(len(rows), max(1, CHUNK_POINTS // (k + 1))):
+            block = rows[part]
+            seen = _images_of_camera(views.take(block), theta[block], int(number), k)
+            outline[block], outline_ok[block], glints[block], glint_ok[block] = seen
+    return Images(outline_px=outline, outline_ok=outline_ok, glints_px=glints, glint_ok=glint_ok)
+
+
+def _images_of_camera(views: Views, theta: Floats, number: int, k: int) -> tuple[Floats, Bools, Floats, Bools]:
+    """Outline, glints and which of them there are, of views by one camera."""
+    camera = views.rig.cameras[number]
+    eye = varied_eyes(take_eyes(views.eyes, views.person), theta)
+    place = views.position_mm + theta[:, SLIPPAGE] + theta[:, POSITION]
+    view = View.of(eye, Poses.listing(theta[:, AZIMUTH], theta[:, ELEVATION]), place, camera)
+
+    def projected(exits: tuple[Floats, Floats, Floats], status: Statuses) -> tuple[Floats, Bools]:
+        pixels, status = view.project(exits, status)
+        return pixels, (status == Status.OK) & camera.in_image(pixels)
+
+    exits, _, status = pupil_exits(eye, k, view.camera_mm)
+    outline, outline_ok = projected(exits, status)
+    if not len(views.rig.lights):
+        return outline[:, :-1], outline_ok[:, :-1], np.empty((len(views), 0, 2)), np.empty((len(views), 0), dtype=bool)
+    exits, _, status = glint_exits(eye, 1, view.into_eye(views.lights_mm), view.camera_mm)
+    return outline[:, :-1], outline_ok[:, :-1], *projected(exits, status)
+
+
+def slopes_of(views: Views, theta: Floats, boundary_points: int) -> Slopes:
+    """Features and their derivatives by all 15 unknowns, by central differences in one batch."""
+    n, count = len(views), len(TRACED)
+    shifts = np.zeros((1 + 2 * count, COUNT))
+    shifts[1 : 1 + count, TRACED] = np.diag(STEPS)
+    shifts[1 + count :, TRACED] = -np.diag(STEPS)
+    every = np.tile(np.arange(n), len(shifts))
+    all_theta = (theta[None] + shifts[:, None]).reshape(-1, COUNT)
+    traced = images_of(views.take(every), all_theta, boundary_points)
+
+    def slopes(points: Floats, ok: Bools) -> tuple[Floats, Bools]:
+        points, ok = points.reshape(len(shifts), n, *points.shape[1:]), ok.reshape(len(shifts), n, -1)
+        step = STEPS[:, None, None, None]
+        central = (points[1 : 1 + count] - points[1 + count :]) / (2.0 * step)
+        out = np.zeros((*points.shape[1:], COUNT))
+        out[..., TRACED] = np.moveaxis(central, 0, -1)
+        out[..., POSITION] = out[..., SLIPPAGE]
+        out[..., ROTATION] = np.einsum("nkax,nx->nka", out[..., SLIPPAGE], _by_rotation(theta))
+        good: Bools = np.all(ok, axis=0)
+        return np.where(good[..., None, None], out, 0.0), good
+
+    outline, outline_ok = slopes(traced.outline_px, traced.outline_ok)
+    glints, glint_ok = slopes(traced.glints_px, traced.glint_ok)
+    first = Images(
+        outline_px=traced.outline_px[:n],
+        outline_ok=traced.outline_ok[:n],
+        glints_px=traced.glints_px[:n],
+        glint_ok=traced.glint_ok[:n],
+    )
+    return Slopes(images=first, outline=outline, glints=glints, outline_ok=outline_ok, glint_ok=glint_ok)
+
+
+def _by_rotation(theta: Floats) -> Floats:
+    """Motion (n, 3) of a turned eye per depth of its rotation centre: x' = M (x - c) + c with c = -d e_x + ..."""
+    return np.asarray(turned(theta)[:, :, 0] - np.array([1.0, 0.0, 0.0]))
+
+
+def turned(theta: Floats) -> Floats:
+    """Rotations M (n, 3, 3) of the eyes by Listing's law."""
+    azimuth, elevation = theta[:, AZIMUTH], theta[:, ELEVATION]
+    tau = np.array(Poses.listing(azimuth, elevation).torsion_rad)
+    (ca, sa), (ce, se), (ct, st) = ((np.cos(a), np.sin(a)) for a in (azimuth, elevation, tau))
+    zero, one = np.zeros_like(ca), np.ones_like(ca)
+    about_z = np.array([[ca, -sa, zero], [sa, ca, zero], [zero, zero, one]])
+    about_y = np.array([[ce, zero, -se], [zero, one, zero], [se, zero, ce]])
+    about_x = np.array([[one, zero, zero], [zero, ct, -st], [zero, st, ct]])
+    return np.asarray(np.einsum("ijn,jkn,kln->nil", about_z, about_y, about_x))
+
+
+def lines_of_sight(views: Views, theta: Floats) -> tuple[Floats, Floats]:
+    """Lines of sight in the world: points (n, 3) where they leave the cornea, and unit directions (n, 3)."""
+    eye = take_eyes(views.eyes, views.person)
+    handed = eye.stop.handed
+    way = eye.chief_ray.direction
+    nasal = np.arctan2(handed * way[:, 1], way[:, 0]) + theta[:, KAPPA][:, 0]
+    up = np.arctan2(way[:, 2], way[:, 0]) + theta[:, KAPPA][:, 1]
+    inside = normalize(np.stack([np.ones_like(up), handed * np.tan(nasal), np.tan(up)], axis=-1))
+    turn, shift = rigid_motion(Poses.listing(theta[:, AZIMUTH], theta[:, ELEVATION]), varied_eyes(eye, theta))
+    place = views.position_mm + theta[:, SLIPPAGE] + theta[:, POSITION]
+    point = np.einsum("nij,nj->ni", turn, eye.chief_ray.point_mm) + shift + place
+    return point, np.asarray(np.einsum("nij,nj->ni", turn, inside))
+
+
+def tangents(direction: Floats) -> Floats:
+    """Two unit vectors (n, 2, 3) across directions (n, 3): to the subject's left and up."""
+    left = normalize(np.cross([0.0, 0.0, 1.0], direction))
+    return np.stack([left, np.cross(direction, left)], axis=1)
+
+
+def gaze_slopes(views: Views, theta: Floats) -> Floats:
+    """Derivatives (n, 2, 15) of the line of sight's direction, left and up (rad), by the unknowns."""
+    across = tangents(lines_of_sight(views, theta)[1])
+    columns = [AZIMUTH, ELEVATION, KAPPA.start, KAPPA.start + 1]
+    return _differences(theta, columns, lambda t: np.einsum("nci,ni->nc", across, lines_of_sight(views, t)[1]))
+
+
+def target_misses(views: Views, theta: Floats, target_mm: Floats) -> Floats:
+    """Angles (n, 2) in rad, left and up, of the line of sight from the direction to the targets (n, 3)."""
+    point, way = lines_of_sight(views, theta)
+    wanted = normalize(target_mm - point)
+    return np.asarray(np.einsum("nci,ni->nc", tangents(wanted), way))
+
+
+def target_slopes(views: Views, theta: Floats, target_mm: Floats) -> Floats:
+    """Derivatives (n, 2, 15) of `target_misses` by the unknowns."""
+    columns = [c for c in range(COUNT) if c not in (PUPIL, RADIUS, ASPHERICITY, DEPTH)]
+    return _differences(theta, columns, lambda t: target_misses(views, t, target_mm))
+
+
+def _differences(theta: Floats, columns: Sequence[int], function: object) -> Floats:
+    """Central differences (n, 2, 15) of a function of the unknowns with values (n, 2)."""
+    assert callable(function)
+    out = np.zeros((len(theta), 2, COUNT))
+    for column in columns:
+        step = np.zeros(COUNT)
+        step[column] = _RAY_STEP
+        out[..., column] = (function(theta + step) - function(theta - step)) / (2.0 * _RAY_STEP)
+    return out
