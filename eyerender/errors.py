@@ -106,14 +106,18 @@ class Problems:
             InputError: the first error, which carries the others.
         """
         if self._listed:
-            first, *others = self._listed
-            raise InputError(
-                first.reason,
-                source=first.source,
-                path=first.path,
-                others=others,
-                unlisted=self._count - len(self._listed),
-            )
+            raise self.error()
+
+    def error(self) -> InputError:
+        """The first error that was noted, which carries the others."""
+        first, *others = self._listed
+        return InputError(
+            first.reason,
+            source=first.source,
+            path=first.path,
+            others=others,
+            unlisted=self._count - len(self._listed),
+        )
 
 
 Refuse = Callable[[str, str], NoReturn]

@@ -111,6 +111,15 @@ class Spec(BaseModel):
     # Pydantic then builds nested records without calling this constructor for each of them.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        try:
+            super().__setattr__(name, value)
+        except ValidationError:
+            kind = type(self).__name__
+            raise AttributeError(
+                f"{kind}: cannot be changed; make a new {kind}, or a changed scene with scene.with_(...)"
+            ) from None
+
     @classmethod
     def from_mapping(cls, data: object, *, source: str = "") -> Self:
         """Validate a plain mapping.
@@ -133,14 +142,13 @@ class Spec(BaseModel):
             raise error.placed(source=source) from None
         except RecursionError:
             raise InputError("is nested too deeply", source=source) from None
-        except (TypeError, ValueError) as error:
-            if not isinstance(error, ValidationError):
-                raise InputError(f"holds a value that is no number, text or list ({error})", source=source) from None
+        except ValidationError as error:
             problems = Problems(source)
             for path, reason in _problems(error):
                 problems.add(reason, path)
-            problems.check()
-            raise
+            raise problems.error() from None
+        except (TypeError, ValueError) as error:
+            raise InputError(f"holds a value that is no number, text or list ({error})", source=source) from None
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -221,3 +222,48 @@ def test_a_picture_in_memory_is_the_one_in_the_folder(tmp_path):
     np.testing.assert_array_equal(entry.image(), image.counts)
     np.testing.assert_array_equal(entry.mask(), image.parts)
     assert er.render(frames[3:5], look=er.Look(iris_albedo=0.5))[0].irradiance.mean() > image.irradiance.mean()
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: er.Camera(resolution_px=(640, 480), focal_length_px=-3), "focal_length_px: must be > 0, not -3"),
+        (lambda: er.SceneSpec.from_mapping({"rig": {}}), "rig.cameras: missing"),
+        (lambda: er.Subject(ipd_mm="wide"), "ipd_mm: must be a valid number, not 'wide'"),
+    ],
+)
+def test_a_refusal_is_shown_without_the_validators_own_error(call, words):
+    with pytest.raises(er.InputError) as caught:
+        call()
+    shown = "".join(traceback.format_exception(caught.value))
+    assert shown.rstrip().endswith(words)
+    assert "pydantic" not in shown
+
+
+def test_what_cannot_be_changed_says_what_to_do():
+    scene = er.load_scene("quickstart")
+    with pytest.raises(AttributeError, match=r"scene\.with_\(pupil_diameter_mm=\.\.\.\)"):
+        scene.pupil_diameter_mm = 3
+    with pytest.raises(AttributeError, match="a Scene cannot be changed"):
+        scene.spec = None
+    with pytest.raises(AttributeError, match=r"Eye: cannot be changed; make a new Eye, .* scene\.with_") as caught:
+        scene.spec.eye.pupil_diameter_mm = 3
+    assert "pydantic" not in "".join(traceback.format_exception(caught.value))
+    assert scene == er.load_scene("quickstart")
+
+
+@pytest.mark.parametrize("function", [er.trace, er.render, lambda x: next(er.render_windows(x))])
+def test_frames_or_a_scene_are_wanted(function):
+    with pytest.raises(TypeError, match="give frames or a scene, not int"):
+        function(3)
+
+
+def test_windows_of_a_scene_are_those_of_its_frames(monkeypatch):
+    """A scene is checked as its frames are, before any renderer is made."""
+    monkeypatch.setattr("eyerender.imaging.capture.MAX_PIXELS", 10)
+    scene = er.load_scene("quickstart")
+    with pytest.raises(er.InputError) as of_frames:
+        next(er.render_windows(scene.frames()))
+    with pytest.raises(er.InputError) as of_scene:
+        next(er.render_windows(scene))
+    assert str(of_scene.value) == str(of_frames.value)

@@ -47,7 +47,7 @@ def test_shipped_scenes_load_and_come_back_from_their_own_yaml(tmp_path):
 
 def test_spec_is_frozen():
     spec = SceneSpec.load(shipped_scenes()["quickstart"])
-    with pytest.raises(Exception, match="frozen"):
+    with pytest.raises(AttributeError, match="cannot be changed"):
         spec.seed = 3  # type: ignore[misc]  # what is tested
 
 

@@ -15,7 +15,7 @@ from ..eye.pose import Poses
 from ..geometry.ellipse import fit_ellipse_direct
 from ..observation import EYES, GlintFeatures, Observations, PupilFeatures
 from ..rig.rig import RigLike
-from ..scene import Frames, Scene
+from ..scene import Frames, Scene, as_frames
 from ..status import Status
 from .features import Features, features
 
@@ -89,7 +89,7 @@ def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points
     Raises:
         InputError: no pose of an eye fixates a target of the scene; the message names it and the reason.
     """
-    frames = frames.frames() if isinstance(frames, Scene) else frames
+    frames = as_frames(frames)
     return AnalyticObserver(boundary_points).observe(frames, rig)
 
 

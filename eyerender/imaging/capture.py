@@ -20,7 +20,7 @@ from ..folders.imagefile import MAX_PIXELS, compressed
 from ..observation import EYES
 from ..progress import Progress, followed_by, one_behind
 from ..rig.camera import Window
-from ..scene import Frames, Scene
+from ..scene import Frames, Scene, as_frames
 
 if TYPE_CHECKING:
     from ..rendering.records.job import RenderJob
@@ -76,7 +76,7 @@ class EyeImage:
 
 
 def render_windows(
-    frames: Frames,
+    frames: Frames | Scene,
     *,
     backend: BackendChoice = "auto",
     threads: int | None = None,
@@ -86,7 +86,7 @@ def render_windows(
     """Render every row of `frames` in its own window, in order.
 
     Args:
-        frames: n rows, one eye in one frame each.
+        frames: n rows, one eye in one frame each; a scene stands for all of its frames.
         backend: the backend, if no renderer is given.
         threads: number of processor threads for rendering; None: all.
         renderer: an existing renderer (see `make_renderer`).
@@ -96,8 +96,8 @@ def render_windows(
         InputError: the scene's windows cannot be rendered.
         BackendError: no backend renders; the message says how to fix it.
     """
-    scene = frames.scene
-    check_windows(scene)
+    frames = as_frames(frames)
+    check_windows(frames.scene)
     if renderer is None:
         renderer = make_renderer(backend, threads)
     images = (begun.image() for begun in one_behind(begin_each([frames], renderer)))

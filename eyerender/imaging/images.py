@@ -20,7 +20,7 @@ from ..plausibility import is_saturated, saturation_warnings
 from ..progress import Progress
 from ..rig.exposure import electrons
 from ..rig.rig import RigLike
-from ..scene import Frame, Frames, Scene
+from ..scene import Frame, Frames, Scene, as_frames
 from .capture import EyeImage, check_windows, make_renderer, render_job, render_windows
 from .labels import image_labels, seen_labels
 
@@ -88,7 +88,7 @@ def render(
         InputError: a value does not fit, or a window cannot be rendered.
         BackendError: no backend renders; the message says how to fix it.
     """
-    frames = frames.frames() if isinstance(frames, Scene) else frames
+    frames = as_frames(frames)
     for name in picture.keys() - PICTURE_FIELDS:
         raise InputError(f"changes more than the picture; allowed are {', '.join(sorted(PICTURE_FIELDS))}", path=name)
     if picture or spp is not None:

@@ -103,6 +103,19 @@ class Frames(ArrayValue):
         return replace(self, scene=scene)
 
 
+def as_frames(frames: Frames | Scene) -> Frames:
+    """Frames as they are, or those of a scene.
+
+    Raises:
+        TypeError: it is something else.
+    """
+    if isinstance(frames, Scene):
+        return frames.frames()
+    if not isinstance(frames, Frames):
+        raise TypeError(f"give frames or a scene, not {type(frames).__name__}")
+    return frames
+
+
 class Frame(Frames):
     """One row of `Frames`: one eye in one frame."""
 
@@ -551,6 +564,14 @@ class Scene:
         scale = max(map(view.scale_at, positions))
         width, height = (16 * math.ceil(side_mm * scale / 16) for side_mm in EYE_WINDOW_MM)
         return min(width, w), min(height, h)
+
+
+def _refuse_change(_scene: Scene, name: str, _value: object) -> None:
+    raise AttributeError(f"a Scene cannot be changed; scene.with_({name}=...) gives a changed one")
+
+
+# A frozen dataclass cannot define this method itself, and with slots its own fails for names that are no fields.
+Scene.__setattr__ = _refuse_change  # type: ignore[method-assign,assignment]
 
 
 def _put(data: dict[str, Any], path: str, value: Any) -> None:
