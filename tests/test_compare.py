@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,3 +32,19 @@ def test_a_comparison_names_its_estimator_and_writes_itself():
     assert "gaze error, degrees (regression R3, leave one target out" in text
     assert f"{result.gaze_truth.mean_deg:8.4f}" in text
     assert "nan" not in text
+
+
+def test_nothing_found_is_said_instead_of_an_empty_table():
+    scene = er.load_scene("quickstart")
+    truth = er.trace(scene)
+    count = len(truth)
+    status = np.full(count, er.Status.NOT_FOUND, dtype=np.int8)
+    lost = replace(
+        truth,
+        pupil=replace(truth.pupil, status=status, centre_px=np.full((count, 2), np.nan)),
+        glints=replace(truth.glints, status=np.full(truth.glints.status.shape, er.Status.NOT_FOUND, dtype=np.int8)),
+    )
+    text = er.compare(truth, lost, scene.rig, Centre()).to_text()
+    assert "no pupil and no glint was found in the images" in text
+    assert "median" not in text
+    assert "median" in er.compare(truth, truth, scene.rig, Centre()).to_text()

@@ -13,6 +13,11 @@ def option_name(field: str) -> str:
     return cyclopts.default_name_transform(field).removesuffix("-s")
 
 
+def shown_default(value: object) -> str | None:
+    """A default in the help; that of a switch which is off, or of an option that is not given, says nothing."""
+    return None if value is None or value is False or value == () else str(value)
+
+
 app = App(
     name="eyerender",
     version=f"eyerender {__version__}",
@@ -22,5 +27,5 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
     help_format="markdown",
-    default_parameter=Parameter(negative=(), name_transform=option_name),
+    default_parameter=Parameter(negative=(), name_transform=option_name, show_default=shown_default),
 )

@@ -249,11 +249,19 @@ def _size(count: int) -> str:
     return f"{count / unit:.1f} {name}"
 
 
+def _short(value: Any) -> str:
+    """A statistic for people: numbers with four digits, the items of lists and mappings side by side."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_short(one)}" for key, one in value.items())
+    if isinstance(value, list | tuple):
+        return " ".join(map(_short, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
 def _validate_text(report: dict[str, Any]) -> str:
     lines = [f"{report['images']} images checked, {report['recomputed']} of them computed again", *report["notes"]]
     for key, value in report["statistics"].items():
-        shown = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else value
-        lines.append(f"{key:<22} {shown}")
+        lines.append(f"{key:<22} {_short(value)}")
     lines += [f"wrong: {problem}" for problem in report["problems"]]
     if report["problems_left_out"]:
         lines.append(f"and {report['problems_left_out']} more")

@@ -62,8 +62,7 @@ def render(
 
 @app.command(name="quickstart")
 def quickstart(
-    output: Annotated[Path, Parameter(name="DIR")],
-    /,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
     *,
     eye: EyeModel = None,
     backend: Backend = "auto",

@@ -33,7 +33,11 @@ from . import (  # noqa: F401
     study,
 )
 from .app import app, option_name
+from .examples import add_examples
+from .hints import usage_error
 from .targets import check_outputs
+
+add_examples(app)
 
 INTERRUPTED = 130
 _interrupted = threading.Event()
@@ -109,7 +113,7 @@ def _reported(error: BaseException) -> int | None:
     if isinstance(error, ValidationError) and error.argument is not None:
         return _fail(f"{error.argument.name}: {error.exception_message}", InputError.exit_code)
     if isinstance(error, CycloptsError):
-        return _fail(" ".join(str(error).split()), InputError.exit_code)
+        return _fail(usage_error(error), InputError.exit_code)
     if isinstance(error, InputError):
         for one in (error, *error.others):
             _fail(str(one), error.exit_code)

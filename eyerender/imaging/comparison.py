@@ -89,12 +89,17 @@ class Comparison:
         lines = [
             f"pupils found   {f['pupils']['found']} of {f['pupils']['expected']}",
             f"glints found   {f['glints']['found']} of {f['glints']['expected']}",
-            "error of the image observer against the analytic one, px     median      p95      max",
         ]
-        for key, name in (("pupil_centre_px", "pupil centre"), ("semi_axes_px", "semi-axes"), ("glint_px", "glint")):
-            d = f[key]
-            if d["n"]:
-                lines.append(f"  {name:<56} {d['median']:>9.4f} {d['p95']:>8.4f} {d['max']:>8.4f}")
+        kinds = (("pupil_centre_px", "pupil centre"), ("semi_axes_px", "semi-axes"), ("glint_px", "glint"))
+        rows = [
+            f"  {name:<56} {d['median']:>9.4f} {d['p95']:>8.4f} {d['max']:>8.4f}"
+            for key, name in kinds
+            if (d := f[key])["n"]
+        ]
+        if rows:
+            lines += ["error of the image observer against the analytic one, px     median      p95      max", *rows]
+        else:
+            lines.append("no pupil and no glint was found in the images, so there is nothing to compare")
         if gaze is None:
             lines.append(f"gaze: none ({data['gaze_reason']})")
         else:

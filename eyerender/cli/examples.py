@@ -1,0 +1,66 @@
+"""Examples at the end of each command's `--help`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from cyclopts import App
+
+EXAMPLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "bench-extractors": (
+            "eyerender bench-extractors images -o bench",
+            "eyerender bench-extractors images -o bench --extractor own-refined --extractor mine=my_module:find",
+        ),
+        "budget": ("eyerender budget quickstart --estimator regression --no-images",),
+        "compare": ("eyerender compare images", "eyerender compare images --function R2 --json -"),
+        "doctor": ("eyerender doctor",),
+        "export-dataset": ("eyerender export-dataset data -o coco --format coco",),
+        "export-scene": ("eyerender export-scene quickstart -o meshes",),
+        "extract": (
+            "eyerender extract eye1.png eye2.png --json -",
+            "eyerender extract images -o records.jsonl --overlay drawn",
+            "eyerender extract recording.mp4 -o records.jsonl --gamma 2.2",
+        ),
+        "eyes": ("eyerender eyes", "eyerender eyes E4 > my_eye.yaml"),
+        "features": ("eyerender features quickstart", "eyerender features my_scene.yaml --eye E4 --json features.json"),
+        "gaze fit": (
+            "eyerender gaze fit recording.csv --rig rig.yaml --estimator regression -o calibration.json",
+            "eyerender gaze fit one_eye.csv --rig rig.yaml --estimator regression --monocular -o calibration.json",
+        ),
+        "gaze predict": (
+            "eyerender gaze predict recording.csv --rig rig.yaml -c calibration.json --screen-px 1920 1080",
+            "eyerender gaze predict features.json -c calibration.json --json gaze.json",
+        ),
+        "generate": (
+            "eyerender generate dataset_quick --dry-run --measure",
+            "eyerender generate dataset_quick -o data --count 100",
+        ),
+        "live": ("eyerender live quickstart --browser",),
+        "population": ("eyerender population adults -o people --faces 0",),
+        "preview": ("eyerender preview headset -o sheet.png",),
+        "quickstart": ("eyerender quickstart first", "eyerender quickstart -o first --eye E4 --overwrite"),
+        "realism": ("eyerender realism my_frames images -o looks.html",),
+        "render": (
+            "eyerender render quickstart -o images",
+            "eyerender render my_scene.yaml -o images --eye E4 --spp 64 --auto-exposure 0.7",
+        ),
+        "sample": ("eyerender sample dataset_quick 5", "eyerender sample dataset_quick 5 -o sample5"),
+        "schema": ("eyerender schema dataset > dataset.schema.json",),
+        "setup-llvm": ("eyerender setup-llvm",),
+        "study": ("eyerender study guestrin2006 -o study --eyes E1,E4",),
+        "validate": ("eyerender validate data", "eyerender validate data --quick --json -"),
+        "view": ("eyerender view eye E4 -o eye.svg", "eyerender view scene quickstart -o rig.pdf"),
+    }
+)
+"""Command lines by command."""
+
+
+def add_examples(app: App) -> None:
+    """Add the examples to the help of each command."""
+    for command, lines in EXAMPLES.items():
+        found = app
+        for word in command.split():
+            found = found[word]
+        found.help_epilogue = "Examples:\n\n" + "\n".join(f"    {line}" for line in lines)
