@@ -23,7 +23,7 @@ from .glints.subtraction import affected_pixels, part_about, subtract_spots, wel
 from .glints.windows import window_radius
 from .preprocessing import DN, Part, Prepared, prepare
 from .pupil.boundary import PupilCandidate
-from .pupil.consensus import median_off
+from .pupil.consensus import far_off
 from .pupil.covariance import boundary_deviation
 from .pupil.edge_model import EdgeModel
 from .pupil.glare import NO_PATCH, levels_beside
@@ -34,6 +34,8 @@ from .result import Extraction, PupilResult
 from .settings import ExtractionSettings, Shape
 from .statistics import median
 
+# Distance of a tenth of the edge points from a refined boundary that contradicts it: in their own scatter, and in px.
+APART, APART_PX = 4.0, 0.5
 SAME_LIGHT = 0.5  # in noise standard deviations; a smaller change of the spots' light does not move the boundary
 
 
@@ -209,11 +211,15 @@ def _fitted_again(
 
 
 def _agrees(fit: PixelFit, found: PupilCandidate) -> bool:
-    """Whether the refined boundary agrees with the edges. Noise and texture may move it, but no more."""
+    """Whether the refined boundary agrees with the edges everywhere, not on average only.
+
+    Noise and texture leave a tenth of the points farther from it than 1.6 standard deviations, light that the model
+    mistakes for iris (a ring of glints) an arc of them much farther.
+    """
     boundary = found.boundary
     points = found.edges.points_px[boundary.inliers]
-    off = median_off(fit.ellipse.numbers(), points, found.edges.sigma_px)
-    return off < max(2.5 * boundary.residual_px, 0.3)
+    off = far_off(fit.ellipse.numbers(), points, found.edges.sigma_px)
+    return off < max(APART * boundary.residual_px, APART_PX)
 
 
 def _fit_spots(prepared: Prepared, found: PupilCandidate, spots: Spots) -> tuple[Spots, SpotFit]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ def as_image(array: NDArray[np.generic]) -> Image:
     return np.asarray(array, dtype=np.float32)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Prepared:
     """An image made ready for extraction.
 
@@ -36,12 +36,23 @@ class Prepared:
         clip_dn: level at which the sensor saturates; infinite for float images.
         noise_dn: standard deviation of a pixel's noise.
         inverted: whether the image is a negative.
+        scale: pixels of the whole image per pixel.
     """
 
     linear: Image
     clip_dn: float
     noise_dn: float
     inverted: bool = False
+    scale: int = 1
+
+    def reduced(self, scale: int) -> Prepared:
+        """The image at 1 / scale of the size, with the noise that it has there."""
+        if scale == 1:
+            return self
+        height, width = (scale * (side // scale) for side in self.linear.shape)
+        size = (width // scale, height // scale)
+        small = as_image(cv2.resize(self.linear[:height, :width], size, interpolation=cv2.INTER_AREA))
+        return replace(self, linear=small, noise_dn=max(estimate_noise(small), self.noise_dn / scale), scale=scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +105,7 @@ def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | st
     # Sensor noise is added after the wells are full, so clipped pixels scatter slightly below full scale.
     if np.isfinite(clip):
         clip -= min(max(3.0 * noise, 0.004 * DN), 0.02 * DN)
-    return Prepared(linear, clip, noise)
+    return Prepared(linear=linear, clip_dn=clip, noise_dn=noise)
 
 
 def _checked(image: object) -> NDArray[np.generic]:
@@ -195,7 +206,7 @@ def invert(prepared: Prepared) -> Prepared:
     smooth = cv2.medianBlur(prepared.linear, 5)
     ceiling = quantile(smooth[::2, ::2].ravel(), 0.999) + 3.0 * prepared.noise_dn
     negative = np.maximum(np.subtract(np.float32(ceiling), prepared.linear), np.float32(0.0))
-    return Prepared(negative, float("inf"), prepared.noise_dn, inverted=True)
+    return replace(prepared, linear=negative, clip_dn=math.inf, inverted=True)
 
 
 def single_threaded() -> None:

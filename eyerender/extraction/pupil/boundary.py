@@ -20,7 +20,6 @@ from .glare import Inpainted, inpaint_glints
 from .places import holding
 
 ROUGH = 0.8  # overlap with its boundary below which a rough candidate's edges are found again, about the boundary
-_TWICE = np.array([2.0, 2.0, 2.0, 2.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,31 +74,32 @@ class PupilCandidate:
         limit = max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
         return inside.darker_dn if abs(inside.darker_dn) > limit else 0.0
 
-    def doubled(self, work: Prepared) -> PupilCandidate:
-        """Convert the candidate to the pixels of an image of twice the resolution."""
-        edges, boundary = self.edges, self.boundary
+    def enlarged(self, work: Prepared) -> PupilCandidate:
+        """Convert the candidate to the pixels of the whole image."""
+        edges, boundary, scale = self.edges, self.boundary, self.image.scale
+        lengths = np.array([scale, scale, scale, scale, 1.0])
         return PupilCandidate(
             image=work,
-            inpainted=self.inpainted.doubled(work.linear),
-            candidate=replace(self.candidate, ellipse=_doubled(self.candidate.ellipse)),
+            inpainted=self.inpainted.enlarged(work.linear, scale),
+            candidate=replace(self.candidate, ellipse=_enlarged(self.candidate.ellipse, scale)),
             edges=replace(
                 edges,
-                points_px=2.0 * edges.points_px + 0.5,
-                sigma_px=2.0 * edges.sigma_px,
-                filter_px=2.0 * edges.filter_px,
+                points_px=scale * (edges.points_px + 0.5) - 0.5,
+                sigma_px=scale * edges.sigma_px,
+                filter_px=scale * edges.filter_px,
             ),
             boundary=replace(
                 boundary,
-                ellipse=_doubled(boundary.ellipse),
-                points_px=2.0 * boundary.points_px + 0.5,
-                residual_px=2.0 * boundary.residual_px,
-                covariance=boundary.covariance * np.outer(_TWICE, _TWICE),
+                ellipse=_enlarged(boundary.ellipse, scale),
+                points_px=scale * (boundary.points_px + 0.5) - 0.5,
+                residual_px=scale * boundary.residual_px,
+                covariance=boundary.covariance * np.outer(lengths, lengths),
             ),
         )
 
 
-def _doubled(ellipse: Ellipse) -> Ellipse:
-    return Ellipse(2.0 * ellipse.centre_px + 0.5, 2.0 * ellipse.semi_axes_px, ellipse.angle_rad)
+def _enlarged(ellipse: Ellipse, scale: int) -> Ellipse:
+    return Ellipse(scale * (ellipse.centre_px + 0.5) - 0.5, scale * ellipse.semi_axes_px, ellipse.angle_rad)
 
 
 def find_boundary(work: Prepared, candidate: Candidate, shape: Shape) -> PupilCandidate | str:

@@ -443,7 +443,7 @@ def find_inside(prepared: Prepared, inpainted: Inpainted, ellipse: Ellipse, shap
     sigma = float(np.clip(0.08 * b, 1.0, 4.0))
     smooth = as_image(cv2.GaussianBlur(cv2.medianBlur(crop, 5), (0, 0), sigma))
     noise = prepared.noise_dn / (2.0 * math.sqrt(math.pi) * sigma)
-    inner = Prepared(smooth, prepared.clip_dn, noise, prepared.inverted)
+    inner = replace(prepared, linear=smooth, noise_dn=noise)
     found = (
         replace(one, ellipse=one.ellipse.shifted((columns.start, rows.start))) for one in find_candidates(inner, shape)
     )

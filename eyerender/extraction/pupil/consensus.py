@@ -293,10 +293,13 @@ def _seen(numbers: Floats, points: Floats) -> Floats:
 
 
 @compiled("UniTuple(f8, 5), f8[:,::1], f8")
-def median_off(ellipse: tuple[float, ...], points: Floats, sigma_px: float) -> float:
-    """Median distance of edge points (n, 2), moved outward by the curvature shift, from (cx, cy, a, b, angle)."""
+def far_off(ellipse: tuple[float, ...], points: Floats, sigma_px: float) -> float:
+    """Distance within which nine in ten edge points (n, 2) lie of an ellipse (cx, cy, a, b, angle).
+
+    They are moved outward by the curvature shift.
+    """
     off = np.empty(points.shape[0])
     for i in range(off.size):
         distance, _, _, curvature = relative_to(ellipse, points[i, 0], points[i, 1])
         off[i] = abs(distance + 0.5 * sigma_px * sigma_px * curvature)
-    return quantile_of(off, 0.5)
+    return quantile_of(off, 0.9)

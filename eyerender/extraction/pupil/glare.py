@@ -16,11 +16,15 @@ from ...arrays import Bools
 from ...geometry.ellipse import Ellipse
 from ...jit import compiled, inlined
 from ..preprocessing import Image, as_image
+from ..statistics import quantile
 from .places import SECTORS
 
 # A glint is brighter than the iris by this share of the step and stands out of its surroundings by that share of it.
 # The texture of an iris reaches a third of the step.
 ABOVE_IRIS, STANDS_OUT = 0.25, 0.75
+# A sharpened iris has as bright pixels. A glint lies above the levels beside the boundary as outliers do: by this many
+# interquartile ranges above the upper quartile. Source: Tukey (1977).
+FENCE, BESIDE_PX = 1.5, 3.0
 NO_PATCH = np.zeros((0, 0), dtype=np.float32)
 NOISE = 6.0  # in standard deviations: what noise alone does not reach in any pixel
 # Flank of a glint below these limits, px. A glint of sigma 2 and four steps falls from one step to a tenth of one in
@@ -60,14 +64,14 @@ class Inpainted:
             crop[to], hidden[to] = self.patch[part], self.mask[part]
         return crop, hidden
 
-    def doubled(self, linear: Image) -> Inpainted:
-        """The same at twice the scale, of the image `linear` at that scale."""
+    def enlarged(self, linear: Image, scale: int) -> Inpainted:
+        """The same at `scale` times the size, of the image `linear` of that size."""
         if self.patch is None or self.mask is None:
             return Inpainted(linear)
-        size = (2 * self.patch.shape[1], 2 * self.patch.shape[0])
+        size = (scale * self.patch.shape[1], scale * self.patch.shape[0])
         mask = cv2.resize(self.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
         patch = as_image(cv2.resize(self.patch, size))
-        x, y = 2 * self.corner[0], 2 * self.corner[1]
+        x, y = scale * self.corner[0], scale * self.corner[1]
         patch[~mask] = linear[y : y + size[1], x : x + size[0]][~mask]
         return Inpainted(linear, (x, y), patch, mask)
 
@@ -127,7 +131,10 @@ def inpaint_glints(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: f
     a, b = ellipse.semi_axes_px.tolist()
     columns, rows = around(ellipse, 1.4 * a + 8.0, linear.shape)
     crop = np.ascontiguousarray(linear[rows, columns])
-    bright = inside_dn + (1.0 + ABOVE_IRIS) * step_dn + NOISE * noise_dn
+    beside = levels_beside(ellipse.numbers(), BESIDE_PX, linear, (0, 0), NO_PATCH)
+    upper = quantile(beside, 0.75)
+    textured = upper + FENCE * (upper - quantile(beside, 0.25))
+    bright = max(inside_dn + (1.0 + ABOVE_IRIS) * step_dn + NOISE * noise_dn, textured)
     if crop.shape[0] < 4 or crop.shape[1] < 4 or not crop.max() > bright:
         return Inpainted(linear)
     # Half resolution is enough for the level around glints.

@@ -17,7 +17,7 @@ each other condition, and 80 without an eye.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
@@ -26,7 +26,7 @@ import numpy as np
 from ...arrays import Floats, frozen
 from ...geometry.ellipse import Ellipse
 from ...status import Status
-from ..preprocessing import DN
+from ..preprocessing import DN, Prepared
 from ..result import Goodness, PupilResult
 from ..settings import ExtractionSettings
 from .boundary import PupilCandidate
@@ -124,6 +124,13 @@ class ScoredCandidate:
     candidate: PupilCandidate
     goodness: Goodness
     confidence: float
+
+    def enlarged(self, work: Prepared) -> ScoredCandidate:
+        """The same in the pixels of the whole image; the evidence is that of the reduced one."""
+        scale, goodness = self.candidate.image.scale, self.goodness
+        pixels = ("residual_px", "blur_px", "boundary_sd_px", "uneven_px")
+        lengths = {name: scale * getattr(goodness, name) for name in pixels}
+        return replace(self, candidate=self.candidate.enlarged(work), goodness=replace(goodness, **lengths))
 
 
 def score(candidate: PupilCandidate) -> ScoredCandidate:

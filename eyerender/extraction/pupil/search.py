@@ -14,13 +14,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from ...geometry.ellipse import Ellipse, iou
-from ..preprocessing import Prepared, as_image, invert
+from ..preprocessing import Prepared, invert
 from ..result import PupilResult
-from ..settings import Shape
+from ..settings import LEAST_PX, Shape
 from .boundary import PupilCandidate, find_boundary
 from .candidates import Candidate, candidate_at, find_candidates, find_inside
 from .scoring import ScoredCandidate, score
@@ -28,6 +27,8 @@ from .scoring import ScoredCandidate, score
 SURE = 0.9  # a hypothesis of this confidence ends the search
 LATE_CONFIDENCE = 0.5  # least confidence of a hypothesis of a later look
 LARGE_PX = 14.0  # pupils from this semi-axis on are found at a quarter of the scale, in a quarter of the time
+SCALES = (1, 2, 4)  # pixels of the image per pixel of the image searched
+LEAST_SIDE = 32  # px of a reduced image
 FEW = 9  # thresholds of the first look; the edges decide, and the later looks use all
 USUAL_PX = 7.0  # smaller pupils are looked for at full resolution and last; lashes and shadows are as small
 # Between two frames a pupil moves by up to a few of its own sizes (a saccade of 500 deg/s covers 4 mm in 1/30 s). Its
@@ -93,14 +94,14 @@ def _search(work: Prepared, shape: Shape, prior: Ellipse | None) -> ScoredCandid
                 scored = score(near)
                 if scored.confidence >= SURE:
                     return scored
-    return _likeliest(hypotheses(work, shape))
+    return _likeliest(work, shape)
 
 
-def _likeliest(looks: Iterator[tuple[bool, PupilCandidate | str]]) -> ScoredCandidate | PupilResult:
+def _likeliest(work: Prepared, shape: Shape) -> ScoredCandidate | PupilResult:
     best: ScoredCandidate | None = None
     reason = ""
     spent = 0.0
-    for late, found in looks:
+    for late, found in hypotheses(work, shape):
         spent += 1.0
         if spent > MOST_WORK:
             break
@@ -109,16 +110,14 @@ def _likeliest(looks: Iterator[tuple[bool, PupilCandidate | str]]) -> ScoredCand
             continue
         spent += found.reach_px**2 / PIXELS_OF_UNIT
         scored = score(found)
-        if found.core_dn > 0.0:
-            late = True  # an iris, or a pupil with a reflection in it
-        elif scored.confidence >= SURE:
-            return scored
-        if scored.confidence > (0.0 if best is None else best.confidence) and not (
-            late and scored.confidence < LATE_CONFIDENCE
-        ):
+        late |= found.core_dn > 0.0  # an iris, or a pupil with a reflection in it
+        least = LATE_CONFIDENCE if late else 0.0
+        if scored.confidence > (0.0 if best is None else best.confidence) and scored.confidence >= least:
             best = scored
+        if scored.confidence >= SURE and not found.core_dn > 0.0:
+            return _at_full_scale(work, scored, shape)
     if best is not None:
-        return best
+        return _at_full_scale(work, best, shape)
     if not reason:
         return PupilResult.missing("coarse search", "no dark round region stands out of its surroundings")
     return PupilResult.missing("edges", reason)
@@ -129,26 +128,60 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, PupilCandid
 
     1. the best candidate at a quarter of the scale, then those of a less reduced image, and those inside each that has
        a dark core
-    2. pupils that lids cut: circles as wide as flat blobs
-    3. the image at half scale, where block compression and texture are finer than the edges
+    2. the same in the image at half and at a quarter of the scale, where texture, block compression and sharpening are
+       finer than the edges, and the spots of a ring light small
+    3. pupils that lids cut: circles as wide as flat blobs
     4. pupils smaller than USUAL_PX
+
+    A boundary is in the pixels of the scale at which it was found.
     """
-    usual = replace(shape, least_px=max(shape.least_px, min(USUAL_PX, 0.5 * shape.most_px)))
-    tried: list[Candidate] = []
+    whole: list[Candidate] = []
+    for image, limits in _pyramid(work, shape):
+        tried = whole if image is work else []
+        usual = replace(limits, least_px=max(limits.least_px, min(USUAL_PX / image.scale, 0.5 * limits.most_px)))
+        for candidates in (_large, find_candidates):
+            yield from ((image is not work, one) for one in _bounded(image, candidates(image, usual), limits, tried))
+    yield from ((True, one) for one in _bounded(work, list(_rounder(_best(whole), shape)), shape, whole))
+    if shape.least_px < USUAL_PX:
+        small = replace(shape, most_px=2.0 * USUAL_PX)
+        yield from ((True, one) for one in _bounded(work, find_candidates(work, small), shape, whole))
 
-    def bounded(candidates: Sequence[Candidate]) -> Iterator[PupilCandidate | str]:
-        for candidate in candidates:
-            if not any(_same(candidate.ellipse, one.ellipse) for one in tried):
-                tried.append(candidate)
-                yield from _with_inner(work, candidate, shape)
 
-    yield from ((False, one) for one in bounded(_large(work, shape)))
-    yield from ((False, one) for one in bounded(find_candidates(work, usual)))
-    yield from ((True, one) for one in bounded(list(_rounder(_best(tried), shape))))
-    yield from ((True, one) for one in _at_half_scale(work, shape))
-    if shape.least_px < usual.least_px:
-        small = replace(shape, most_px=2.0 * usual.least_px)
-        yield from ((True, one) for one in bounded(find_candidates(work, small)))
+def _bounded(
+    work: Prepared, candidates: Sequence[Candidate], shape: Shape, tried: list[Candidate]
+) -> Iterator[PupilCandidate | str]:
+    """Boundaries about those candidates that were not tried before, and inside those with a darker core."""
+    for candidate in candidates:
+        if any(_same(candidate.ellipse, one.ellipse) for one in tried):
+            continue
+        tried.append(candidate)
+        found = find_boundary(work, candidate, shape)
+        yield found
+        if isinstance(found, PupilCandidate) and found.core_dn > 0.0:
+            for inner in find_inside(work, found.inpainted, found.boundary.ellipse, shape):
+                yield find_boundary(work, inner, shape)
+
+
+def _pyramid(work: Prepared, shape: Shape) -> Iterator[tuple[Prepared, Shape]]:
+    """The image at full, half and quarter scale, and the sizes to look for there."""
+    for scale in SCALES:
+        if min(work.linear.shape) >= LEAST_SIDE * scale:
+            least = max(shape.least_px / scale, LEAST_PX)
+            yield work.reduced(scale), replace(shape, least_px=least, most_px=shape.most_px / scale)
+
+
+def _at_full_scale(work: Prepared, scored: ScoredCandidate, shape: Shape) -> ScoredCandidate:
+    """A boundary of a reduced image in the pixels of the whole image: through the edges there, if it is as likely."""
+    if scored.candidate.image is work:
+        return scored
+    coarse = scored.enlarged(work)
+    near = candidate_at(work, coarse.candidate.boundary.ellipse)
+    fine = "" if near is None else find_boundary(work, near, shape)
+    if isinstance(fine, PupilCandidate):
+        again = score(fine)
+        if again.confidence >= min(coarse.confidence, SURE):
+            return again
+    return coarse
 
 
 def _large(work: Prepared, shape: Shape) -> list[Candidate]:
@@ -176,15 +209,6 @@ def _near(work: Prepared, shape: Shape, prior: Ellipse) -> Iterator[PupilCandida
     crop = replace(work, linear=np.ascontiguousarray(work.linear[y0:y1, x0:x1]))
     for found in find_candidates(crop, alike):
         yield find_boundary(work, replace(found, ellipse=found.ellipse.shifted((x0, y0))), shape)
-
-
-def _with_inner(work: Prepared, candidate: Candidate, shape: Shape) -> Iterator[PupilCandidate | str]:
-    """The boundary about a candidate, and those inside it if it has a darker core."""
-    found = find_boundary(work, candidate, shape)
-    yield found
-    if isinstance(found, PupilCandidate) and found.core_dn > 0.0:
-        for inner in find_inside(work, found.inpainted, found.boundary.ellipse, shape):
-            yield find_boundary(work, inner, shape)
 
 
 def _same(first: Ellipse, second: Ellipse) -> bool:
@@ -215,17 +239,3 @@ def _rounder(candidates: Sequence[Candidate], shape: Shape) -> Iterator[Candidat
         for side in (0.0, 1.0, -1.0):
             centre = candidate.ellipse.centre_px + side * 0.9 * (a - b) * across
             yield replace(candidate, ellipse=Ellipse(centre, np.array([a, a]), 0.0))
-
-
-def _at_half_scale(work: Prepared, shape: Shape) -> Iterator[PupilCandidate | str]:
-    """Boundaries in the image at half scale, in the pixels of the whole image."""
-    height, width = work.linear.shape
-    if min(height, width) < 64:
-        return
-    half = as_image(cv2.resize(work.linear[: height // 2 * 2, : width // 2 * 2], None, fx=0.5, fy=0.5,
-                               interpolation=cv2.INTER_AREA))  # fmt: skip
-    small = replace(work, linear=half, noise_dn=max(0.5 * work.noise_dn, 1e-3))
-    limits = replace(shape, least_px=max(0.5 * shape.least_px, 3.0), most_px=0.5 * shape.most_px)
-    for candidate in find_candidates(small, replace(limits, least_px=max(limits.least_px, 0.5 * USUAL_PX))):
-        for found in _with_inner(small, candidate, limits):
-            yield found if isinstance(found, str) else found.doubled(work)
