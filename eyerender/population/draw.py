@@ -12,8 +12,9 @@ on the predictors: these are drawn first, and accepted with the probability
     exp(-(c - m)^T V^-1 (c - m) / 2),
 
 c the latent numbers that the values require, m and V their conditional mean and covariance given the latent numbers of
-the predictors; then the others follow as above. A range of a quantity that is independent of all others truncates its
-latent number. Any other range is met by drawing again.
+the predictors; then the others follow as above. A range of a subject's quantity with a marginal truncates its latent
+number z to z', and the numbers that are correlated with it follow by cov (z' - z), unless an exact value fixes one of
+them. Any other range is met by drawing again.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Conditions:
     Attributes:
         exact: quantities with a regression -> value.
         ranges: quantity -> low and high.
-        cut: latent column -> ends of the truncated latent number.
+        cut: latent column -> ends of the truncated latent number, and how the others follow it (width,).
         fixed: (f,) latent numbers of `columns`.
         columns: (f,) their columns.
         carry: (f, w) change of all latent numbers per change of those.
@@ -57,7 +58,7 @@ class Conditions:
 
     exact: Mapping[str, float]
     ranges: Mapping[str, tuple[float, float]]
-    cut: Mapping[int, tuple[float, float]]
+    cut: Mapping[int, tuple[float, float, Floats]]
     fixed: Floats
     columns: list[int]
     carry: Floats
@@ -77,7 +78,7 @@ class Conditions:
         fixed: dict[int, float] = {}
         exact: dict[str, float] = {}
         ranges: dict[str, tuple[float, float]] = {}
-        cut: dict[int, tuple[float, float]] = {}
+        cut: dict[str, tuple[float, float]] = {}
         for name, wanted in where.items():
             found, places = model.distributions[name], model.places(name)
             if isinstance(found, Regression):
@@ -87,13 +88,7 @@ class Conditions:
                     ranges[name] = _range(name, wanted)
                 continue
             if isinstance(found, Share) or not isinstance(wanted, int | float):
-                ends = _ends(name, found, wanted)
-                alone = all(np.count_nonzero(model.reference.latent[p]) == 1 for p in places)
-                if alone:
-                    cut |= dict.fromkeys(places, ends)
-                else:
-                    assert not isinstance(wanted, int | float)
-                    ranges[name] = _range(name, wanted)
+                cut[name] = _ends(name, found, wanted)
             else:
                 z = float(found.latent(np.array(float(wanted))))
                 if not np.isfinite(z) or abs(float(found.at(np.array(z))) - wanted) > 1e-6 * (1 + abs(wanted)):
@@ -101,6 +96,13 @@ class Conditions:
                 fixed |= dict.fromkeys(places, z)
         cov = model.reference.latent
         columns = list(fixed)
+        truncated_at: dict[int, tuple[float, float, Floats]] = {}
+        for name, ends in cut.items():
+            places = model.places(name)
+            if len(places) == 1 and not cov[places[0], columns].any():
+                truncated_at[places[0]] = (*ends, cov[places[0]])
+            else:
+                ranges[name] = _range(name, where[name])
         given = sorted({p for root in ROOTS for p in model.places(root)} | set(columns))
         fitted = [p for name in exact for p in model.places(name)]
         weight = np.linalg.solve(cov[np.ix_(given, given)], cov[given])
@@ -109,7 +111,7 @@ class Conditions:
         return cls(
             exact=exact,
             ranges=ranges,
-            cut=cut,
+            cut=truncated_at,
             fixed=np.array([fixed[c] for c in columns]),
             columns=columns,
             carry=np.asarray(np.linalg.solve(cov[np.ix_(columns, columns)], cov[columns]), dtype=np.float64),
@@ -155,8 +157,8 @@ def uniform_numbers(seed: int, stream: int, first: int, count: int, width: int) 
 def _conditioned(model: Model, conditions: Conditions, z: Floats, u: Floats) -> tuple[Floats, Bools]:
     """Latent numbers with the exact conditions, and whether each subject is accepted."""
     good = np.ones(len(z), dtype=bool)
-    for column, (low, high) in conditions.cut.items():
-        z[:, column] = truncated(z[:, column], low, high)
+    for column, (low, high, follow) in conditions.cut.items():
+        z = z + (truncated(z[:, column], low, high) - z[:, column])[:, None] * follow
     if conditions.columns:
         z = z + _times(conditions.fixed - z[:, conditions.columns], conditions.carry)
     if conditions.exact:

@@ -9,6 +9,9 @@ The table gives total means, spreads and correlations of its reference populatio
 subtracted: s_i^2 = sd_i^2 - var(m_i), and the residuals' correlation is (r_ij sd_i sd_j - cov(m_i, m_j)) / (s_i s_j).
 Pairs that the table does not name are independent given the others (Dempster 1972). The nearest correlation matrix
 (Higham 2002) replaces the one that results, where that is none.
+
+The predictors are independent but for age and refraction, whose latent numbers have a correlation r. The covariance of
+two monotone functions F, G of such numbers is the sum over k >= 1 of r^k E[F He_k] E[G He_k] / k! (Mehler's formula).
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
+from numpy.polynomial.hermite_e import hermegauss, hermevander
 
 from ..arrays import Floats
 from ..errors import InputError
@@ -26,6 +30,7 @@ from .correlation import completed, nearest_correlation
 from .table import ROOTS, Distribution, Pair, Quantity, Regression, Table, default_table
 
 SIDES: tuple[Side, Side] = ("right", "left")
+_NODES, _ORDERS = 200, 16  # r^16 is below 1e-11 for the correlations of refraction and age
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,9 @@ class Reference:
         np.fill_diagonal(between, [table.quantities[name].eyes for name in eye])
         whole = np.eye(subjects + 2 * len(eye))
         whole[subjects:, subjects:] = np.block([[inside, between], [between.T, inside]])
+        age = [name for name, q in table.quantities.items() if q.of == "subject"].index("age_years")
+        for k in (subjects, subjects + len(eye)):
+            whole[age, k + eye.index("refraction_d")] = whole[k + eye.index("refraction_d"), age] = table.age_r
         nearest = nearest_correlation(whole)
         return cls(table, found, asked, nearest, float(np.linalg.norm(nearest - whole)))
 
@@ -165,7 +173,7 @@ class Model:
         found = self.distributions[name]
         if not isinstance(found, Regression):
             return found.moments
-        variance = found.residual_sd**2 + _explained(found, found, self.distributions)
+        variance = found.residual_sd**2 + _explained(found, found, self.distributions, self.reference.table)
         return _mean(found, self.distributions), float(np.sqrt(variance))
 
     def expected_correlation(self, first: str, second: str) -> float:
@@ -175,7 +183,8 @@ class Model:
         latent = float(self.reference.latent[i, j])
         if not (isinstance(a, Regression) and isinstance(b, Regression)):
             return latent
-        shared = latent * a.residual_sd * b.residual_sd + _explained(a, b, self.distributions)
+        explained = _explained(a, b, self.distributions, self.reference.table)
+        shared = latent * a.residual_sd * b.residual_sd + explained
         return shared / (self.expected(first)[1] * self.expected(second)[1])
 
 
@@ -204,7 +213,7 @@ def _resolved(name: str, quantity: Quantity, table: Table, about: Mapping[str, f
         return bare
     assert quantity.sd is not None
     roots = {root: _marginal(table.quantities[root]) for root in ROOTS}
-    rest = quantity.sd**2 - _explained(bare, bare, roots)
+    rest = quantity.sd**2 - _explained(bare, bare, roots, table)
     if not rest > 0:
         raise InputError("is smaller than what the predictors explain", path=f"quantities.{name}.sd")
     return bare.model_copy(update={"residual_sd": float(np.sqrt(rest))})
@@ -216,15 +225,33 @@ def _latent(pair: Pair, table: Table, found: Mapping[str, Distribution]) -> floa
     if pair.of == "residuals" or not (isinstance(a, Regression) and isinstance(b, Regression)):
         return pair.r
     roots = {root: found[root] for root in ROOTS}
-    spreads = [np.sqrt(q.residual_sd**2 + _explained(q, q, roots)) for q in (a, b)]
-    rest = pair.r * spreads[0] * spreads[1] - _explained(a, b, roots)
+    spreads = [np.sqrt(q.residual_sd**2 + _explained(q, q, roots, table)) for q in (a, b)]
+    rest = pair.r * spreads[0] * spreads[1] - _explained(a, b, roots, table)
     return float(np.clip(rest / (a.residual_sd * b.residual_sd), -0.999, 0.999))
 
 
-def _explained(a: Regression, b: Regression, roots: Mapping[str, Distribution]) -> float:
-    """Covariance of the means of two regressions; the predictors are independent of each other."""
-    shared = a.slopes.keys() & b.slopes.keys()
-    return sum(a.slopes[root] * b.slopes[root] * _moments(roots[root])[1] ** 2 for root in sorted(shared))
+def _explained(a: Regression, b: Regression, roots: Mapping[str, Distribution], table: Table) -> float:
+    """Covariance of the means of two regressions in one eye."""
+    pairs = [(p, q) for p in sorted(a.slopes) for q in sorted(b.slopes)]
+    return sum(a.slopes[p] * b.slopes[q] * _covariance(p, q, roots, table) for p, q in pairs)
+
+
+def _covariance(first: str, second: str, roots: Mapping[str, Distribution], table: Table) -> float:
+    """Covariance of two predictors."""
+    if first == second:
+        return _moments(roots[first])[1] ** 2
+    if {first, second} != {"age_years", "refraction_d"} or not table.age_r:
+        return 0.0
+    k = np.arange(1, _ORDERS)
+    series = table.age_r**k * _hermite(roots[first]) * _hermite(roots[second])
+    return float(np.sum(series / np.cumprod(k.astype(float))))
+
+
+def _hermite(found: Distribution) -> Floats:
+    """E[F(z) He_k(z)] for k >= 1 of the map F of a marginal."""
+    assert not isinstance(found, Regression)
+    z, weight = hermegauss(_NODES)
+    return np.asarray((weight / weight.sum() * found.at(z)) @ hermevander(z, _ORDERS - 1)[:, 1:])
 
 
 def _mean(found: Regression, roots: Mapping[str, Distribution]) -> float:

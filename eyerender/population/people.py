@@ -166,17 +166,26 @@ class Person(Spec):
         return min(max(demand_d, 0.0), self.amplitude_d)
 
     def entrance_pupil_mm(
-        self, luminance_cd_m2: float | None = None, field_deg: float | None = None, demand_d: float = 0.0
+        self,
+        luminance_cd_m2: float | None = None,
+        field_deg: float | None = None,
+        demand_d: float = 0.0,
+        *,
+        side: Side | None = None,
     ) -> float:
         """Diameter of the entrance pupil in a field of a luminance and diameter (deg), looking at a distance.
 
-        The near response narrows it by the person's miosis per dioptre of the demand that it accommodates to.
+        The near response narrows it by the person's miosis per dioptre of the demand that it accommodates to. The
+        pupils of both eyes differ by the person's anisocoria; without a `side` it is their mean.
         """
         table = default_table()
         luminance = table.constant("luminance_cd_m2") if luminance_cd_m2 is None else luminance_cd_m2
         field = table.constant("field_deg") if field_deg is None else field_deg
         far = far_pupil_mm(table, luminance, field, np.array(self.number("age_years")), self.number("pupil_score"))
         near = float(far) - self.number("miosis_mm_per_d") * self.accommodation_d(demand_d)
+        # People of earlier versions have none.
+        if side is not None and "anisocoria_mm" in self.numbers:
+            near += self.number("anisocoria_mm") * (0.5 if side == "right" else -0.5)
         return float(np.clip(near, table.constant("smallest_pupil_mm"), table.constant("largest_pupil_mm")))
 
     def eye(
@@ -206,7 +215,7 @@ class Person(Spec):
             default_table(),
             age_years=self.number("age_years"),
             accommodation_d=self.accommodation_d(demand_d),
-            entrance_mm=self.entrance_pupil_mm(luminance_cd_m2, field_deg, demand_d),
+            entrance_mm=self.entrance_pupil_mm(luminance_cd_m2, field_deg, demand_d, side=side),
             seed=self.draw_seed(f"pupil/{side}"),
         )
 

@@ -60,6 +60,9 @@ class Quantity(Spec):
     residual_sd: Positive | None = Field(default=None, description="standard deviation about the regression")
     slopes: dict[str, Number] = Field(default_factory=dict, description="predictor -> change per unit")
     eyes: Correlation = Field(default=0.9, description="correlation of the two eyes' residuals")
+    age_r: Correlation = Field(
+        default=0.0, description="correlation of the latent number of `refraction_d` with that of `age_years`"
+    )
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = Field(description="where the numbers come from")
 
     @model_validator(mode="after")
@@ -127,6 +130,18 @@ class Table(FileSpec):
             if unknown:
                 raise ValueError(f"presets.{name}.replace: unknown quantity {min(unknown)}")
         return self
+
+    @model_validator(mode="after")
+    def _check_age_r(self) -> Self:
+        for name, quantity in self.quantities.items():
+            if quantity.age_r and name != "refraction_d":
+                raise ValueError(f"quantities.{name}.age_r: only refraction_d may have it; give others a slope")
+        return self
+
+    @property
+    def age_r(self) -> float:
+        """Correlation of the latent numbers of age and refraction."""
+        return self.quantities["refraction_d"].age_r
 
     def constant(self, name: str) -> float:
         """Value of a constant."""

@@ -101,6 +101,31 @@ def test_exact_conditions_on_predictors():
     assert people["axial_length_mm"].mean() > 24
 
 
+def test_trends_with_age():
+    """Hyperopic by 0.023 D and against the rule by 0.009 D a year, within four standard errors of 10,000 people."""
+    people = er.Population("adults").draw(10_000, 5)
+    age = people["age_years"]
+    for name, slope in (("refraction_d", 0.0231), ("refraction_j0_d", -0.009)):
+        value = people[name][:, 0]
+        found, rest = np.polyfit(age, value, 1)[0], value.std()
+        assert found == pytest.approx(slope, abs=4 * rest / age.std() / 100), name
+
+
+def test_a_range_of_ages_has_the_refractions_of_its_age():
+    """People of an age range are those that a selection from everybody finds, also where the refraction is given."""
+    everybody = er.Population("adults").draw(20_000, 6)
+    chosen = (everybody["age_years"] > 60) & (everybody["age_years"] < 65)
+    wanted = everybody["refraction_d"][chosen, 0]
+    old = er.Population("adults", where={"age_years": (60, 65)}).draw(2000, 7)
+    found = old["refraction_d"][:, 0]
+    error = np.sqrt(wanted.var() / len(wanted) + found.var() / len(found))
+    assert found.mean() == pytest.approx(wanted.mean(), abs=4 * error)
+    assert found.mean() > everybody["refraction_d"].mean() + 4 * error
+    both = er.Population("adults", where={"age_years": (60, 65), "refraction_d": -4.0}).draw(50, 8)
+    assert np.all((both["age_years"] > 60) & (both["age_years"] < 65))
+    np.testing.assert_allclose(both["refraction_d"], -4.0, atol=1e-9)
+
+
 def test_replaced_marginals_are_used():
     population = er.Population("adults", replace={"age_years": {"kind": "uniform", "low": 25, "high": 26}})
     ages = population.draw(200, 1)["age_years"]

@@ -97,7 +97,7 @@ def test_light_and_distance_set_pupil_and_lens(scene):
     dark, bright = (scene.with_({"subject.luminance_cd_m2": value}) for value in (0.5, 500.0))
     assert dark.stop_diameter_mm("left") > bright.stop_diameter_mm("left") + 1.0
     for one, luminance in ((dark, 0.5), (bright, 500.0)):
-        wanted = person.entrance_pupil_mm(luminance, demand_d=1000 / 600 + own)
+        wanted = person.entrance_pupil_mm(luminance, demand_d=1000 / 600 + own, side="right")
         assert entrance_pupil_mm(one.eye("right")) == pytest.approx(wanted, abs=1e-6)
     assert near.stop_diameter_mm("right") <= scene.stop_diameter_mm("right")
     relaxed = scene.with_({"subject.accommodation_d": 0.0})
