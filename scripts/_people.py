@@ -35,6 +35,7 @@ def recipe(file: Path, divisor: int, spp: int | None, images: int, subjects: int
     """The mapping of a recipe with fewer pixels, which see the same, and with so many images of each subject."""
     data = yaml.safe_load(file.read_text(encoding="utf-8"))
     _shrink(data["scene"], divisor)
+    data = {key: value for key, value in data.items() if key not in ("planned", "choice")}
     data |= {"count": images * subjects, "subjects": subjects, "shard_size": images}
     if spp is not None:
         data["scene"]["image"]["spp"] = spp

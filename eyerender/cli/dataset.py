@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from ..dataset.options import RunOptions
+from ..dataset.options import PlanOptions, RunOptions
 from ..errors import EyerenderError, InputError
 from .app import app
 from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads
@@ -26,6 +26,7 @@ def generate(
     eye: EyeModel = None,
     seed: Seed = None,
     count: int | None = None,
+    changes: Annotated[PlanOptions, Parameter(name="*")] = PlanOptions(),
     options: Annotated[RunOptions, Parameter(name="*")] = RunOptions(),
     strict: Strict = False,
     json: Result = None,
@@ -55,19 +56,20 @@ def generate(
         raise InputError(
             "cannot be combined with --shard, because other jobs may be writing to the folder", source="--overwrite"
         )
+    from ..dataset.plan import Plan
+
     heed = Heed(strict)
+    plan = Plan.load(spec, eye=eye, seed=seed, count=count, changes=changes)
     if output is None or dry_run:
         from ..dataset.estimate import estimate
 
-        found = estimate(spec, options, eye=eye, seed=seed, count=count, measure=measure, warn=heed)
+        found = estimate(plan, options, measure=measure, warn=heed)
         emit(found, _estimate_text(found), json, heed)
         return 0
     from ..dataset.run import generate as run
 
     with progress("generating") as steps:
-        done = run(
-            spec, output, options, eye=eye, seed=seed, count=count, part=part, progress=steps, say=say, warn=heed
-        )
+        done = run(plan, output, options, part=part, progress=steps, say=say, warn=heed)
     emit(done, _generate_text(done), json, heed)
     return 0
 
@@ -81,6 +83,7 @@ def sample(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     eye: EyeModel = None,
     seed: Seed = None,
+    changes: Annotated[PlanOptions, Parameter(name="*")] = PlanOptions(),
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -93,9 +96,10 @@ def sample(
     """
     import yaml
 
+    from ..dataset.plan import Plan
     from ..dataset.realise import sample as drawn
 
-    found = drawn(spec, index, eye=eye, seed=seed)
+    found = drawn(Plan.load(spec, eye=eye, seed=seed, changes=changes), index)
     heed = Heed(strict)
     heed(found.warnings())
     if output is not None:

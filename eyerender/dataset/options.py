@@ -1,12 +1,15 @@
-"""Options of a dataset run, shared by Python, the command line and the engines."""
+"""Options of a dataset run and of its plan, shared by Python, the command line and the engines."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..backends.choose import BackendChoice
 from ..errors import InputError
+
+if TYPE_CHECKING:
+    from .spec import DatasetSpec
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,3 +41,53 @@ class RunOptions:
                 raise InputError(f"must be >= 1, not {value}", path=name)
         if not self.timeout_s > 0:
             raise InputError(f"must be > 0, not {self.timeout_s:g}", path="timeout_s")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanOptions:
+    """Subjects, splits and size of the pictures, in place of those of the spec.
+
+    Attributes:
+        subjects: Replace the number of subjects of the plan.
+        splits: Replace the splits, as NAME=SHARE,NAME=SHARE: the shares of the subjects.
+        size: Replace the size of the pictures, as WIDTHxHEIGHT in pixels; the cameras are scaled so that they see the
+            same.
+    """
+
+    subjects: int | None = None
+    splits: str | None = None
+    size: str | None = None
+
+    def apply(self, spec: DatasetSpec) -> DatasetSpec:
+        """Spec with these changes.
+
+        Raises:
+            InputError: they cannot be read, or do not fit.
+        """
+        from .picturesize import scaled
+
+        if self.subjects is not None:
+            spec = spec.replaced("--subjects", {"subjects": self.subjects})
+        if self.splits is not None:
+            spec = spec.replaced("--splits", {"splits": _splits(self.splits)})
+        if self.size is not None:
+            spec = spec.replaced("--size", {"scene": scaled(spec.scene, _size(self.size))})
+        return spec
+
+
+def _splits(text: str) -> dict[str, Any]:
+    out = {}
+    for part in text.split(","):
+        name, _, share = part.partition("=")
+        try:
+            out[name.strip()] = float(share)
+        except ValueError:
+            raise InputError(f"must be NAME=SHARE,NAME=SHARE, not {text!r}", source="--splits") from None
+    return out
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise InputError(f"must be WIDTHxHEIGHT in pixels, not {text!r}", source="--size")
+    return int(width), int(height)

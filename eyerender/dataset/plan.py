@@ -31,6 +31,7 @@ from ..scene import Scene
 from ..scene.spec import SceneSpec
 from .draws import is_draw, unit_number
 from .files import check_files, sum_of_file, sums_of_files
+from .options import PlanOptions
 from .spec import DatasetSpec, find_dataset
 from .template import Template, Turn, possible
 
@@ -112,17 +113,19 @@ class Plan:
         eye: str | None = None,
         seed: int | None = None,
         count: int | None = None,
+        changes: PlanOptions = PlanOptions(),
     ) -> Plan:
         """Load a plan from a file, the bare name of a shipped dataset, or a spec; a plan is returned as it is.
 
         `eye` and `seed` replace those of the spec; parameters of other eye models are then dropped. `count` requests
-        so many samples of the plan, or of its continuation (see `DatasetSpec.first`).
+        so many samples of the plan, or of its continuation (see `DatasetSpec.first`). `changes` replaces subjects,
+        splits and the size of the pictures.
 
         Raises:
             InputError: with one line.
         """
         if isinstance(given, Plan):
-            if (eye, seed, count) != (None, None, None):
+            if (eye, seed, count, changes) != (None, None, None, PlanOptions()):
                 raise InputError("a plan has its eye, seed and count already; give its spec", path="spec")
             return given
         if isinstance(given, DatasetSpec):
@@ -132,6 +135,7 @@ class Plan:
             spec = DatasetSpec.load(file)
         if seed is not None:
             spec = spec.replaced("--seed", {"seed": seed})
+        spec = changes.apply(spec)
         if count is not None:
             spec = spec.first(count)
         if eye is not None:

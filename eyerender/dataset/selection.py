@@ -42,7 +42,7 @@ class Joined(Sequence[int]):
         return self.head[k] if k < len(self.head) else int(self.tail[k - len(self.head)])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Selection:
     """The `count` samples that are made of a plan of `planned` samples and `subjects` subjects, in shards of a size."""
 

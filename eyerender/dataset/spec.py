@@ -166,7 +166,13 @@ class DatasetSpec(FileSpec):
 
 @lru_cache(maxsize=16)
 def _selection(count: int, planned: int, subjects: int, shard_size: int, spread: bool) -> Selection:
-    return Selection(count, planned, subjects, shard_size, spread and count % planned > 0)
+    return Selection(
+        count=count,
+        planned=planned,
+        subjects=subjects,
+        shard_size=shard_size,
+        spread=spread and count % planned > 0,
+    )
 
 
 def shipped_datasets() -> dict[str, Path]:

@@ -74,7 +74,7 @@ def test_a_larger_count_continues_the_plan_with_new_subjects(tmp_path):
 def test_a_choice_goes_through_the_subjects_in_rounds(planned, subjects):
     for count in range(1, 2 * planned + 1):
         whole = [i for block in range(count // planned) for i in range(block * planned, (block + 1) * planned)]
-        found = Selection(count, planned, subjects, 5, count % planned > 0)
+        found = Selection(count=count, planned=planned, subjects=subjects, shard_size=5, spread=count % planned > 0)
         block = range(len(whole), len(whole) + planned)
         order = sorted(block, key=lambda i: (i - found.first_of(found.subject_of(i)), found.subject_of(i)))
         expected = sorted(whole + order[: count - len(whole)])

@@ -1,0 +1,73 @@
+"""Pictures of another size: the cameras of a scene template scaled, so that they see the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..errors import InputError
+from .template import possible
+
+_OPTION = "--size"
+
+
+def scaled(scene: Mapping[str, Any], size_px: tuple[int, int]) -> dict[str, Any]:
+    """Scale resolution, focal length and principal point of all cameras, and the window, to a width and height.
+
+    The size is that of the pictures: of the window, or of the sensor where there is none. Pixels stay as large as they
+    are (`sensor.pixel_pitch_um`), as if another lens were before a sensor of more or fewer of them, so the
+    exposure stays, too.
+
+    Raises:
+        InputError: the pictures have several sizes, another shape, or the size of a camera is drawn or calibrated.
+    """
+    image = scene.get("image")
+    window = image.get("window_px") if isinstance(image, Mapping) else None
+    cameras = list(_cameras(scene.get("rig", {})))
+    sizes = {_numbers(window)} if window is not None else {_numbers(camera["resolution_px"]) for camera in cameras}
+    if len(sizes) != 1:
+        raise InputError("the pictures of this spec have several sizes", source=_OPTION)
+    width, height = sizes.pop()
+    factor = size_px[0] / width
+    if round(factor * height) != size_px[1] and round(size_px[1] / height * width) != size_px[0]:
+        raise InputError(f"must have the shape of {width} x {height}", source=_OPTION)
+    out: dict[str, Any] = _replaced(scene, factor)
+    if window is not None:
+        out["image"] = {**out["image"], "window_px": list(size_px)}
+    return out
+
+
+def _cameras(node: Any) -> list[Mapping[str, Any]]:
+    """Every camera of a template."""
+    if isinstance(node, Mapping):
+        if "resolution_px" in node:
+            return [node]
+        return [camera for value in node.values() for camera in _cameras(value)]
+    return [camera for value in node for camera in _cameras(value)] if isinstance(node, list | tuple) else []
+
+
+def _replaced(node: Any, factor: float) -> Any:
+    if isinstance(node, list | tuple):
+        return [_replaced(value, factor) for value in node]
+    if not isinstance(node, Mapping):
+        return node
+    if "resolution_px" not in node:
+        return {key: _replaced(value, factor) for key, value in node.items()}
+    if node.get("calibration") is not None:
+        raise InputError("a calibrated camera has one size", source=_OPTION)
+    camera = {**node, "resolution_px": [round(factor * n) for n in _numbers(node["resolution_px"])]}
+    if node.get("focal_length_px") is not None:
+        (focal,) = possible(node["focal_length_px"]) or [None]
+        if not isinstance(focal, int | float):
+            raise InputError("the focal length of a camera is drawn in pixels", source=_OPTION)
+        camera["focal_length_px"] = factor * focal
+    if node.get("principal_point_px") is not None:
+        # Pixel centres are at integers.
+        camera["principal_point_px"] = [factor * (v + 0.5) - 0.5 for v in _numbers(node["principal_point_px"])]
+    return camera
+
+
+def _numbers(pair: Any) -> tuple[Any, ...]:
+    if isinstance(pair, list | tuple) and len(pair) == 2 and all(isinstance(v, int | float) for v in pair):
+        return tuple(pair)
+    raise InputError("the size of a camera is drawn", source=_OPTION)

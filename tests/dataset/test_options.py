@@ -1,0 +1,69 @@
+"""Subjects, splits and picture size from the command line."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from eyerender.analytic.observer import trace
+from eyerender.dataset.options import PlanOptions
+from eyerender.dataset.plan import Plan
+from eyerender.errors import InputError
+from tests.support.dataset_specs import mapping, write
+
+
+def loaded(path, **options):
+    return Plan.load(path, changes=PlanOptions(**options))
+
+
+def test_subjects_and_splits_are_replaced(tmp_path):
+    plan = loaded(write(tmp_path / "tiny.yaml"), subjects=8, splits="train=3,test=1")
+    assert Counter(plan.split_of(s) for s in range(8)) == {"train": 6, "test": 2}
+    assert [plan.subject_of(i)[0] for i in (0, 2, 3, 23)] == [0, 0, 1, 7]
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"focal_length_px": 2400.0, "principal_point_px": [300.0, 250.5]},
+        {"focal_length_px": None, "focal_length_mm": 18.0, "sensor_mm": [4.8, 3.6]},
+    ],
+)
+def test_the_camera_scales_with_the_size(tmp_path, camera):
+    data = {f"scene.rig.cameras.0.{key}": value for key, value in camera.items()}
+    path = write(tmp_path / "tiny.yaml", **data)
+    own, half = loaded(path), loaded(path, size="48x36")
+    scenes = [plan.draw(7).build() for plan in (own, half)]
+    a, b = (scene.rig.cameras[0] for scene in scenes)
+    assert (b.resolution_px, scenes[1].spec.image.window_px) == ((320, 240), (48, 36))
+    # The same rays: an edge of a pixel of the small picture is an edge of the large one.
+    pupils = [trace(scene.frames()).pupil.centre_px[0] for scene in scenes]
+    np.testing.assert_allclose(pupils[1] + 0.5, (pupils[0] + 0.5) / 2, atol=1e-6)
+    assert a.resolution_px == (640, 480)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"size": "48x48"}, "--size: must have the shape of 96 x 72"),
+        ({"size": "48"}, "--size: must be WIDTHxHEIGHT in pixels, not '48'"),
+        ({"size": "0x0"}, "--size: must be WIDTHxHEIGHT"),
+        ({"splits": "train:1"}, "--splits: must be NAME=SHARE,NAME=SHARE"),
+        ({"splits": "Train=1"}, "--splits: splits.Train: a name must consist of"),
+        ({"subjects": 25}, "--subjects: subjects: must be <= the number of planned samples"),
+    ],
+)
+def test_wrong_options_are_refused(tmp_path, options, words):
+    with pytest.raises(InputError) as caught:
+        loaded(write(tmp_path / "tiny.yaml"), **options)
+    assert words in str(caught.value)
+
+
+def test_a_drawn_size_is_refused(tmp_path):
+    focal = {"draw": "uniform", "low": 2000, "high": 2400}
+    path = write(tmp_path / "tiny.yaml", **{"scene.rig.cameras.0.focal_length_px": focal})
+    with pytest.raises(InputError, match="--size: the focal length of a camera is drawn"):
+        loaded(path, size="48x36")
+    assert mapping()["scene"]["image"]["window_px"] == [96, 72]
