@@ -16,6 +16,8 @@ from .dataset.run import generate as generate
 from .dataset.sheet import preview as preview
 from .dataset.spec import DatasetSpec as DatasetSpec
 from .dataset.validate import validate as validate
+from .design.fit import EyeFit as EyeFit
+from .design.fit import fit_eye as fit_eye
 from .design.information import Information as Information
 from .design.information import information as information
 from .design.noise import FeatureNoise as FeatureNoise

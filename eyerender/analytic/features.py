@@ -183,7 +183,7 @@ def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class View:
-    """View of one camera on a chunk of turned eyes: x_cam = R x_eye + t for each, and the camera in the eye frame."""
+    """View of one camera on a batch of turned eyes: x_cam = R x_eye + t for each, and the camera in the eye frame."""
 
     rotation: Floats
     translation: Floats
@@ -193,6 +193,7 @@ class View:
 
     @classmethod
     def of(cls, eye: EyeModel, poses: Poses, position_mm: Floats, camera: PinholeCamera) -> View:
+        """View of a camera on turned eyes at places (n, 3) in the world."""
         turn, shift = rigid_motion(poses, eye)
         whole = shift + position_mm
         rotation, translation, at = np.empty(turn.shape), np.empty(shift.shape), np.empty(shift.shape[::-1])

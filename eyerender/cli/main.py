@@ -24,6 +24,7 @@ from . import (  # noqa: F401
     environment,
     export,
     eyes,
+    fit_eye,
     gaze,
     images,
     live,

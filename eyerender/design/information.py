@@ -228,7 +228,9 @@ def information(
     for person in np.unique(case.instants.person):
         rows = np.flatnonzero(case.instants.person == person)
         at = index.take(rows)
-        found.append(_of_person(EYES[int(at.eye[0])], (at.fixation, at.head), matrices[rows], slopes[rows], unknowns))
+        found.append(
+            eye_information(EYES[int(at.eye[0])], (at.fixation, at.head), matrices[rows], slopes[rows], unknowns)
+        )
     return Information(tuple(found))
 
 
@@ -285,7 +287,9 @@ def inverse(matrix: Floats) -> Inverse:
     return Inverse(covariance=covariance, unseen=basis)
 
 
-def _of_person(eye: str, at: tuple[Ints, Ints], matrices: Floats, gaze: Floats, unknowns: Unknowns) -> EyeInformation:
+def eye_information(
+    eye: str, at: tuple[Ints, Ints], matrices: Floats, gaze: Floats, unknowns: Unknowns
+) -> EyeInformation:
     """Covariances of one eye from the information of its instants."""
     count = len(matrices)
     joint, free = joint_matrix(matrices, unknowns)

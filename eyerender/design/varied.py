@@ -91,9 +91,9 @@ class Slopes:
 
     Attributes:
         images: the features.
-        outline: (n, k, 2, 15) px per rad or mm.
+        outline: (n, k, 2, 15) px per rad or mm; 0 where a point does not exist.
         glints: (n, m, 2, 15).
-        outline_ok: (n, k) whether a point and its derivatives exist.
+        outline_ok: (n, k) whether a point is on the sensor, and its derivatives exist.
         glint_ok: (n, m).
     """
 
@@ -227,15 +227,15 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int) -> Slopes:
     traced = images_of(views.take(every), all_theta, boundary_points)
 
     def slopes(points: Floats, ok: Bools) -> tuple[Floats, Bools]:
-        points, ok = points.reshape(len(shifts), n, *points.shape[1:]), ok.reshape(len(shifts), n, -1)
+        points = points.reshape(len(shifts), n, *points.shape[1:])
         step = STEPS[:, None, None, None]
         central = (points[1 : 1 + count] - points[1 + count :]) / (2.0 * step)
         out = np.zeros((*points.shape[1:], COUNT))
         out[..., TRACED] = np.moveaxis(central, 0, -1)
         out[..., POSITION] = out[..., SLIPPAGE]
         out[..., ROTATION] = np.einsum("nkax,nx->nka", out[..., SLIPPAGE], _by_rotation(theta))
-        good: Bools = np.all(ok, axis=0)
-        return np.where(good[..., None, None], out, 0.0), good
+        exists: Bools = np.isfinite(out).all(axis=(2, 3))
+        return np.where(exists[..., None, None], out, 0.0), exists & ok[:n]
 
     outline, outline_ok = slopes(traced.outline_px, traced.outline_ok)
     glints, glint_ok = slopes(traced.glints_px, traced.glint_ok)

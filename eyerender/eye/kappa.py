@@ -45,7 +45,7 @@ def kappa_deg(eye: EyeModel) -> tuple[float, float]:
         InputError: the cornea has no pupillary axis.
     """
     _, axis = pupillary_axis(eye)
-    horizontal, vertical = np.degrees(_angles(eye, eye.chief_ray.direction) - _angles(eye, axis))
+    horizontal, vertical = np.degrees(angles_of(eye, eye.chief_ray.direction) - angles_of(eye, axis))
     return float(horizontal), float(vertical)
 
 
@@ -61,7 +61,7 @@ def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
     """
     reason = "no place of the fovea gives this angle"
     _, axis = pupillary_axis(eye)
-    nasal, up = _angles(eye, axis) + np.radians(wanted_deg)
+    nasal, up = angles_of(eye, axis) + np.radians(wanted_deg)
     way = field_direction(np.array([_handed(eye) * nasal, up]))
     point, _ = _through_stop(eye, lambda _: way, reason)
     traced = trace(path_to_retina(eye), 1.0, point + _START_MM * way, -way)
@@ -104,7 +104,7 @@ def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: flo
         return (fovea_by_nodal_ray(eye, incident_node(eye), field, distance_mm) - wanted)[1:]
 
     # A nodal ray has the same direction on both sides, so it starts near that of the fovea from the node.
-    field = _angles(eye, normalize(incident_node(eye) - wanted)) * [_handed(eye), 1.0]
+    field = angles_of(eye, normalize(incident_node(eye) - wanted)) * [_handed(eye), 1.0]
     for _ in range(_STEPS):
         error = miss(field)
         if np.abs(error).max() < _SETTLED_MM:
@@ -148,7 +148,7 @@ def _through_stop(eye: EyeModel, way: Callable[[Floats], Floats], reason: str) -
     return ray(found.x)
 
 
-def _angles(eye: EyeModel, way: Floats) -> Floats:
+def angles_of(eye: EyeModel, way: Floats) -> Floats:
     """Angles (2,) rad of a direction from the optic axis, nasal and up: it is along (1, tan h, tan v)."""
     return np.asarray(np.arctan2([_handed(eye) * way[1], way[2]], way[0]))
 

@@ -17,6 +17,7 @@ from .estimate import ray_errors_deg as ray_errors_deg
 from .guestrin import GuestrinEizenman as GuestrinEizenman
 from .hennessey import Hennessey as Hennessey
 from .homography import Homography as Homography
+from .likelihood import MaximumLikelihood as MaximumLikelihood
 from .parameters import EyeParameters as EyeParameters
 from .parameters import ParameterBounds as ParameterBounds
 from .recalibration import Recalibration as Recalibration

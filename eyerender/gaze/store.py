@@ -25,6 +25,7 @@ from .estimate import GazeEstimator
 from .guestrin import GuestrinEizenman
 from .hennessey import Hennessey
 from .homography import Homography
+from .likelihood import PERSON_NUMBERS, MaximumLikelihood
 from .own import OwnEstimator
 from .parameters import MEAN_EYE, Calibration, EyeParameters
 from .predictions import predictions
@@ -40,12 +41,16 @@ FIT_SCHEMA = "eyerender/gaze-fit/2"
 
 
 EstimatorName = Literal[
-    "regression", "direction-regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman"
-]
+    "regression", "direction-regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman",
+    "maximum-likelihood",
+]  # fmt: skip
 NAMES: tuple[str, ...] = get_args(EstimatorName)
 
 
-BuiltIn = Regression | DirectionRegression | Homography | CrossRatio | GuestrinEizenman | Hennessey | ShihWuLiu
+BuiltIn = (
+    Regression | DirectionRegression | Homography | CrossRatio | GuestrinEizenman | Hennessey | ShihWuLiu
+    | MaximumLikelihood
+)  # fmt: skip
 
 
 class EstimatorSpec(Spec):
@@ -60,6 +65,8 @@ class EstimatorSpec(Spec):
     free_index: bool = False
     index: float | None = Field(default=None, ge=1.0, le=2.0)
     recalibration: Literal["angle", "screen", "none"] = "angle"
+    eye: str = "E2"
+    slippage_mm: Annotated[float, Field(ge=0, le=50)] = 3.0
 
     @classmethod
     def of(cls, estimator: GazeEstimator) -> EstimatorSpec:
@@ -77,6 +84,9 @@ class EstimatorSpec(Spec):
             key = "function" if isinstance(estimator.function, str) else "terms"
             options = {"name": "direction-regression", key: estimator.function, "feature": estimator.feature}
             bare = replace(estimator, fits={})
+        elif type(estimator) is MaximumLikelihood:
+            options = {"name": "maximum-likelihood", "eye": estimator.eye, "slippage_mm": estimator.slippage_mm}
+            bare = replace(estimator, persons={})
         elif type(estimator) is Homography:
             options, bare = {"name": "homography"}, replace(estimator, homographies={})
         elif type(estimator) is CrossRatio:
@@ -112,6 +122,8 @@ class EstimatorSpec(Spec):
             return directions
         if self.name == "homography":
             return Homography()
+        if self.name == "maximum-likelihood":
+            return MaximumLikelihood(self.eye, self.slippage_mm)
         if self.name == "cross-ratio":
             return CrossRatio()
         if self.name == "hennessey":
@@ -304,6 +316,10 @@ class _CrossRatioState(Spec):
     alpha: tuple[float, float, float, float]
 
 
+class _PersonState(Spec):
+    person: Annotated[tuple[float, ...], Field(min_length=PERSON_NUMBERS, max_length=PERSON_NUMBERS)]
+
+
 _Six = tuple[float, float, float, float, float, float]
 
 
@@ -338,6 +354,7 @@ _STATES: dict[type[BuiltIn], type[Spec]] = {
     GuestrinEizenman: _ModelState,
     Hennessey: _CorrectionState,
     ShihWuLiu: _CorrectionState,
+    MaximumLikelihood: _PersonState,
 }
 
 
@@ -367,6 +384,8 @@ def _state(estimator: BuiltIn) -> dict[str, Any]:
         found = {e: {"homography": H.tolist()} for e, H in estimator.homographies.items()}
     elif isinstance(estimator, CrossRatio):
         found = {e: {"alpha": a.tolist()} for e, a in estimator.alphas.items()}
+    elif isinstance(estimator, MaximumLikelihood):
+        found = {e: {"person": p.tolist()} for e, p in estimator.persons.items()}
     elif isinstance(estimator, GuestrinEizenman):
         found = {e: c.to_mapping() for e, c in estimator.calibrations.items()}
     else:
@@ -388,6 +407,8 @@ def _restored(estimator: BuiltIn, eyes: dict[int, Any]) -> BuiltIn:
         return replace(estimator, homographies=arrays("homography"))
     if isinstance(estimator, CrossRatio):
         return replace(estimator, alphas=arrays("alpha"))
+    if isinstance(estimator, MaximumLikelihood):
+        return replace(estimator, persons=arrays("person"))
     if isinstance(estimator, GuestrinEizenman):
         found = {}
         for e, state in eyes.items():

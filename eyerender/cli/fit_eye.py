@@ -1,0 +1,78 @@
+"""The command fit-eye: an eye and its gaze from a recording's features."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from .app import app
+from .options import Overwrite, Result
+from .output import emit
+
+
+@app.command(name="fit-eye")
+def fit_eye(
+    recording: Path,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    rig: str | None = None,
+    unknowns: Path | None = None,
+    eye: str = "E2",
+    columns: Path | None = None,
+    targets: bool = True,
+    robust: Literal["geman-mcclure", "huber", "none"] = "geman-mcclure",
+    outline_px: float = 0.1,
+    glint_px: float = 0.05,
+    overwrite: Overwrite = False,
+    json: Result = None,
+) -> int:
+    """Fit the eye behind a recording's features, and its gaze in every frame, with covariances.
+
+    The folder receives one eye file per eye (right.yaml, left.yaml), which every other command accepts, and fit.json:
+    gaze, pupil and slippage of every frame, what belongs to the person with its standard deviations, chi^2, and what
+    the recording does not show.
+
+    Args:
+        recording: Records as `features` or `extract` write them (JSON, JSONL), or a table (CSV).
+        output: The folder to write.
+        rig: A rig file or a scene for its rig (default: the rig in the recording).
+        unknowns: A YAML file with the keys of `er.Unknowns` (default: the priors of a population, 3 mm of slippage).
+        eye: The eye that the fit begins with and the mean of its priors: a name or an eye file.
+        columns: A YAML file that says what the columns of a table are.
+        targets: Use the known targets, which give the line of sight.
+        robust: Weights against wrong features.
+        outline_px: Standard deviation of one pixel of outline, where records have no covariance.
+        glint_px: Standard deviation of a glint along each axis, where records have none.
+    """
+    from ..design.fit import fit_eye as fit
+    from ..design.fitfolder import write_fits
+    from ..design.noise import FeatureNoise
+    from ..design.unknowns import Unknowns
+    from ..eye.catalogue import load_eye
+    from ..gaze.records import load_observations
+    from ..spec import read_yaml
+
+    observations, built = load_observations(recording, rig=rig, columns=columns)
+    given = None if unknowns is None else Unknowns.from_mapping(read_yaml(unknowns), source=str(unknowns))
+    noise = FeatureNoise.of(outline_px, glint_px, rig=built)
+    fits = fit(observations, built, given, prior=load_eye(eye), noise=noise, targets=targets, robust=robust)
+    found = write_fits(output, fits, overwrite=overwrite)
+    emit(found, _text(found, output), json)
+    return 0
+
+
+def _text(found: dict[str, Any], output: Path) -> str:
+    lines = []
+    for one in found["eyes"]:
+        lines.append(f"{one['eye']} eye: {len(one['frames'])} frames, chi^2 {one['chi2']:.1f} "
+                     f"for {one['degrees_of_freedom']} degrees of freedom")  # fmt: skip
+        for name, value in one["person"].items():
+            if value["deviation"] != 0.0:
+                spread = "not seen" if value["deviation"] is None else f"+- {value['deviation']:.4g}"
+                lines.append(f"  {name:<16} {value['change']:>+10.4f} {spread}")
+        if one["not_seen"]:
+            lines.append(f"  not seen: {', '.join(one['not_seen'])}")
+    return "\n".join([*lines, f"written to {output}"])

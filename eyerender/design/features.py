@@ -1,0 +1,230 @@
+"""Observed features against modelled ones: distances from the outline along its normal, and shifts of glints, whitened.
+
+An observed outline is a set of points: those of the record, or points of its ellipse. Their distances d from the
+modelled outline along its normal have the covariance that the noise gives (l px of outline have s^2 / l), or that of
+the record's ellipse. For a covariance C of the ellipse's parameters e, d = H de to first order, and the whitened
+distances are C^(-1/2) H^+ d.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..arrays import ArrayValue, Bools, Floats, Ints
+from ..observation import Observations
+from ..status import Status
+from .noise import FeatureNoise
+from .unknowns import COUNT
+from .varied import Images, Slopes
+
+ELLIPSE_POINTS, MOST_POINTS = 24, 40
+_NEWTON = 4
+_LEAST_RATIO = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Measured(ArrayValue):
+    """Observed features of n views.
+
+    Attributes:
+        outline_px: (n, k, 2) points of the outline; 0 where there are none.
+        outline_white: (n, k, k) whitening of their distances; 0 where there is no outline.
+        outline_size: (n,) number of independent distances.
+        glints_px: (n, m, 2) glint of each light; 0 where there is none.
+        glint_white: (n, m, 2, 2) whitening of their shifts; 0 where there is no glint.
+    """
+
+    outline_px: Floats
+    outline_white: Floats
+    outline_size: Ints
+    glints_px: Floats
+    glint_white: Floats
+
+    def take(self, rows: Ints) -> Measured:
+        """Some of the views."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in self.__slots__})
+
+    @property
+    def has_glint(self) -> Bools:
+        """Which glints were observed, (n, m)."""
+        return np.asarray(self.glint_white.any(axis=(2, 3)))
+
+    @property
+    def count(self) -> int:
+        """Number of independent numbers."""
+        return int(self.outline_size.sum() + 2 * self.has_glint.sum())
+
+
+def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Measured:
+    """Features of observations with their covariances, or `noise` where they have none."""
+    camera = np.maximum(observations.index.camera, 0)
+    points, white, size = _outlines(observations, noise.outline_px[camera])
+    glints, weights = np.zeros((len(camera), lights, 2)), np.zeros((len(camera), lights, 2, 2))
+    for light in range(lights):
+        place, found = observations.glints.of_light(light)
+        deviation = noise.glint_px[camera, light]
+        covariance = np.where(found, deviation, 1.0)[:, None, None] ** 2 * np.eye(2)
+        given = _covariance_of(observations, light)
+        own = found & np.isfinite(given).all(axis=(1, 2))
+        covariance[own] = given[own]
+        usable = found & np.isfinite(covariance).all(axis=(1, 2))
+        weights[usable, light] = _whitening(covariance[usable])
+        glints[usable, light] = place[usable]
+    return Measured(outline_px=points, outline_white=white, outline_size=size, glints_px=glints, glint_white=weights)
+
+
+def _covariance_of(observations: Observations, light: int) -> Floats:
+    """Covariance (n, 2, 2) of one light's glint; NaN where there is none."""
+    glints = observations.glints
+    out = np.full((len(observations), 2, 2), np.nan)
+    if glints.light.shape[1]:
+        here = (glints.light == light) & glints.ok
+        rows = np.flatnonzero(here.any(axis=1))
+        out[rows] = glints.covariance[rows, here[rows].argmax(axis=1)]
+    return out
+
+
+def _whitening(covariance: Floats) -> Floats:
+    """Inverse square roots (n, q, q) of covariances, W^T W = C^-1; directions of no weight are left out."""
+    values, vectors = np.linalg.eigh(covariance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.where(values > 0, 1.0 / np.sqrt(values), 0.0)
+    return np.asarray(root[..., None] * np.swapaxes(vectors, -1, -2))
+
+
+def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Floats, Ints]:
+    """Points of the outlines, the whitening of their distances, and how many of these are independent."""
+    pupil = observations.pupil
+    given = pupil.points_px[:, :: max(1, -(-pupil.points_px.shape[1] // MOST_POINTS))]
+    traced = np.isfinite(given).all(axis=2).sum(axis=1) >= 6
+    of_ellipse = ~traced & (pupil.status == Status.OK) & np.isfinite(pupil.centre_px).all(axis=1)
+    width = max(given.shape[1] if traced.any() else 0, ELLIPSE_POINTS if of_ellipse.any() else 0)
+    n = len(observations)
+    points, white, size = np.zeros((n, width, 2)), np.zeros((n, width, width)), np.zeros(n, dtype=np.int64)
+    for row in np.flatnonzero(traced):
+        good = np.flatnonzero(np.isfinite(given[row]).all(axis=1))
+        points[row, good] = given[row, good]
+        gaps = np.linalg.norm(np.diff(given[row, good], axis=0, append=given[row, good[:1]]), axis=1)
+        length = (gaps + np.roll(gaps, 1)) / 2.0
+        white[row, good, good] = np.sqrt(length) / deviation[row]
+        size[row] = len(good)
+    covered = np.isfinite(pupil.covariance).all(axis=(1, 2))
+    for row in np.flatnonzero(of_ellipse):
+        at, basis, speed = _of_ellipse(pupil.centre_px[row], pupil.semi_axes_px[row], float(pupil.angle_rad[row]))
+        points[row, :ELLIPSE_POINTS] = at
+        if covered[row]:
+            part = _whitening(pupil.covariance[row]) @ np.linalg.pinv(basis, rcond=_LEAST_RATIO)
+        else:
+            part = np.diag(np.sqrt(speed * 2.0 * np.pi / ELLIPSE_POINTS) / deviation[row])
+        white[row, : len(part), :ELLIPSE_POINTS] = part
+        size[row] = len(part)
+    return points, white, size
+
+
+def _of_ellipse(centre: Floats, axes: Floats, angle: float) -> tuple[Floats, Floats, Floats]:
+    """Points of an ellipse, their normal shifts by (cx, cy, a, b, angle) (k, 5), and |dp / df| for its parameter f."""
+    f = 2.0 * np.pi * np.arange(ELLIPSE_POINTS) / ELLIPSE_POINTS
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    circle = np.stack([np.cos(f), np.sin(f)], axis=-1)
+    about = (circle * axes) @ turn.T
+    along = (np.stack([-np.sin(f), np.cos(f)], axis=-1) * axes) @ turn.T
+    speed = np.linalg.norm(along, axis=1)
+    normal = np.stack([along[:, 1], -along[:, 0]], axis=-1) / speed[:, None]
+    by_a, by_b = circle[:, :1] * turn[:, 0], circle[:, 1:] * turn[:, 1]
+    by_angle = np.stack([-about[:, 1], about[:, 0]], axis=-1)
+    shifts = [normal[:, 0], normal[:, 1], *(np.sum(normal * by, axis=1) for by in (by_a, by_b, by_angle))]
+    return centre + about, np.stack(shifts, axis=-1), speed
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Residuals:
+    """Whitened residuals of n views and their derivatives by the unknowns.
+
+    Attributes:
+        outline: (n, k).
+        glints: (n, m, 2).
+        outline_slopes: (n, k, 15); empty where not asked for.
+        glint_slopes: (n, m, 2, 15).
+        outline_size: (n,) number of independent distances that the model has, too.
+        glint_ok: (n, m) glints that are observed and that the model has.
+    """
+
+    outline: Floats
+    glints: Floats
+    outline_slopes: Floats
+    glint_slopes: Floats
+    outline_size: Ints
+    glint_ok: Bools
+
+
+def residuals(seen: Measured, model: Images | Slopes) -> Residuals:
+    """Compare observed features with a model; what the model does not show has residuals 0."""
+    images = model.images if isinstance(model, Slopes) else model
+    whole = np.isfinite(images.outline_px).all(axis=(1, 2)) & (seen.outline_size > 0)
+    k, m = seen.outline_px.shape[1], seen.glints_px.shape[1]
+    outline, by_outline = np.zeros((len(whole), k)), np.zeros((len(whole), k, COUNT))
+    rows = np.flatnonzero(whole)
+    if len(rows):
+        slopes = model.outline[rows] if isinstance(model, Slopes) else None
+        distance, by = outline_distances(images.outline_px[rows], slopes, seen.outline_px[rows])
+        outline[rows] = np.einsum("nij,nj->ni", seen.outline_white[rows], distance)
+        if by is not None:
+            by_outline[rows] = seen.outline_white[rows] @ by
+    ok = seen.has_glint & np.isfinite(images.glints_px).all(axis=2)
+    gap = np.where(ok[..., None], seen.glints_px - images.glints_px, 0.0)
+    glints = np.einsum("nmij,nmj->nmi", seen.glint_white, gap)
+    by_glints = np.zeros((len(whole), m, 2, COUNT))
+    if isinstance(model, Slopes):
+        by_glints = np.where(ok[..., None, None], -seen.glint_white @ model.glints, 0.0)
+    return Residuals(
+        outline=outline,
+        glints=glints,
+        outline_slopes=by_outline,
+        glint_slopes=by_glints,
+        outline_size=np.where(whole, seen.outline_size, 0),
+        glint_ok=ok,
+    )
+
+
+def outline_distances(model_px: Floats, slopes: Floats | None, observed_px: Floats) -> tuple[Floats, Floats | None]:
+    """Signed distances (n, k) of observed points from modelled outlines along their normals, and the derivatives.
+
+    The outline through the modelled points is their trigonometric interpolation p(f). The foot of a point o satisfies
+    (p(f) - o) . p'(f) = 0 (Newton's steps from the nearest point), and its distance is n . (o - p).
+
+    Args:
+        model_px: (n, j, 2) points, evenly spaced in the parameter.
+        slopes: (n, j, 2, 15) their derivatives, or None.
+        observed_px: (n, k, 2).
+    """
+    count = model_px.shape[1]
+    waves = np.arange((count - 1) // 2 + 1)
+
+    def harmonics(values: Floats) -> Floats:
+        found = np.fft.rfft(values, axis=1)[:, : len(waves)] / count
+        found[:, 1:] *= 2.0
+        return np.asarray(found)
+
+    parts = harmonics(model_px)
+    gaps = np.linalg.norm(observed_px[:, :, None] - model_px[:, None], axis=-1)
+    f = 2.0 * np.pi / count * np.argmin(gaps, axis=2)
+    first, second = 1j * waves[:, None] * parts, -(waves[:, None] ** 2) * parts
+    for _ in range(_NEWTON):
+        wave = np.exp(1j * f[..., None] * waves)
+        point, along, bend = ((wave @ c).real for c in (parts, first, second))
+        gap = point - observed_px
+        square = np.sum(along**2, axis=-1)
+        slope = square + np.sum(gap * bend, axis=-1)
+        step = np.sum(gap * along, axis=-1) / np.where(slope > 0.2 * square, slope, square)
+        f = f - np.clip(step, -0.3, 0.3)
+    wave = np.exp(1j * f[..., None] * waves)
+    point, along = (wave @ parts).real, (wave @ first).real
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1) / np.linalg.norm(along, axis=-1)[..., None]
+    distance = np.sum(normal * (observed_px - point), axis=-1)
+    if slopes is None:
+        return distance, None
+    by = harmonics(slopes.reshape(*model_px.shape[:2], -1))
+    moved = (wave @ by).real.reshape(*f.shape, 2, -1)
+    return distance, -np.einsum("nkx,nkxa->nka", normal, moved)

@@ -1,0 +1,552 @@
+"""Fit eyes to features: Gauss-Newton through the analytic observer, which is maximum likelihood for Gaussian noise.
+
+    minimise  sum_b w_b |W_b (y_b - h_b(theta))|^2 + |(theta - theta_0) / sigma|^2                                  (4)
+
+over the unknowns of all frames and of the person. The blocks b are whole outlines, single glints, and the angles
+between line of sight and known targets; W_b whitens them. The weights w_b are Huber's or those of Geman and McClure
+with a flat core: 1 while a block's root mean square t of whitened residuals is at most 3, then 3 / t or (18 / (9 +
+t^2))^2. While all blocks of an instant are far off, t counts relative to their median, at most 1000 times in the first
+step and half as much in each that follows. Steps are damped by Levenberg's rule. The normal equations are arrow-shaped:
+the unknowns of a frame meet those of other frames only through the person's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from ..arrays import ArrayValue, Bools, Floats, Ints
+from ..errors import InputError
+from ..eye.catalogue import load_eye
+from ..eye.spec import EyeSpec
+from ..observation import EYES, Observations
+from ..rig.rig import RigGeometry, RigLike
+from .eyefile import changed_file
+from .features import Measured, Residuals, measured, residuals
+from .information import EyeInformation, eye_information
+from .noise import FeatureNoise
+from .unknowns import (
+    ANGLES,
+    AZIMUTH,
+    COUNT,
+    ELEVATION,
+    LOCAL,
+    PERSON,
+    PUPIL,
+    Unknowns,
+)
+from .varied import (
+    Views,
+    diameters_mm,
+    gaze_slopes,
+    images_of,
+    lines_of_sight,
+    slopes_of,
+    stacked_eyes,
+    target_misses,
+    target_slopes,
+)
+
+Robust = Literal["geman-mcclure", "huber", "none"]
+CORE = 3.0
+"""Root mean square of a block's whitened residuals up to which it has its full weight."""
+_STEPS, _SETTLED = 40, 1e-10
+_POINTS = 30
+_START_AZIMUTH, _START_ELEVATION = np.radians(np.linspace(-36, 36, 9)), np.radians(np.linspace(-24, 24, 7))
+_FAR_PX = 60.0
+_PUPIL_MM = (0.5, 9.5)
+_FIRST_SCALE = 1000.0
+_MOST_RAD, _STUCK, _RELATIVE, _TINY = 0.25, 1e12, 1e-10, 1e-16
+DEFAULT_OUTLINE_PX, DEFAULT_GLINT_PX = 0.1, 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Problem:
+    """What is fitted: the views with their features, one eye.
+
+    Attributes:
+        views: n views.
+        seen: their features.
+        instant: (n,) instant of each view.
+        instants: i views, one for each instant.
+        target_mm: (i, 3) known targets; NaN where there is none.
+        fixation_rad: noise of fixation per axis.
+        centre: (i, 15) means of the priors.
+        precision: (15,) of the priors.
+        free: (15,) what is fitted.
+        robust: the weights.
+    """
+
+    views: Views
+    seen: Measured
+    instant: Ints
+    instants: Views
+    target_mm: Floats
+    fixation_rad: float
+    centre: Floats
+    precision: Floats
+    free: Bools
+    robust: Robust
+
+    @property
+    def shared(self) -> bool:
+        """Whether anything of the person is fitted."""
+        return bool(self.free[LOCAL:].any())
+
+    @property
+    def has_target(self) -> Bools:
+        """Which instants have a known target, (i,)."""
+        return np.asarray(np.isfinite(self.target_mm).all(axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class EyeFit(ArrayValue):
+    """One eye as fitted.
+
+    Attributes:
+        eye: right or left.
+        rows: (n,) rows of the observations.
+        instant: (n,) instant of each row.
+        theta: (i, 15) unknowns of each instant (`design.unknowns`), rad and mm.
+        origin_mm: (i, 3) where the line of sight leaves the cornea.
+        direction: (i, 3) unit direction of the line of sight.
+        known: covariances, and what is not seen.
+        chi2: (i,) squared whitened residuals with the weights of each instant, priors included.
+        dof: degrees of freedom of the sum of `chi2`.
+        outline_weight: (n,) robust weight of each outline; NaN without one.
+        glint_weight: (n, m) of each glint.
+        converged: whether the steps settled, (i,).
+        prior: the eye that the fit began with.
+    """
+
+    eye: str
+    rows: Ints
+    instant: Ints
+    theta: Floats
+    origin_mm: Floats
+    direction: Floats
+    known: EyeInformation
+    chi2: Floats
+    dof: int
+    outline_weight: Floats
+    glint_weight: Floats
+    converged: Bools
+    prior: EyeSpec
+
+    @property
+    def spec(self) -> EyeSpec:
+        """The fitted eye as a file.
+
+        Raises:
+            InputError: such an eye cannot exist, as with a pupil behind the front of the lens.
+        """
+        return changed_file(self.prior, self.theta[0])
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Convert to plain values; angles in degrees."""
+        degrees = np.where(ANGLES, np.degrees(1.0), 1.0)
+        shared, spread = self.theta[0, LOCAL:] * degrees[LOCAL:], self.known.person_deviation * degrees[LOCAL:]
+
+        def number(value: float) -> float | None:
+            return float(value) if np.isfinite(value) else None
+
+        return {
+            "eye": self.eye,
+            "chi2": float(self.chi2.sum()),
+            "degrees_of_freedom": self.dof,
+            "converged": bool(self.converged.all()),
+            "not_seen": list(self.known.unseen),
+            "person": {
+                name: {"change": float(value), "deviation": number(sd)}
+                for name, value, sd in zip(PERSON, shared, spread, strict=True)
+            },
+            "frames": [
+                {
+                    "rows": self.rows[self.instant == k].tolist(),
+                    "azimuth_deg": float(np.degrees(self.theta[k, AZIMUTH])),
+                    "elevation_deg": float(np.degrees(self.theta[k, ELEVATION])),
+                    "pupil_mm": float(self.theta[k, PUPIL]),
+                    "slippage_mm": self.theta[k, 3:6].tolist(),
+                    "origin_mm": self.origin_mm[k].tolist(),
+                    "direction": self.direction[k].tolist(),
+                    "gaze_deviation_deg": number(self.known.gaze_deg[k]),
+                    "chi2": float(self.chi2[k]),
+                }
+                for k in range(len(self.theta))
+            ],
+        }
+
+
+def fit_eye(
+    observations: Observations,
+    rig: RigLike,
+    unknowns: Unknowns | None = None,
+    *,
+    prior: EyeSpec | str = "E2",
+    noise: FeatureNoise | None = None,
+    targets: bool = True,
+    robust: Robust = "geman-mcclure",
+    start: Floats | None = None,
+) -> tuple[EyeFit, ...]:
+    """Fit the gaze of every frame and the eye behind them to features, one fit for each observed eye.
+
+    Args:
+        observations: of any observer, or of a table; each needs the approximate position of its eye.
+        rig: their rig.
+        unknowns: what is fitted, with which priors; default: `Unknowns.population()`.
+        prior: the eye that the fit begins with, and the mean of all priors of the person.
+        noise: of features whose covariance is null; default: 0.1 px for one px of outline, 0.05 px for a glint.
+        targets: use the known targets, with the noise of fixation.
+        robust: the weights against wrong features.
+        start: (i, 15) unknowns to begin with, for one eye; default: a search.
+
+    Raises:
+        InputError: there is nothing to fit, or an eye has no position.
+    """
+    unknowns = Unknowns.population() if unknowns is None else unknowns
+    spec = load_eye(prior) if isinstance(prior, str) else prior
+    built = rig.build()
+    noise = FeatureNoise.of(DEFAULT_OUTLINE_PX, DEFAULT_GLINT_PX, rig=built) if noise is None else noise
+    options = Options(targets=targets, robust=robust, start=start)
+    return tuple(
+        fit_one(observations, np.flatnonzero(observations.index.eye == eye), built, spec, unknowns, noise, options)
+        for eye in np.unique(observations.index.eye)
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """How a fit is done, see `fit_eye`; `person` (9,) are numbers of the person that stand in place of the prior's."""
+
+    targets: bool = True
+    robust: Robust = "geman-mcclure"
+    start: Floats | None = None
+    person: Floats | None = None
+
+
+def instants_of(observations: Observations) -> Ints:
+    """Number the instants (n,) of observations of one eye: the k-th frames of all cameras of a fixation are one."""
+    index = observations.index
+    place = np.stack([index.head, index.fixation, index.camera], axis=-1)
+    turn = np.zeros(len(index), dtype=np.int64)
+    for row in np.unique(place, axis=0):
+        same = (place == row).all(axis=1)
+        turn[same] = np.arange(same.sum())
+    keys = np.stack([index.head, index.fixation, turn], axis=-1)
+    return np.asarray(np.unique(keys, axis=0, return_inverse=True)[1]).reshape(-1)
+
+
+def fit_one(
+    observations: Observations,
+    rows: Ints,
+    rig: RigGeometry,
+    spec: EyeSpec,
+    unknowns: Unknowns,
+    noise: FeatureNoise,
+    options: Options,
+) -> EyeFit:
+    """Fit one eye."""
+    mine = observations.take(rows)
+    problem = problem_of(mine, rig, spec, unknowns, noise, options)
+    theta = start_of(problem) if options.start is None else np.array(options.start)
+    theta, converged = solve(problem, theta)
+    if options.robust != "none" and (other := without_wrong_outlines(problem, theta)) is not None:
+        theta, converged = solve(problem, other)
+    return _result(mine, rows, problem, (theta, converged), (spec, unknowns))
+
+
+def problem_of(
+    mine: Observations, rig: RigGeometry, spec: EyeSpec, unknowns: Unknowns, noise: FeatureNoise, options: Options
+) -> Problem:
+    """Set up the fit of one eye.
+
+    Raises:
+        InputError: there is nothing to fit, or the eye has no position.
+    """
+    index = mine.index
+    side = EYES[max(int(index.eye[0]), 0)] if len(index) else "right"
+    seen = measured(mine, noise, len(rig.lights))
+    if not seen.count:
+        raise InputError(f"hold neither a pupil nor a glint with a known light of the {side} eye", path="observations")
+    position = index.eye_position_mm + np.nan_to_num(index.head_mm)
+    if not np.isfinite(position).all():
+        raise InputError("is needed by a fit, at least roughly", path="eye_position_mm")
+    eyes = stacked_eyes([spec.build(eye="left" if side == "left" else "right")])
+    instant = instants_of(mine)
+    first = np.unique(instant, return_index=True)[1]
+    camera = np.maximum(index.camera, 0)
+    views = Views(eyes=eyes, person=np.zeros(len(mine), np.int64), position_mm=position, camera=camera, rig=rig)
+    centre = np.zeros((len(first), COUNT))
+    centre[:, PUPIL] = diameters_mm(eyes)[0]
+    if options.person is not None:
+        centre[:, LOCAL:] = options.person
+    target = np.array(index.target_mm[first]) if options.targets else np.full((len(first), 3), np.nan)
+    return Problem(
+        views=views,
+        seen=seen,
+        instant=instant,
+        instants=views.take(first),
+        target_mm=target,
+        fixation_rad=float(np.radians(noise.fixation_deg)),
+        centre=centre,
+        precision=unknowns.precision(),
+        free=unknowns.free(),
+        robust=options.robust,
+    )
+
+
+def start_of(problem: Problem) -> Floats:
+    """Unknowns (i, 15) to begin with: the best of a grid of directions for the pupil's centre and the glints."""
+    seen, n = problem.seen, len(problem.views)
+    azimuth, elevation = (a.ravel() for a in np.meshgrid(_START_AZIMUTH, _START_ELEVATION))
+    count = len(azimuth)
+    theta = np.tile(problem.centre[problem.instant], (count, 1))
+    theta[:, AZIMUTH], theta[:, ELEVATION] = np.repeat(azimuth, n), np.repeat(elevation, n)
+    images = images_of(problem.views.take(np.tile(np.arange(n), count)), theta, 6)
+    centre = images.outline_px.mean(axis=1).reshape(count, n, 2)
+    has: Bools = np.any(seen.outline_white, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        own = np.sum(seen.outline_px * has[..., None], axis=1) / has.sum(axis=1)[:, None]
+    gaps = [np.linalg.norm(centre - own, axis=-1)]
+    gaps += list(np.moveaxis(np.linalg.norm(images.glints_px.reshape(count, n, -1, 2) - seen.glints_px, axis=-1), 2, 0))
+    used = np.concatenate([np.any(has, axis=1)[None], seen.has_glint.T])
+    miss = np.minimum(np.nan_to_num(np.array(gaps), nan=_FAR_PX), _FAR_PX)
+    cost = np.zeros((count, len(problem.centre)))
+    np.add.at(cost.T, problem.instant, np.einsum("gcn,gn->nc", miss, used.astype(float)))
+    best = np.argmin(cost, axis=0)
+    out = problem.centre.copy()
+    out[:, AZIMUTH], out[:, ELEVATION] = azimuth[best], elevation[best]
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Weights:
+    """Robust weights of outlines (n,) and of glints (n, m)."""
+
+    outline: Floats
+    glints: Floats
+
+
+def weights_of(problem: Problem, found: Residuals, most: float = 1.0) -> Weights:
+    """Weights of all blocks; residuals count relative to the median of their instant, at most `most` times."""
+    outline = np.sqrt(np.sum(found.outline**2, axis=1) / np.maximum(found.outline_size, 1))
+    glints = np.sqrt(np.sum(found.glints**2, axis=2) / 2.0)
+    if problem.robust == "none":
+        return Weights(outline=np.ones_like(outline), glints=np.ones_like(glints))
+    at = np.concatenate([problem.instant, np.repeat(problem.instant, glints.shape[1])])
+    there = np.concatenate([found.outline_size > 0, found.glint_ok.ravel()])
+    middle = _medians(at[there], np.concatenate([outline, glints.ravel()])[there], len(problem.centre))
+    scale = np.clip(middle, 1.0, most)
+    by_view = scale[problem.instant]
+    weigh = _huber if problem.robust == "huber" else _geman_mcclure
+    return Weights(outline=weigh(outline / by_view), glints=weigh(glints / by_view[:, None]))
+
+
+def _medians(group: Ints, values: Floats, count: int) -> Floats:
+    """Median (count,) of the values of each group; 0 of an empty one."""
+    order = np.lexsort((values, group))
+    sizes = np.bincount(group, minlength=count)
+    middle = np.cumsum(sizes) - sizes + sizes // 2
+    some = sizes > 0
+    out = np.zeros(count)
+    out[some] = values[order][middle[some]]
+    return out
+
+
+def _huber(t: Floats) -> Floats:
+    """1 in the core, CORE / t outside."""
+    return np.asarray(CORE / np.maximum(t, CORE))
+
+
+def _geman_mcclure(t: Floats) -> Floats:
+    """1 in the core, (2 CORE^2 / (CORE^2 + t^2))^2 outside."""
+    return np.asarray((2.0 * CORE**2 / (CORE**2 + np.maximum(t, CORE) ** 2)) ** 2)
+
+
+def costs_of(problem: Problem, theta: Floats, found: Residuals, weights: Weights) -> tuple[Floats, Floats]:
+    """Equation (4): cost (i,) of each instant, and that of the person's prior."""
+    own = weights.outline * np.sum(found.outline**2, axis=1)
+    own = own + np.sum(weights.glints * np.sum(found.glints**2, axis=2), axis=1)
+    cost = np.zeros(len(theta))
+    np.add.at(cost, problem.instant, own)
+    rows = np.flatnonzero(problem.has_target)
+    if len(rows):
+        miss = target_misses(problem.instants.take(rows), theta[rows], problem.target_mm[rows])
+        cost[rows] += np.sum(miss**2, axis=1) / problem.fixation_rad**2
+    off = (theta - problem.centre) ** 2 * problem.precision
+    return cost + off[:, :LOCAL].sum(axis=1), off[0, LOCAL:].sum()
+
+
+def equations_of(problem: Problem, theta: Floats, found: Residuals, weights: Weights) -> tuple[Floats, Floats]:
+    """Information (i, 15, 15) of each instant without priors, and half of the negative gradient (i, 15)."""
+    n = len(problem.views)
+    roots = np.sqrt(weights.outline)[:, None], np.sqrt(weights.glints)[..., None]
+    slopes = np.concatenate(
+        [found.outline_slopes * roots[0][..., None], (found.glint_slopes * roots[1][..., None]).reshape(n, -1, COUNT)],
+        axis=1,
+    )
+    values = np.concatenate([found.outline * roots[0], (found.glints * roots[1]).reshape(n, -1)], axis=1)
+    matrix, vector = np.zeros((len(theta), COUNT, COUNT)), np.zeros((len(theta), COUNT))
+    np.add.at(matrix, problem.instant, np.swapaxes(slopes, 1, 2) @ slopes)
+    np.add.at(vector, problem.instant, -np.einsum("nka,nk->na", slopes, values))
+    rows = np.flatnonzero(problem.has_target)
+    if len(rows):
+        at = problem.instants.take(rows)
+        miss = target_misses(at, theta[rows], problem.target_mm[rows]) / problem.fixation_rad
+        by = target_slopes(at, theta[rows], problem.target_mm[rows]) / problem.fixation_rad
+        matrix[rows] += np.swapaxes(by, 1, 2) @ by
+        vector[rows] -= np.einsum("nca,nc->na", by, miss)
+    return matrix, vector
+
+
+def arrow_step(problem: Problem, matrix: Floats, vector: Floats, theta: Floats, damping: Floats) -> Floats:
+    """Damped Gauss-Newton step (i, 15) of the arrow-shaped normal equations.
+
+    With blocks A_i of the frames, B_i to the person and C of the person, the person's step is that of the Schur
+    complement C - sum B_i^T A_i^-1 B_i, and A_i x_i = a_i - B_i y gives the frames'.
+
+    Args:
+        problem: the fit.
+        matrix: (i, 15, 15) information without priors.
+        vector: (i, 15).
+        theta: (i, 15).
+        damping: (i,) Levenberg's factors.
+    """
+    off = (problem.centre - theta) * problem.precision
+    local, person = np.flatnonzero(problem.free[:LOCAL]), LOCAL + np.flatnonzero(problem.free[LOCAL:])
+    step = np.zeros_like(theta)
+    a = matrix[:, local[:, None], local] + np.diag(problem.precision[local])
+    lift = np.einsum("iaa->ia", a) * damping[:, None]
+    a = a + (lift + 1e-12 * np.einsum("iaa->ia", a).max(axis=1, initial=1.0)[:, None])[:, None] * np.eye(len(local))
+    right = vector[:, local] + off[:, local]
+    if not len(person):
+        step[:, local] = np.linalg.solve(a, right[..., None])[..., 0]
+        return step
+    b = matrix[:, local[:, None], person]
+    c = matrix[:, person[:, None], person].sum(axis=0) + np.diag(problem.precision[person])
+    c = c + np.diag(np.diag(c) * damping.max() + 1e-12 * max(np.diag(c).max(), 1.0))
+    inner = np.linalg.solve(a, np.concatenate([b, right[..., None]], axis=2))
+    schur = c - np.einsum("iab,iac->bc", b, inner[..., :-1])
+    shared = np.linalg.lstsq(schur, vector[:, person].sum(axis=0) + off[0, person] - np.einsum(
+        "iab,ia->b", b, inner[..., -1]
+    ), rcond=1e-13)[0]  # fmt: skip
+    step[:, person] = shared
+    step[:, local] = inner[..., -1] - inner[..., :-1] @ shared
+    return step
+
+
+def solve(problem: Problem, theta: Floats, steps: int = _STEPS) -> tuple[Floats, Bools]:
+    """Minimise equation (4) from `theta` (i, 15); returns the unknowns, and which instants settled."""
+    theta, settled = theta.copy(), np.zeros(len(theta), dtype=bool)
+    damping = np.full(len(theta), 1e-3)
+    for count in range(steps):
+        most = max(1.0, _FIRST_SCALE * 0.5**count)
+        found = residuals(problem.seen, slopes_of(problem.views, theta[problem.instant], _POINTS))
+        weights = weights_of(problem, found, most)
+        matrix, vector = equations_of(problem, theta, found, weights)
+        step = _limited(problem, arrow_step(problem, matrix, vector, theta, damping))
+        trial = theta + step
+        trial[:, PUPIL] = np.clip(trial[:, PUPIL], *_PUPIL_MM)
+        good, gain = _improves(problem, (theta, found), trial, weights)
+        theta = np.where(good[:, None], trial, theta)
+        damping = np.where(good, damping / 10.0, damping * 10.0)
+        settled |= (good & gain) | (np.abs(step).max(axis=1) < _SETTLED) | (damping > _STUCK)
+        if problem.robust != "none" and most > 1.0 and not _all_in_core(weights):
+            settled[:] = False
+        if settled.all():
+            break
+    return theta, settled
+
+
+def _all_in_core(weights: Weights) -> bool:
+    """Whether every block has its full weight."""
+    return bool((weights.outline == 1.0).all() and (weights.glints == 1.0).all())
+
+
+def without_wrong_outlines(problem: Problem, theta: Floats) -> Floats | None:
+    """Another start, where the glints of an instant agree without its outline; None where there is no such instant.
+
+    An outline has many points, so a wrong one draws the gaze along, and all glints look wrong together. Whichever
+    leaves fewer blocks unexplained is kept.
+    """
+    now = unexplained(problem, theta)
+    if not (now > CORE**2).any():
+        return None
+    alone = problem.free & (np.arange(COUNT) < LOCAL)
+    seen = problem.seen
+    blind = replace(seen, outline_white=0.0 * seen.outline_white, outline_size=0 * seen.outline_size)
+    other, _ = solve(replace(problem, free=alone, seen=blind), theta)
+    better = unexplained(problem, other) < now - CORE
+    return np.where(better[:, None], other, theta) if better.any() else None
+
+
+def unexplained(problem: Problem, theta: Floats) -> Floats:
+    """Sum (i,) over the blocks of each instant of their mean squared residual, at most CORE^2 each."""
+    found = residuals(problem.seen, images_of(problem.views, theta[problem.instant], _POINTS))
+    outline = np.sum(found.outline**2, axis=1) / np.maximum(found.outline_size, 1)
+    own = np.minimum(outline, CORE**2) + np.minimum(np.sum(found.glints**2, axis=2) / 2.0, CORE**2).sum(axis=1)
+    out = np.zeros(len(theta))
+    np.add.at(out, problem.instant, own)
+    return out
+
+
+def _limited(problem: Problem, step: Floats) -> Floats:
+    """The steps (i, 15), shortened where a direction would turn by more than `_MOST_RAD`."""
+    share = np.minimum(1.0, _MOST_RAD / np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-12))
+    return np.asarray(step * (share.min() if problem.shared else share[:, None]))
+
+
+def _improves(problem: Problem, now: tuple[Floats, Residuals], trial: Floats, weights: Weights) -> tuple[Bools, Bools]:
+    """Which instants (i,) get no worse by a step and lose no feature, and where the gain no longer matters.
+
+    Where instants share a person, the answers are the same for all.
+    """
+    theta, found = now
+    new = residuals(problem.seen, images_of(problem.views, trial[problem.instant], _POINTS))
+    before, prior = costs_of(problem, theta, found, weights)
+    after, prior_after = costs_of(problem, trial, new, weights)
+    gone = (new.outline_size < found.outline_size) | (new.glint_ok.sum(axis=1) < found.glint_ok.sum(axis=1))
+    lost = np.zeros(len(theta), dtype=bool)
+    np.logical_or.at(lost, problem.instant, gone)
+    if problem.shared:
+        before, after = (np.full(len(theta), total) for total in (before.sum() + prior, after.sum() + prior_after))
+        lost[:] = lost.any()
+    limit = _RELATIVE * before + _TINY
+    return np.asarray((after <= before + limit) & ~lost), np.asarray(np.abs(after - before) <= limit)
+
+
+def _result(
+    mine: Observations, rows: Ints, problem: Problem, state: tuple[Floats, Bools], made: tuple[EyeSpec, Unknowns]
+) -> EyeFit:
+    """The fit with its covariances and its eye file."""
+    (theta, converged), (spec, unknowns) = state, made
+    found = residuals(problem.seen, slopes_of(problem.views, theta[problem.instant], _POINTS))
+    weights = weights_of(problem, found)
+    matrix, _ = equations_of(problem, theta, found, weights)
+    first = np.unique(problem.instant, return_index=True)[1]
+    index = mine.index.take(first)
+    side = EYES[max(int(index.eye[0]), 0)]
+    gaze = gaze_slopes(problem.instants, theta)
+    known = eye_information(side, (index.fixation, index.head), matrix, gaze, unknowns)
+    cost, prior = costs_of(problem, theta, found, weights)
+    measures = int(found.outline_size.sum() + 2 * found.glint_ok.sum() + 2 * problem.has_target.sum())
+    flat = int((problem.free & (problem.precision == 0))[:LOCAL].sum()) * len(theta)
+    flat += int((problem.free & (problem.precision == 0))[LOCAL:].sum())
+    point, way = lines_of_sight(problem.instants, theta)
+    return EyeFit(
+        eye=side,
+        rows=rows,
+        instant=problem.instant,
+        theta=theta,
+        origin_mm=point,
+        direction=way,
+        known=known,
+        chi2=cost + prior / len(cost),
+        dof=measures - flat,
+        outline_weight=np.where(found.outline_size > 0, weights.outline, np.nan),
+        glint_weight=np.where(found.glint_ok, weights.glints, np.nan),
+        converged=converged,
+        prior=spec,
+    )

@@ -1,0 +1,29 @@
+"""The folder of a fit: one eye file for each eye, and fit.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..folders.outfolder import staged
+from ..storage.files import write_json, write_text
+from .fit import EyeFit
+
+SCHEMA = "eyerender/fit-eye/1"
+FIT = "fit.json"
+
+
+def write_fits(output: str | Path, fits: Sequence[EyeFit], *, overwrite: bool = False) -> dict[str, Any]:
+    """Write right.yaml or left.yaml and fit.json into a folder; returns the content of the latter.
+
+    Raises:
+        InputError: the folder is not empty.
+    """
+    found = {"schema": SCHEMA, "eyes": [{**fit.to_mapping(), "file": f"{fit.eye}.yaml"} for fit in fits]}
+    specs = {fit.eye: fit.spec for fit in fits}
+    with staged(output, overwrite=overwrite) as folder:
+        for eye, spec in specs.items():
+            write_text(folder / f"{eye}.yaml", spec.to_yaml())
+        write_json(folder / FIT, found)
+    return found

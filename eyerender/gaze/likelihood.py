@@ -1,0 +1,109 @@
+"""Maximum likelihood: gaze by fits of a traced eye model to outlines and glints.
+
+A calibration fits the person (corneal radius and asphericity, pupil depth, kappa, centre of rotation) with the priors
+of a population, together with gaze, pupil and slippage of every frame. Afterwards these three are fitted for each
+frame alone. It is `design.fit` with equation (4) there, and approaches the Cramer-Rao bound of the rig where the model
+holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal, Self
+
+import numpy as np
+
+from ..arrays import Floats, frozen
+from ..errors import InputError
+from ..observation import EYES, Observations
+from ..rig.rig import RigLike
+from .estimate import GazePoints, GazeRays
+from .rays import screen_of
+
+if TYPE_CHECKING:
+    from ..design.fit import EyeFit
+
+PERSON_NUMBERS = 9
+
+
+@dataclass(frozen=True, slots=True)
+class MaximumLikelihood:
+    """Fits of an eye model to the features of every frame.
+
+    Args:
+        eye: name of the eye model that the fits begin with.
+        slippage_mm: standard deviation of the eye's position in a frame about the one in the record; 0: it is exact.
+        persons: numbers of the person (9,) by eye (0 right, 1 left), set by `fit`.
+    """
+
+    eye: str = "E2"
+    slippage_mm: float = 3.0
+    persons: Mapping[int, Floats] = field(default_factory=dict, repr=False)
+
+    def fit(self, observations: Observations, rig: RigLike) -> Self:
+        """Fit each eye's person to calibration targets.
+
+        Raises:
+            InputError: there are no targets or no features.
+        """
+        from ..design.unknowns import LOCAL, Unknowns
+
+        if not np.isfinite(observations.index.target_mm).all(axis=1).any():
+            raise InputError("a calibration needs records with target_mm")
+        unknowns = Unknowns.population(slippage_mm=self._slippage)
+        fits = self._fits(observations, rig, unknowns, targets=True)
+        return replace(self, persons={eye: frozen(found.theta[0, LOCAL:]) for eye, found in fits.items()})
+
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
+        """Estimate gaze points on the screen's plane."""
+        rig = rig.build()
+        screen = screen_of(rig, "predict_rays gives rays without one")
+        rays = self.predict_rays(observations, rig)
+        on_screen, hits = screen.intersect(rays.origin_mm, rays.direction)
+        reason = rays.reason.copy()
+        reason[(reason == None) & ~hits] = "the line of sight does not meet the screen"  # noqa: E711
+        return GazePoints.of(screen.world(on_screen), reason)
+
+    def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
+        """Estimate lines of sight; no screen is needed."""
+        from ..design.unknowns import Unknowns
+
+        if not self.persons:
+            raise InputError("the estimator is not calibrated; call fit first")
+        n = len(observations)
+        reason = np.full(n, None, dtype=object)
+        reason[~np.isin(observations.index.eye, list(self.persons))] = "this eye is not calibrated"
+        reason[(reason == None) & ~observations.pupil.ok] = "no pupil"  # noqa: E711
+        usable = np.flatnonzero(reason == None)  # noqa: E711
+        origin, direction = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+        if len(usable):
+            unknowns = Unknowns(slippage_mm=self._slippage)
+            for found in self._fits(observations.take(usable), rig, unknowns, targets=False).values():
+                rows = usable[found.rows]
+                origin[rows], direction[rows] = found.origin_mm[found.instant], found.direction[found.instant]
+        return GazeRays.of(origin, direction, reason)
+
+    @property
+    def _slippage(self) -> Literal["known"] | float:
+        return self.slippage_mm if self.slippage_mm > 0 else "known"
+
+    def _fits(self, observations: Observations, rig: RigLike, unknowns: object, *, targets: bool) -> dict[int, EyeFit]:
+        """Fits by eye; of known persons where the estimator has them and no targets are used."""
+        from ..design.fit import DEFAULT_GLINT_PX, DEFAULT_OUTLINE_PX, Options, fit_one
+        from ..design.noise import FeatureNoise
+        from ..design.unknowns import Unknowns
+        from ..eye.catalogue import load_eye
+
+        assert isinstance(unknowns, Unknowns)
+        built = rig.build()
+        noise = FeatureNoise.of(DEFAULT_OUTLINE_PX, DEFAULT_GLINT_PX, rig=built)
+        out = {}
+        for eye in np.unique(observations.index.eye):
+            options = Options(targets=targets, person=None if targets else self.persons[int(eye)])
+            rows = np.flatnonzero(observations.index.eye == eye)
+            try:
+                out[int(eye)] = fit_one(observations, rows, built, load_eye(self.eye), unknowns, noise, options)
+            except InputError as error:
+                raise error.placed(under=f"{EYES[max(int(eye), 0)]} eye") from None
+        return out
