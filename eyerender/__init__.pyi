@@ -22,6 +22,8 @@ from .design.information import Information as Information
 from .design.information import information as information
 from .design.noise import FeatureNoise as FeatureNoise
 from .design.noise import sensor_noise as sensor_noise
+from .design.safety import Exposure as Exposure
+from .design.safety import eye_exposure as eye_exposure
 from .design.unknowns import Unknowns as Unknowns
 from .errors import BackendError as BackendError
 from .errors import EyerenderError as EyerenderError

@@ -98,7 +98,7 @@ def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Fl
     """Points of the outlines, the whitening of their distances, and how many of these are independent."""
     pupil = observations.pupil
     given = pupil.points_px[:, :: max(1, -(-pupil.points_px.shape[1] // MOST_POINTS))]
-    traced = np.isfinite(given).all(axis=2).sum(axis=1) >= 6
+    traced = np.sum(np.isfinite(given).all(axis=2), axis=1) >= 6
     of_ellipse = ~traced & (pupil.status == Status.OK) & np.isfinite(pupil.centre_px).all(axis=1)
     width = max(given.shape[1] if traced.any() else 0, ELLIPSE_POINTS if of_ellipse.any() else 0)
     n = len(observations)

@@ -234,7 +234,7 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int) -> Slopes:
         out[..., TRACED] = np.moveaxis(central, 0, -1)
         out[..., POSITION] = out[..., SLIPPAGE]
         out[..., ROTATION] = np.einsum("nkax,nx->nka", out[..., SLIPPAGE], _by_rotation(theta))
-        exists: Bools = np.isfinite(out).all(axis=(2, 3))
+        exists: Bools = np.asarray(np.isfinite(out).all(axis=(2, 3)))
         return np.where(exists[..., None, None], out, 0.0), exists & ok[:n]
 
     outline, outline_ok = slopes(traced.outline_px, traced.outline_ok)

@@ -47,6 +47,12 @@ class Led(Spec):
     intensity_mw_sr: Positive = Field(default=20.0, description="radiant intensity on the axis")
     lobe_exponent: NonNegative = Field(default=1.0, description="m of cos^m; 1 is Lambertian, 0 isotropic")
 
+    duty_cycle: Annotated[float, Field(gt=0, le=1)] | None = Field(
+        default=None,
+        description="share of the time in which it is on, for eye safety alone; pictures expose while it is on; "
+        "default: 1",
+    )
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if (self.position_mm is None) == (self.ring is None):
@@ -78,6 +84,7 @@ class Led(Spec):
                 intensity_mw_sr=self.intensity_mw_sr,
                 lobe_exponent=self.lobe_exponent,
                 inner_radius_mm=self.inner_radius_mm,
+                duty_cycle=1.0 if self.duty_cycle is None else self.duty_cycle,
             )
             for p in places
         )
@@ -94,6 +101,7 @@ class Lamp(ArrayValue):
         intensity_mw_sr: radiant intensity on the axis.
         lobe_exponent: m of cos^m.
         inner_radius_mm: radius of the hole of a ring-shaped emitter.
+        duty_cycle: share of the time in which it is on, for eye safety alone.
     """
 
     position_mm: Floats
@@ -102,3 +110,4 @@ class Lamp(ArrayValue):
     intensity_mw_sr: float
     lobe_exponent: float
     inner_radius_mm: float = 0.0
+    duty_cycle: float = 1.0

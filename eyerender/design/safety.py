@@ -1,0 +1,152 @@
+"""Eye safety of a rig's LEDs against the limits of IEC 62471 and ICNIRP 2013. This is not a conformity test.
+
+    cornea:  E = sum over LEDs of  d I / r^2                   <= 100 W/m^2 for t >= 1000 s, 18000 t^(-3/4) below   (5)
+    retina:  L_R = R(lambda) d I / (A cos a)                   <= 6000 / alpha W/m^2/sr                             (6)
+
+with the duty cycle d, the radiant intensity I towards the eye, its distance r, the emitting area A seen at an angle a,
+and R = 10^((700 nm - lambda) / 500 nm). alpha is the angle that the source subtends, taken as at least 0.011 and at
+most 0.1 rad. Equation (6) is the limit for a weak visual stimulus and long exposures. Corneal irradiances of all LEDs
+add; their images on the retina lie apart and do not.
+
+Sources: IEC 62471:2006, infrared radiation hazard of the eye and retinal thermal hazard for a weak visual stimulus
+(its limit 6000 / alpha from memory); ICNIRP, Health Phys. 105 (2013), 74-96: the corneal limits, and 6300 / alpha.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..errors import InputError
+from ..rig.light import Lamp
+from ..rig.rig import RigLike
+
+BOX_MM = (3.0, 3.0, 3.0)
+"""Half sizes of the eye box about the eye's place (chosen)."""
+LONG_S = 1000.0
+_RETINA, _LEAST_RAD, _MOST_RAD = 6000.0, 0.011, 0.1
+_MEASURED_NM = (700.0, 1400.0)
+NOTE = "not a conformity test"
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Exposure(ArrayValue):
+    """Exposure of an eye to the LEDs of a rig, at the nearest place of its box for each LED.
+
+    Attributes:
+        distance_mm: (m,) distance of each LED.
+        cornea_w_m2: (m,) irradiance by each LED.
+        cornea_limit_w_m2: limit of their sum.
+        retina_w_m2_sr: (m,) weighted radiance; NaN for a point source, whose radiance is not known.
+        retina_limit_w_m2_sr: (m,) its limit.
+    """
+
+    distance_mm: Floats
+    cornea_w_m2: Floats
+    cornea_limit_w_m2: float
+    retina_w_m2_sr: Floats
+    retina_limit_w_m2_sr: Floats
+
+    @property
+    def cornea_share(self) -> float:
+        """Sum of the irradiances over its limit."""
+        return float(self.cornea_w_m2.sum() / self.cornea_limit_w_m2)
+
+    @property
+    def retina_share(self) -> Floats:
+        """Weighted radiance of each LED over its limit, (m,); NaN where it is not known."""
+        return np.asarray(self.retina_w_m2_sr / self.retina_limit_w_m2_sr)
+
+    @property
+    def retina_known(self) -> Bools:
+        """Whether the radiance of an LED is known, (m,)."""
+        return np.isfinite(self.retina_w_m2_sr)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Convert to plain values; an unknown retinal exposure names the key that is missing."""
+        lights = [
+            {
+                "light": k,
+                "distance_mm": float(self.distance_mm[k]),
+                "cornea_w_m2": float(self.cornea_w_m2[k]),
+                "retina": _retina(self, k),
+            }
+            for k in range(len(self.distance_mm))
+        ]
+        return {
+            "note": NOTE,
+            "cornea_w_m2": float(self.cornea_w_m2.sum()),
+            "cornea_limit_w_m2": self.cornea_limit_w_m2,
+            "cornea_share": self.cornea_share,
+            "lights": lights,
+        }
+
+
+def _retina(found: Exposure, k: int) -> Any:
+    if not found.retina_known[k]:
+        return f"not known; give rig.lights.{k}.radius_mm (it is 0, a point)"
+    return {"radiance_w_m2_sr": float(found.retina_w_m2_sr[k]), "share": float(found.retina_share[k])}
+
+
+def eye_exposure(
+    rig: RigLike,
+    eye_mm: ArrayLike,
+    *,
+    wavelength_nm: float = 850.0,
+    box_mm: ArrayLike = BOX_MM,
+    duration_s: float = 3e4,
+) -> Exposure:
+    """Compute the exposure of one eye, equations (5) and (6).
+
+    Intensities are those of the rig: give that of the brightest bin of an LED.
+
+    Args:
+        rig: the rig, with the duty cycles of its LEDs.
+        eye_mm: (3,) corneal apex.
+        wavelength_nm: wavelength.
+        box_mm: (3,) half sizes of the box in which the eye may be.
+        duration_s: exposure within a day.
+
+    Raises:
+        InputError: the wavelength is not between 700 and 1400 nm, an LED is inside the box, or a time is not > 0.
+    """
+    low, high = _MEASURED_NM
+    if not low <= wavelength_nm <= high:
+        raise InputError(f"must be {low:g} to {high:g} for these limits, not {wavelength_nm:g}", path="wavelength_nm")
+    if not duration_s > 0:
+        raise InputError("must be > 0", path="duration_s")
+    eye, box = np.asarray(eye_mm, dtype=float), np.asarray(box_mm, dtype=float)
+    rows = [_of_lamp(lamp, eye, box, wavelength_nm, f"rig.lights.{k}") for k, lamp in enumerate(rig.build().lights)]
+    distance, cornea, retina, limit = np.array(rows).reshape(-1, 4).T
+    return Exposure(
+        distance_mm=frozen(distance),
+        cornea_w_m2=frozen(cornea),
+        cornea_limit_w_m2=100.0 if duration_s >= LONG_S else float(18000.0 * duration_s**-0.75),
+        retina_w_m2_sr=frozen(retina),
+        retina_limit_w_m2_sr=frozen(limit),
+    )
+
+
+def _of_lamp(
+    lamp: Lamp, eye_mm: Floats, box_mm: Floats, wavelength_nm: float, path: str
+) -> tuple[float, float, float, float]:
+    """Distance, irradiance, weighted radiance and its limit for one LED at the nearest place of the box."""
+    place = eye_mm + np.clip(lamp.position_mm - eye_mm, -box_mm, box_mm)
+    gap = place - lamp.position_mm
+    distance = float(np.linalg.norm(gap))
+    if distance == 0.0:
+        raise InputError("lies inside the eye box", path=path)
+    cosine = max(float(gap @ lamp.axis) / distance, 0.0)
+    lobe = 1.0 if lamp.lobe_exponent == 0 else cosine**lamp.lobe_exponent
+    watts = 1e-3 * lamp.intensity_mw_sr * lamp.duty_cycle * lobe
+    cornea = watts / (distance * 1e-3) ** 2
+    limit = _RETINA / float(np.clip(2.0 * lamp.radius_mm / distance, _LEAST_RAD, _MOST_RAD))
+    area = np.pi * (lamp.radius_mm**2 - lamp.inner_radius_mm**2) * 1e-6 * cosine
+    if lamp.radius_mm == 0.0:
+        return distance, cornea, np.nan, limit
+    radiance = 0.0 if cosine == 0.0 else 10.0 ** ((700.0 - wavelength_nm) / 500.0) * watts / area
+    return distance, cornea, float(radiance), limit
