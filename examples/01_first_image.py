@@ -17,7 +17,7 @@ rig = er.Rig(cameras=[camera], lights=[er.Led((300, 60, -80)), er.Led((300, -60,
 
 # %%
 # A subject looks somewhere: here one eye looks five degrees to the side and up. The frames hold the pose of each eye.
-frames = er.Subject(eye, eyes=["right"], ipd_mm=0.001).looking([(5, 5)], rig)
+frames = er.Subject.one_eye(eye).looking([(5, 5)], rig)
 
 # %%
 # Rendering a frame gives the sensor's counts, the light before noise, what each pixel shows, and the labels.

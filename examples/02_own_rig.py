@@ -16,7 +16,7 @@ rig = er.Rig(cameras=[camera], lights=[ring])
 
 # %%
 # Every LED of the ring has a glint. Moving one LED by 4 mm moves one glint; the other LEDs stay where they are.
-frames = er.Subject(er.Eye("E4"), eyes=["right"], ipd_mm=0.001).looking([(0, 0)], rig)
+frames = er.Subject.one_eye(er.Eye("E4")).looking([(0, 0)], rig)
 before = er.trace(frames)
 after = er.trace(frames, rig.with_light(2, moved_mm=(0, 4, 0)))
 moved = np.linalg.norm(after.glints.xy_px - before.glints.xy_px, axis=-1)[0]

@@ -26,7 +26,7 @@ width = []
 for scale in radii:
     data["cornea"][0]["shape"] = {**shape, "radius_mm": shape["radius_mm"] * scale}
     eye = er.Eye(er.EyeSpec.from_mapping(data), pupil_diameter_mm=4.0)
-    frames = er.Subject(eye, eyes=["right"], ipd_mm=0.001).looking([(0, 0)], rig)
+    frames = er.Subject.one_eye(eye).looking([(0, 0)], rig)
     seen = er.trace(frames)
     width.append(2 * seen.pupil.semi_axes_px[0, 0] / rig.build().cameras[0].scale_at(np.zeros(3)))
 

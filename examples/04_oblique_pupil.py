@@ -19,7 +19,7 @@ rig = er.Rig(
 figure, axes = plt.subplots(figsize=(5.5, 4))
 for model in ("E1", "E3", "E5"):
     eye = er.Eye(model, pupil_diameter_mm=4.0)
-    frames = er.Subject(eye, eyes=["right"], ipd_mm=0.001).looking([(-a, 0) for a in angles], rig)
+    frames = er.Subject.one_eye(eye).looking([(-a, 0) for a in angles], rig)
     seen = er.trace(frames)
     a, b = seen.pupil.semi_axes_px.T
     axes.plot(angles, b / a, label=model)

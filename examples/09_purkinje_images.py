@@ -18,7 +18,7 @@ rig = er.Rig(
 )
 angles = np.linspace(-6, 6, 25)
 eye = er.Eye("E4", pupil_diameter_mm=7.0)
-frames = er.Subject(eye, eyes=["right"], ipd_mm=0.001).looking([(a, 0) for a in angles], rig)
+frames = er.Subject.one_eye(eye).looking([(a, 0) for a in angles], rig)
 _, features = er.AnalyticObserver().observe_in_detail(frames, purkinje=(1, 2, 3, 4))
 
 figure, axes = plt.subplots(figsize=(5.5, 4))

@@ -15,7 +15,7 @@ BLINKS = (0.0, 0.35, 0.6, 1.0)  # small: (0.5,)
 
 camera = er.Camera.looking_at((0, 0, -2), position_mm=(250, -40, -60), focal_length_px=2400, size_px=(400, 300))
 rig = er.Rig(cameras=[camera], lights=[er.Led((250, 40, -60), intensity_mw_sr=40), er.Led((250, -120, -60))])
-subject = er.Subject(er.Eye("E4", pupil_diameter_mm=4.0), eyes=["right"], ipd_mm=0.001)
+subject = er.Subject.one_eye(er.Eye("E4", pupil_diameter_mm=4.0))
 frames = subject.looking([(0, 0)], rig)
 
 # %%

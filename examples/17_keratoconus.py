@@ -45,9 +45,7 @@ rig = er.Rig(cameras=[camera], lights=[er.Led(ring=er.LedRing(radius_mm=22, coun
 look = er.Look(iris_contrast=0.8)
 pictures, seen = [], []
 for spec in (healthy, ill):
-    frames = er.Subject(er.Eye(spec, pupil_diameter_mm=4.0), eyes=["right"], ipd_mm=0.001, look=look).looking(
-        [(0, 0)], rig
-    )
+    frames = er.Subject.one_eye(er.Eye(spec, pupil_diameter_mm=4.0), look=look).looking([(0, 0)], rig)
     pictures.append(er.render(frames, spp=SPP)[0].counts)
     seen.append(er.trace(frames))
 

@@ -267,3 +267,34 @@ def test_windows_of_a_scene_are_those_of_its_frames(monkeypatch):
     with pytest.raises(er.InputError) as of_scene:
         next(er.render_windows(scene))
     assert str(of_scene.value) == str(of_frames.value)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_one_eye_is_where_it_shall_be(side):
+    """The features are those of an eye at the middle of a head without width, up to the mirror and rounding."""
+    place = np.array([5.0, 7.0, -3.0])
+    subject = er.Subject.one_eye(er.Eye("E4"), side=side, at_mm=place)
+    assert subject.ipd_mm == 63
+    frames = subject.looking([(5, 5)], RIG)
+    assert len(frames) == 1
+    np.testing.assert_allclose((frames.index.eye_position_mm + frames.index.head_mm)[0], place, atol=1e-12)
+    seen = er.trace(frames)
+    narrow = er.Subject(er.Eye("E4"), eyes=[side], ipd_mm=1e-9, head_positions_mm=[place]).looking([(5, 5)], RIG)
+    same = er.trace(narrow)
+    # 1e-9 mm of the head's width are 1e-8 px.
+    np.testing.assert_allclose(seen.pupil.centre_px, same.pupil.centre_px, atol=1e-6)
+    np.testing.assert_allclose(seen.glints.xy_px, same.glints.xy_px, atol=1e-6)
+
+
+def test_one_eye_at_several_places_has_frames_at_each():
+    places = [(0, 0, 0), (10, -4, 2)]
+    subject = er.Subject.one_eye(at_mm=places, look=er.Look(iris_contrast=0.8))
+    frames = subject.looking([(0, 0)], RIG)
+    np.testing.assert_allclose(frames.index.eye_position_mm + frames.index.head_mm, places, atol=1e-12)
+    assert subject.look.iris_contrast == 0.8
+    with pytest.raises(er.InputError, match="eyes"):
+        er.Subject.one_eye(side="third")  # type: ignore[arg-type]
+
+
+def test_examples_need_no_head_without_width():
+    assert not [p.name for p in (ROOT / "examples").glob("*.py") if "ipd_mm=0.001" in p.read_text(encoding="utf-8")]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
+import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
@@ -43,6 +44,34 @@ class Subject(SubjectSpec):
         if "ipd_mm" not in fields:
             own["ipd_mm"] = person.apex_distance_mm
         return cls(person=person, **{**own, **fields})
+
+    @classmethod
+    def one_eye(
+        cls,
+        eye: Any = None,
+        *,
+        side: Literal["right", "left"] = "right",
+        at_mm: ArrayLike = (0.0, 0.0, 0.0),
+        **fields: Any,
+    ) -> Self:
+        """A subject of whom one eye is observed.
+
+        The head is placed so that the apex of this eye, unrotated, is where it shall be.
+
+        Args:
+            eye: the eye model; default: E2.
+            side: the eye.
+            at_mm: (3,) world point of the eye's apex, or (n, 3) for n positions of the head.
+            fields: further fields, such as `look`, `region` or `ipd_mm`.
+
+        Raises:
+            InputError: a value does not fit.
+        """
+        subject = cls(**{**({} if eye is None else {"eye": eye}), **fields, "eyes": [side]})
+        at = np.asarray(at_mm, dtype=float).reshape(-1, 3)
+        half = subject.ipd_mm / 2
+        heads = at + np.array([0.0, half if side == "right" else -half, 0.0])
+        return cls(**{**subject.to_mapping(), "head_positions_mm": heads})
 
     def fixating(self, targets_mm: ArrayLike, rig: Rig, **scene: Any) -> Frames:
         """The frames in which the subject fixates targets, one after the other.
