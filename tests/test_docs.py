@@ -143,3 +143,30 @@ def test_the_site_builds_without_a_warning(tmp_path):
     done = subprocess.run(command, env={**os.environ, "EYERENDER_DOCS_EXAMPLES": "0"}, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert (Path(tmp_path) / "generated" / "keys_scene.html").is_file()
+
+
+def test_the_page_on_stability_names_the_formats_of_the_code():
+    """A format that rises in the code must rise on the page, too."""
+    code = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "eyerender").rglob("*.py"))
+    newest: dict[str, int] = {}
+    for name, version in re.findall(r"eyerender/([a-z-]+)/(\d+)", code):
+        newest[name] = max(newest.get(name, 0), int(version))
+    page = (DOCS / "stability.md").read_text(encoding="utf-8")
+    on_page: dict[str, int] = {}
+    for name, version in re.findall(r"eyerender/([a-z-]+)/(\d+)", page):
+        on_page[name] = max(on_page.get(name, 0), int(version))
+    assert {"record", "image", "gaze", "gaze-calibration"} <= on_page.keys()
+    assert on_page == {name: newest[name] for name in on_page}
+    row = next(line for line in page.splitlines() if line.startswith("| eye (YAML)"))
+    oldest, *_, last = er.EyeSpec.FORMATS
+    assert row == f"| eye (YAML) | {last} | {oldest} to {last} |"
+
+
+def test_the_first_hour_leaves_no_file_in_the_checkout():
+    page = (DOCS / "first_hour.md").read_text(encoding="utf-8")
+    lines = [line for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL) for line in block.splitlines()]
+    start = lines.index("cd out/first_hour")
+    assert not [line for line in lines[start + 1 :] if line.startswith("cd ") or " -o /" in line or "-o .." in line]
+    environment = next(line.split()[-1] for line in lines if "-m venv" in line)
+    for place in ("out/first_hour/x", f"{environment}/x"):
+        assert subprocess.run(["git", "check-ignore", "-q", place], cwd=ROOT, check=False).returncode == 0, place
