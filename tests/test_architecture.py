@@ -183,8 +183,8 @@ LARGE = {
     "torch.__init__": "options of a loader",
     "analytic.features.features": "options of an observation",
     # Kernels take arrays, not records.
-    "optics.fermat_kernels.refract_all": "a kernel",
-    "optics.mirror_kernels.mirror_all": "a kernel",
+    "optics.fermat_kernels.connect_all": "a kernel",
+    "optics.fermat_kernels.mirror_start": "a kernel",
     "analytic.view_kernels.project_all": "a kernel",
     "report.eye_section._curve": "a curve and its style",
     "report.overlay.eye_picture": "a picture and its style",

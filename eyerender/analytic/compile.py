@@ -8,10 +8,10 @@ from pathlib import Path
 from ..eye import pose_kernels
 from ..geometry import ellipse_kernels, graph_kernels
 from ..jit import RAYS, compile_share, ensure_compiled
-from ..optics import fermat_kernels, mirror_kernels
+from ..optics import fermat_kernels
 from . import view_kernels
 
-MODULES = (graph_kernels, ellipse_kernels, fermat_kernels, mirror_kernels, pose_kernels, view_kernels)
+MODULES = (graph_kernels, ellipse_kernels, fermat_kernels, pose_kernels, view_kernels)
 """All modules with compiled functions of the ray optics."""
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ COLUMNS = SHAPE + 7
 
 helper = njit(**HELPER)
 inlined = njit(forceinline=True, **HELPER)  # calls would pass every field of every array
+merged = njit(inline="always", **HELPER)  # numba types and optimizes a large function with its caller only, not twice
 _biconic_jet = inlined(biconic_jet)
 
 

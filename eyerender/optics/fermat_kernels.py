@@ -23,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Floats, Ints, Statuses
-from ..geometry.graph_kernels import AXIS, LEAN, ORIGIN, SMOOTH, inlined, measured_jet, smooth_jet
+from ..geometry.graph_kernels import APEX, AXIS, LEAN, ORIGIN, SMOOTH, inlined, measured_jet, merged, smooth_jet
 from ..jit import compiled
 from ..status import Status
 
@@ -69,7 +69,7 @@ def point_at(points, i, k):  # type: ignore[no-untyped-def]
     return points[0, row, column], points[1, row, column], points[2, row, column]
 
 
-@inlined
+@merged
 def load(numbers, ladder, viewpoint, target, first, count, columns, nodes):  # type: ignore[no-untyped-def]
     """Set up the nodes of rays `first` and following, of which there are `count` in rows of `columns`."""
     last = nodes.shape[0] - 1
@@ -106,7 +106,7 @@ def evaluate(kinds, numbers, table, j, first, count, columns, nodes):  # type: i
             w[YY, lane], w[YZ, lane], w[ZZ, lane] = found[3], found[4], found[5]
 
 
-@inlined
+@merged
 def paraxial_start(kinds, numbers, table, first, count, columns, nodes):  # type: ignore[no-untyped-def]
     """First guesses (y, z) on each surface.
 
@@ -119,7 +119,8 @@ def paraxial_start(kinds, numbers, table, first, count, columns, nodes):  # type
     for lane in range(LANES):
         start[Y, lane], start[Z, lane] = 0.0, 0.0
     for turn in range(3):
-        evaluate(kinds, numbers, table, 1, first, count, columns, nodes)
+        for j in range(1, 2):
+            evaluate(kinds, numbers, table, j, first, count, columns, nodes)
         if turn == 0:
             for lane in range(LANES):
                 # At the axis; the rows of the traced ray are free until then.
@@ -236,7 +237,7 @@ def step(nodes, j, innermost):  # type: ignore[no-untyped-def]
     return moving
 
 
-@inlined
+@merged
 def solve(kinds, numbers, table, first, count, columns, nodes):  # type: ignore[no-untyped-def]
     """Newton on all surfaces: the block-tridiagonal system is eliminated inwards and solved outwards."""
     last = nodes.shape[0] - 1
@@ -246,31 +247,15 @@ def solve(kinds, numbers, table, first, count, columns, nodes):  # type: ignore[
             evaluate(kinds, numbers, table, j, first, count, columns, nodes)
         if turn == STEPS or (turn > 1 and moving == 0):
             break
-        aim(nodes, 0)
-        for j in range(1, last):
+        for j in range(last):
             aim(nodes, j)
-            block(nodes, j)
-            if j < last - 1:
-                couple(nodes, j)
+            if j > 0:
+                block(nodes, j)
+                if j < last - 1:
+                    couple(nodes, j)
         moving = 0
         for j in range(last - 1, 0, -1):
             moving += step(nodes, j, j == last - 1)
-
-
-@inlined
-def leave(nodes, reflects):  # type: ignore[no-untyped-def]
-    """Start the traced ray on the outermost surface: the direction from the viewpoint, refracted or reflected there."""
-    for lane in range(LANES):
-        dx = nodes[1, X, lane] - nodes[0, X, lane]
-        dy = nodes[1, Y, lane] - nodes[0, Y, lane]
-        dz = nodes[1, Z, lane] - nodes[0, Z, lane]
-        inverse = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
-        nodes[0, W_X, lane], nodes[0, W_Y, lane], nodes[0, W_Z, lane] = dx * inverse, dy * inverse, dz * inverse
-        nodes[1, P_X, lane], nodes[1, P_Y, lane], nodes[1, P_Z, lane] = (
-            nodes[1, X, lane], nodes[1, Y, lane], nodes[1, Z, lane]
-        )  # fmt: skip
-        nodes[0, ON, lane] = 1.0
-    bend(nodes, 1, reflects)
 
 
 @inlined
@@ -292,36 +277,56 @@ def bend(nodes, j, reflects):  # type: ignore[no-untyped-def]
         nodes[j, ON, lane] = nodes[j - 1, ON, lane] if cosine > 0.0 and (reflects or square > 0.0) else 0.0
 
 
-@inlined
-def trace_on(kinds, numbers, table, first, count, columns, nodes):  # type: ignore[no-untyped-def]
-    """Trace from the outermost surface through the others, meeting each by Newton from the path's own point."""
-    for j in range(2, nodes.shape[0] - 1):
-        for lane in range(LANES):
-            nodes[j, T, lane] = (
-                (nodes[j, X, lane] - nodes[j - 1, P_X, lane]) * nodes[j - 1, W_X, lane]
-                + (nodes[j, Y, lane] - nodes[j - 1, P_Y, lane]) * nodes[j - 1, W_Y, lane]
-                + (nodes[j, Z, lane] - nodes[j - 1, P_Z, lane]) * nodes[j - 1, W_Z, lane]
-            )
-        for _ in range(2):
-            for lane in range(LANES):
-                t = nodes[j, T, lane]
-                nodes[j, P_X, lane] = nodes[j - 1, P_X, lane] + t * nodes[j - 1, W_X, lane]
-                nodes[j, Y, lane] = nodes[j - 1, P_Y, lane] + t * nodes[j - 1, W_Y, lane]
-                nodes[j, Z, lane] = nodes[j - 1, P_Z, lane] + t * nodes[j - 1, W_Z, lane]
-            evaluate(kinds, numbers, table, j, first, count, columns, nodes)
-            for lane in range(LANES):
-                error = nodes[j, P_X, lane] - nodes[j, X, lane]
-                rate = (
-                    nodes[j - 1, W_X, lane]
-                    - nodes[j, SLOPE_Y, lane] * nodes[j - 1, W_Y, lane]
-                    - nodes[j, SLOPE_Z, lane] * nodes[j - 1, W_Z, lane]
-                )
-                nodes[j, T, lane] -= error / rate
-                nodes[j, P_Y, lane], nodes[j, P_Z, lane] = nodes[j, Y, lane], nodes[j, Z, lane]
-        bend(nodes, j, False)
+@merged
+def trace(kinds, numbers, table, reflects, first, count, columns, nodes):  # type: ignore[no-untyped-def]
+    """Trace the ray that leaves the viewpoint for the outermost surface through all others.
+
+    Each is met by Newton from the path's own point.
+    """
+    for lane in range(LANES):
+        dx = nodes[1, X, lane] - nodes[0, X, lane]
+        dy = nodes[1, Y, lane] - nodes[0, Y, lane]
+        dz = nodes[1, Z, lane] - nodes[0, Z, lane]
+        inverse = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+        nodes[0, W_X, lane], nodes[0, W_Y, lane], nodes[0, W_Z, lane] = dx * inverse, dy * inverse, dz * inverse
+        nodes[1, P_X, lane], nodes[1, P_Y, lane], nodes[1, P_Z, lane] = (
+            nodes[1, X, lane], nodes[1, Y, lane], nodes[1, Z, lane]
+        )  # fmt: skip
+        nodes[0, ON, lane] = 1.0
+    for j in range(1, nodes.shape[0] - 1):
+        if j > 1:
+            meet(kinds, numbers, table, j, first, count, columns, nodes)
+        bend(nodes, j, reflects)
         for lane in range(LANES):
             if not abs(nodes[j, P_X, lane] - nodes[j, X, lane]) < SURE_MM:
                 nodes[j, ON, lane] = 0.0
+
+
+@merged
+def meet(kinds, numbers, table, j, first, count, columns, nodes):  # type: ignore[no-untyped-def]
+    """Move the traced ray from the node before to the surface of node j."""
+    for lane in range(LANES):
+        nodes[j, T, lane] = (
+            (nodes[j, X, lane] - nodes[j - 1, P_X, lane]) * nodes[j - 1, W_X, lane]
+            + (nodes[j, Y, lane] - nodes[j - 1, P_Y, lane]) * nodes[j - 1, W_Y, lane]
+            + (nodes[j, Z, lane] - nodes[j - 1, P_Z, lane]) * nodes[j - 1, W_Z, lane]
+        )
+    for _ in range(2):
+        for lane in range(LANES):
+            t = nodes[j, T, lane]
+            nodes[j, P_X, lane] = nodes[j - 1, P_X, lane] + t * nodes[j - 1, W_X, lane]
+            nodes[j, Y, lane] = nodes[j - 1, P_Y, lane] + t * nodes[j - 1, W_Y, lane]
+            nodes[j, Z, lane] = nodes[j - 1, P_Z, lane] + t * nodes[j - 1, W_Z, lane]
+        evaluate(kinds, numbers, table, j, first, count, columns, nodes)
+        for lane in range(LANES):
+            error = nodes[j, P_X, lane] - nodes[j, X, lane]
+            rate = (
+                nodes[j - 1, W_X, lane]
+                - nodes[j, SLOPE_Y, lane] * nodes[j - 1, W_Y, lane]
+                - nodes[j, SLOPE_Z, lane] * nodes[j - 1, W_Z, lane]
+            )
+            nodes[j, T, lane] -= error / rate
+            nodes[j, P_Y, lane], nodes[j, P_Z, lane] = nodes[j, Y, lane], nodes[j, Z, lane]
 
 
 @inlined
@@ -332,7 +337,7 @@ def axis_distance(numbers, i, x, y, z):  # type: ignore[no-untyped-def]
     return np.sqrt(max(x * x + y * y + z * z - along * along, 0.0))
 
 
-@inlined
+@merged
 def store(numbers, rims, reflects, first, columns, nodes, out, state):  # type: ignore[no-untyped-def]
     """Write the rays and their statuses, from the miss of the traced ray at its target."""
     last = nodes.shape[0] - 1
@@ -361,11 +366,43 @@ def store(numbers, rims, reflects, first, columns, nodes, out, state):  # type: 
             state[i, k] = LOST
 
 
-TYPES = "i8[::1], f8[:,:,::1], f8[::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], i1[:,::1]"
+@merged
+def mirror_start(kinds, numbers, table, rims, first, count, columns, nodes, out, state):  # type: ignore[no-untyped-def]
+    """First guesses of mirror points: where the bisectors through the apex' centre of curvature meet the surface.
+
+    They are exact on a sphere for source and viewpoint at infinity. A ray is OUTSIDE whose guess is far outside the rim
+    or on a bisector that does not point to the front: its mirror point cannot be on the surface.
+    """
+    last = nodes.shape[0] - 1
+    w = nodes[1]
+    for lane in range(LANES):
+        row = min(min(first + lane, count - 1) // columns, len(numbers) - 1)
+        w[Y, lane], w[Z, lane] = numbers[row, 0, APEX], numbers[row, 0, APEX + 1]
+    for j in range(1, last):
+        evaluate(kinds, numbers, table, j, first, count, columns, nodes)
+    for lane in range(LANES):
+        i, k = divmod(min(first + lane, count - 1), columns)
+        row, rim = min(i, len(numbers) - 1), rims[min(i, len(rims) - 1)]
+        hy, hz = w[SLOPE_Y, lane], w[SLOPE_Z, lane]
+        size = np.sqrt(1.0 + hy * hy + hz * hz)
+        nx, ny, nz = 1.0 / size, -hy / size, -hz / size
+        bent = -w[YY, lane] - w[ZZ, lane] + ny * ny * w[YY, lane] + 2.0 * ny * nz * w[YZ, lane] + nz * nz * w[ZZ, lane]
+        radius = 2.0 * size / bent
+        cx, cy, cz = w[X, lane] - radius * nx, w[Y, lane] - radius * ny, w[Z, lane] - radius * nz
+        ax, ay, az = nodes[last, X, lane] - cx, nodes[last, Y, lane] - cy, nodes[last, Z, lane] - cz
+        bx, by, bz = nodes[0, X, lane] - cx, nodes[0, Y, lane] - cy, nodes[0, Z, lane] - cz
+        a, b = 1.0 / np.sqrt(ax * ax + ay * ay + az * az), 1.0 / np.sqrt(bx * bx + by * by + bz * bz)
+        ax, ay, az = a * ax + b * bx, a * ay + b * by, a * az + b * bz
+        reach = radius / np.sqrt(max(ax * ax + ay * ay + az * az, 1e-300))
+        x, y, z = cx + reach * ax, cy + reach * ay, cz + reach * az
+        w[Y, lane], w[Z, lane] = y, z
+        out[GUESS, i, k], out[GUESS + 1, i, k], out[GUESS + 2, i, k] = x, y, z
+        away = ax * nx + ay * ny + az * nz <= 0.0 or axis_distance(numbers, row, x, y, z) > 1.25 * rim
+        state[i, k] = OUTSIDE if rim < np.inf and away else LOST
 
 
-@compiled(TYPES)
-def refract_all(
+@compiled("i8[::1], f8[:,:,::1], f8[::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], b1, f8[:,:,::1], i1[:,::1]")
+def connect_all(
     kinds: Ints,
     numbers: Floats,
     table: Floats,
@@ -373,10 +410,11 @@ def refract_all(
     rims: Floats,
     viewpoint: Floats,
     target: Floats,
+    reflects: bool,
     out: Floats,
     state: Statuses,
 ) -> None:
-    """Find the rays from viewpoints through all surfaces to targets.
+    """Find the rays from viewpoints to targets, through all surfaces or by way of one that reflects them outside.
 
     Every path is traced from the viewpoint; a ray that misses the target by more than rounding is LOST.
 
@@ -388,6 +426,7 @@ def refract_all(
         rims: (1 or n,) radius at which the outermost surface ends.
         viewpoint: (3, 1 or n, 1 or m).
         target: (3, 1 or n, 1 or m).
+        reflects: whether the only surface reflects the rays.
         out: (RESULTS, n, m), written.
         state: (n, m), LOST, written.
     """
@@ -395,8 +434,10 @@ def refract_all(
     count, columns = state.size, max(state.shape[1], 1)
     for first in range(0, count, LANES):
         load(numbers, ladder, viewpoint, target, first, count, columns, nodes)
-        paraxial_start(kinds, numbers, table, first, count, columns, nodes)
+        if reflects:
+            mirror_start(kinds, numbers, table, rims, first, count, columns, nodes, out, state)
+        else:
+            paraxial_start(kinds, numbers, table, first, count, columns, nodes)
         solve(kinds, numbers, table, first, count, columns, nodes)
-        leave(nodes, False)
-        trace_on(kinds, numbers, table, first, count, columns, nodes)
-        store(numbers, rims, False, first, columns, nodes, out, state)
+        trace(kinds, numbers, table, reflects, first, count, columns, nodes)
+        store(numbers, rims, reflects, first, columns, nodes, out, state)

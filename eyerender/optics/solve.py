@@ -9,7 +9,7 @@ side: at grazing angles, Newton from a straight line's guess may miss a ray that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,8 +20,7 @@ from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
 from ..geometry.graphs import Graphs, graphs_of
 from ..geometry.surfaces import Surface, Xyz, components, join, shift, turn, turn_back
 from ..status import Status
-from .fermat_kernels import END, EXIT, GUESS, LOST, RESIDUAL, RESULTS, WAY, refract_all
-from .mirror_kernels import mirror_all
+from .fermat_kernels import END, EXIT, GUESS, LOST, RESIDUAL, RESULTS, WAY, connect_all
 from .shooting import Connection, connect, taken
 from .trace import Crossing, outward_path, trace
 
@@ -146,7 +145,7 @@ def refracted_rays(
         rays = _from_connection(connect(path, n_outside, viewpoint, target, target))
     else:
         ladder = np.stack(np.broadcast_arrays(*(np.atleast_1d(n) for n in (n_outside, *indices))), axis=-1)
-        rays, found, _ = _joined(refract_all, graphs, ladder, rim_mm, viewpoint, target)
+        rays, found, _ = _joined(graphs, ladder, rim_mm, viewpoint, target)
         if not found.all():
             rays = _searched(path, n_outside, viewpoint, target, target, rays, ~found)
     return _launched(path, n_outside, viewpoint, target, rays)
@@ -158,19 +157,14 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Floa
     graphs = graphs_of(surface)
     if graphs is None:
         return _from_connection(connect(path, 1.0, viewpoint, source, components(apex_of(surface))))
-    rays, found, guess = _joined(mirror_all, graphs, np.ones((1, 2)), rim_mm, viewpoint, source)
+    rays, found, guess = _joined(graphs, np.ones((1, 2)), rim_mm, viewpoint, source, reflects=True)
     return rays if found.all() else _searched(path, 1.0, viewpoint, source, guess, rays, ~found)
 
 
 def _joined(
-    solver: Callable[..., None],
-    graphs: Graphs,
-    ladder: Floats,
-    rim_mm: FloatLike,
-    viewpoint: Xyz,
-    target: Xyz,
+    graphs: Graphs, ladder: Floats, rim_mm: FloatLike, viewpoint: Xyz, target: Xyz, *, reflects: bool = False
 ) -> tuple[Rays, Bools, Xyz]:
-    """Rays of a compiled solver, which of them it has found, and the first guesses of mirror points."""
+    """Rays of the compiled solver, which of them it has found, and the first guesses of mirror points."""
     shape = np.broadcast_shapes(*(p.shape for p in (*viewpoint, *target)))
     full = shape or (1,)
     if not graphs.plain:
@@ -179,7 +173,7 @@ def _joined(
     out = np.empty((RESULTS, *state.shape))
     rims = np.array(np.atleast_1d(rim_mm), dtype=np.float64)
     ends = _rows(viewpoint, full), _rows(target, full)
-    solver(graphs.kinds, graphs.numbers, graphs.table, ladder, rims, *ends, out, state)
+    connect_all(graphs.kinds, graphs.numbers, graphs.table, ladder, rims, *ends, reflects, out, state)
     values = out.reshape(RESULTS, *shape)
     exits, way, end, guess = ((values[k], values[k + 1], values[k + 2]) for k in (EXIT, WAY, END, GUESS))
     if not graphs.plain:
