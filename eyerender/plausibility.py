@@ -236,8 +236,9 @@ def _misplaced(
 def _unaimed(lamp: Lamp, eyes_mm: Mapping[str, Floats]) -> str | None:
     """Reason of a warning about a lamp that points past the nearest eye, if it does."""
     ways = {name: eye - lamp.position_mm for name, eye in eyes_mm.items()}
-    name = min(ways, key=lambda eye: float(np.linalg.norm(ways[eye])))
-    cosine = float(lamp.axis @ ways[name] / max(np.linalg.norm(ways[name]), 1e-9))
+    distances = {name: float(np.linalg.norm(way)) for name, way in ways.items()}
+    name = min(distances, key=lambda eye: distances[eye])
+    cosine = float(lamp.axis @ ways[name]) / max(distances[name], 1e-9)
     share = max(cosine, 0.0) ** lamp.lobe_exponent
     return None if share >= _LEAST_AIMED else f"sends {share:.0%} of its axial intensity to the {name}; set aim_mm"
 
