@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self, get_args
 
+import numpy as np
 from pydantic import Field, model_validator
-from scipy.special import log_ndtr, ndtri_exp
+from scipy.special import betaincinv, log_ndtr, ndtri, ndtri_exp
 
 from ..errors import InputError
 from ..spec import Positive, Spec
@@ -80,6 +82,76 @@ class NormalDraw(_RangeDraw):
     draw: Literal["truncated_normal"]
     mean: Drawn
     sd: Positive
+
+
+class GaussianDraw(_Draw):
+    """Normal distribution without limits."""
+
+    draw: Literal["normal"]
+    mean: Drawn
+    sd: Positive
+
+
+class BetaDraw(_Draw):
+    """Beta distribution of the shapes `a` and `b`, from `low` to `high`."""
+
+    draw: Literal["beta"]
+    a: Annotated[Positive, Field(le=1e6)]
+    b: Annotated[Positive, Field(le=1e6)]
+    low: Drawn = 0.0
+    high: Drawn = 1.0
+
+
+class MultivariateNormalDraw(_Draw):
+    """Correlated normal numbers, a list: mean + L z, where L is the Cholesky factor of the covariance."""
+
+    draw: Literal["multivariate_normal"]
+    mean: Annotated[tuple[Drawn, ...], Field(min_length=1, max_length=100)]
+    covariance: Annotated[tuple[tuple[Drawn, ...], ...], Field(min_length=1, max_length=100)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        n = len(self.mean)
+        if any(len(row) != n for row in self.covariance) or len(self.covariance) != n:
+            raise ValueError(f"covariance: must be {n} x {n}, as there are {n} means")
+        matrix = np.array(self.covariance)
+        if not np.array_equal(matrix, matrix.T):
+            raise ValueError("covariance: must be symmetric")
+        try:
+            np.linalg.cholesky(matrix)
+        except np.linalg.LinAlgError:
+            raise ValueError("covariance: must be positive definite") from None
+        return self
+
+    def at(self, numbers: Sequence[float]) -> list[float]:
+        """Value at one number in (0, 1) for each dimension."""
+        factor = np.linalg.cholesky(np.array(self.covariance))
+        return [float(v) for v in np.array(self.mean) + factor @ ndtri(np.array(numbers))]
+
+
+class MixtureDraw(_Draw):
+    """One of several draws, by weight; it is read as a choice of draws."""
+
+    draw: Literal["mixture"]
+    components: Annotated[tuple[Any, ...], Field(min_length=1)]
+
+    def as_choice(self) -> ChoiceDraw:
+        """The choice of the components.
+
+        Raises:
+            InputError: a component is no draw, or has no weight.
+        """
+        data: dict[str, Any] = {MARK: "choice", "values": [], "weights": []}
+        for k, component in enumerate(self.components):
+            if not is_draw(component) or "weight" not in component:
+                raise InputError("must be a draw with a weight", path=f"components.{k}")
+            data["weights"].append(component["weight"])
+            # Where its components are drawn is theirs to say; by default with the mixture.
+            data["values"].append({"per": self.per, **{k: v for k, v in component.items() if k != "weight"}})
+        for value in data["values"]:
+            if value["per"] is None:
+                del value["per"]
+        return ChoiceDraw.from_mapping({**data, **({} if self.per is None else {"per": self.per})})
 
 
 class ChoiceDraw(_Draw):
@@ -150,13 +222,16 @@ Draw = (
     | LogUniformDraw
     | IntegerDraw
     | NormalDraw
+    | GaussianDraw
+    | BetaDraw
+    | MultivariateNormalDraw
     | ChoiceDraw
     | GridDraw
     | SobolDraw
     | SequenceDraw
 )
 _KINDS: dict[str, type[Draw]] = {str(get_args(kind.model_fields[MARK].annotation)[0]): kind for kind in get_args(Draw)}
-KINDS = tuple(_KINDS)
+KINDS = (*_KINDS, "mixture", "table")
 
 
 def is_draw(node: object) -> bool:
@@ -170,11 +245,14 @@ def parse_draw(node: dict[str, Any], *, source: str, path: str) -> Draw:
     Raises:
         InputError: with the path of the wrong key.
     """
-    kind = _KINDS.get(str(node[MARK]))
+    kind: type[Draw | MixtureDraw] | None = MixtureDraw if node[MARK] == "mixture" else _KINDS.get(str(node[MARK]))
+    if node[MARK] == "table":
+        raise InputError("a table is read with the file of a spec; give its rows as a choice", source=source, path=path)
     if kind is None:
         raise InputError(f"must be one of {', '.join(KINDS)}, not {node[MARK]!r}", source=source, path=f"{path}.draw")
     try:
-        return kind.from_mapping(node)
+        draw = kind.from_mapping(node)
+        return draw.as_choice() if isinstance(draw, MixtureDraw) else draw
     except InputError as error:
         raise error.placed(source=source, under=path) from None
 
@@ -195,6 +273,10 @@ def random_value(draw: Draw, u: float) -> Any:
         return min(draw.low + int(u * (draw.high - draw.low + 1)), draw.high)
     if isinstance(draw, NormalDraw):
         return truncated_normal(u, mean=draw.mean, sd=draw.sd, low=draw.low, high=draw.high)
+    if isinstance(draw, GaussianDraw):
+        return draw.mean + draw.sd * float(ndtri(u))
+    if isinstance(draw, BetaDraw):
+        return draw.low + (draw.high - draw.low) * float(betaincinv(draw.a, draw.b, u))
     if isinstance(draw, ChoiceDraw):
         weights = draw.weights or (1.0,) * len(draw.values)
         level, total = u * math.fsum(weights), 0.0

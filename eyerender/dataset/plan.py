@@ -11,9 +11,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -29,8 +30,10 @@ from ..observation import EYES
 from ..population.people import PersonChoice, choice_of
 from ..scene import Scene
 from ..scene.spec import SceneSpec
-from .draws import is_draw, unit_number
+from ..spec import read_yaml
+from .draws import Unit, is_draw, unit_number
 from .files import check_files, sum_of_file, sums_of_files
+from .gathering import aliased_draws
 from .options import PlanOptions
 from .spec import DatasetSpec, find_dataset
 from .template import Template, Turn, possible
@@ -96,7 +99,7 @@ class Plan:
     """A dataset spec with the eyes it names, and checksums of the files that it names, including eye files.
 
     `files` maps names, relative to the folder `base`, to SHA-256. Workers of a run find the files there, wherever they
-    run.
+    run. `aliases` are pairs of places of the spec's file in which one draw stands.
     """
 
     spec: DatasetSpec
@@ -104,6 +107,7 @@ class Plan:
     files: Mapping[str, str]
     base: Path
     source: str = ""
+    aliases: tuple[tuple[str, str], ...] = ()
 
     @classmethod
     def load(
@@ -140,7 +144,10 @@ class Plan:
             spec = spec.first(count)
         if eye is not None:
             spec = spec.replaced("--eye", _with_eye(spec, eye))
-        return cls.of(spec) if file is None else cls.of(spec, base=file.parent, source=str(file))
+        if file is None:
+            return cls.of(spec)
+        aliases = tuple(aliased_draws(read_yaml(file)))
+        return replace(cls.of(spec, base=file.parent, source=str(file)), aliases=aliases)
 
     @classmethod
     def of(cls, spec: DatasetSpec, *, base: Path | None = None, source: str = "") -> Plan:
@@ -179,15 +186,34 @@ class Plan:
         return plan
 
     @cached_property
+    def variable_template(self) -> Template:
+        """Template of the variables."""
+        return Template.of({"variables": self.spec.variables or {}}, self.spec.seed, source=self.source)
+
+    @cached_property
+    def _variables(self) -> dict[str, Unit]:
+        """For what each variable is drawn; a plain value is the same for every sample."""
+        draws = self.variable_template.draws
+        names = self.spec.variables or {}
+        return {
+            name: "sample"
+            if any(_is_at(path, name) and placed.unit == "sample" for path, placed in draws.items())
+            else "subject"
+            for name in names
+        }
+
+    @cached_property
     def scene_template(self) -> Template:
         """Template of the scene."""
-        return Template.of(self.spec.scene, self.spec.seed, source=self.source, prefix="scene")
+        return Template.of(
+            self.spec.scene, self.spec.seed, source=self.source, prefix="scene", variables=self._variables
+        )
 
     @cached_property
     def eye_template(self) -> Template:
         """Template of the eyes' parameters."""
         tree = {"eye_parameters": self.spec.eye_parameters}
-        return Template.of(tree, self.spec.seed, source=self.source)
+        return Template.of(tree, self.spec.seed, source=self.source, variables=self._variables)
 
     @cached_property
     def digest(self) -> str:
@@ -209,6 +235,9 @@ class Plan:
     def warnings(self) -> list[InputWarning]:
         """Probable mistakes in the scenes of some samples, spread over the dataset; each is reported once."""
         found: dict[tuple[str, str], InputWarning] = {}
+        for first, again in self.aliases:
+            reason = f"is an alias of {first}, but drawn on its own; use 'variables' for one value in both places"
+            found["alias", again] = InputWarning(code="alias", reason=reason, source=self.source, path=again)
         count = min(self.spec.count, _LOOKED_AT)
         for sample in self.spread(count):
             try:
@@ -331,7 +360,9 @@ class Plan:
         )
 
     def _scene_of(self, turn: Turn) -> tuple[dict[str, Any], dict[str, Any]]:
-        tree, drawn = self.scene_template.values(turn)
+        variables, variables_drawn = self.variable_template.values(turn)
+        tree, drawn = self.scene_template.values(turn, variables["variables"])
+        drawn |= variables_drawn
         if not isinstance(tree, dict):
             raise InputError(f"must be a mapping in every sample, not {tree!r}", path="scene")
         return tree, drawn
@@ -363,7 +394,7 @@ class Plan:
                         _eye(json.dumps(eye, sort_keys=True)).build()
             except InputError as error:
                 reasons.append(error.reason if not error.path else f"{error.path}: {error.reason}")
-                if self.spec.population is None and not self.eye_template.draws:
+                if self.spec.population is None and not (self.eye_template.draws or self.variable_template.draws):
                     break
             else:
                 return attempt, tuple(reasons)
@@ -381,7 +412,8 @@ class Plan:
     def _eye_of(self, tree: Mapping[str, Any], turn: Turn) -> tuple[dict[str, Any], dict[str, Any], bool]:
         if self.spec.population is not None:
             return {}, {}, False
-        values, drawn = self.eye_template.values(turn)
+        variables = self.variable_template.values(turn)[0]["variables"]
+        values, drawn = self.eye_template.values(turn, variables)
         eye_part = tree.get("eye")
         model = eye_part.get("model", "E2") if isinstance(eye_part, Mapping) else "E2"
         eye = deepcopy(dict(self.eyes[model]))
@@ -426,6 +458,11 @@ def _eye_names(spec: DatasetSpec, source: str) -> list[str]:
         if not isinstance(name, str):
             raise InputError(f"must be the name of an eye, not {name!r}", source=source, path="scene.eye.model")
     return names
+
+
+def _is_at(path: str, name: str) -> bool:
+    """Whether the path of a draw is at or below a variable."""
+    return re.match(rf"variables\.{name}(?![A-Za-z0-9_])", path) is not None
 
 
 def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:

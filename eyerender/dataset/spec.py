@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import keyword
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,8 @@ from ..population.people import PopulationSpec
 from ..scene import is_shipped_dataset, refuse_folder, shipped_files
 from ..scene.spec import DATASET_KIND, NOT_A_DATASET
 from ..spec import FileSpec, Positive, Spec
+from .expressions import FUNCTIONS
+from .gathering import extended, with_tables
 from .selection import Selection
 
 # Largest number of samples of a run; a Sobol sequence has no more points.
@@ -75,6 +78,11 @@ class DatasetSpec(FileSpec):
         default={"train": 1.0}, description="name -> share of the subjects; shares are scaled to 1"
     )
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="selects all draws")
+    variables: dict[str, Any] | None = Field(
+        default=None,
+        description="name -> value or draw, which `{var: EXPRESSION}` in the scene or the eye's parameters refers to; "
+        "each is drawn once per sample, or once per subject with `per: subject`",
+    )
     scene: dict[str, Any] = Field(description="a scene in which any value may be a draw")
     eye_parameters: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="eye model -> dotted path in its eye file -> value or draw"
@@ -111,6 +119,9 @@ class DatasetSpec(FileSpec):
             raise ValueError("subjects: must be <= the number of planned samples")
         if self.population is not None and self.eye_parameters:
             raise ValueError("eye_parameters: cannot stand beside a population; use its 'replace'")
+        for name in self.variables or {}:
+            if not (name.isidentifier() and name.isascii()) or name in FUNCTIONS or keyword.iskeyword(name):
+                raise ValueError(f"variables.{name}: a name must be a plain word that is no function")
         for key in ("population", "person"):
             if key in self.scene:
                 raise ValueError(f"scene.{key}: write 'population' beside 'scene', not in it")
@@ -120,6 +131,12 @@ class DatasetSpec(FileSpec):
             if not _SPLIT.fullmatch(name):
                 raise ValueError(f"splits.{name}: a name must consist of lower-case letters and digits")
         return self
+
+    @classmethod
+    def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """The mapping of a file in this folder, with the spec that it extends and the rows of its tables."""
+        found: dict[str, Any] = with_tables(extended(data, find_dataset, folder), folder)
+        return found
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:

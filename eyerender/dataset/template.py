@@ -6,7 +6,9 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,12 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError, Problems
 from .draws import (
+    MARK,
     ChoiceDraw,
     Draw,
     FixedDraw,
     GridDraw,
+    MultivariateNormalDraw,
     SequenceDraw,
     SobolDraw,
     Unit,
@@ -26,6 +30,7 @@ from .draws import (
     random_value,
     unit_number,
 )
+from .expressions import REFERENCE, evaluate, is_reference, names_of
 
 # Values of a subject's identity, which are drawn once per subject unless the draw says otherwise.
 IDENTITY = ("eye.model", "eye.margin", "look", "region", "subject.ipd_mm", "subject.eyes", "eye_parameters")
@@ -37,6 +42,8 @@ _BLOCK = 256
 # Each draw becomes a column of the run, and all Sobol draws form one sequence of as many dimensions.
 MAX_DRAWS = 1000
 _CHOSEN = re.compile(r"#\d+")
+# Keys of draws that no mapping of a scene has together with a key like "draw".
+_PARTS = frozenset(("low", "high", "mean", "sd", "weights", "steps", "covariance", "components", "value", "values"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +74,16 @@ class Template:
     seed: int
 
     @classmethod
-    def of(cls, tree: Mapping[str, Any], seed: int, *, source: str = "", prefix: str = "") -> Template:
-        """Find and check every draw.
+    def of(
+        cls,
+        tree: Mapping[str, Any],
+        seed: int,
+        *,
+        source: str = "",
+        prefix: str = "",
+        variables: Mapping[str, Unit] = MappingProxyType({}),
+    ) -> Template:
+        """Find and check every draw, and every reference to `variables`, which are drawn per sample or subject.
 
         Raises:
             InputError: with the path of the draw (after `prefix`).
@@ -76,15 +91,18 @@ class Template:
         draws: dict[str, PlacedDraw] = {}
         problems = Problems(source)
         _collect(tree, "", draws, problems, prefix)
+        _check_references(tree, "", variables, problems, prefix)
         problems.check()
         # Draws are sorted by name, so that the order of keys in a file has no effect.
         return cls(tree, dict(sorted(draws.items())), seed)
 
-    def values(self, turn: Turn) -> tuple[dict[str, Any], dict[str, Any]]:
+    def values(
+        self, turn: Turn, variables: Mapping[str, Any] = MappingProxyType({})
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Tree of plain values of one sample, and every draw's value (None where it was not used)."""
         drawn: dict[str, Any] = dict.fromkeys(self.draws)
         tree = self._resolve(self.tree, "", turn, drawn)
-        return tree, drawn
+        return _with_variables(tree, variables) if variables else tree, drawn
 
     def _resolve(self, node: Any, path: str, turn: Turn, drawn: dict[str, Any]) -> Any:
         if path in self.draws and is_draw(node):
@@ -115,6 +133,9 @@ class Template:
             dimensions = [p for p, d in self.draws.items() if isinstance(d.draw, SobolDraw) and d.unit == unit]
             points = sobol_block(self.seed, unit, len(dimensions), number // _BLOCK)
             return random_value(draw, float(points[number % _BLOCK, dimensions.index(path)])), 0
+        if isinstance(draw, MultivariateNormalDraw):
+            places = (f"{path}[{k}]" for k in range(len(draw.mean)))
+            return draw.at([unit_number(self.seed, place, unit, number, attempt) for place in places]), 0
         value = random_value(draw, unit_number(self.seed, path, unit, number, attempt))
         if isinstance(draw, ChoiceDraw):
             return draw.values[value], value
@@ -129,6 +150,15 @@ class Template:
                 return number % size
             number //= size
         raise KeyError(path)
+
+
+def _with_variables(node: Any, variables: Mapping[str, Any]) -> Any:
+    """Replace references by their values."""
+    if is_reference(node):
+        return evaluate(str(node[REFERENCE]), variables)
+    if isinstance(node, Mapping):
+        return {key: _with_variables(value, variables) for key, value in node.items()}
+    return [_with_variables(value, variables) for value in node] if isinstance(node, list | tuple) else node
 
 
 def possible(node: Any) -> list[Any]:
@@ -189,11 +219,57 @@ def _collect(node: Any, path: str, draws: dict[str, PlacedDraw], problems: Probl
         for k, value in enumerate(_values_of(placed.draw)):
             _collect(value, f"{path}#{k}", draws, problems, prefix)
     elif isinstance(node, Mapping):
+        try:
+            _refuse_misspelt(node, problems.source, _join(prefix, path))
+        except InputError as error:
+            problems.include(error)
+            return
         for key, value in node.items():
             _collect(value, _join(path, key), draws, problems, prefix)
     elif isinstance(node, list | tuple):
         for k, value in enumerate(node):
             _collect(value, _join(path, k), draws, problems, prefix)
+
+
+def _check_references(node: Any, path: str, variables: Mapping[str, Unit], problems: Problems, prefix: str) -> None:
+    """Check every reference to variables."""
+    if is_reference(node):
+        try:
+            _check_reference(node, path, variables)
+        except InputError as error:
+            problems.include(error.placed(source=problems.source, under=_join(prefix, path)))
+        return
+    children = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list | tuple) else ()
+    for key, value in children:
+        _check_references(value, _join(path, key), variables, problems, prefix)
+
+
+def _check_reference(node: Mapping[str, Any], path: str, variables: Mapping[str, Unit]) -> None:
+    """Check that an expression can be read, and that what makes an eye does not change from frame to frame.
+
+    Raises:
+        InputError: without a path.
+    """
+    if set(node) != {REFERENCE}:
+        raise InputError(f"no other key may stand beside {REFERENCE!r}")
+    for name in names_of(str(node[REFERENCE])):
+        if name not in variables:
+            known = ", ".join(sorted(variables)) or "none"
+            raise InputError(f"there is no variable {name!r}; the spec has {known}")
+        if variables[name] == "sample" and _under(_CHOSEN.sub("", path), FIXED_IDENTITY):
+            raise InputError(f"the eye must be drawn once per subject; write 'per: subject' for {name!r}")
+
+
+def _refuse_misspelt(node: Mapping[str, Any], source: str, shown: str) -> None:
+    """Refuse a mapping that looks like a draw, but whose key `draw` is misspelt.
+
+    Raises:
+        InputError: naming the key.
+    """
+    keys = [key for key in node if isinstance(key, str)]
+    if _PARTS.intersection(keys):
+        for key in get_close_matches(MARK, [key for key in keys if key not in _PARTS], 1, 0.6):
+            raise InputError(f"unknown key; did you mean {MARK!r}?", source=source, path=_join(shown, key))
 
 
 def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
