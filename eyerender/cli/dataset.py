@@ -168,6 +168,27 @@ def validate(
     return 0 if report["ok"] else EyerenderError.exit_code
 
 
+@app.command(name="status")
+def status(folder: Annotated[Path, Parameter(name="DIR")], /, *, watch: bool = False, json: Result = None) -> int:
+    """Show how far a dataset's run is: rates by host, the time left, retries, stalled parts, and the disk.
+
+    Args:
+        folder: A folder that generate fills.
+        watch: Show it again every ten seconds until the run has ended.
+    """
+    import time
+
+    from ..dataset.status import status as look
+
+    found = look(folder)
+    while watch and found["state"] == "running":
+        emit(found, _status_text(found), json)
+        time.sleep(10)
+        found = look(folder)
+    emit(found, _status_text(found), json)
+    return 0
+
+
 @app.command(name="export-dataset")
 def export_dataset(
     folder: Annotated[Path, Parameter(name="DIR")],
@@ -237,6 +258,27 @@ def _estimate_text(found: dict[str, Any]) -> str:
         f"{text} of {found['threads_per_worker']} threads on {rate['backend']}: about {_duration(found['seconds'])}, "
         f"{_size(found['bytes'])} (rate {how} with {rate['samples']} samples, {rate['time']})"
     )
+
+
+def _status_text(found: dict[str, Any]) -> str:
+    done, partial = found["samples_finished"], found["samples_in_partial_shards"]
+    more = f" and {partial} in partial shards" if partial else ""
+    lines = [
+        f"{found['state']}: {done}{more} of {found['samples']} samples, "
+        f"{found['shards_finished']} of {found['shards']} shards, {found['retries']} retries"
+    ]
+    if found["images_per_s"] is not None:
+        left = found["seconds_left"]
+        lines.append(f"{found['images_per_s']:.2f} images/s, {'' if left is None else _duration(left) + ' left'}")
+    if found["bytes_left"]:
+        lines.append(f"{_size(found['bytes_left'])} to write, {_size(found['bytes_free'])} free")
+    for part in found["parts"]:
+        rate = "" if part["images_per_s"] is None else f", {part['images_per_s']:.2f} images/s"
+        retries = f", {part['retries']} retries" if part["retries"] else ""
+        lines.append(
+            f"  {part['host']} {part['part']}: {part['state']}, {part['images']} images{rate}{retries}, {part['last']}"
+        )
+    return "\n".join(lines)
 
 
 def _duration(seconds: float) -> str:

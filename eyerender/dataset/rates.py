@@ -22,6 +22,7 @@ from ..storage.files import read_json, write_json
 from .done import cpu_family
 from .plan import Plan
 
+ENOUGH_SAMPLES = 200  # more samples make a rate no more representative
 _BYTES = 2**16
 _Count = Annotated[float, Field(ge=0, le=1e15)]
 
@@ -50,9 +51,13 @@ def now() -> str:
 
 
 def keep_rate(plan: Plan, rate: Rate) -> None:
-    """Store a rate; it is dropped where the cache cannot be written."""
+    """Store a rate, unless the one that is stored tells more: of the same backend, with more than twice the samples.
+
+    It is dropped where the cache cannot be written.
+    """
     path = _path(plan)
-    if path is not None:
+    old = last_rate(plan, rate.backend)
+    if path is not None and (old is None or rate.samples >= min(old.samples, ENOUGH_SAMPLES) / 2):
         with suppress(OSError, EyerenderError):
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, rate.to_mapping(), sync=False)
@@ -76,6 +81,6 @@ def _path(plan: Plan) -> Path | None:
     if folder is None:
         return None
     data = plan.to_mapping()
-    data["spec"] = {k: v for k, v in data["spec"].items() if k not in ("count", "planned", "seed")}
+    data["spec"] = {k: v for k, v in data["spec"].items() if k not in ("count", "planned", "choice", "seed")}
     key = json.dumps([data, platform.node(), cpu_family()], sort_keys=True)
     return folder / "rates" / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.json"

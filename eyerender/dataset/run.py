@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import EyerenderError, InputError, Warn
-from ..folders.imagefolder import DATASET, finished
+from ..folders.imagefolder import DATASET, LOG, finished
 from ..folders.outfolder import clear, refuse_non_empty
 from ..plausibility import saturation_warnings
 from ..progress import Progress, Say
@@ -27,7 +27,7 @@ from .plan import Plan
 from .pool import NO_SHARD, LocalPool
 from .rates import Rate, keep_rate, now
 from .realise import frames_of
-from .runfile import LOG, begin, refuse_another_count, refuse_taken
+from .runfile import begin, refuse_another_count, refuse_taken
 from .selection import in_spread_order
 from .shard import Staged, commit, is_finished, remove_leftovers, withdraw_damaged
 from .spec import DatasetSpec
@@ -36,6 +36,7 @@ from .worker import Job
 if TYPE_CHECKING:
     from .cluster import RayEngine
 
+LOG_S = 60.0  # the log is written at least so often while samples are made
 MEMORY_A_WORKER = 0.9e9  # bytes, measured resident size with head-room
 
 
@@ -181,6 +182,7 @@ class _Run:
     bytes: int = 0
     backends: set[str] = field(default_factory=set)
     seen: set[str] = field(default_factory=set)
+    logged: float = 0.0  # when the log was last written
     verified: set[int] = field(default_factory=set)  # shards whose checksums this run has verified
 
     def make(self, resumed: bool) -> dict[str, Any]:
@@ -205,19 +207,8 @@ class _Run:
             for shard in sorted(done):
                 with suppress(InputError):  # a damaged shard of another part
                     self._mixed(read_done(self.folder, shard), old=True)
-            self._log("start", shards=len(todo), finished=len(done & mine), part=f"{k}/{n}", engine=self.options.engine)
-            self.progress(0, self.total, "samples")
-            try:
-                lost = self._engine(len(todo)).run(todo, self)
-            finally:
-                self._keep_rate()
-                remove_leftovers(self.folder, mine, finished(self.folder))
-            if lost:
-                shard, reason = next(iter(lost.items()))
-                raise EyerenderError(
-                    f"{len(lost)} of {len(todo)} shards could not be made; shard {shard}: {reason}; "
-                    "the others are kept; start again to retry these"
-                )
+            self._log("start", shards=len(todo), finished=len(done & mine), engine=self.options.engine)
+            self._render(todo, mine)
         missing = self._missing()
         statistics = None
         if not missing:
@@ -240,10 +231,33 @@ class _Run:
             "seconds": round(time.monotonic() - self.start, 3),
             "retries": self.retries,
         }
+        self._log("end", **(statistics or {}))
         if statistics is not None:
-            self._log("end", **statistics)
             summary |= {"statistics": statistics}
         return summary
+
+    def _render(self, todo: list[int], mine: set[int]) -> None:
+        """Make missing shards.
+
+        Raises:
+            EyerenderError: some could not be made; or as the engines.
+        """
+        self.progress(0, self.total, "samples")
+        try:
+            lost = self._engine(len(todo)).run(todo, self)
+        except BaseException as error:
+            with suppress(OSError):
+                self._log("stop", reason=type(error).__name__)
+            raise
+        finally:
+            self._keep_rate()
+            remove_leftovers(self.folder, mine, finished(self.folder))
+        if lost:
+            shard, reason = next(iter(lost.items()))
+            raise EyerenderError(
+                f"{len(lost)} of {len(todo)} shards could not be made; shard {shard}: {reason}; "
+                "the others are kept; start again to retry these"
+            )
 
     def repaired(self, what: str) -> None:
         """Report that something was damaged and is made or written again."""
@@ -316,6 +330,8 @@ class _Run:
             self.kept += samples - 1 if images else samples
         self._count(shard, samples)
         self.images += images
+        if time.monotonic() - self.logged > LOG_S:
+            self._log("progress", made=self.images)
         self._show()
 
     def staged(self, staged: Staged, worker: str) -> None:
@@ -338,6 +354,8 @@ class _Run:
             given_up=staged.given_up,
             shard_seconds=round(staged.seconds, 3),
             worker=worker,
+            bytes=staged.bytes,
+            made=self.images,
         )
         self._show()
 
@@ -378,10 +396,12 @@ class _Run:
         line = {
             "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "host": socket.gethostname(),
+            "part": f"{self.part[0]}/{self.part[1]}",
             "event": event,
             "seconds": round(time.monotonic() - self.start, 3),
             **data,
         }
+        self.logged = time.monotonic()
         with open(self.folder / LOG, "ab+") as file:
             if file.tell():
                 file.seek(-1, os.SEEK_END)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..folders.imagefolder import DATASET, METADATA, RUN, RUN_SCHEMA, SHARDS, STAGE, finished
+from ..folders.imagefolder import DATASET, LOG, METADATA, RUN, RUN_SCHEMA, SHARDS, STAGE, finished
 from ..folders.outfolder import MARKER, clear
 from ..progress import Say
 from ..storage.files import MAX_FILE_BYTES, PART, read_json, remove_file, remove_parts, write_json
@@ -20,7 +20,6 @@ from .croissant import CROISSANT
 from .done import KINDS, read_done, run_versions
 from .plan import Plan
 
-LOG = "log.jsonl"
 _OWN = {RUN, LOG, SHARDS, *KINDS, METADATA, FAILURES, CARD, CROISSANT, DATASET}
 _ELSE = "choose another folder or give --overwrite"
 _SHOWN = 4

@@ -116,7 +116,7 @@ class DatasetSpec(FileSpec):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.subjects is not None and self.subjects > self.planned_count:
-            raise ValueError("subjects: must be <= the number of planned samples")
+            raise ValueError("subjects: must be <= count, or planned where it is given")
         if self.population is not None and self.eye_parameters:
             raise ValueError("eye_parameters: cannot stand beside a population; use its 'replace'")
         for name in self.variables or {}:

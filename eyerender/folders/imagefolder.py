@@ -32,6 +32,7 @@ DATASET_SCHEMA = "eyerender/dataset/1"
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
 RUN = "run.json"  # in a folder that `generate` fills, from its start
 RUN_SCHEMA = "eyerender/run/1"
+LOG = "log.jsonl"
 # Files of a finished shard. LINES is not called metadata.jsonl, because loaders of image folders would read it, too.
 SHARDS, DONE, LINES = "shards", "done.json", "lines.jsonl"
 STAGE = ".partial-"

@@ -52,7 +52,7 @@ def test_the_camera_scales_with_the_size(tmp_path, camera):
         ({"size": "0x0"}, "--size: must be WIDTHxHEIGHT"),
         ({"splits": "train:1"}, "--splits: must be NAME=SHARE,NAME=SHARE"),
         ({"splits": "Train=1"}, "--splits: splits.Train: a name must consist of"),
-        ({"subjects": 25}, "--subjects: subjects: must be <= the number of planned samples"),
+        ({"subjects": 25}, "--subjects: subjects: must be <= count, or planned where it is given"),
     ],
 )
 def test_wrong_options_are_refused(tmp_path, options, words):
