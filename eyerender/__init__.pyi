@@ -6,6 +6,7 @@ from .analytic.observer import AnalyticObserver as AnalyticObserver
 from .analytic.observer import trace as trace
 from .applications.quickstart import compare_folder as compare_folder
 from .applications.quickstart import run_quickstart as run_quickstart
+from .benchmark.options import BenchOptions as BenchOptions
 from .benchmark.protocol import Extractor as Extractor
 from .benchmark.run import bench_extractors as bench_extractors
 from .dataset.estimate import estimate as estimate

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 from scipy.optimize import least_squares
 from scipy.special import erf
 
@@ -40,29 +41,47 @@ class Edge:
         return self.noise_dn / abs(self.step_dn) * math.sqrt(2.0 * self.sigma_px / (math.sqrt(math.pi) * radius))
 
 
+def is_bounded(visible: float | None, known: Mapping[str, float]) -> bool:
+    """Whether the bound covers an image: it shows the whole pupil (a drawn lid of unknown extent may hide some)."""
+    return not known if visible is None else visible >= _LEAST_VISIBLE
+
+
 def edge_of(
     image: NDArray[Any],
     bit_depth: int,
     pupil: Ellipse | None,
-    visible: float | None,
     glints_px: Floats,
     known: Mapping[str, float],
+    shows: Bools | None = None,
 ) -> Edge | None:
-    """Edge as the folder states it (`known`), else measured along the true outline.
+    """Edge as the folder states it (`known`), else measured along the true outline where it is visible.
 
-    None where the image shows no pupil or hides part of it, which the bound does not cover, or where nothing can be
-    measured.
+    Args:
+        image: (h, w) as stored.
+        bit_depth: bits of the file.
+        pupil: the true outline; None where the image shows no pupil, and then there is no edge.
+        glints_px: (n, 2) places to leave out.
+        known: noise, blur and step where the folder states them.
+        shows: (h, w) pixels that show pupil or iris, None where that is unknown.
+
+    Returns:
+        The edge, None where nothing can be measured.
     """
-    if pupil is None or (visible is not None and visible < _LEAST_VISIBLE) or (visible is None and known):
+    if pupil is None:
         return None
     quantum = 255.0 / (2**bit_depth - 1)
     if known:
         noise = math.hypot(known["noise_dn"], quantum / math.sqrt(12.0))
         return Edge(noise, known["step_dn"], math.sqrt(known["blur_px"] ** 2 + 1.0 / 12.0))
-    return measure_edge(np.asarray(image, dtype=np.float64) * quantum, pupil, glints_px, quantum)
+    grey = np.asarray(image, dtype=np.float64) * quantum
+    # The blur mixes the pixels beside a lid with it.
+    inner = None if shows is None else binary_erosion(shows, iterations=2, border_value=1)
+    return measure_edge(grey, pupil, glints_px, quantum, inner)
 
 
-def measure_edge(grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn: float = 0.0) -> Edge | None:
+def measure_edge(
+    grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn: float = 0.0, shows: Bools | None = None
+) -> Edge | None:
     """Measure noise, step and blur along a known outline.
 
     The levels inside and outside are linear in the distance d from the outline, with an error function between them
@@ -74,12 +93,14 @@ def measure_edge(grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn:
         pupil: the outline.
         glints_px: (n, 2) places to leave out.
         quantum_dn: smallest step of a stored value.
+        shows: (h, w) pixels to use, None for all.
     """
     widest = 0.6 * float(pupil.semi_axes_px[1])
     reach = min(6.0, widest)
-    fit = _profile(grey_dn, pupil, glints_px, reach)
+    usable = np.ones(grey_dn.shape, dtype=bool) if shows is None else shows
+    fit = _profile(grey_dn, pupil, glints_px, reach, usable)
     if fit is not None and 5.0 * fit[1] > reach and widest > reach:
-        fit = _profile(grey_dn, pupil, glints_px, min(5.0 * fit[1], widest))
+        fit = _profile(grey_dn, pupil, glints_px, min(5.0 * fit[1], widest), usable)
     if fit is None:
         return None
     step, sigma, part, free = fit
@@ -90,7 +111,7 @@ def measure_edge(grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn:
 
 
 def _profile(
-    grey_dn: Floats, pupil: Ellipse, glints_px: Floats, reach: float
+    grey_dn: Floats, pupil: Ellipse, glints_px: Floats, reach: float, usable: Bools
 ) -> tuple[float, float, Floats, Bools] | None:
     """Step, sigma, the part of the image around the pupil, and its pixels off the edge and the glints."""
     x0, y0 = np.maximum(np.floor(pupil.centre_px - pupil.semi_axes_px[0] - reach - 2), 0).astype(int)
@@ -101,7 +122,7 @@ def _profile(
     y, x = np.mgrid[y0 : y0 + part.shape[0], x0 : x0 + part.shape[1]]
     points = np.stack([x, y], axis=-1).astype(np.float64)
     distance = signed_distance(pupil, points)
-    free = np.ones(part.shape, dtype=bool)
+    free = usable[y0:y1, x0:x1].copy()
     for spot in glints_px:
         free &= np.hypot(*np.moveaxis(points - spot, -1, 0)) > _GLINT_PX
     near = free & (np.abs(distance) < reach)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Bytes, Floats
 from ..errors import InputError
 from ..folders.imagefile import read_any_image, read_image
 from ..folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
@@ -26,6 +26,7 @@ from ..scene import Scene
 from ..scene.spec import SceneSpec
 from ..storage.files import inside, read_json
 from ..storage.jsonlines import JsonLines
+from .hints import FolderHints
 from .own import is_own, own_labels
 
 IDEAL_SCHEMA = "eyerender/ideal-images/1"
@@ -57,6 +58,11 @@ class LabelledImage:
         hints: what an extractor may know.
         known: what the folder itself states of noise (DN), blur (px) and step (DN).
         factors: possible causes of an error, by name.
+        subject: whose eye it is; "" where unknown, and then the image counts as a subject of its own.
+        iris: outline of the iris, None where unknown.
+        lids_px: (n, 2) margins of the lids, as far as they are known.
+        mask_path: file of the classes of the pixels, None where they are unknown.
+        gamma_from: where the gamma of the hints comes from: the folder, an option (`given`), or nowhere (`assumed`).
     """
 
     name: str
@@ -70,15 +76,41 @@ class LabelledImage:
     hints: Mapping[str, Any]
     known: Mapping[str, float] = field(default_factory=dict)
     factors: Mapping[str, float] = field(default_factory=dict)
+    gamma_from: str = "folder"
+    subject: str = ""
+    iris: Ellipse | None = None
+    lids_px: tuple[Floats, ...] = ()
+    mask_path: Path | None = None
+
+    def classes(self) -> Bytes | None:
+        """Read the class of each pixel (0 skin, 1 sclera, 2 iris, 3 pupil, 4 a frame), None where they are unknown."""
+        return None if self.mask_path is None else np.asarray(read_image(self.mask_path)[0], dtype=np.uint8)
 
 
-def load_labelled(folder: str | Path) -> list[LabelledImage]:
+def load_labelled(folder: str | Path, gamma: float | None = None) -> list[LabelledImage]:
     """Load every image of a folder.
 
+    Args:
+        folder: the folder.
+        gamma: encoding gamma of images whose folder states none; None assumes 1.
+
     Raises:
-        InputError: it is not such a folder, an image is missing or has another size, or does not have exactly one eye.
+        InputError: it is not such a folder, an image is missing or has another size, or does not have exactly one eye;
+            the folder states another gamma than `gamma`.
     """
-    path = Path(folder)
+    images = _load(Path(folder))
+    out = []
+    for image in images:
+        stated = float(image.hints["gamma"])
+        if image.gamma_from == "assumed" and gamma is not None:
+            image = replace(image, hints={**image.hints, "gamma": gamma}, gamma_from="given")
+        elif gamma is not None and gamma != stated:
+            raise InputError(f"{image.name} states a gamma of {stated:g}, not {gamma:g}", source="--gamma")
+        out.append(image)
+    return out
+
+
+def _load(path: Path) -> list[LabelledImage]:
     if _is_ideal(path):
         return _load_ideal(path)
     if is_own(path):
@@ -102,9 +134,12 @@ def load_labelled(folder: str | Path) -> list[LabelledImage]:
 
 def _load_own(folder: Path) -> list[LabelledImage]:
     out = []
+    told = FolderHints.load(folder)
+    hints, source = told.to_request(), "assumed" if told.gamma is None else "folder"
     for name, path, pupil in own_labels(folder):
         image, depth, _ = read_any_image(path)
-        out.append(_without_rig(name, path, (depth, image.shape), pupil))
+        found = _without_rig(name, path, (depth, image.shape), pupil)
+        out.append(replace(found, hints=hints, gamma_from=source))
     if not out:
         raise InputError("holds no labelled images", source=str(folder))
     return out
@@ -167,7 +202,24 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int, rig: RigGeometry
         _hints(entry.line, truth, row, rig, corner),
         {},
         factors | _ellipse_factors(ellipse, visible),
+        subject=str(entry.line.get("subject", "")),
+        iris=_iris(labels, corner),
+        lids_px=_lids(labels, corner),
+        mask_path=entry.mask_path,
     )
+
+
+def _iris(labels: Mapping[str, Any], corner: Floats) -> Ellipse | None:
+    outline = (labels.get("iris") or {}).get("amodal")
+    if not isinstance(outline, dict) or outline.get("status") != "ok":
+        return None
+    centre = np.asarray(outline["centre_px"], dtype=np.float64) - corner
+    return Ellipse(centre, outline["semi_axes_px"], outline["angle_rad"])
+
+
+def _lids(labels: Mapping[str, Any], corner: Floats) -> tuple[Floats, ...]:
+    margins = labels.get("lid_margins_px") or {}
+    return tuple(np.asarray(margins[lid], dtype=np.float64).reshape(-1, 2) - corner for lid in sorted(margins))
 
 
 def _visible(labels: Mapping[str, Any]) -> float | None:

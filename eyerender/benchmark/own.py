@@ -3,6 +3,7 @@
     images/a.png, images/b.png, ...      or the images beside labels.csv
     labels.csv                           image,centre_x_px,centre_y_px,semi_axis_a_px,semi_axis_b_px,angle_deg
     masks/a.png, masks/b.png, ...        pixels above 0 are the pupil (its visible part, or all of it)
+    hints.json                           what the extractors may know (`hints`); optional
 
 A line without numbers, and an empty mask, say that the image shows no pupil.
 """

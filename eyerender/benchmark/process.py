@@ -87,7 +87,8 @@ class ExtractorProcess:
         os.set_blocking(self._process.stdin.fileno(), False)
         self._stderr = _Tail(self._process.stderr)
         try:
-            self.greeting = Greeting.parse(self._line(start_timeout_s, "no greeting"))
+            self.greeting_line = self._line(start_timeout_s, "no greeting")
+            self.greeting = Greeting.parse(self.greeting_line)
         except InputError as error:
             self.close()
             raise Failed(f"greeting: {error}") from None

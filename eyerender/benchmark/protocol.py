@@ -102,6 +102,7 @@ class Reply:
         cpu_s: processor time that the extractor reports, None where it gives none.
         wall_s: the same for elapsed time.
         error: why it failed on this image, in its own words; the rest is then empty.
+        line: the answer as it was sent.
     """
 
     ellipse: Ellipse | None
@@ -111,6 +112,7 @@ class Reply:
     cpu_s: float | None
     wall_s: float | None
     error: str | None = None
+    line: str = ""
 
     @classmethod
     def parse(cls, line: str, request_id: int, conventions: Conventions) -> Reply:
@@ -149,6 +151,7 @@ class Reply:
             glints=_glints(record.get("glints"), conventions),
             cpu_s=_optional(data.get("cpu_s"), "cpu_s"),
             wall_s=_optional(data.get("wall_s"), "wall_s"),
+            line=line,
         )
 
 

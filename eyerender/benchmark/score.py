@@ -59,6 +59,10 @@ class Score:
         wall_s: elapsed time that the extractor reports.
         trip_s: time from question to answer.
         ellipse: the ellipse that was reported.
+        with_pupil: whether the image shows a pupil.
+        subject: whose eye the image shows; "" where unknown.
+        kind: what a wrong ellipse shows instead of the pupil (`failurekinds`).
+        radius_px: sqrt(a b) of the true pupil.
     """
 
     outcome: Outcome
@@ -74,6 +78,10 @@ class Score:
     wall_s: float | None = None
     trip_s: float | None = None
     ellipse: Ellipse | None = None
+    with_pupil: bool = True
+    subject: str = ""
+    kind: str | None = None
+    radius_px: float | None = None
 
     @property
     def centre_px(self) -> float | None:
@@ -90,7 +98,9 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
     found, true = reply.ellipse, image.pupil
     if true is None:
         outcome: Outcome = "absent" if found is None else "false"
-        return Score(outcome, reply.reason, None, None, None, None, None, reply.confidence, glints, *times, found)
+        return Score(
+            outcome, reply.reason, None, None, None, None, None, reply.confidence, glints, *times, found, False
+        )
     if found is None:
         reason = reply.reason or "gave no reason"
         return Score("none", reason, None, None, None, None, None, reply.confidence, glints, *times)
@@ -110,13 +120,14 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
         glints,
         *times,
         found,
+        radius_px=math.sqrt(float(true.semi_axes_px.prod())),
     )
 
 
 def failed(image: LabelledImage, reason: str, reports_glints: bool) -> Score:
     """Score without a usable answer."""
     glints = GlintScore(true=len(image.glints)) if reports_glints else None
-    return Score("error", reason, glints=glints)
+    return Score("error", reason, glints=glints, with_pupil=image.pupil is not None)
 
 
 def score_glints(image: LabelledImage, reply: Reply) -> GlintScore:

@@ -13,7 +13,8 @@ import numpy as np
 from ..arrays import Floats
 from .bound import MEDIAN_OF_RADIAL
 from .folder import LabelledImage
-from .score import Score
+from .intervals import subject_interval, wilson
+from .score import Outcome, Score
 
 # name -> (meaning, unit)
 FACTORS = {
@@ -27,7 +28,11 @@ FACTORS = {
     "phase_x": ("sub-pixel phase, x", "px"),
     "phase_y": ("sub-pixel phase, y", "px"),
 }
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
+_OUTCOMES: tuple[Outcome, ...] = ("right", "wrong", "none", "error")
 _BINS = 4
+# Ends of the tiers of visibility, as hidden shares of the pupil.
+HIDDEN_TIERS = (0.0, 0.02, 0.3, 0.7, 1.0)
 # A factor gets a breakdown where it varies by more than this share of its largest value.
 _VARIES = {"noise_dn": 0.25, "blur_px": 0.25, "contrast_to_noise": 0.25, "pupil_px": 0.1, "aspect": 0.05}
 
@@ -38,7 +43,10 @@ def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], report
     Errors are those of correctly found pupils (IoU > 0.9); `centre_px_of_all_found` includes wrong ones.
     """
     counts = Counter(s.outcome for s in scores)
-    shown = sum(counts[o] for o in ("right", "wrong", "none", "error"))
+    shown = sum(s.with_pupil for s in scores)
+    without = len(scores) - shown
+    errors = sum(s.with_pupil and s.outcome == "error" for s in scores)
+    outcomes = {**{o: counts[o] for o in ("right", "wrong", "none")}, "error": errors}
     right = [s for s in scores if s.outcome == "right"]
     offsets = np.array([s.offset_px for s in right]).reshape(-1, 2)
     axes = np.array([s.axes_px for s in right]).reshape(-1, 2)
@@ -46,21 +54,45 @@ def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], report
     return {
         "images": len(scores),
         "with_pupil": shown,
-        **{o: counts[o] for o in ("right", "wrong", "none", "error")},
-        "rates": {o: _ratio(counts[o], shown) for o in ("right", "wrong", "none", "error")},
-        "without_pupil": counts["absent"] + counts["false"],
+        **outcomes,
+        "errors": counts["error"],
+        "rates": {**{o: _ratio(n, shown) for o, n in outcomes.items()}, "false": _ratio(counts["false"], without)},
+        "intervals": _intervals(scores, reports_glints),
+        "failure_kinds": dict(sorted(Counter(s.kind for s in scores if s.kind is not None).items())),
+        "without_pupil": without,
         "false": counts["false"],
-        "centre_px": _sizes(np.hypot(*offsets.T)),
+        "centre_px": sizes(np.hypot(*offsets.T)),
         "centre_bias_px": _vector(offsets),
         "centre_bias_standard_error_px": _standard_error(offsets),
-        "centre_px_of_all_found": _sizes(np.array(found)),
+        "centre_px_of_all_found": sizes(np.array(found)),
         "semi_axes_bias_px": _vector(axes),
-        "semi_axes_px": _sizes(np.abs(axes).max(axis=1) if len(axes) else np.zeros(0)),
-        "iou": _sizes(np.array([s.iou for s in right if s.iou is not None]), low=True),
-        "boundary_px": _sizes(np.array([s.boundary_px for s in right if s.boundary_px is not None])),
+        "semi_axes_px": sizes(np.abs(axes).max(axis=1) if len(axes) else np.zeros(0)),
+        "iou": sizes(np.array([s.iou for s in right if s.iou is not None]), low=True),
+        "boundary_px": sizes(np.array([s.boundary_px for s in right if s.boundary_px is not None])),
         "efficiency": efficiency(scores, sigmas_px),
         "glints": _glints(scores) if reports_glints else None,
-        "time": _times(scores),
+    }
+
+
+def _intervals(scores: Sequence[Score], reports_glints: bool) -> dict[str, Any]:
+    """95 % intervals of every rate: `wilson` for independent trials, `subjects` for images that are alike."""
+    shown = [s for s in scores if s.with_pupil]
+    trials = {o: ([s.outcome == o for s in shown], [1] * len(shown), shown) for o in _OUTCOMES}
+    without = [s for s in scores if not s.with_pupil]
+    trials["false"] = ([s.outcome == "false" for s in without], [1] * len(without), without)
+    if reports_glints:
+        seen = [s for s in scores if s.glints is not None]
+        glints = [s.glints for s in seen if s.glints is not None]
+        matched = [len(g.errors_px) for g in glints]
+        trials["glint_recall"] = (matched, [g.true for g in glints], seen)
+        trials["glint_precision"] = (matched, [g.reported for g in glints], seen)
+        trials["swap_rate"] = ([g.swapped for g in glints], [g.named for g in glints], seen)
+    return {
+        name: {
+            "wilson": wilson(sum(parts), sum(wholes)),
+            "subjects": subject_interval(parts, wholes, [s.subject for s in members]),
+        }
+        for name, (parts, wholes, members) in trials.items()
     }
 
 
@@ -84,30 +116,44 @@ def efficiency(scores: Sequence[Score], sigmas_px: Sequence[float | None]) -> di
 
 def failures(scores: Sequence[Score], images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
     """Every reason for a wrong, missing or unusable answer, with its count and first image."""
-    seen: dict[tuple[str, str], dict[str, Any]] = {}
+    seen: dict[tuple[Outcome, str], dict[str, Any]] = {}
+    members: dict[tuple[Outcome, str], list[Score]] = {}
     for s, image in zip(scores, images, strict=True):
         if s.outcome in ("right", "absent"):
             continue
-        reason = failure_kind(s)
-        entry = seen.setdefault((s.outcome, reason), {"outcome": s.outcome, "reason": reason, "count": 0})
+        key: tuple[Outcome, str] = (s.outcome, failure_kind(s))
+        entry = seen.setdefault(key, {"outcome": s.outcome, "reason": "", "count": 0})
         entry["count"] += 1
         entry.setdefault("first", image.name)
+        members.setdefault(key, []).append(s)
+    for kind, entry in seen.items():
+        is_wrong = kind[0] == "wrong"
+        entry["reason"] = kind[1] if is_wrong else _joined([s.reason or kind[1] for s in members[kind]])
     return sorted(seen.values(), key=lambda e: (-e["count"], e["outcome"], e["reason"]))
 
 
 def failure_kind(score: Score) -> str:
     """Reason of a failure, as it is counted; of a missing pupil without numbers, which differ from image to image."""
     if score.outcome == "wrong":
-        return "another ellipse than the pupil's"
+        return score.kind or "another ellipse than the pupil's"
     reason = score.reason or "gave no reason"
-    return re.sub(r"-?\d+(\.\d+)?", "#", reason) if score.outcome == "none" else reason
+    return _NUMBER.sub("#", reason) if score.outcome == "none" else reason
+
+
+def _joined(reasons: Sequence[str]) -> str:
+    """One text for reasons that differ only by their numbers, with the span of each number."""
+    columns = zip(*([m.group() for m in _NUMBER.finditer(reason)] for reason in reasons), strict=True)
+    ordered = [sorted(column, key=float) for column in columns]
+    spans = iter(c[0] if c[0] == c[-1] else f"{c[0]} to {c[-1]}" for c in ordered)
+    return _NUMBER.sub(lambda _: next(spans), reasons[0])
 
 
 def bins(values: Sequence[float | None], name: str) -> list[tuple[float, float, list[int]]]:
     """Divide the values of a factor into bins, each as (low, high, members).
 
-    A factor with up to six values has one bin per value. A phase has quarters of a pixel, any other factor quarters of
-    the images. There are no bins where the factor hardly varies or is unknown for all images.
+    A factor with up to six values has one bin per value. A phase has quarters of a pixel, the hidden share has its
+    tiers (whole, more than 0.7 visible, 0.3 to 0.7, less than 0.3), and any other factor has quarters of the images.
+    There are no bins where the factor hardly varies or is unknown for all images.
     """
     known = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
     there = np.flatnonzero(np.isfinite(known))
@@ -118,6 +164,8 @@ def bins(values: Sequence[float | None], name: str) -> list[tuple[float, float, 
     single = np.unique(np.round(some, 6))
     if name.startswith("phase"):
         edges = np.linspace(0.0, 1.0, _BINS + 1)
+    elif name == "occlusion" and len(single) > 1:
+        edges = np.array(HIDDEN_TIERS)
     elif len(single) <= 6:
         if len(single) < 2:
             return []
@@ -142,7 +190,7 @@ def breakdown(
     reports_glints: bool,
 ) -> dict[str, list[dict[str, Any]]]:
     """Summaries for every bin of every factor that varies, over the images that show a pupil."""
-    shown = [i for i, s in enumerate(scores) if s.outcome not in ("absent", "false")]
+    shown = [i for i, s in enumerate(scores) if s.with_pupil]
     out: dict[str, list[dict[str, Any]]] = {}
     for name in FACTORS:
         rows = []
@@ -170,23 +218,13 @@ def _glints(scores: Sequence[Score]) -> dict[str, Any]:
         "named": named,
         "swapped": swapped,
         "swap_rate": _ratio(swapped, named),
-        "error_px": _sizes(np.hypot(*errors.T)),
+        "error_px": sizes(np.hypot(*errors.T)),
         "bias_px": _vector(errors),
     }
 
 
-def _times(scores: Sequence[Score]) -> dict[str, Any]:
-    own = [s.cpu_s for s in scores if s.cpu_s is not None]
-    trips = [s.trip_s for s in scores if s.trip_s is not None]
-    return {
-        "cpu_ms": _sizes(1e3 * np.array(own)),
-        "wall_ms": _sizes(1e3 * np.array([s.wall_s for s in scores if s.wall_s is not None])),
-        "round_trip_ms": _sizes(1e3 * np.array(trips)),
-    }
-
-
-def _sizes(values: Floats, low: bool = False) -> dict[str, Any]:
-    """Number, median, 95th percentile (5th where low is bad) and worst value."""
+def sizes(values: Floats, low: bool = False) -> dict[str, Any]:
+    """Summarise sizes: number, median, 95th percentile (5th where low is bad) and worst value."""
     tail = "p5" if low else "p95"
     if not len(values):
         return {"n": 0, "median": None, tail: None, "worst": None}

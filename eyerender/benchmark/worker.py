@@ -1,5 +1,8 @@
 """A Python callable behind the protocol: `python -m eyerender.benchmark.worker module:callable [NAME]`.
 
+With `--check` before it, the callable is only loaded: the files of its code are printed as a JSON list, or the exit
+code is 2 if there is no such callable.
+
 The callable follows `protocol.Extractor`. What it prints goes to stderr. A `registry.Command` may take the place of a
 callable; it is then run instead.
 """
@@ -23,11 +26,13 @@ from .registry import Command
 
 
 def main(argv: list[str]) -> int:
-    """Serve requests until the input ends."""
+    """Serve requests until the input ends, or check a reference."""
     stdout = os.dup(1)
     # Output of libraries or the callable must not mix with the answers.
     os.dup2(2, 1)
     sys.stdout = sys.stderr
+    if argv[0] == "--check":
+        return _check(argv[1], os.fdopen(stdout, "w", encoding="utf-8"))
     try:
         found = load_reference(argv[0])
     except InputError as error:
@@ -63,6 +68,29 @@ def main(argv: list[str]) -> int:
         except Exception as error:  # a defect of the extractor on one image is that image's result
             text = json.dumps({"id": request["id"], "error": f"{type(error).__name__}: {error}"})
         _send(answers, text)
+    return 0
+
+
+def _check(reference: str, answers: TextIO) -> int:
+    """Load a callable and print the files of its module and of others that no installation holds."""
+    try:
+        found = load_reference(reference)
+    except InputError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    if not callable(found) and not isinstance(found, Command):
+        sys.stderr.write(f"{reference} is neither a callable nor a Command\n")
+        return 2
+    installed = (sys.prefix, sys.base_prefix)
+    files = {
+        name: file
+        for name, module in list(sys.modules.items())
+        if isinstance(file := getattr(module, "__file__", None), str)
+    }
+    own = {
+        file for name, file in files.items() if name == reference.partition(":")[0] or not file.startswith(installed)
+    }
+    _send(answers, json.dumps(sorted(os.path.abspath(file) for file in own)))
     return 0
 
 

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from ..errors import InputError
+from ..storage.files import read_json
 from .app import app
-from .options import Overwrite, Result
-from .output import emit, progress
+from .options import Overwrite, Result, at_least_one
+from .output import emit, progress, say
 
 
 @app.command(name="bench-extractors")
@@ -20,14 +20,24 @@ def bench_extractors(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     extractor: tuple[str, ...] = (),
+    jobs: Annotated[int, Parameter(validator=at_least_one)] = 1,
+    gamma: float | None = None,
+    against: Path | None = None,
+    require: tuple[str, ...] = (),
     timeout: float = 30.0,
+    fresh: bool = False,
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
     """Measure pupil and glint extractors against the labels of a folder of images.
 
-    The output folder receives report.html, results.json and results.csv. Each extractor runs in its own process. If it
-    crashes, hangs or returns invalid answers, only its own result fails, with a reason.
+    The output folder receives report.html, results.json, results.csv and times.json; only times.json differs between
+    identical runs. Each extractor runs in its own process. If it crashes, hangs or returns invalid answers, only its
+    own result fails, with a reason. Answers are stored, so a second run asks only about what is new.
+
+    The exit code is 1 if an extractor gives no usable answer to any image. With --against or --require it is also 1 if
+    an extractor fails on any image, if a required figure is not reached, or if significantly more images were lost than
+    gained (exact McNemar test, p < 0.05).
 
     Args:
         folder: A folder of labelled images written by quickstart, render or generate, or a folder of ideal images.
@@ -35,31 +45,48 @@ def bench_extractors(
         extractor: The name of an installed extractor (own-fast, own-refined, opencv-contour, pupil-detectors, or a
             plug-in), a Python module:callable, or a command that speaks the protocol. NAME=... names it in the report.
             Repeat the option for several extractors (default: all installed ones).
+        jobs: The number of extractor processes that run at the same time.
+        gamma: The encoding gamma of images whose folder states none (default: 1, linear).
+        against: The results.json of an earlier bench to compare with.
+        require: A figure that must be reached, such as right>=.95 or own-fast:centre_px<.1. Repeat the option for
+            several.
         timeout: Seconds that an extractor may take for one image.
+        fresh: Ask about every image again, also where an answer is stored.
     """
-    from ..benchmark.run import REPORT, bench_extractors
+    from ..benchmark.options import BenchOptions
+    from ..benchmark.run import REPORT, TIMES, bench_extractors
 
-    if not 0 < timeout <= 86400:
-        raise InputError("must be above 0 and at most 86400 seconds", source="--timeout")
+    options = BenchOptions(
+        jobs=jobs,
+        timeout_s=timeout,
+        gamma=gamma,
+        fresh=fresh,
+        against=against,
+        require=require,
+        overwrite=overwrite,
+    )
     with progress("benching") as steps:
-        data = bench_extractors(
-            folder, output, extractor or None, timeout_s=timeout, overwrite=overwrite, progress=steps
-        )
-    emit(data, f"{_table(data)}\n\nreport: {output / REPORT}", json)
-    return 0
+        data = bench_extractors(folder, output, extractor or None, options, progress=steps)
+    for entry in data["gamma"]:
+        if entry["from"] == "assumed":
+            say(f"{entry['images']} images state no gamma; {entry['gamma']:g} (linear) is assumed (--gamma)")
+    emit(data, f"{_table(data, read_json(output / TIMES, limit=2**30))}\n\nreport: {output / REPORT}", json)
+    for problem in data["problems"]:
+        say(f"error: {problem}")
+    return 1 if data["problems"] else 0
 
 
-def _table(data: dict[str, Any]) -> str:
+def _table(data: dict[str, Any], times: dict[str, Any]) -> str:
     """One line per extractor, then the reasons of failures."""
     lines = [
         f"{'':<18} {'right':>5} {'wrong':>5} {'none':>5} {'error':>5} {'centre px':>10} {'p95':>8} {'bias x':>8} "
         f"{'bias y':>8} {'eff.':>5} {'axis a':>8} {'axis b':>8} {'bound.':>7} {'IoU':>6} "
         f"{'glints':>9} {'gl. px':>7} {'ms':>6}"
     ]
-    for e in data["extractors"]:
+    for e, spent in zip(data["extractors"], times["extractors"], strict=True):
         s, g = e["summary"], e["summary"]["glints"]
         bias, axes = s["centre_bias_px"] or (None, None), s["semi_axes_bias_px"] or (None, None)
-        time = s["time"]["cpu_ms"]["median"] or s["time"]["round_trip_ms"]["median"]
+        time = spent["cpu_ms"]["median"] or spent["round_trip_ms"]["median"]
         lines.append(
             f"{e['name']:<18} {s['right']:>5} {s['wrong']:>5} {s['none']:>5} {s['error']:>5} "
             f"{_f(s['centre_px']['median'], 4):>10} {_f(s['centre_px']['p95'], 4):>8} {_f(bias[0], 4):>8} "
@@ -70,6 +97,11 @@ def _table(data: dict[str, Any]) -> str:
         )
     for e in data["extractors"]:
         lines += [f"{e['name']}: {f['count']} x {f['outcome']}: {f['reason']}" for f in e["failures"][:3]]
+    for c in data["against"]:
+        lines.append(
+            f"{c['extractor']}: {c['successes_before']} -> {c['successes']} of {c['images']} right; "
+            f"{len(c['lost'])} lost, {len(c['gained'])} gained (p = {c['p']:.2g})"
+        )
     lines += [f"{e['name']}: not run: {e['reason']}" for e in data["not_run"]]
     return "\n".join(lines)
 

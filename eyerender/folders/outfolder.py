@@ -40,7 +40,7 @@ _FILES = re.compile(
     r"(images/)?("  # a study's images are a dataset of their own
     r"(dataset|run|croissant)\.json|(metadata|failures|log)\.jsonl|README\.md|report\.html|"
     r"(images|masks|amodal_masks|noiseless|highlights)/([0-9]+/)?[^/]+\.(png|exr)|shards/[0-9]+/(lines\.jsonl|done\.json))"
-    r"|(study|summary|findings|results)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
+    r"|(study|summary|findings|results|times)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
 )
 # Names of files that are being written, with their final names.
 _PARTS = re.compile(r"(?P<folder>(?:.*/)?)(?:\.(?P<hidden>[^/]+)\.[0-9a-f]{8}|(?P<plain>[^/]+))\.part")

@@ -25,6 +25,7 @@ _LOOK = (
 )  # fmt: skip
 _OUTCOMES = (("right", "#0072B2"), ("wrong", "#D55E00"), ("none", "#bbbbbb"), ("error", "#222222"))
 _PANELS = 4
+_GAMMA = {"folder": "stated by the folder", "given": "given", "assumed": "assumed, because nothing states it"}
 _MOST = 24  # thumbnails of an extractor
 
 
@@ -64,7 +65,21 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
     ]
     sections = [
         Section("Results", tables=(_pupil_table(entries), _rate_table(entries), _glint_table(entries))),
+        Section(
+            "Compared in pairs",
+            [
+                "The same images, extractor against extractor. An image is a success if its pupil is right, or if none "
+                "is reported where none is. p is the exact McNemar test's, not corrected for the number of pairs. "
+                "Errors are compared on the pupils that both find right."
+            ],
+            tables=(_pair_table(data["pairs"]), _common_table(data["common"])),
+        ),
         Section("Errors", figures=_error_figures(data, rows)),
+        Section(
+            "Other thresholds",
+            ["Share of the images with a pupil that are right, if another overlap or another error is allowed."],
+            [Figure(curve_figure(entries), "Overlap, centre error in radii of the pupil, and confidence.")],
+        ),
         Section(
             "Breakdown",
             [
@@ -85,7 +100,7 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
             caption="Not run",
             wide=(1,),
         )
-        sections[3] = replace(sections[3], tables=(_failure_table(entries), table))
+        sections[5] = replace(sections[5], tables=(_failure_table(entries), table))
     write_page(path, Page(f"{data['folder']}: extractors compared", lead, cards, sections))
 
 
@@ -171,6 +186,29 @@ def outcome_figure(entries: Sequence[Row]) -> str:
         return svg(fig)
 
 
+def curve_figure(entries: Sequence[Row]) -> str:
+    """Draw the share of right pupils over the overlap and the centre error, and over the confidence asked for."""
+    names = [e["name"] for e in entries]
+    with figure(11.0, 3.6, 3) as (fig, axes):
+        for e in entries:
+            colour = look(names, e["name"])[0]
+            curves = e["curves"]
+            for ax, key in zip(axes, ("iou", "centre_radii"), strict=False):
+                share = [np.nan if y is None else y for y in curves[key]["share"]]
+                ax.plot(curves[key]["x"], share, color=colour, lw=1.6, label=e["name"])
+            sure = curves["confidence"]
+            if sure is not None:
+                right = [np.nan if y is None else y for y in sure["right"]]
+                axes[2].plot(sure["answered"], right, color=colour, lw=1.6)
+        axes[0].set(xlabel="IoU, at least", ylabel="share of the images", ylim=(0, 1.02))
+        axes[1].set(xlabel="centre error (radii), at most", ylim=(0, 1.02), xscale="log")
+        axes[2].set(
+            xlabel="share answered with a confidence", ylabel="right ones of these", xlim=(0, 1), ylim=(0, 1.02)
+        )
+        legend_above(fig, axes[0], 4)
+        return svg(fig)
+
+
 def vector_figure(names: Sequence[str], everyone: Sequence[str], rows: Sequence[Row]) -> str:
     """Draw centre errors as vectors, one panel per extractor with its own scale; up to four panels."""
     with figure(11.0, 3.3, _PANELS) as (fig, axes):
@@ -252,7 +290,7 @@ def _error_figures(data: Row, rows: Sequence[Row]) -> list[Figure]:
 def _pupil_table(entries: Sequence[Row]) -> Table:
     header = (
         "extractor", "right", "centre error: median", "95 %", "bias x", "bias y", "efficiency", "bias a", "bias b",
-        "boundary", "IoU", "CPU ms",
+        "boundary", "IoU",
     )  # fmt: skip
     rows = []
     for e in entries:
@@ -263,14 +301,12 @@ def _pupil_table(entries: Sequence[Row]) -> Table:
                 e["name"], f"{s['right']} of {s['with_pupil']}", _px(s["centre_px"]["median"]),
                 _px(s["centre_px"]["p95"]), *map(_signed, bias), _number(s["efficiency"]["value"], 2),
                 *map(_signed, axes), _px(s["boundary_px"]["median"]), _number(s["iou"]["median"], 4),
-                _time(s["time"]),
             )
         )  # fmt: skip
     caption = (
         "Errors of the right pupils, in px. Efficiency: Cramér-Rao bound divided by the error, median of the ratio; "
-        "1 reaches the bound. Boundary: mean distance of the true outline, median over the images. CPU: median "
-        "milliseconds per image on one core, without reading the image; in brackets the round trip, if an extractor "
-        "does not report its own time."
+        "1 reaches the bound. Boundary: mean distance of the true outline, median over the images. Times are in "
+        "times.json."
     )
     return Table(header=header, rows=rows, caption=caption)
 
@@ -279,12 +315,40 @@ def _rate_table(entries: Sequence[Row]) -> Table:
     rows = []
     for e in entries:
         s = e["summary"]
+        spans = s["intervals"]
         rates = [_percent(s["rates"][o]) for o, _ in _OUTCOMES]
+        rates[:1] = [rates[0], _span(spans["right"]["wilson"]), _span(spans["right"]["subjects"])]
         absent = f"{s['false']} of {s['without_pupil']}" if s["without_pupil"] else "-"
         worst = s["centre_px_of_all_found"]
         rows.append((e["name"], *rates, absent, _px(worst["p95"]), _px(worst["worst"])))
-    header = ("extractor", "right", "wrong", "none", "error", "pupil where none is", "all found: 95 %", "worst")
-    return Table(header=header, rows=rows, caption="Rates, and the centre errors (px) including wrong pupils.")
+    header = (
+        "extractor", "right", "95 %", "95 %, subjects", "wrong", "none", "error", "pupil where none is",
+        "all found: 95 %", "worst",
+    )  # fmt: skip
+    caption = (
+        "Rates, and the centre errors (px) including wrong pupils. The first interval is Wilson's for independent "
+        "images; the second resamples subjects. results.json has both for every rate."
+    )
+    return Table(header=header, rows=rows, caption=caption)
+
+
+def _pair_table(pairs: Sequence[Row]) -> Table:
+    rows = []
+    for pair in pairs:
+        medians = pair["centre_px"] or (None, None)
+        counts = (str(pair["only_first"]), str(pair["only_second"]), f"{pair['p']:.2g}", str(pair["common"]))
+        rows.append((pair["first"], pair["second"], *counts, *map(_px, medians)))
+    header = ("first", "second", "only first", "only second", "p", "both right", "first: median error", "second")
+    return Table(header=header, rows=rows, caption="Successes of only one of two extractors.", folded=len(rows) > 20)
+
+
+def _common_table(common: Row) -> Table:
+    rows = [
+        (name, _px(e["centre_px"]["median"]), _px(e["centre_px"]["p95"]), _px(e["boundary_px"]["median"]))
+        for name, e in common["extractors"].items()
+    ]
+    caption = f"Errors (px) on the {common['n']} pupils that all of these find right."
+    return Table(header=("extractor", "centre error: median", "95 %", "boundary"), rows=rows, caption=caption)
 
 
 def _glint_table(entries: Sequence[Row]) -> Table:
@@ -365,9 +429,10 @@ def _convention_table(entries: Sequence[Row]) -> Table:
 
 def _how(data: Row) -> list[str]:
     versions = ", ".join(f"{name} {v}" for name, v in data["versions"].items())
+    gammas = "; ".join(f"{g['gamma']:g} for {g['images']} images ({_GAMMA[g['from']]})" for g in data["gamma"])
     return [
-        f"{data['machine']['processor']}; {data['machine']['system']}; one thread per extractor, one extractor at "
-        f"a time, at most {data['timeout_s']:g} s per image. {versions}.",
+        f"Each extractor uses one thread. {versions}.",
+        f"Encoding gamma that the extractors were told: {gammas}.",
         "Cramér-Rao bound of the centre, per axis: (s / step) sqrt(2 sigma_b / (sqrt(pi) sqrt(a b))). Here s is "
         "the noise, step the grey-level step from pupil to iris, and sigma_b the blur of the edge, including the "
         "pixel. The median distance is 1.177 times the bound. It holds for a fully visible outline. In rendered "
@@ -384,16 +449,13 @@ def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
+def _span(ends: Sequence[float] | None) -> str:
+    return "-" if ends is None else f"{100 * ends[0]:.1f} to {100 * ends[1]:.1f} %"
+
+
 def _signed(value: float | None) -> str:
     return "-" if value is None else f"{value:+.4f}"
 
 
 def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.0f} %" if value in (0.0, 1.0) else f"{100 * value:.1f} %"
-
-
-def _time(times: Row) -> str:
-    if times["cpu_ms"]["median"] is not None:
-        return f"{times['cpu_ms']['median']:.1f}"
-    trip = times["round_trip_ms"]["median"]
-    return "-" if trip is None else f"({trip:.1f})"

@@ -57,20 +57,24 @@ def bench(drawn, tmp_path_factory):
     dead = f"dead={sys.executable} -c 'import sys; sys.exit(\"no licence\")'"
     chosen = [w for e in ("own-refined", "opencv-contour", dead) for w in ("--extractor", e)]
     target = out.parent / "results.json"
-    assert run(["bench-extractors", str(drawn), "-o", str(out), *chosen, "--json", str(target)]) == 0
+    # 1, because the one that dies answers nothing.
+    assert run(["bench-extractors", str(drawn), "-o", str(out), *chosen, "--json", str(target)]) == 1
     return out, json.loads(target.read_text())
 
 
 def test_the_figures_are_those_of_the_extractors(bench):
-    _, data = bench
-    assert data["schema"] == "eyerender/bench-extractors/1"
+    out, data = bench
+    assert data["schema"] == "eyerender/bench-extractors/2"
     own, contour, dead = data["extractors"]
     s = own["summary"]
     assert (s["right"], s["with_pupil"]) == (6, 6)
     assert s["centre_px"]["worst"] < 0.1  # six errors about a bound of some 0.01 px each
     assert 0.3 < s["efficiency"]["value"] < 3.0  # the median of six errors scatters by a factor of two
     assert s["glints"]["recall"] == s["glints"]["precision"] == 1.0
-    assert s["time"]["cpu_ms"]["median"] > 0
+    spent = json.loads((out / "times.json").read_text())["extractors"]
+    assert spent[0]["cpu_ms"]["median"] > 0
+    assert spent[2]["cpu_ms"]["n"] == 0
+    assert data["problems"] == ["dead: gave no usable answer to any image"]
     # A contour runs through the centres of the outermost dark pixels.
     assert contour["summary"]["right"] == 6
     assert all(-0.8 < b < -0.1 for b in contour["summary"]["semi_axes_bias_px"])
@@ -89,7 +93,7 @@ def own_first(data):
 
 def test_the_folder_holds_report_table_and_json(bench):
     out, data = bench
-    assert {p.name for p in out.iterdir()} == {"report.html", "results.json", "results.csv"}
+    assert {p.name for p in out.iterdir()} == {"report.html", "results.json", "results.csv", "times.json"}
     assert json.loads((out / "results.json").read_text()) == data
     with open(out / "results.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -110,7 +114,7 @@ def test_the_folder_holds_report_table_and_json(bench):
 def test_an_earlier_bench_is_replaced_and_other_files_are_not(bench, drawn, tmp_path, capsys):
     out = shutil.copytree(bench[0], tmp_path / "bench")
     dead = ["--extractor", f"{sys.executable} -c 0"]
-    assert run(["bench-extractors", str(drawn), "-o", str(out), *dead, "--json", "-"]) == 0
+    assert run(["bench-extractors", str(drawn), "-o", str(out), *dead, "--json", "-"]) == 1
     shown = json.loads(capsys.readouterr().out)
     assert [e["summary"]["error"] for e in shown["extractors"]] == [6]
     (tmp_path / "other").mkdir()

@@ -10,11 +10,12 @@ import tracemalloc
 
 import pytest
 
+from eyerender.benchmark.asking import ask_extractors
 from eyerender.benchmark.folder import load_labelled
+from eyerender.benchmark.options import BenchOptions
 from eyerender.benchmark.process import ExtractorProcess, Failed
 from eyerender.benchmark.protocol import Request
 from eyerender.benchmark.registry import ExtractorCommand, resolve
-from eyerender.benchmark.run import run_extractor
 
 HEAD = """
 import json, os, subprocess, sys, time
@@ -41,6 +42,10 @@ def program(tmp_path):
 @pytest.fixture(scope="module")
 def images(drawn):
     return load_labelled(drawn)
+
+
+def run_extractor(extractor, images, **options):
+    return ask_extractors([extractor], images, BenchOptions(**options))[0]
 
 
 def gone(pid):
@@ -144,6 +149,22 @@ def test_after_three_failures_in_a_row_it_is_not_asked_again(program, images, tm
     )
     assert count.read_text() == "xxx"
     assert run.scores[5].reason.startswith("not asked after 3 failures in a row, the last: was killed by SIGABRT")
+
+
+def test_results_do_not_depend_on_the_number_of_processes(program, images):
+    """One that answers about some images, dies on others, and dies three times in a row in the second half."""
+    body = """
+    say(GREETING)
+    for line in sys.stdin:
+        request = json.loads(line)
+        if request["id"] in (0, 2, 3, 4): os.abort()
+        ok(request)
+    """
+    runs = [run_extractor(program(body), images, jobs=jobs) for jobs in (1, 2, 3, 9)]
+    outcomes = [[(s.outcome, s.reason) for s in run.scores] for run in runs]
+    assert [o for o, _ in outcomes[0]] == ["error", "none", "error", "error", "error", "error"]
+    assert outcomes[0][5][1].startswith("not asked after 3 failures in a row")
+    assert outcomes[1:] == outcomes[:1] * 3
 
 
 def test_what_a_hanging_extractor_started_is_killed_with_it(program, images, tmp_path):

@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import norm
 
 import make_ideal_images as ideal
-from eyerender.benchmark.bound import Edge, edge_of, measure_edge
+from eyerender.benchmark.bound import Edge, edge_of, is_bounded, measure_edge
 from eyerender.benchmark.folder import LabelledImage, TrueGlint, load_labelled
 from eyerender.benchmark.protocol import Reply
 from eyerender.benchmark.score import GlintScore, Score, score, score_glints
@@ -77,9 +77,14 @@ def test_glints_are_matched_one_to_one_and_swaps_are_counted():
 def test_rates_are_over_the_images_that_show_a_pupil():
     scores = [Score("right", offset_px=(0.3, 0.4), axes_px=(0.1, -0.2), iou=0.98, boundary_px=0.2)] * 3
     scores += [Score("wrong", "IoU", offset_px=(9, 12), axes_px=(3, 3), iou=0.3)]
-    scores += [Score("none", "dark"), Score("error", "crash"), Score("absent"), Score("false")]
+    scores += [
+        Score("none", "dark"),
+        Score("error", "crash"),
+        Score("absent", with_pupil=False),
+        Score("false", with_pupil=False),
+    ]
     got = summarise(scores, [None] * len(scores), False)
-    assert got["rates"] == {"right": 0.5, "wrong": 1 / 6, "none": 1 / 6, "error": 1 / 6}
+    assert got["rates"] == {"right": 0.5, "wrong": 1 / 6, "none": 1 / 6, "error": 1 / 6, "false": 0.5}
     assert (got["without_pupil"], got["false"]) == (2, 1)
     assert got["centre_px"] == {"n": 3, "median": 0.5, "p95": 0.5, "worst": 0.5}
     assert got["centre_px_of_all_found"]["worst"] == 15.0
@@ -100,6 +105,26 @@ def test_an_extractor_at_the_bound_has_efficiency_one():
     far = [Score("right", offset_px=(2 * s.offset_px[0], 2 * s.offset_px[1])) for s in scores]
     assert efficiency(far, sigmas.tolist())["value"] == pytest.approx(0.5 * value)
     assert efficiency([Score("none")], [0.01])["value"] is None
+
+
+def test_under_a_lid_the_edge_is_measured_where_it_is_visible():
+    """A drawn pupil whose upper half a bright bar hides: without the mask, the bar would count as well."""
+    condition = ideal.Condition(size=(240, 200), blur=(1.0, 1.0), noise=(2.0, 2.0), semi_axis=(30, 30), glints="none")
+    drawing = ideal.draw(condition, 10_000)
+    label = drawing.label["pupil"]
+    pupil = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"])
+    row = int(pupil.centre_px[1]) - 5
+    grey = drawing.image.astype(float)
+    grey[:row] = 150.0
+    shows = np.ones(grey.shape, dtype=bool)
+    shows[:row] = False
+    edge = edge_of(grey, 8, pupil, np.zeros((0, 2)), {}, shows)
+    # As for a whole outline, with half as many pixels.
+    assert edge.step_dn == pytest.approx(55.0, rel=0.05)
+    assert edge.sigma_px == pytest.approx(math.sqrt(1 + 1 / 12), rel=0.12)
+    assert edge.noise_dn == pytest.approx(math.sqrt(4 + 1 / 12), rel=0.2)
+    blind = edge_of(grey, 8, pupil, np.zeros((0, 2)), {})
+    assert blind.noise_dn < 1.5  # the bar has no noise
 
 
 @pytest.mark.parametrize(("radius", "blur", "noise"), [(17.0, 1.0, 2.0), (40.0, 0.8, 1.0), (30.0, 2.5, 8.0)])
@@ -140,9 +165,12 @@ def test_the_bound_leaves_out_what_it_does_not_cover():
     known = {"noise_dn": 0.0, "blur_px": 1.0, "step_dn": 55.0}
     none = np.zeros((0, 2))
     grey = np.zeros((80, 100))
-    assert edge_of(grey, 8, PUPIL, 1.0, none, known).noise_dn == pytest.approx(1 / math.sqrt(12))  # rounding
-    assert edge_of(grey, 8, PUPIL, 0.7, none, known) is None
-    assert edge_of(grey, 8, None, 1.0, none, known) is None
+    assert edge_of(grey, 8, PUPIL, none, known).noise_dn == pytest.approx(1 / math.sqrt(12))  # rounding
+    assert edge_of(grey, 8, None, none, known) is None
+    assert is_bounded(1.0, known)
+    assert is_bounded(None, {})
+    assert not is_bounded(0.7, known)
+    assert not is_bounded(None, known)  # a drawn lid of unknown extent
     assert measure_edge(grey, PUPIL, none) is None  # an even image has no edge
 
 
@@ -162,7 +190,7 @@ def test_bins():
 
 def test_a_breakdown_holds_every_image_with_a_pupil_once():
     scores = [Score("right", offset_px=(0.1 * k, 0.0), axes_px=(0, 0), iou=1.0, boundary_px=0.0) for k in range(8)]
-    scores += [Score("absent"), Score("none", "dark")]
+    scores += [Score("absent", with_pupil=False), Score("none", "dark")]
     factors = [{"noise_dn": float(k % 2)} for k in range(9)] + [{}]
     got = breakdown(scores, [None] * 10, factors, False)
     assert list(got) == ["noise_dn"]

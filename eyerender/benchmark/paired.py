@@ -1,0 +1,61 @@
+"""Paired comparison of extractors on the same images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from .asking import Run
+from .exact import mcnemar
+from .score import Score
+from .summary import sizes
+
+
+def is_success(score: Score) -> bool:
+    """Whether the pupil is right, or none is reported where none is."""
+    return score.outcome in ("right", "absent")
+
+
+def pairs_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Compare every two extractors: successes of only one of them, and errors on the pupils that both find.
+
+    `p` is that of the exact McNemar test. It is not corrected for the number of pairs.
+    """
+    out = []
+    for first, second in combinations(runs, 2):
+        pairs = list(zip(first.scores, second.scores, strict=True))
+        only = [sum(is_success(a) and not is_success(b) for a, b in pairs)]
+        only += [sum(is_success(b) and not is_success(a) for a, b in pairs)]
+        both = [(a.centre_px, b.centre_px) for a, b in pairs if a.outcome == b.outcome == "right"]
+        medians = np.median(np.array(both), axis=0).tolist() if both else None
+        out.append(
+            {
+                "first": first.extractor.name,
+                "second": second.extractor.name,
+                "only_first": only[0],
+                "only_second": only[1],
+                "p": mcnemar(*only),
+                "common": len(both),
+                "centre_px": medians,
+            }
+        )
+    return out
+
+
+def common_errors(runs: Sequence[Run]) -> dict[str, Any]:
+    """Errors on the pupils that every extractor finds, of those that find any."""
+    some = [run for run in runs if any(s.outcome == "right" for s in run.scores)]
+    rows = [k for k in range(len(some[0].scores)) if all(r.scores[k].outcome == "right" for r in some)] if some else []
+    return {
+        "n": len(rows),
+        "extractors": {
+            run.extractor.name: {
+                "centre_px": sizes(np.array([run.scores[k].centre_px for k in rows], dtype=np.float64)),
+                "boundary_px": sizes(np.array([run.scores[k].boundary_px for k in rows], dtype=np.float64)),
+            }
+            for run in some
+        },
+    }

@@ -1,0 +1,148 @@
+"""Results of a bench as JSON, rows and tables: what extractors answered apart from how long it took.
+
+results.json and results.csv are the same for identical runs; times.json holds what differs from run to run.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import platform
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import EyerenderError
+from .asking import Run
+from .curves import curves_of
+from .folder import LabelledImage
+from .score import Score
+from .summary import FACTORS, breakdown, failures, sizes, summarise
+
+TIMES_SCHEMA = "eyerender/bench-times/1"
+
+
+def entry_of(
+    run: Run, images: Sequence[LabelledImage], sigmas: Sequence[float | None], factors: Sequence[dict[str, float]]
+) -> dict[str, Any]:
+    """Results of one extractor."""
+    greeting = run.greeting
+    return {
+        "name": run.extractor.name,
+        "given": run.extractor.given,
+        "says": greeting.name if greeting else None,
+        "conventions": greeting.conventions.to_mapping() if greeting else None,
+        "reports": list(greeting.reports) if greeting else None,
+        "summary": summarise(run.scores, sigmas, run.reports_glints),
+        "breakdown": breakdown(run.scores, sigmas, factors, run.reports_glints),
+        "curves": curves_of(run.scores),
+        "failures": failures(run.scores, images),
+        "answers": [
+            {"image": i.name, "outcome": s.outcome, "iou": s.iou, "centre_px": s.centre_px, "confidence": s.confidence}
+            for i, s in zip(images, run.scores, strict=True)
+        ],
+    }
+
+
+def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors: dict[str, float]) -> dict[str, Any]:
+    """One line of results.csv: the answer of an extractor about an image."""
+    s = run.scores[k]
+    dx, dy = s.offset_px or (None, None)
+    da, db = s.axes_px or (None, None)
+    g = s.glints
+    return {
+        "extractor": run.extractor.name,
+        "image": image.name,
+        "outcome": s.outcome,
+        "reason": s.reason,
+        "centre_x_px": dx,
+        "centre_y_px": dy,
+        "centre_px": s.centre_px,
+        "bound_sigma_px": sigma,
+        "semi_axis_a_px": da,
+        "semi_axis_b_px": db,
+        "angle_deg": s.angle_deg,
+        "kind": s.kind,
+        "iou": s.iou,
+        "boundary_px": s.boundary_px,
+        "confidence": s.confidence,
+        "glints_true": g.true if g else None,
+        "glints_reported": g.reported if g else None,
+        "glints_matched": len(g.errors_px) if g else None,
+        "glints_named": g.named if g else None,
+        "glints_swapped": g.swapped if g else None,
+        "glint_px": float(np.mean([np.hypot(*e) for e in g.errors_px])) if g and g.errors_px else None,
+        **{name: factors.get(name) for name in FACTORS},
+    }
+
+
+def times_of(runs: Sequence[Run], images: Sequence[LabelledImage]) -> dict[str, Any]:
+    """Content of times.json: the machine, and the times of every extractor in all and per image, in ms."""
+    return {
+        "schema": TIMES_SCHEMA,
+        "machine": {"system": platform.platform(), "processor": _processor(), "threads": 1},
+        "extractors": [
+            {
+                "name": run.extractor.name,
+                **{kind: sizes(_times(run.scores, kind)) for kind in _TIMES},
+                "answers": [
+                    {"image": i.name, **{kind: _ms(getattr(s, field)) for kind, field in _TIMES.items()}}
+                    for i, s in zip(images, run.scores, strict=True)
+                ],
+            }
+            for run in runs
+        ],
+    }
+
+
+def digest_of(image: LabelledImage, key: str) -> str:
+    """Digest of an image, its hints and its truth, by which benches recognise the same task."""
+    pupil = None if image.pupil is None else image.pupil.numbers()
+    truth = [key, pupil, image.visible, [[g.light, *g.xy_px] for g in image.glints]]
+    return hashlib.sha256(json.dumps(truth).encode()).hexdigest()[:16]
+
+
+def gammas_of(images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
+    """Encoding gammas that the extractors were told, where they come from, and the number of images of each."""
+    counts = Counter((float(image.hints["gamma"]), image.gamma_from) for image in images)
+    return [{"gamma": gamma, "from": source, "images": n} for (gamma, source), n in sorted(counts.items())]
+
+
+def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write rows as a CSV file.
+
+    Raises:
+        EyerenderError: it cannot be written.
+    """
+    try:
+        with open(path, "w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+_TIMES = {"cpu_ms": "cpu_s", "wall_ms": "wall_s", "round_trip_ms": "trip_s"}
+
+
+def _times(scores: Sequence[Score], kind: str) -> Any:
+    return np.array([1e3 * t for s in scores if (t := getattr(s, _TIMES[kind])) is not None])
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else 1e3 * seconds
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+    except OSError:
+        names = []
+    return f"{names[0] if names else platform.processor() or platform.machine()}, {os.cpu_count()} cores"

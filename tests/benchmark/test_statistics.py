@@ -1,0 +1,164 @@
+"""Intervals, curves, pairs and kinds of failure against simulations and constructed cases."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binom, binomtest
+
+from eyerender.benchmark.asking import Run
+from eyerender.benchmark.curves import curves_of
+from eyerender.benchmark.failurekinds import kind_of
+from eyerender.benchmark.folder import LabelledImage, TrueGlint
+from eyerender.benchmark.intervals import subject_interval, wilson
+from eyerender.benchmark.paired import common_errors, pairs_of
+from eyerender.benchmark.registry import ExtractorCommand
+from eyerender.benchmark.score import Score
+from eyerender.benchmark.summary import bins, summarise
+from eyerender.geometry.ellipse import Ellipse
+
+
+def test_wilson_is_that_of_scipy():
+    for part, whole in ((0, 20), (7, 20), (20, 20), (390, 400)):
+        known = binomtest(part, whole).proportion_ci(0.95, method="wilson")
+        assert wilson(part, whole) == pytest.approx((known.low, known.high))
+    assert wilson(0, 0) is None
+
+
+@pytest.mark.parametrize(("subjects", "images", "rate", "alike"), [
+    (10, 4, 0.8, 0.3), (10, 10, 0.5, 0.3), (10, 10, 0.95, 0.1), (30, 4, 0.8, 0.0), (30, 4, 0.95, 0.3),
+    (100, 4, 0.98, 0.1), (100, 2, 0.8, 0.3),
+])  # fmt: skip
+def test_intervals_cover_the_rate_of_simulated_subjects(subjects, images, rate, alike):
+    """Each subject has a rate of its own from a beta distribution with the given intra-class correlation."""
+    rng, trials = np.random.default_rng(5), 400
+    names = np.repeat(np.arange(subjects), images)
+    covered = 0
+    for _ in range(trials):
+        own = rng.beta(rate * (1 / alike - 1), (1 - rate) * (1 / alike - 1), subjects) if alike else rate
+        right = rng.random((subjects, images)) < np.reshape(own, (-1, 1))
+        low, high = subject_interval(right.ravel(), np.ones(right.size), names)
+        covered += low <= rate <= high
+    # 0.93 is asked for; the standard error of a coverage of 0.95 is 0.011 in 400 trials.
+    assert covered >= 0.93 * trials
+
+
+def test_wilson_covers_the_rate_of_independent_images():
+    """Exact coverage, from the distribution of the counts; it varies with the rate, because counts are whole."""
+    rates = np.linspace(0.02, 0.98, 97)
+    for n in (40, 100, 400):
+        ends = np.array([wilson(k, n) for k in range(n + 1)])
+        weight = binom.pmf(np.arange(n + 1), n, rates[:, None])
+        inside = (ends[:, 0] <= rates[:, None]) & (rates[:, None] <= ends[:, 1])
+        coverage = (weight * inside).sum(axis=1)
+        assert coverage.mean() > 0.945
+        assert np.mean(coverage >= 0.93) > 0.9
+        assert coverage.min() > 0.88
+
+
+def test_an_interval_of_subjects_needs_two_and_is_never_empty():
+    assert subject_interval([1, 1], [1, 1], ["a", "a"]) is None
+    low, high = subject_interval([1] * 20, [1] * 20, [str(k // 2) for k in range(20)])
+    assert (low < 0.8, high) == (True, 1.0)
+    # Glints: several trials of an image.
+    low, high = subject_interval([3, 1], [4, 4], ["a", "b"])
+    assert low < 0.5 < high
+
+
+PUPIL = Ellipse(np.array([100.0, 80.0]), np.array([20.0, 18.0]), 0.3)
+IRIS = Ellipse(np.array([101.0, 80.0]), np.array([50.0, 48.0]), 0.0)
+IMAGE = LabelledImage(
+    "a.png", Path("a.png"), 8, (200, 160), PUPIL, PUPIL.points(120), 1.0, (TrueGlint(0, (110.0, 84.0)),), {},
+    iris=IRIS, lids_px=(np.stack([np.arange(20.0, 180.0, 4.0), np.full(40, 30.0)], axis=-1),),
+)  # fmt: skip
+
+
+def circle(x, y, r):
+    return Ellipse(np.array([x, y]), np.array([r, r]), 0.0)
+
+
+def test_each_kind_of_failure():
+    grey = np.full((160, 200), 150.0)
+    grey[135:156, 10:31] = 60.0
+    cases = {
+        "near miss": PUPIL.scaled(1.1),
+        "glint": circle(110, 84, 5),
+        "iris": IRIS.scaled(0.95),
+        "lash or lid": circle(60, 30, 12),
+        "shadow": circle(20, 145, 10),
+        "elsewhere": circle(150, 120, 10),
+    }
+    assert {kind: kind_of(found, IMAGE, grey, None) for kind, found in cases.items()} == {k: k for k in cases}
+    # With a mask, the border between skin and eye decides, not the margins.
+    mask = np.zeros((160, 200), dtype=np.uint8)
+    mask[60:, :] = 1
+    assert kind_of(circle(60, 30, 12), IMAGE, grey, mask) == "elsewhere"
+    assert kind_of(circle(60, 60, 12), IMAGE, grey, mask) == "lash or lid"
+    # Without a labelled iris, a larger concentric ellipse counts as one.
+    unknown = replace(IMAGE, iris=None)
+    assert kind_of(IRIS.scaled(0.95), unknown, grey, None) == "iris"
+    assert kind_of(circle(100, 80, 21), replace(IMAGE, pupil=None, iris=None, lids_px=()), grey, None) == "elsewhere"
+
+
+def answer(error, right=True, **more):
+    outcome = "right" if right else "wrong"
+    iou = 0.95 if right else 0.3
+    return Score(outcome, offset_px=(error, 0.0), axes_px=(0, 0), iou=iou, boundary_px=error, radius_px=10.0, **more)
+
+
+def run_of(name, scores):
+    return Run(ExtractorCommand(name, name, ()), None, tuple(scores))
+
+
+def test_errors_are_compared_on_the_pupils_that_both_find():
+    """The second is better on every common pupil, and alone finds the hard ones, so its own median is worse."""
+    easy, hard = [0.10] * 5, [0.50] * 6
+    first = run_of("first", [*map(answer, easy), *[answer(9, right=False)] * 6])
+    second = run_of("second", [*[answer(0.08)] * 5, *map(answer, hard)])
+    own = [summarise(r.scores, [None] * 11, False)["centre_px"]["median"] for r in (first, second)]
+    assert own == [0.1, 0.5]
+    (pair,) = pairs_of([first, second])
+    assert (pair["common"], pair["centre_px"]) == (5, [0.1, 0.08])
+    assert (pair["only_first"], pair["only_second"], pair["p"]) == (0, 6, pytest.approx(2 / 64))
+    common = common_errors([first, second, run_of("lost", [Score("none")] * 11)])
+    assert common["n"] == 5
+    assert list(common["extractors"]) == ["first", "second"]
+    assert common_errors([run_of("lost", [Score("none")])]) == {"n": 0, "extractors": {}}
+
+
+def test_curves_at_every_threshold():
+    scores = [answer(0.2, confidence=0.9), answer(3.0, right=False, confidence=0.4), Score("none", confidence=0.0)]
+    got = curves_of([*scores, Score("absent", with_pupil=False)])
+    share = dict(zip(got["iou"]["x"], got["iou"]["share"], strict=True))
+    assert (share[0.5], share[0.95], share[0.96]) == (1 / 3, 1 / 3, 0.0)
+    share = np.array(got["centre_px"]["share"])
+    x = np.array(got["centre_px"]["x"])
+    assert set(share[x < 0.19]) == {0.0}
+    assert set(share[(x > 0.21) & (x < 2.9)]) == {1 / 3}
+    assert set(share[x > 3.1]) == {2 / 3}
+    x = np.array(got["centre_radii"]["x"])
+    assert set(np.array(got["centre_radii"]["share"])[x > 0.31]) == {2 / 3}
+    sure = got["confidence"]
+    at = {x: (r, a) for x, r, a in zip(sure["x"], sure["right"], sure["answered"], strict=True)}
+    assert at[0.0] == (0.5, 0.5)
+    assert at[0.5] == (1.0, 0.25)
+    assert at[1.0] == (None, 0.0)
+
+
+def test_tiers_of_visibility():
+    hidden = [0.0, 0.01, 0.1, 0.25, 0.5, 0.69, 0.9]
+    got = bins(hidden, "occlusion")
+    assert [members for _, _, members in got] == [[0, 1], [2, 3], [4, 5], [6]]
+
+
+def test_a_summary_has_intervals_for_every_rate():
+    scores = [answer(0.1, subject=str(k)) for k in range(8)]
+    scores.append(Score("false", with_pupil=False, subject="9", kind="shadow"))
+    got = summarise(scores, [None] * 9, False)
+    assert got["intervals"]["right"]["wilson"] == pytest.approx(wilson(8, 8))
+    assert got["intervals"]["false"]["subjects"] is None
+    assert set(got["intervals"]) == {"right", "wrong", "none", "error", "false"}
+    assert got["failure_kinds"] == {"shadow": 1}
