@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eyerender.dataset import assemble, croissant, runfile, shard
+from eyerender.dataset import assemble, croissant, done
 from eyerender.errors import EyerenderError, InputError
 from eyerender.folders.imagefile import write_png
-from eyerender.folders.imagefolder import write_dataset
+from eyerender.folders.imagefolder import DONE, LINES, LOG, SHARDS, write_dataset
 from eyerender.folders.outfolder import MARKER, clear, refuse_non_empty, staged
 from eyerender.imaging.images import render_folder
 from eyerender.scene import load_scene
@@ -159,9 +159,9 @@ def test_a_damaged_sign_is_no_sign(tmp_path, text):
 
 def test_what_the_rooms_write_can_be_replaced(tmp_path):
     """The names that the rooms above give their files are the known ones."""
-    kinds = [f"{kind}/00000/s0.png" for kind in shard.KINDS]
-    shards = [f"{shard.SHARDS}/00000/{name}" for name in (shard.LINES, shard.DONE)]
-    whole = [runfile.LOG, assemble.FAILURES, assemble.CARD, croissant.CROISSANT, "run.json", "metadata.jsonl"]
+    kinds = [f"{kind}/00000/s0.png" for kind in done.KINDS]
+    shards = [f"{SHARDS}/00000/{name}" for name in (LINES, DONE)]
+    whole = [LOG, assemble.FAILURES, assemble.CARD, croissant.CROISSANT, "run.json", "metadata.jsonl"]
     dataset = [*kinds, *shards, *whole, f"{assemble.FAILURES}.part", f".{assemble.CARD}.0123abcd.part"]
     results = ["summary.json", "summary.csv", "findings.json", "findings.csv", "waterfall.csv", study.REPORT]
     for name in [*dataset, *(f"images/{name}" for name in dataset), *results, study.MARKER, f"images/{LOCK}"]:

@@ -32,9 +32,9 @@ def curves_of(scores: Sequence[Score]) -> dict[str, Any]:
     centre = np.array([s.centre_px for s in found], dtype=np.float64)
     radii = centre / np.array([s.radius_px or np.nan for s in found], dtype=np.float64)
     return {
-        "iou": _curve(IOU, [np.count_nonzero(overlap >= x) for x in IOU], len(shown)),
-        "centre_px": _curve(CENTRE_PX, [np.count_nonzero(centre <= x) for x in CENTRE_PX], len(shown)),
-        "centre_radii": _curve(CENTRE_RADII, [np.count_nonzero(radii <= x) for x in CENTRE_RADII], len(shown)),
+        "iou": _curve(IOU, [int(np.sum(overlap >= x)) for x in IOU], len(shown)),
+        "centre_px": _curve(CENTRE_PX, [int(np.sum(centre <= x)) for x in CENTRE_PX], len(shown)),
+        "centre_radii": _curve(CENTRE_RADII, [int(np.sum(radii <= x)) for x in CENTRE_RADII], len(shown)),
         "confidence": _confidence(scores),
     }
 

@@ -110,7 +110,7 @@ def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Fl
         length = (gaps + np.roll(gaps, 1)) / 2.0
         white[row, good, good] = np.sqrt(length) / deviation[row]
         size[row] = len(good)
-    covered = np.isfinite(pupil.covariance).all(axis=(1, 2))
+    covered: Bools = np.asarray(np.isfinite(pupil.covariance).all(axis=(1, 2)))
     for row in np.flatnonzero(of_ellipse):
         at, basis, speed = _of_ellipse(pupil.centre_px[row], pupil.semi_axes_px[row], float(pupil.angle_rad[row]))
         points[row, :ELLIPSE_POINTS] = at

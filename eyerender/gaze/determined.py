@@ -42,9 +42,9 @@ def seen_shares(vectors: Floats, terms: Terms) -> Floats:
     axes = [np.linspace(low[k], high[k], _STEPS) for k in range(2)]
     area = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     scale = np.abs(area).max(axis=0)
-    upper = np.linalg.qr(monomials(area / scale, terms) / _STEPS, mode="r")
+    upper: Floats = np.linalg.qr(monomials(area / scale, terms) / _STEPS).R
     design = monomials(vectors / scale, terms) / np.sqrt(len(vectors))
-    found = np.linalg.svd(np.linalg.solve(upper.T, design.T), compute_uv=False)
+    found = np.linalg.svdvals(np.linalg.solve(upper.T, design.T))
     shares[: len(found)] = found
     return shares
 

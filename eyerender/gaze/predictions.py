@@ -108,7 +108,7 @@ def _ray_predictions(estimator: RayEstimator, observations: Observations, rig: R
         }
         for i in range(len(observations))
     ]
-    source = np.where(rays.ok, RAYS, None)
+    source = np.array([RAYS if ok else None for ok in rays.ok], dtype=object)
     return {
         "schema": RAYS_SCHEMA,
         "gaze": entries,
@@ -136,7 +136,7 @@ def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGe
     """Place of each eye (n, 3) mm in the world, NaN where it is unknown, and where it is from (n,)."""
     index = observations.index
     place = np.array(index.eye_position_mm + index.head_mm)
-    source = np.where(np.isfinite(place).all(axis=1), GIVEN, None).astype(object)
+    source = np.array([GIVEN if np.isfinite(one).all() else None for one in place], dtype=object)
     for name in (RAYS, GLINTS):
         rows = np.flatnonzero(source == None)  # noqa: E711  (element by element)
         if not len(rows):
@@ -175,7 +175,7 @@ def _middles(observations: Observations, place: Floats, frames: Observations) ->
     np.add.at(total, which, place)
     middle = total / np.bincount(which, minlength=len(frames))[:, None]
     head = frames.index.head_mm
-    return np.where(np.isfinite(head).all(axis=1)[:, None], head, middle)
+    return np.where(np.isfinite(head).all(axis=1, keepdims=True), head, middle)
 
 
 def _by_eye(observations: Observations, ok: Bools, errors: dict[str, Floats], source: Objects) -> list[dict[str, Any]]:

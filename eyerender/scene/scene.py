@@ -359,7 +359,7 @@ class Scene:
         self, cameras: list[tuple[str, PinholeCamera]], lights: list[tuple[str, Lamp]]
     ) -> list[InputWarning]:
         """Warn of cameras and lamps, with their paths, that are below the skin of the first head position."""
-        region, found = self.spec.region, {}
+        region, found = self.spec.region, dict[str, InputWarning]()
         if region is None or region.head is not None:
             return []
         places = [(path, "camera", camera.nodal_point_mm) for path, camera in cameras]

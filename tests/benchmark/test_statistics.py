@@ -16,7 +16,7 @@ from eyerender.benchmark.folder import LabelledImage, TrueGlint
 from eyerender.benchmark.intervals import subject_interval, wilson
 from eyerender.benchmark.paired import common_errors, pairs_of
 from eyerender.benchmark.registry import ExtractorCommand
-from eyerender.benchmark.score import Score
+from eyerender.benchmark.score import Outcome, Score
 from eyerender.benchmark.summary import bins, summarise
 from eyerender.geometry.ellipse import Ellipse
 
@@ -35,12 +35,12 @@ def test_wilson_is_that_of_scipy():
 def test_intervals_cover_the_rate_of_simulated_subjects(subjects, images, rate, alike):
     """Each subject has a rate of its own from a beta distribution with the given intra-class correlation."""
     rng, trials = np.random.default_rng(5), 400
-    names = np.repeat(np.arange(subjects), images)
+    names = [str(k) for k in range(subjects) for _ in range(images)]
     covered = 0
     for _ in range(trials):
         own = rng.beta(rate * (1 / alike - 1), (1 - rate) * (1 / alike - 1), subjects) if alike else rate
         right = rng.random((subjects, images)) < np.reshape(own, (-1, 1))
-        low, high = subject_interval(right.ravel(), np.ones(right.size), names)
+        low, high = subject_interval(right.ravel().astype(float), np.ones(right.size), names)
         covered += low <= rate <= high
     # 0.93 is asked for; the standard error of a coverage of 0.95 is 0.011 in 400 trials.
     assert covered >= 0.93 * trials
@@ -104,7 +104,7 @@ def test_each_kind_of_failure():
 
 
 def answer(error, right=True, **more):
-    outcome = "right" if right else "wrong"
+    outcome: Outcome = "right" if right else "wrong"
     iou = 0.95 if right else 0.3
     return Score(outcome, offset_px=(error, 0.0), axes_px=(0, 0), iou=iou, boundary_px=error, radius_px=10.0, **more)
 
@@ -134,11 +134,11 @@ def test_curves_at_every_threshold():
     got = curves_of([*scores, Score("absent", with_pupil=False)])
     share = dict(zip(got["iou"]["x"], got["iou"]["share"], strict=True))
     assert (share[0.5], share[0.95], share[0.96]) == (1 / 3, 1 / 3, 0.0)
-    share = np.array(got["centre_px"]["share"])
+    shares = np.array(got["centre_px"]["share"])
     x = np.array(got["centre_px"]["x"])
-    assert set(share[x < 0.19]) == {0.0}
-    assert set(share[(x > 0.21) & (x < 2.9)]) == {1 / 3}
-    assert set(share[x > 3.1]) == {2 / 3}
+    assert set(shares[x < 0.19]) == {0.0}
+    assert set(shares[(x > 0.21) & (x < 2.9)]) == {1 / 3}
+    assert set(shares[x > 3.1]) == {2 / 3}
     x = np.array(got["centre_radii"]["x"])
     assert set(np.array(got["centre_radii"]["share"])[x > 0.31]) == {2 / 3}
     sure = got["confidence"]

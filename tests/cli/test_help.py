@@ -6,6 +6,7 @@ import inspect
 import json
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -90,7 +91,7 @@ def test_a_wrong_line_says_what_to_write_instead(line, words, capsys, tmp_path, 
 
 
 def test_statistics_have_short_numbers():
-    report = {
+    report: dict[str, Any] = {
         "images": 2,
         "recomputed": 2,
         "notes": [],

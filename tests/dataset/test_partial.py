@@ -24,6 +24,8 @@ LARGE = {"shard_size": SHARD}
 class Counted(Maker):
     """A maker that knows which samples it made."""
 
+    made: list[int]
+
     def make_all(self, indices):
         for sample in super().make_all(indices):
             self.made.append(sample.index)

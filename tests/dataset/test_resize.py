@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from typing import Any
 
 import pytest
 
@@ -34,7 +35,7 @@ def grown(spec, folder, count):
 
 @pytest.mark.slow
 def test_a_dataset_grows_and_shrinks_and_keeps_what_it_has(spec, tmp_path):
-    folder, seen = tmp_path / "out", {}
+    folder, seen = tmp_path / "out", dict[str, Any]()
     images = {}
     for count, made in ((9, 9), (24, 15), (14, 0), (40, 16), (24, 0)):
         images[count] = grown(spec, folder, count)

@@ -79,7 +79,7 @@ def noisy(frames, noise, draws, seed, slippage_mm=0.0):
     theta[:, 3:6] = slippage_mm * rng.standard_normal((draws, 3))
     views = case.views.take(np.zeros(draws, dtype=int))
     images = images_of(views, theta, 30)
-    normal, length = outline_normals(images.outline_px, np.isfinite(images.outline_px).all(axis=2))
+    normal, length = outline_normals(images.outline_px, np.asarray(np.isfinite(images.outline_px).all(axis=2)))
     shift = rng.standard_normal(length.shape) * noise.outline_px[0] / np.sqrt(length)
     seen = er.trace(frames.take(np.zeros(draws, dtype=int)))
     glints = images.glints_px + rng.standard_normal(images.glints_px.shape) * noise.glint_px[0][:, None]

@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given
 
 from eyerender.analytic.observer import trace
+from eyerender.gaze.predictions import predictions
 from eyerender.gaze.records import load_observations, rig_from_mapping
-from eyerender.gaze.store import choose_estimator, fit_estimator, load_estimator, predictions, save_estimator
+from eyerender.gaze.store import choose_estimator, fit_estimator, load_estimator, save_estimator
 from eyerender.observation import Observations
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec

@@ -13,7 +13,8 @@ import pytest
 import eyerender as er
 from eyerender.cli.main import run
 from eyerender.gaze.own import OwnEstimator
-from eyerender.gaze.store import choose_estimator, load_calibration, predictions
+from eyerender.gaze.predictions import predictions
+from eyerender.gaze.store import choose_estimator, load_calibration
 
 OWN = '''
 import numpy as np

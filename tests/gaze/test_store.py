@@ -10,6 +10,7 @@ import pytest
 from eyerender.analytic.observer import trace
 from eyerender.cli.main import run
 from eyerender.errors import InputError
+from eyerender.gaze.predictions import predictions
 from eyerender.gaze.records import load_observations, rig_from_mapping
 from eyerender.gaze.regression import EyeFit, Regression
 from eyerender.gaze.store import (
@@ -17,7 +18,6 @@ from eyerender.gaze.store import (
     fit_estimator,
     load_calibration,
     load_estimator,
-    predictions,
     save_estimator,
 )  # fmt: skip
 from eyerender.scene import load_scene

@@ -18,8 +18,9 @@ import eyerender as er
 from eyerender.cli.main import run
 from eyerender.errors import InputError
 from eyerender.gaze.columns import CsvColumns
+from eyerender.gaze.predictions import predictions
 from eyerender.gaze.records import load_observations
-from eyerender.gaze.store import choose_estimator, fit_estimator, predictions
+from eyerender.gaze.store import choose_estimator, fit_estimator
 from eyerender.gaze.table import observations_from_csv
 from eyerender.observation import EYES, Observations
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
