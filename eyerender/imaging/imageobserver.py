@@ -87,16 +87,25 @@ class ImageObserver:
         return self.observe_entries(folder.entries, folder.truth().index, scene, progress=progress)
 
     def observe_entries(
-        self, entries: Sequence[ImageEntry], index: Index, scene: Scene, *, progress: Progress | None = None
+        self,
+        entries: Sequence[ImageEntry],
+        index: Index,
+        scene: Scene,
+        *,
+        progress: Progress | None = None,
+        exposed: Callable[[NDArray[Any], ImageEntry], NDArray[Any]] | None = None,
     ) -> Observations:
-        """Extract the features of some images of a scene; `index` has a row for each of their records."""
+        """Extract the features of some images of a scene; `index` has a row for each of their records.
+
+        `exposed` turns each image into what the extractor sees, such as another exposure of it.
+        """
         parts: list[Observations] = []
         few: list[Observations] = []  # observations of one row each take ten times the memory of joined ones
         row = 0
         for entry in followed(entries, progress):
             if len(entry.records) == 0:
                 raise InputError("has no records", source=str(entry.path))
-            image = entry.image()
+            image = entry.image() if exposed is None else exposed(entry.image(), entry)
             rows = np.arange(row, row + len(entry.records))
             depth = int(entry.line.get("bit_depth") or 8 * image.itemsize)
             few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene, entry.gamma))

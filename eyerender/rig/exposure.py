@@ -69,6 +69,26 @@ def expose(
     return out
 
 
+def expose_again(
+    sensor: Sensor, codes: NDArray[np.uint16], seed: int, corner_px: tuple[int, int] = (0, 0)
+) -> NDArray[np.uint16]:
+    """Expose a picture that was stored without noise once more, with noise.
+
+    A code tells the pixel's mean charge. At full scale it does not, so these pixels stay saturated.
+
+    Args:
+        sensor: the sensor; its `noise` does not matter.
+        codes: (h, w) codes of an exposure without noise.
+        seed: seed of the noise.
+        corner_px: the sensor's pixel at the first row and column.
+    """
+    full = sensor.full_scale_dn
+    linear = full * (codes / full) ** sensor.gamma
+    mean = np.maximum((linear - sensor.black_dn) / sensor.gain, 0.0).astype(np.float32)
+    mean[codes >= full] = 4 * sensor.full_well_e
+    return _codes(sensor, mean, _Noise.of(sensor, seed, corner_px, codes.shape)).astype(np.uint16)
+
+
 @dataclass(frozen=True, slots=True)
 class _Noise:
     """Noise of a window: 16 bits for the shot noise and for the read noise of each pixel (2, h, w), and what is fixed.

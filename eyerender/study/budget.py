@@ -9,6 +9,8 @@
 Each is a mean over the frames for which all four have an estimate, so the terms add up exactly. These are net effects:
 a cause that moves gaze across the existing error has nearly none. The rms angle between the paired estimates shows
 how far it moves gaze; its square is that of the shift (the mean of each eye) plus that of the pattern over the frames.
+Where the images are exposed several times, these three are means over the noise seeds, and the scatter between seeds is
+split from the pattern: rms^2 = shift^2 + pattern^2 + scatter^2. The net effect is that of the stored exposure.
 
 A difference has a 95 % interval (Student's t of the paired differences). The frames are a design, not a sample, and a
 symmetric rig shows each with its mirror image. The interval of E - A is therefore narrower than for independent frames,
@@ -20,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +46,9 @@ class Term:
         high_deg: upper end.
         rms_deg: rms angle between the paired estimates; of the algorithm, between estimate and truth.
         shift_deg: what is common to all frames of an eye.
-        pattern_deg: what differs between the frames, with the noise of this one exposure.
+        pattern_deg: what differs between the frames and repeats with every seed; with one exposure its noise too.
+        scatter_deg: what differs between noise seeds; None without several.
+        seeds: number of exposures with other noise; None where there is one.
     """
 
     name: str
@@ -53,6 +58,8 @@ class Term:
     rms_deg: float | None = None
     shift_deg: float | None = None
     pattern_deg: float | None = None
+    scatter_deg: float | None = None
+    seeds: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +85,7 @@ def budgets(parts: Sequence[ModelResults]) -> list[Budget]:
     The reference is the first eye model of the run, which is E1 by default.
     """
     errors = _by_key(parts, "errors")
-    vectors = _by_key(parts, "vectors")
+    vectors, seeds = _by_key(parts, "vectors"), _by_key(parts, "seed_vectors")
     models = list(dict.fromkeys(part.eye_model for part in parts))
     reference = "E1" if "E1" in models else models[0]
     out = []
@@ -91,7 +98,8 @@ def budgets(parts: Sequence[ModelResults]) -> list[Budget]:
             continue
         if any(len(errors[key]) != len(errors[first]) for key in keys):
             continue
-        steps = [_Step(key[3], errors[key], vectors.get(key)) for key in keys]
+        noisy = seeds.get((protocol, name, model, "image-noiseless"))
+        steps = [_Step(k[3], errors[k], vectors.get(k), noisy if k[3] == "image" else None) for k in keys]
         budget = _budget(steps, _eyes(parts, protocol, len(errors[first])))
         if budget is not None:
             out.append(Budget(protocol, name, model, reference, *budget))
@@ -100,11 +108,12 @@ def budgets(parts: Sequence[ModelResults]) -> list[Budget]:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """Errors (n,) and error vectors (n, 2) of one observer."""
+    """Errors (n,), error vectors (n, 2), and those of several exposures (s, n, 2) of one observer."""
 
     observer: str
     errors: Floats
     vectors: Floats | None
+    seeds: Floats | None = None
 
 
 def _by_key(parts: Sequence[ModelResults], kind: str) -> dict[tuple[str, str, str, str], Floats]:
@@ -141,13 +150,18 @@ def _budget(steps: Sequence[_Step], eye: Ints) -> tuple[int, tuple[Term, ...], f
     return n, tuple(terms), float(steps[-1].errors[rows].mean())
 
 
-def _moved(before: _Step, after: _Step, rows: Bools, eye: Ints) -> tuple[float, float, float] | tuple[()]:
-    """Rms angle, shift and pattern of a displacement."""
+def _moved(before: _Step, after: _Step, rows: Bools, eye: Ints) -> tuple[Any, ...]:
+    """Rms angle, shift, pattern and scatter of a displacement, and the number of exposures."""
     if before.vectors is None or after.vectors is None:
         return ()
-    rms, shift, pattern, _ = displacement(before.vectors[None, rows], after.vectors[None, rows], eye[rows])
+    vectors = after.vectors[None] if after.seeds is None else after.seeds
+    rows = rows & np.isfinite(vectors).all(axis=(0, 2))
+    if not rows.any():
+        return ()
+    rms, shift, pattern, scatter = displacement(before.vectors[None, rows], vectors[:, rows], eye[rows])
     common = sum(float(np.mean(eye[rows] == k)) * float(v @ v) for k, v in shift.items())
-    return rms, float(np.sqrt(common)), pattern
+    several = () if after.seeds is None else (scatter, len(after.seeds))
+    return rms, float(np.sqrt(common)), pattern, *several
 
 
 def _name(observer: str, steps: Sequence[str]) -> str:

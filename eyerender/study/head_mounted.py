@@ -27,7 +27,7 @@ from ..scene import Scene, load_scene
 from ..scene.spec import SceneSpec
 from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
 from .observing import Observing
-from .results import Finding, ModelResults, mean_row
+from .results import Finding, ModelResults, mean_row, over_seeds
 
 SCENE, PROTOCOL = "head_mounted", "head-mounted"
 AZIMUTHS_DEG = (15.0, 7.5, 0.0, -7.5, -15.0)
@@ -58,6 +58,10 @@ def head_mounted_part(eye: str, observings: Sequence[Observing]) -> ModelResults
         seen = observing.observe(own)
         key = PROTOCOL, observing.kind
         out.seen[key] = own.rig, seen
+        again = [one.observe(own) for one in observing.exposures()]
+        out.seed_vectors[key] = over_seeds(
+            [{name: direction_errors_deg(one, own.rig, name) for name in FEATURES} for one in again]
+        )
         out.errors[key], out.vectors[key] = {}, {}
         for name in FEATURES:
             vector = direction_errors_deg(seen, own.rig, name)

@@ -11,18 +11,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Ints, frozen
 from ..errors import InputError
 from ..folders.imagefolder import DATASET, METADATA, RUN, ImageEntry
 from ..observation import EYES, Observations
 from ..progress import Progress, Say
+from ..rig.exposure import expose_again
 from ..scene import Scene
 from ..scene.spec import SceneSpec
 from ..storage.files import read_json
@@ -58,8 +61,8 @@ class StudyImages:
         found = self.of(scene)
         return len(found) == len(scene.index()) and all(entry.path.is_file() for entry in found)
 
-    def observe(self, scene: Scene) -> Observations:
-        """Features of a shot's images.
+    def observe(self, scene: Scene, noise_seed: int | None = None) -> Observations:
+        """Features of a shot's images, or of other exposures of them with the noise of a seed.
 
         Raises:
             InputError: they do not exist.
@@ -68,7 +71,15 @@ class StudyImages:
 
         if not self.holds(scene):
             raise InputError("the images of this scene are not in the study's dataset", source=scene.name)
-        return ImageObserver().observe_entries(self.of(scene), scene.index(), scene)
+
+        def exposed(codes: NDArray[Any], entry: ImageEntry) -> NDArray[Any]:
+            name = zlib.crc32(entry.path.name.encode())
+            draw = np.random.SeedSequence([scene.spec.seed, name, 0 if noise_seed is None else noise_seed])
+            seed = int(draw.generate_state(1, np.uint64)[0])
+            return expose_again(scene.spec.sensor, codes, seed, entry.window[:2])
+
+        again = None if noise_seed is None else exposed
+        return ImageObserver().observe_entries(self.of(scene), scene.index(), scene, exposed=again)
 
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:

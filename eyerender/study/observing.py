@@ -33,11 +33,18 @@ ObserverKind = Literal["analytic", "image", "image-noiseless"]
 class Observing:
     """One of the observers for a study's scenes: ray optics, or images with the sensor's noise or without it.
 
-    Only the image observers need images.
+    Only the image observers need images. Images without noise may be exposed again with the noise of `noise_seed`, and
+    `noise_seeds` tells how many such exposures a study compares.
     """
 
     kind: ObserverKind = "analytic"
     images: StudyImages | None = None
+    noise_seeds: int = 0
+    noise_seed: int | None = None
+
+    def exposures(self) -> list[Observing]:
+        """Observers of the same images, exposed again with the noise of one seed each."""
+        return [replace(self, noise_seed=seed) for seed in range(self.noise_seeds)]
 
     def observe(self, scene: Scene, *, facing: bool = False) -> Observations:
         """Observe every (frame, eye) of a scene; with `facing` the cameras are turned to the eyes.
@@ -51,7 +58,7 @@ class Observing:
             raise InputError("the image observer needs images")
         parts, order = [], []
         for shot in self.shots(scene, facing=facing, spp=self.images.spp):
-            seen = self.images.observe(shot.scene)
+            seen = self.images.observe(shot.scene, self.noise_seed)
             if facing:
                 seen = moved(seen, shot.scene.rig.cameras[0], scene.rig.cameras[0])
             parts.append(with_index_of(seen, scene, shot.rows))

@@ -21,6 +21,8 @@ class StudyOptions:
         workers: Number of worker processes (default: one per processor).
         spp: Samples per pixel of the images (default: the scene's value).
         noise: Images with sensor noise (on), without it (off), or both.
+        noise_seeds: With both: exposures of each image with other noise, for the shift and scatter in the error budget;
+            0 leaves them out.
         auto_exposure: Choose one exposure time for the images of each eye model, so that 98 % of the pixels are at most
             at this share of full scale.
         backend: The render backend.
@@ -33,6 +35,7 @@ class StudyOptions:
     workers: int | None = None
     spp: int | None = None
     noise: Literal["on", "off", "both"] = "both"
+    noise_seeds: int = 10
     auto_exposure: float | None = None
     backend: BackendChoice = "auto"
     threads: int | None = None
@@ -43,3 +46,5 @@ class StudyOptions:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InputError(f"must be >= 1, not {value}", path=name)
+        if self.noise_seeds < 0 or self.noise_seeds == 1:
+            raise InputError(f"must be 0, or at least 2, not {self.noise_seeds}", path="noise_seeds")

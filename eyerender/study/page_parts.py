@@ -88,6 +88,8 @@ def _told(term: Term | None) -> str:
     if term is None:
         return "-"
     rms = "" if term.rms_deg is None else f" ({number(term.rms_deg)})"
+    if term.scatter_deg is not None:
+        rms = f" ({number(term.rms_deg)}; shift {number(term.shift_deg)}, scatter {number(term.scatter_deg)})"
     if term.low_deg is None or term.high_deg is None:
         return number(term.deg) + rms
     return f"{term.deg:+.4f} ± {(term.high_deg - term.low_deg) / 2:.4f}{rms}"

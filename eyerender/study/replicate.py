@@ -16,7 +16,7 @@ from . import blignaut, guestrin
 from .clouds import Cloud
 from .literature import CALIBRATION_SETS
 from .observing import Observing
-from .results import ModelResults, WaterfallStep
+from .results import ModelResults, WaterfallStep, over_seeds
 
 
 @dataclass(slots=True)
@@ -83,8 +83,10 @@ def guestrin_part(
     scenes = _Scenes(guestrin, eye, observing)
     analytic = observing.kind == "analytic"
     out = GuestrinPart(eye)
+    exposures = [_Scenes(guestrin, eye, one) for one in observing.exposures()]
     for protocol in protocols:
         departures = departures_of(guestrin, protocol)
+        out.seed_vectors[protocol, observing.kind] = over_seeds([_guestrin_vectors(s, departures) for s in exposures])
         scene, seen = scenes(departures)
         for variant, free in (("index fixed", False), ("index free", True)):
             if free and "index" in departures:
@@ -109,12 +111,25 @@ def guestrin_part(
     return out
 
 
+def _guestrin_vectors(scenes: _Scenes, departures: frozenset[str]) -> dict[str, Floats]:
+    """Error vectors (n, 2) by variant."""
+    scene, seen = scenes(departures)
+    variants = {"index fixed": False} if "index" in departures else {"index fixed": False, "index free": True}
+    return {
+        f"model-based, {name}": guestrin.run(seen, scene.rig, departures, free_index=free).vector_deg
+        for name, free in variants.items()
+    }
+
+
 def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> BlignautPart:
     """Replicate [29] with one eye model and one observer."""
     scenes = _Scenes(blignaut, eye, observing)
     out = BlignautPart(eye)
+    exposures = [_Scenes(blignaut, eye, one) for one in observing.exposures()]
     for protocol in protocols:
         departures = departures_of(blignaut, protocol)
+        seeds = [_blignaut_vectors(s.run(departures)) for s in exposures]
+        out.seed_vectors[protocol, observing.kind] = over_seeds(seeds)
         scene, seen = scenes(departures)
         done = blignaut.run(seen, scene.rig, departures)
         key = protocol, observing.kind
@@ -122,7 +137,7 @@ def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> B
         out.clouds[key] = Cloud.of(seen)
         out.seen[key] = scene.rig, seen
         out.errors[key] = {f"{o.function} on {o.calibration}": o.error_deg for o in done if len(o.error_deg)}
-        out.vectors[key] = {f"{o.function} on {o.calibration}": o.vector_deg for o in done if len(o.error_deg)}
+        out.vectors[key] = _blignaut_vectors(done)
         keys = {"protocol": protocol, "observer": observing.kind, "eye_model": eye}
         out.rows += blignaut.rows_of(done, variant="vector", **keys)
         if protocol == "corrected":
@@ -132,6 +147,11 @@ def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> B
     if observing.kind == "analytic" and len(protocols) == 2:
         out.waterfall = _waterfall(eye, blignaut, lambda d: _best_means(scenes.run(d)))
     return out
+
+
+def _blignaut_vectors(done: list[blignaut.Outcome]) -> dict[str, Floats]:
+    """Error vectors (n, 2) by function and calibration set."""
+    return {f"{o.function} on {o.calibration}": o.vector_deg for o in done if len(o.error_deg)}
 
 
 def _best_means(done: list[blignaut.Outcome]) -> dict[str, float | None]:

@@ -56,6 +56,7 @@ class ModelResults:
         seen: by (protocol, observer) the rig and its observations.
         errors: by (protocol, observer) and name of the estimator the errors (n,) deg.
         vectors: the same errors to the right and up (n, 2) deg (`error_vectors_deg`).
+        seed_vectors: the same (s, n, 2) of s further exposures of images without noise, with other noise each.
     """
 
     eye_model: str
@@ -63,6 +64,13 @@ class ModelResults:
     seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
     errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
     vectors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
+    seed_vectors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
+
+
+def over_seeds(found: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
+    """Stack the error vectors (n, 2) of every seed, (s, n, 2) by estimator; one that a seed lacks is left out."""
+    names = [name for name in (found[0] if found else ()) if all(name in one for one in found)]
+    return {name: np.stack([one[name] for one in found]) for name in names}
 
 
 @dataclass(frozen=True, slots=True)

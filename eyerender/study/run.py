@@ -87,7 +87,7 @@ def run_study(
         raise InputError("the study 'observers' compares both observers", source="--observer")
     settings: dict[str, Any] = {"study": name, "protocol": options.protocol, "observer": observer, "eyes": list(eyes)}
     if observer != "analytic":
-        settings |= {"spp": options.spp, "sensor_noise": options.noise}
+        settings |= {"spp": options.spp, "sensor_noise": options.noise, "noise_seeds": options.noise_seeds}
     settings |= _exposure(options.auto_exposure, observer)
     folder = Path(folder)
     protocols = ("published", "corrected") if options.protocol == "both" else (options.protocol,)
@@ -98,7 +98,9 @@ def run_study(
         if any(kind != "analytic" for kind in kinds):
             scenes = _image_scenes(name, eyes, protocols, kinds, options.spp)
             images = make_images(name, scenes, folder / IMAGES, options, _noted(progress), say)
-        observers = [Observing(kind, None if kind == "analytic" else images) for kind in kinds]
+        # The term of noise, which needs images with it and without it, is the mean of several exposures.
+        seeds = {"image-noiseless": options.noise_seeds} if "image" in kinds else {}
+        observers = [Observing(k, None if k == "analytic" else images, seeds.get(k, 0)) for k in kinds]
         # One job compares all observers, or has one of them.
         together_or_alone = [tuple(observers)] if name == "observers" else [(one,) for one in observers]
         jobs = [

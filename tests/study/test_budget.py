@@ -21,6 +21,7 @@ class Seen:
     eye_model: str
     errors: dict = field(default_factory=dict)
     vectors: dict = field(default_factory=dict)
+    seed_vectors: dict = field(default_factory=dict)
     seen: dict = field(default_factory=dict)
 
 
@@ -64,6 +65,35 @@ def test_a_term_moves_gaze_by_the_rms_angle_though_its_net_effect_vanishes():
     np.testing.assert_allclose([noise.rms_deg, noise.shift_deg, noise.pattern_deg], [0.03, 0, 0.03], atol=1e-8)
     assert image.deg == pytest.approx(np.hypot(0.2, 0.05) - 0.2)
     assert abs(noise.deg) < 2e-4  # .03^2 .05^2 / (2 .2^3) and smaller
+
+
+def test_several_exposures_split_the_noise_into_shift_pattern_and_scatter():
+    """The noise moves each seed by .03 deg rms on either axis, and all of them by .02 deg up: within 2 standard errors.
+
+    Of s seeds and n frames, the scatter has a relative standard error of 1 / sqrt(4 (s - 1) n), and the shift one of
+    .03 / sqrt(s n) on either axis.
+    """
+    rng = np.random.default_rng(4)
+    seeds, n = 12, 200
+    parts = drawn(models=("E1",), n=n)
+    quiet = rng.normal(0.0, 0.1, (n, 2))
+    noisy = quiet + np.array([0.0, 0.02]) + rng.normal(0.0, 0.03, (seeds, n, 2))
+    for observer, vector in {"analytic": quiet, "image-noiseless": quiet, "image": noisy[0]}.items():
+        parts[0].vectors["corrected", observer] = {"a": vector}
+        parts[0].errors["corrected", observer] = {"a": np.linalg.norm(vector, axis=1)}
+    parts[0].seed_vectors["corrected", "image-noiseless"] = {"a": noisy}
+    (found,) = budgets(parts)
+    image, noise = found.term(IMAGE), found.term(NOISE)
+    assert (image.rms_deg, image.scatter_deg, image.seeds) == (0.0, None, None)
+    assert noise.seeds == seeds
+    assert noise.shift_deg == pytest.approx(0.02, abs=2 * 0.03 / np.sqrt(seeds * n))
+    scatter = 0.03 * np.sqrt(2)
+    assert noise.scatter_deg == pytest.approx(scatter, rel=2 / np.sqrt(4 * (seeds - 1) * n))
+    total = noise.shift_deg**2 + noise.pattern_deg**2 + noise.scatter_deg**2
+    # The pattern is cut at 0 where the other two exceed the whole by their own error.
+    assert noise.rms_deg**2 == pytest.approx(total, rel=2 / np.sqrt(4 * (seeds - 1) * n))
+    assert noise.pattern_deg < 0.25 * scatter
+    assert sum(t.deg for t in found.terms) == pytest.approx(found.total_deg, abs=1e-12)
 
 
 def test_what_was_not_observed_has_no_term():
