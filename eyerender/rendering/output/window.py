@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from ...arrays import ArrayValue, Bools, Singles, frozen, sealed
 from ...errors import InputError
 from ...rig import defocus, exposure, psf, stray
-from ...rig.camera import Window
+from ...rig.camera import PinholeCamera, Window
+from ...rig.imaging import Lens
 from ..glints.splatting import Mirrored, Shine, add_shines
-from ..glints.tracing import GlintTable
+from ..glints.tracing import GlintTable, Spots
 from ..records.job import RenderJob
 from ..scene.blur import Blur
 from .labels import PartLabels
@@ -63,6 +64,8 @@ class RawFrame(ArrayValue):
         failed: number of light paths that did not converge.
         lid_margins_px: landmarks along the lids, where there are any.
         highlights: (height, width) highlights of wet and oily surfaces, if they were requested.
+        around: mean radiance of the whole sensor in blocks (`CoarseSensor`), where light from there strays into the
+            window; else None.
     """
 
     job: RenderJob
@@ -74,6 +77,7 @@ class RawFrame(ArrayValue):
     failed: int
     lid_margins_px: dict[str, list[list[float]]] | None
     highlights: Bools | None
+    around: Singles | None = None
 
     def develop(self) -> RenderedWindow:
         """Apply lens and sensor. This never touches the device, so another thread may do it.
@@ -109,11 +113,37 @@ class RawFrame(ArrayValue):
     def _irradiance(self) -> Singles:
         """Irradiance (height, width) of the window, W/m^2."""
         job = self.job
-        seen = (job.lens, job.camera, job.window)
         # Single precision is finer than the samples' noise, and takes half the time.
         picture = psf.blur(self.blur.of_pictures(self.picture).astype(np.float32), job.sensor.psf_sigma_px)
         add_shines(self.glints, picture, job)
-        if job.lens.vignetting > 0:
-            picture *= defocus.vignette(*seen)
-        picture = stray.scattered(stray.framed(picture, *seen), *seen)
+        seen = (job.lens, job.camera, job.window)
+        picture = _framed(picture, *seen)
+        if self.around is None:
+            picture = stray.scattered(picture, *seen)
+        else:
+            picture = stray.scattered_around(picture, self._around(self.around), *seen)
         return np.asarray(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)))
+
+    def _around(self, cells: Singles) -> Singles:
+        """The whole sensor in blocks, behind openings, with the mirror images of the lamps."""
+        job, side = self.job, stray.block_px(self.job.lens)
+        lens, camera = stray.in_blocks(job.lens, job.camera, side)
+        whole, picture = (0, 0, *camera.resolution_px), cells.copy()
+        sensor = job.sensor.model_copy(update={"psf_sigma_px": job.sensor.psf_sigma_px / side})
+        shines = [
+            replace(
+                shine,
+                spots=Spots(frozen((shine.spots.xy_px + 0.5) / side - 0.5), frozen(shine.spots.energy / side**2)),
+                blur_px=shine.blur_px / side,
+            )
+            for shine in self.glints
+        ]
+        add_shines(shines, picture, replace(job, camera=camera, window=whole, sensor=sensor))
+        return _framed(picture, lens, camera, whole)
+
+
+def _framed(picture: Singles, lens: Lens, camera: PinholeCamera, window: Window) -> Singles:
+    """Picture (height, width) of a window behind vignetting and openings; it may be changed."""
+    if lens.vignetting > 0:
+        picture *= defocus.vignette(lens, camera, window)
+    return np.asarray(stray.framed(picture, lens, camera, window))

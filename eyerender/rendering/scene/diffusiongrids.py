@@ -12,6 +12,7 @@ from ...optics.diffusion import half_space_length_mm, slab_length_mm
 from ...region.globe import Globe
 from ...region.mesh import RegionMesh, sheet_neighbours
 from ...region.skin import SHEET_ROWS, sheet_place
+from ...rig.stray import misses_light
 from ..records.job import RenderJob
 
 GRID_ROWS, GRID_COLUMNS = 160, 768  # of the finer grid over the sheet of skin
@@ -118,7 +119,8 @@ def _globe_cells(radius_mm: float) -> tuple[Floats, Floats]:
 
 def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -> Bools:
     """Which points (n, 3) are in a window, or beside it by no more than what is spare."""
-    camera, (x0, y0, width, height) = job.camera, job.window
+    camera, whole = job.camera, misses_light(job.lens, job.camera, job.window)
+    x0, y0, width, height = (0, 0, *camera.resolution_px) if whole else job.window
     xy, front = camera.project(points)
     depth = np.maximum((points - camera.nodal_point_mm) @ camera.R[2], 1.0)
     spare = spare_px + spare_mm * float(max(camera.K[0, 0], camera.K[1, 1])) / depth
