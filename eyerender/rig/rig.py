@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..spec import Spec
 from .camera import Camera, PinholeCamera
 from .light import MAX_LIGHTS, Lamp, Led
+from .mount import Mount
 from .screen import Screen, ScreenPlane
 
 # Every camera has its own frame for every target and head position.
@@ -31,6 +32,9 @@ class Rig(Spec):
         description="the infrared LEDs; all of them are on in every frame"
     )
     screen: Screen | None = Field(default=None, description="the screen that holds the targets")
+    mount: Mount | None = Field(
+        default=None, description="moves all cameras and lights together, not the screen: a tilted headset, a tolerance"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -49,7 +53,8 @@ class Rig(Spec):
     def with_light(self, number: int, **changes: Any) -> Self:
         """Change one light of the rig.
 
-        An LED of a ring becomes an LED of its own, and so do the others of that ring, where they are.
+        An LED of a ring becomes an LED of its own, and so do the others of that ring, where they are. Places are those
+        before the mount moves the rig.
 
         Args:
             number: which light, from 0, each LED of a ring counted.
@@ -102,7 +107,7 @@ class Rig(Spec):
         """Fields of all LEDs, those of rings one by one, after a look whether there is light `number`."""
         if not 0 <= number < self.light_count:
             raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
-        geometry, leds = self.build(), []
+        geometry, leds = self.model_copy(update={"mount": None}).build(), []
         for led in self.lights:
             if led.ring is None:
                 leds.append(led.to_mapping())
@@ -113,7 +118,8 @@ class Rig(Spec):
         return leds
 
     def _with_leds(self, leds: list[dict[str, Any]], **fields: Any) -> Self:
-        return type(self).from_mapping({"cameras": self.cameras, "lights": leds, "screen": self.screen, **fields})
+        kept = {"cameras": self.cameras, "lights": leds, "screen": self.screen, "mount": self.mount}
+        return type(self).from_mapping({**kept, **fields})
 
     def resolved(self, base: Path | None = None) -> Self:
         """The rig with the numbers of its cameras' calibration files, which are relative to `base`.
@@ -129,6 +135,9 @@ class Rig(Spec):
         """Build the numeric rig."""
         cameras = tuple(camera.build() for camera in self.cameras)
         lights = tuple(light for spec in self.lights for light in spec.build(cameras))
+        if self.mount is not None:
+            cameras = tuple(map(self.mount.camera, cameras))
+            lights = tuple(map(self.mount.lamp, lights))
         return RigGeometry(cameras, lights, self.screen.build() if self.screen else None)
 
 

@@ -194,14 +194,14 @@ def test_a_panel_is_the_same_rectangle_for_both_eyes():
     wall = near.model_copy(update={"aim_mm": (40.0, -100.0, 30.0)})
     ambient = Ambient(panels=(near, wall))
     anchors = [np.array([0.0, y, 5.0]) for y in (-31.5, 31.5)]
-    one, other = (panel_table(ambient, anchor) for anchor in anchors)
+    one, other = panel_table(ambient, anchors[0]), panel_table(ambient, anchors[1])
     lamps = [panel_lamps(ambient, anchor) for anchor in anchors]
     np.testing.assert_allclose(one[:, :3] + anchors[0], other[:, :3] + anchors[1])
     np.testing.assert_array_equal(one[:, 3:], other[:, 3:])
     np.testing.assert_allclose(one[:, 3:6], [[-0.8, 0, -0.6], [0, -1, 0]], atol=1e-12)
     np.testing.assert_allclose(one[1, 9:12], [0, 0, 1 / 10])  # upright, 20 mm high
-    one_lamps, other_lamps = (np.array([lamp.position_mm for lamp in part]) for part in lamps)
-    np.testing.assert_allclose(one_lamps, other_lamps)
+    places = np.array([[lamp.position_mm for lamp in part] for part in lamps])
+    np.testing.assert_allclose(places[0], places[1])
     # Straight below there is no level direction but a chosen one; on its own aim there is no panel.
     assert np.all(
         np.isfinite(

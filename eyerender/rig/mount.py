@@ -1,0 +1,48 @@
+"""The mount of a rig: a rigid motion of all its cameras and lights, as of a tilted headset or a mounting tolerance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from ..arrays import Floats, frozen
+from ..spec import Spec, Vec3
+from .camera import PinholeCamera
+from .light import Lamp
+
+
+class Mount(Spec):
+    """A turn about a point, followed by a shift: x' = C + R (x - C) + T, with R = Rz Ry Rx, in the world frame."""
+
+    rotation_deg: Vec3 = Field(
+        default=(0, 0, 0), description="angles about the world's x, y and z, applied in this order"
+    )
+    translation_mm: Vec3 = Field(default=(0, 0, 0), description="shift after the turn")
+    about_mm: Vec3 = Field(default=(0, 0, 0), description="the point that the turn leaves where it is")
+
+    def _motion(self) -> tuple[Floats, Floats]:
+        """Rotation R and offset d of x' = R x + d."""
+        rotation = np.eye(3)
+        for axis, angle in enumerate(np.radians(np.array(self.rotation_deg, dtype=float))):
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            turn = np.eye(3)
+            turn[i, i] = turn[j, j] = np.cos(angle)
+            turn[j, i], turn[i, j] = np.sin(angle), -np.sin(angle)
+            rotation = turn @ rotation
+        centre = np.array(self.about_mm, dtype=float)
+        return rotation, centre - rotation @ centre + np.array(self.translation_mm, dtype=float)
+
+    def camera(self, camera: PinholeCamera) -> PinholeCamera:
+        """Move a camera: R x + t of the moved world point is what it was of the point."""
+        rotation, offset = self._motion()
+        turned = camera.R @ rotation.T
+        return replace(camera, R=frozen(turned), t=frozen(camera.t - turned @ offset))
+
+    def lamp(self, lamp: Lamp) -> Lamp:
+        """Move a light with its axis."""
+        rotation, offset = self._motion()
+        return replace(
+            lamp, position_mm=frozen(rotation @ lamp.position_mm + offset), axis=frozen(rotation @ lamp.axis)
+        )
