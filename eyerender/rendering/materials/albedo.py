@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...region.iris import WIDTH_MM, DrawnPattern, iris_maps
-from ...region.look import Look
+from ...region.look import LIMBAL_RING, Look
 from ...region.mapcache import kept
 from ...region.texture import sclera_texture
 from ..records.frame import Frame
@@ -18,7 +18,6 @@ from ..records.frame import Frame
 GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of maps of the globe
 _WIDE_MM = 2.5  # width of an iris whose relief has its full height
 STEEPEST = 1.5  # slope of the opacity of the cornea's rim where it is steepest, times the width of the rim
-_RING = (0.62, 0.95)  # share of the way from the pupil to the root over which a limbal ring grows dark
 
 
 @dataclass(kw_only=True)
@@ -96,7 +95,7 @@ def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
     s, turn, left, _ = _iris_place(frame, x)
     texture = _on_iris(frame.textures.iris, s, turn)
     albedo = frame.iris.albedo * dr.maximum(1 + frame.iris.contrast * (texture - 1), 0.02)
-    edge = dr.clip((s - _RING[0]) / (_RING[1] - _RING[0]), 0, 1)
+    edge = dr.clip((s - LIMBAL_RING[0]) / (LIMBAL_RING[1] - LIMBAL_RING[0]), 0, 1)
     albedo *= 1 - frame.iris.ring * edge * edge * (3 - 2 * edge)
     return dr.select(left > 0, albedo, frame.limbus.albedo)
 

@@ -28,10 +28,11 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from ...arrays import ArrayValue, Bools, Floats, Ints, Singles, frozen, remembered
+from ...arrays import Bools, Floats, Ints, Singles, frozen, remembered
 from ...eye.meshes import chamber_rim
-from ...eye.model import EyeModel
+from ...eye.model import EyeModel, Stop
 from ...geometry.surfaces import Surface
+from ...region.look import LIMBAL_RING, Look
 from .chamberrays import ChamberShape, Walls, air_side, trace_inside
 
 IRIS_RINGS, TURNS = 16, 16  # points in the plane of the iris, over radius and angle
@@ -46,8 +47,10 @@ _SAME_MM = 0.005  # chambers of depths and radii that differ by less are one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Chamber(ArrayValue):
-    """The chamber of one eye, in the eye frame; arrays with PATCHES rows list the rings from the middle, then the wall.
+class Chamber:
+    """The chamber of one eye, in the eye frame; it equals only itself.
+
+    Arrays with PATCHES rows list the rings from the middle, then the wall.
 
     Attributes:
         root_mm: radius of the iris' root, between two rings.
@@ -181,16 +184,28 @@ def _in_plane(centre: Floats, normal: Floats, y: Floats, z: Floats) -> Floats:
     return np.stack([x, y, z], axis=-1)
 
 
-def patch_albedo(eye: EyeModel, chamber: Chamber, inside: float, iris: float, beyond: float) -> Floats:
-    """Mean albedo (PATCHES,) of the patches, from that of pupil (`inside`), iris, and limbal tissue (`beyond`)."""
+def patch_albedo(eye: EyeModel, chamber: Chamber, look: Look) -> Floats:
+    """Mean albedo (PATCHES,) of the patches, from that of pupil, iris with its limbal ring, and limbal tissue."""
     fine = (np.arange(4) + 0.5) / 4
     ring, turn = np.arange(IRIS)[:, None] // TURNS, np.arange(IRIS)[:, None] % TURNS
     part, side = (v.ravel() for v in np.meshgrid(fine, fine))
     r, a = _radius(ring + part, chamber.root_mm, chamber.reach_mm), 2 * np.pi * (turn + side) / TURNS
     at = _in_plane(np.asarray(eye.stop.centre_mm), np.asarray(eye.stop.normal), r * np.cos(a), r * np.sin(a))
-    albedo = np.where(ring < ROOT_RINGS, iris, beyond)
-    albedo = np.mean(np.where(eye.stop.contains(at), inside, albedo), axis=1)
-    return np.append(albedo, np.full(TURNS * LEVELS, beyond))
+    iris = look.iris_albedo * (1 - look.limbal_ring * _limbal_ring(eye.stop, at, chamber.root_mm - r))
+    albedo = np.where(ring < ROOT_RINGS, iris, look.limbus_albedo)
+    albedo = np.mean(np.where(eye.stop.contains(at), look.pupil_albedo, albedo), axis=1)
+    return np.append(albedo, np.full(TURNS * LEVELS, look.limbus_albedo))
+
+
+def _limbal_ring(stop: Stop, points: Floats, left_mm: Floats) -> Floats:
+    """Share of the limbal ring's darkness at points (..., 3) at such distances from the root, as in `iris_albedo`."""
+    a, b = stop.semi_axes_mm
+    _, y, z = np.moveaxis((points - stop.centre_mm) @ stop.rotation, -1, 0)
+    margin = stop.relative_radius(np.arctan2(z / b, stop.handed * y / a))
+    beyond = (np.hypot(y / a, z / b) - margin) * np.sqrt(a * b)
+    s = np.clip(beyond / np.maximum(beyond + np.maximum(left_mm, 0), 1e-4), 0, 1)
+    edge = np.clip((s - LIMBAL_RING[0]) / (LIMBAL_RING[1] - LIMBAL_RING[0]), 0, 1)
+    return np.asarray(edge * edge * (3 - 2 * edge))
 
 
 def _radius(ring: Floats, root: float, reach: float) -> Floats:
