@@ -55,5 +55,5 @@ def _confidence(scores: Sequence[Score]) -> dict[str, Any] | None:
     }
 
 
-def _curve(x: Floats, counts: Sequence[int], total: int) -> dict[str, Any]:
+def _curve(x: Floats, counts: Sequence[Any], total: int) -> dict[str, Any]:
     return {"x": x.tolist(), "share": [int(n) / total if total else None for n in counts]}

@@ -6,6 +6,7 @@ with labels (`own`).
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -32,6 +33,7 @@ from .own import is_own, own_labels
 IDEAL_SCHEMA = "eyerender/ideal-images/1"
 # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens them.
 _RADIUS_MM = (0.6, 5.0)
+EYE_ERROR_MM = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,18 +89,26 @@ class LabelledImage:
         return None if self.mask_path is None else np.asarray(read_image(self.mask_path)[0], dtype=np.uint8)
 
 
-def load_labelled(folder: str | Path, gamma: float | None = None) -> list[LabelledImage]:
+def load_labelled(
+    folder: str | Path,
+    gamma: float | None = None,
+    *,
+    eye_error_mm: float = EYE_ERROR_MM,
+    pupil_class: int | None = None,
+) -> list[LabelledImage]:
     """Load every image of a folder.
 
     Args:
         folder: the folder.
         gamma: encoding gamma of images whose folder states none; None assumes 1.
+        eye_error_mm: standard deviation per axis of the error of the hinted position of the eye.
+        pupil_class: value of the pupil in masks of several classes.
 
     Raises:
         InputError: it is not such a folder, an image is missing or has another size, or does not have exactly one eye;
             the folder states another gamma than `gamma`.
     """
-    images = _load(Path(folder))
+    images = _load(Path(folder), eye_error_mm, pupil_class)
     out = []
     for image in images:
         stated = float(image.hints["gamma"])
@@ -110,11 +120,11 @@ def load_labelled(folder: str | Path, gamma: float | None = None) -> list[Labell
     return out
 
 
-def _load(path: Path) -> list[LabelledImage]:
+def _load(path: Path, eye_error_mm: float, pupil_class: int | None) -> list[LabelledImage]:
     if _is_ideal(path):
         return _load_ideal(path)
     if is_own(path):
-        return _load_own(path)
+        return _load_own(path, pupil_class)
     images = ImageFolder.load(path)
     truth = images.truth()
     scene_rig = _rig_of(images)
@@ -128,15 +138,17 @@ def _load(path: Path) -> list[LabelledImage]:
                 path=f"line {k + 1}",
             )
         # There is one record per image, so an image's row in the truth is its number.
-        out.append(_rendered(entry, truth, k, scene_rig))
+        image = _rendered(entry, truth, k)
+        hints = _hints(entry, truth, k, scene_rig, eye_error_mm)
+        out.append(replace(image, hints=hints))
     return out
 
 
-def _load_own(folder: Path) -> list[LabelledImage]:
+def _load_own(folder: Path, pupil_class: int | None) -> list[LabelledImage]:
     out = []
     told = FolderHints.load(folder)
     hints, source = told.to_request(), "assumed" if told.gamma is None else "folder"
-    for name, path, pupil in own_labels(folder):
+    for name, path, pupil in own_labels(folder, pupil_class):
         image, depth, _ = read_any_image(path)
         found = _without_rig(name, path, (depth, image.shape), pupil)
         out.append(replace(found, hints=hints, gamma_from=source))
@@ -164,7 +176,7 @@ def _without_rig(
     return LabelledImage(name, path, bit_depth, size, pupil, outline, visible, glints, hints, known or {}, factors)
 
 
-def _rendered(entry: ImageEntry, truth: Observations, row: int, rig: RigGeometry | None) -> LabelledImage:
+def _rendered(entry: ImageEntry, truth: Observations, row: int) -> LabelledImage:
     image = entry.image()
     x0, y0, width, height = entry.window
     corner = np.array([x0, y0], dtype=np.float64)
@@ -199,7 +211,7 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int, rig: RigGeometry
         outline,
         visible,
         tuple(shown),
-        _hints(entry.line, truth, row, rig, corner),
+        {},
         {},
         factors | _ellipse_factors(ellipse, visible),
         subject=str(entry.line.get("subject", "")),
@@ -240,13 +252,17 @@ def _ellipse_factors(pupil: Ellipse | None, visible: float | None) -> dict[str, 
 
 
 def _hints(
-    line: Mapping[str, Any], truth: Observations, row: int, scene_rig: RigGeometry | None, corner: Floats
+    entry: ImageEntry, truth: Observations, row: int, scene_rig: RigGeometry | None, eye_error_mm: float
 ) -> dict[str, Any]:
     """Information that an extractor may have, but never the truth.
 
-    It is the rig, a rough place of the eye, and thus a range of sizes.
+    It is the rig, a rough place of the eye, and thus a range of sizes. The place has a normal error of its own for each
+    image, which follows from the image's name.
     """
-    eye_mm = truth.index.eye_position_mm[row] + truth.index.head_mm[row]
+    line, corner = entry.line, np.array(entry.window[:2], dtype=np.float64)
+    seed = int.from_bytes(hashlib.sha256(str(line["file_name"]).encode()).digest()[:8], "big")
+    error_mm = eye_error_mm * np.random.default_rng(seed).standard_normal(3)
+    eye_mm = truth.index.eye_position_mm[row] + truth.index.head_mm[row] + error_mm
     camera, lights = _camera_and_lights(line, int(truth.index.camera[row]), scene_rig)
     hints: dict[str, Any] = {
         "polarity": "dark",
@@ -268,6 +284,7 @@ def _hints(
             "distortion": camera.distortion.tolist(),
             "lights_mm": lights.tolist(),
             "eye_mm": eye_mm.tolist(),
+            "eye_sd_mm": eye_error_mm,
         },
     }
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ..errors import InputError
-from ..spec import Number, Positive, Spec, Vec3
+from ..spec import NonNegative, Number, Positive, Spec, Vec3
 from ..storage.files import read_json, shown
 
 HINTS = "hints.json"
@@ -25,6 +25,7 @@ class RigHints(Spec):
         distortion: OpenCV's coefficients.
         lights_mm: positions of the lights in the world.
         eye_mm: rough position of the eye in the world.
+        eye_sd_mm: its standard deviation per axis.
     """
 
     K: tuple[Vec3, Vec3, Vec3]
@@ -33,6 +34,7 @@ class RigHints(Spec):
     distortion: Annotated[tuple[Number, ...], Field(max_length=14)] = (0.0, 0.0, 0.0, 0.0, 0.0)
     lights_mm: Annotated[tuple[Vec3, ...], Field(max_length=1000)]
     eye_mm: Vec3
+    eye_sd_mm: NonNegative = 5.0
 
 
 class FolderHints(Spec):

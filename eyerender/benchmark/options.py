@@ -20,6 +20,8 @@ class BenchOptions:
         timeout_s: Longest time for an image, s.
         start_timeout_s: Longest time until an extractor greets, s.
         gamma: Encoding gamma of images whose folder states none (default: 1, linear).
+        eye_error_mm: Standard deviation, per axis, by which the hinted position of the eye is off.
+        pupil_class: Value of the pupil in masks of several classes.
         fresh: Ask the extractors again, also about images whose answers are stored.
         against: results.json of an earlier bench, to compare with.
         require: Figures that must be reached, such as `right>=.95` or `own-fast:right>=.95`.
@@ -30,6 +32,8 @@ class BenchOptions:
     timeout_s: float = 30.0
     start_timeout_s: float = 60.0
     gamma: float | None = None
+    eye_error_mm: float = 5.0
+    pupil_class: int | None = None
     fresh: bool = False
     against: str | Path | None = None
     require: tuple[str, ...] = ()
@@ -42,5 +46,9 @@ class BenchOptions:
             if not 0 < getattr(self, name) <= LONGEST_S:
                 source = f"--{name.removesuffix('_s').replace('_', '-')}"
                 raise InputError(f"must be above 0 and at most {LONGEST_S:g} seconds", source=source)
+        if not 0 <= self.eye_error_mm <= 1000:
+            raise InputError("must be 0 to 1000 mm", source="--eye-error")
+        if self.pupil_class is not None and not 1 <= self.pupil_class <= 65535:
+            raise InputError("must be 1 to 65535", source="--pupil-class")
         if self.gamma is not None and not (math.isfinite(self.gamma) and 0.1 <= self.gamma <= 10):
             raise InputError("must be between 0.1 and 10", source="--gamma")

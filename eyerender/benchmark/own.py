@@ -2,7 +2,7 @@
 
     images/a.png, images/b.png, ...      or the images beside labels.csv
     labels.csv                           image,centre_x_px,centre_y_px,semi_axis_a_px,semi_axis_b_px,angle_deg
-    masks/a.png, masks/b.png, ...        pixels above 0 are the pupil (its visible part, or all of it)
+    masks/a.png, masks/b.png, ...        the pupil (its visible part, or all of it), or classes
     hints.json                           what the extractors may know (`hints`); optional
 
 A line without numbers, and an empty mask, say that the image shows no pupil.
@@ -18,17 +18,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import Bools
+from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..folders.imagefile import read_any_image
 from ..folders.imagefolder import DATASET
-from ..geometry.ellipse import Ellipse
+from ..geometry.ellipse import Ellipse, fit_ellipse_direct, signed_distance
 from ..storage.files import inside, read_text
 
 LABELS, MASKS, IMAGES = "labels.csv", "masks", "images"
 COLUMNS = ("centre_x_px", "centre_y_px", "semi_axis_a_px", "semi_axis_b_px", "angle_deg")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 MAX_IMAGES = 100_000
+_TRIALS, _NEAR_PX, _OUTSIDE_PX = 200, 0.7, 1.2
 
 
 def is_own(folder: Path) -> bool:
@@ -36,13 +37,18 @@ def is_own(folder: Path) -> bool:
     return not (folder / DATASET).exists() and ((folder / LABELS).is_file() or (folder / MASKS).is_dir())
 
 
-def own_labels(folder: Path) -> Iterator[tuple[str, Path, Ellipse | None]]:
+def own_labels(folder: Path, pupil_class: int | None = None) -> Iterator[tuple[str, Path, Ellipse | None]]:
     """Yield (name, file, pupil or None) of every labelled image.
 
+    Args:
+        folder: the folder.
+        pupil_class: value of the pupil in masks of several classes.
+
     Raises:
-        InputError: a table or mask cannot be used, or names an image that is not there.
+        InputError: a table or mask cannot be used, or names an image that is not there; a mask has several classes, and
+            none is given.
     """
-    return _of_table(folder) if (folder / LABELS).is_file() else _of_masks(folder)
+    return _of_table(folder) if (folder / LABELS).is_file() else _of_masks(folder, pupil_class)
 
 
 def _of_table(folder: Path) -> Iterator[tuple[str, Path, Ellipse | None]]:
@@ -72,7 +78,7 @@ def _ellipse(cells: list[str | None], source: str, where: str) -> Ellipse:
     return Ellipse(np.array([x, y]), np.array([a, b]), math.radians(degrees))
 
 
-def _of_masks(folder: Path) -> Iterator[tuple[str, Path, Ellipse | None]]:
+def _of_masks(folder: Path, pupil_class: int | None) -> Iterator[tuple[str, Path, Ellipse | None]]:
     home = folder / IMAGES if (folder / IMAGES).is_dir() else folder
     images = {p.stem: p for p in sorted(home.iterdir()) if p.suffix.lower() in SUFFIXES}
     masks = [p for p in sorted((folder / MASKS).iterdir()) if p.suffix.lower() in SUFFIXES]
@@ -83,16 +89,84 @@ def _of_masks(folder: Path) -> Iterator[tuple[str, Path, Ellipse | None]]:
             raise InputError(f"there is no image {mask.stem} in {home.name}", source=str(mask))
         path = inside(home, images[mask.stem].name, source=str(mask))
         level, _, _ = read_any_image(inside(folder / MASKS, mask.name, source=str(mask)))
-        yield path.name, path, _of_mask(level > 0, str(mask))
+        found = np.unique(level[level > 0])
+        if pupil_class is None and len(found) > 1:
+            values = ", ".join(str(v) for v in found[:6])
+            raise InputError(f"has several classes ({values}); --pupil-class names the pupil's", source=str(mask))
+        value = pupil_class if pupil_class is not None else (found[0] if len(found) else 1)
+        yield path.name, path, ellipse_of_mask(level == value, str(mask))
 
 
-def _of_mask(mask: Bools, source: str) -> Ellipse | None:
-    """Ellipse with the second moments of a mask; each pixel is a square."""
+def ellipse_of_mask(mask: Bools, source: str = "") -> Ellipse | None:
+    """Ellipse of a pupil of which a mask shows all or a part; None where it is empty.
+
+    An ellipse that covers the mask as it is has the mask's second moments (each pixel is a square). If their overlap is
+    worse than the raggedness of pixels explains, something hides a part of the pupil. Then the ellipse is fitted to the
+    mask's contour, without what hides it: the contour's points are weighted down the farther they lie inside the fit.
+
+    Raises:
+        InputError: too few pixels are marked.
+    """
     y, x = np.nonzero(mask)
     if x.size == 0:
         return None
     if x.size < 20:
         raise InputError(f"marks only {x.size} pixels", source=source)
+    whole = _of_moments(x, y)
+    points = _contour(mask)
+    # Half a pixel is what a whole outline strays from its ellipse.
+    if np.max(np.abs(signed_distance(whole, points))) < 1.0 + 0.02 * float(whole.semi_axes_px[0]):
+        return whole
+    return _of_visible_arc(points) or whole
+
+
+def _of_visible_arc(points: Floats) -> Ellipse | None:
+    """The ellipse that holds a contour and follows the longest stretches of it.
+
+    Ellipses through stretches of the contour are tried. An ellipse is supported by the points within 0.7 px of it, and
+    none of the others may lie more than 1 px outside, because nothing adds to a pupil. The best one is fitted again to
+    the points that support it.
+    """
+    rng = np.random.default_rng(0)
+    best, most = None, 0
+    for _ in range(_TRIALS):
+        start, span = rng.integers(len(points)), rng.integers(len(points) // 5, len(points))
+        chosen = points[(start + np.linspace(0, span, 12).astype(int)) % len(points)]
+        for _ in range(3):
+            fit = fit_ellipse_direct(chosen)
+            if not bool(fit.ok):
+                break
+            ellipse = Ellipse(fit.centre_px, fit.semi_axes_px, float(fit.angle_rad))
+            distance = signed_distance(ellipse, points)
+            support = np.abs(distance) < _NEAR_PX
+            if np.count_nonzero(support) < max(12, len(points) // 5):
+                break
+            chosen = points[support]
+            if distance.max() < _OUTSIDE_PX and np.count_nonzero(support) > most:
+                best, most = ellipse, int(np.count_nonzero(support))
+    return best
+
+
+def _contour(mask: Bools) -> Floats:
+    """Points (n, 2) on the border of a mask, between its pixels and those beside it, in order of their direction.
+
+    Pixels at the frame's edge are no border: the pupil goes on behind it.
+    """
+    y, x = np.nonzero(mask)
+    height, width = mask.shape
+    out = []
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        u, v = x + dx, y + dy
+        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        beside = np.zeros(len(x), dtype=bool)
+        beside[inside] = ~mask[v[inside], u[inside]]
+        out.append(np.stack([x[beside] + 0.5 * dx, y[beside] + 0.5 * dy], axis=-1))
+    points = np.concatenate(out).astype(np.float64)
+    away = points - points.mean(axis=0)
+    return points[np.argsort(np.arctan2(away[:, 1], away[:, 0]))]
+
+
+def _of_moments(x: Ints, y: Ints) -> Ellipse:
     moments = np.cov(np.stack([x, y])) + np.eye(2) / 12.0
     values, vectors = np.linalg.eigh(moments)
     angle = math.atan2(vectors[1, 1], vectors[0, 1])

@@ -67,7 +67,7 @@ def bench_extractors(
     old = None if options.against is None else read_results(options.against)
     is_bench = options.overwrite or _is_bench(Path(output))
     refuse_non_empty(output, is_bench)
-    images = load_labelled(folder, gamma=options.gamma)
+    images = load_labelled(folder, options.gamma, eye_error_mm=options.eye_error_mm, pupil_class=options.pupil_class)
     sources = [check_reference(extractor, options.start_timeout_s) for extractor in chosen]
     keys = [image_key(image) for image in images]
     done, total = 0, len(chosen) * len(images)

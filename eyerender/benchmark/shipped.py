@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -115,6 +116,6 @@ def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None
         t_mm=camera.t,
         lights_mm=rig["lights_mm"],
         eye_mm=rig["eye_mm"],
-        position_sd_mm=_PLACE_MM,
+        position_sd_mm=math.hypot(_PLACE_MM, rig.get("eye_sd_mm", 0.0)),
     )
     return [int(k) if k >= 0 else None for k in assigned.light]

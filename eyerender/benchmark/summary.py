@@ -77,9 +77,8 @@ def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], report
 def _intervals(scores: Sequence[Score], reports_glints: bool) -> dict[str, Any]:
     """95 % intervals of every rate: `wilson` for independent trials, `subjects` for images that are alike."""
     shown = [s for s in scores if s.with_pupil]
-    trials: dict[str, tuple[Sequence[int], Sequence[int], Sequence[Score]]] = {
-        outcome: ([s.outcome == outcome for s in shown], [1] * len(shown), shown) for outcome in _OUTCOMES
-    }
+    trials: dict[str, tuple[Sequence[float], Sequence[float], list[Score]]] = {}
+    trials |= {o: ([s.outcome == o for s in shown], [1] * len(shown), shown) for o in _OUTCOMES}
     without = [s for s in scores if not s.with_pupil]
     trials["false"] = ([s.outcome == "false" for s in without], [1] * len(without), without)
     if reports_glints:

@@ -22,6 +22,8 @@ def bench_extractors(
     extractor: tuple[str, ...] = (),
     jobs: Annotated[int, Parameter(validator=at_least_one)] = 1,
     gamma: float | None = None,
+    eye_error: float = 5.0,
+    pupil_class: int | None = None,
     against: Path | None = None,
     require: tuple[str, ...] = (),
     timeout: float = 30.0,
@@ -47,6 +49,8 @@ def bench_extractors(
             Repeat the option for several extractors (default: all installed ones).
         jobs: The number of extractor processes that run at the same time.
         gamma: The encoding gamma of images whose folder states none (default: 1, linear).
+        eye_error: The standard deviation per axis, in mm, by which the hinted position of the eye is off.
+        pupil_class: The value of the pupil in masks of several classes.
         against: The results.json of an earlier bench to compare with.
         require: A figure that must be reached, such as right>=.95 or own-fast:centre_px<.1. Repeat the option for
             several.
@@ -60,6 +64,8 @@ def bench_extractors(
         jobs=jobs,
         timeout_s=timeout,
         gamma=gamma,
+        eye_error_mm=eye_error,
+        pupil_class=pupil_class,
         fresh=fresh,
         against=against,
         require=require,

@@ -223,7 +223,7 @@ def test_a_lid_s_occlusion_is_what_it_covers():
 
 @pytest.mark.render
 def test_a_rendered_folder_s_labels_and_hints_are_in_image_coordinates(rendered):
-    images = load_labelled(rendered)
+    images = load_labelled(rendered, eye_error_mm=0.0)
     assert len(images) == 4
     for image in images:
         grey = np.asarray(read_image(image.path)[0], dtype=float)
@@ -242,6 +242,18 @@ def test_a_rendered_folder_s_labels_and_hints_are_in_image_coordinates(rendered)
         assert np.hypot(*(seen[:2] / seen[2] - image.pupil.centre_px)) < 2 * high
         assert image.visible == 1.0
         assert 0 < image.factors["gaze_deg"] < 30
+
+
+@pytest.mark.render
+def test_the_hinted_eye_is_off_by_a_stated_and_repeatable_error(rendered):
+    exact, off, again = (load_labelled(rendered, eye_error_mm=sd) for sd in (0.0, 5.0, 5.0))
+    place = [np.array([i.hints["rig"]["eye_mm"] for i in images]) for images in (exact, off, again)]
+    assert np.array_equal(place[1], place[2])
+    error = (place[1] - place[0]).ravel()
+    # The root mean square of twelve draws has a standard error of a fifth.
+    assert 2.5 < np.sqrt(np.mean(error**2)) < 7.5
+    assert len(np.unique(error)) == 12
+    assert {i.hints["rig"]["eye_sd_mm"] for i in off} == {5.0}
 
 
 def test_images_of_two_eyes_and_damaged_folders_are_refused(drawn, tmp_path):
