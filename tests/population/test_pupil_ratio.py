@@ -48,7 +48,7 @@ def seen_from(angle_deg: float, eyes: list[EyeModel]) -> Features:
 
 def test_eyes_traced_together_give_what_each_gives_alone():
     """So far to the side, some rays are only found by the search from the pupil, done for many eyes at once."""
-    eyes = wide_pupils(12, 0.003)
+    eyes = wide_pupils(4, 0.003)
     together = seen_from(75, eyes)
     alone = [seen_from(75, [eye]).points_px[0] for eye in eyes]
     np.testing.assert_allclose(together.points_px, alone, atol=1e-6)

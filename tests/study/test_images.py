@@ -118,11 +118,18 @@ def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
     for scene in scenes[2:4]:
         for own, beside in zip(alone.of(scene), made.of(scene), strict=True):
             assert own.path.read_bytes() == beside.path.read_bytes()
-    # Exposed automatically, they are others, which are used again.
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_images_exposed_automatically_are_others_and_are_used_again(tmp_path):
+    """`tests/dataset/test_auto_exposure.py` holds the exposure itself."""
+    scenes = small_scenes()[2:4]
+    alone = make_images("small", scenes, tmp_path / "alone", StudyOptions(workers=1))
     auto = tmp_path / "alone", StudyOptions(workers=1, auto_exposure=0.3)
-    exposed = make_images("small", scenes[2:4], *auto)
-    assert make_images("small", scenes[2:4], *auto) == exposed != alone
-    codes = read_image(exposed.of(scenes[2])[0].path)[0]
+    exposed = make_images("small", scenes, *auto)
+    assert make_images("small", scenes, *auto) == exposed != alone
+    codes = read_image(exposed.of(scenes[0])[0].path)[0]
     assert np.quantile(codes, 0.98) / 65535 == pytest.approx(0.3, abs=0.03)
 
 
