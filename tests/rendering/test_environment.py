@@ -198,7 +198,7 @@ def test_a_panel_is_the_same_rectangle_for_both_eyes():
     lamps = [panel_lamps(ambient, anchor) for anchor in anchors]
     np.testing.assert_allclose(one[:, :3] + anchors[0], other[:, :3] + anchors[1])
     np.testing.assert_array_equal(one[:, 3:], other[:, 3:])
-    np.testing.assert_allclose(one[:, 3:6], [[-0.8, 0, -0.6], [0, -1, 0]], atol=1e-12)
+    np.testing.assert_allclose(one[:, 3:6], [[-0.8, 0.0, -0.6], [0.0, -1.0, 0.0]], atol=1e-12)
     np.testing.assert_allclose(one[1, 9:12], [0, 0, 1 / 10])  # upright, 20 mm high
     places = np.array([[lamp.position_mm for lamp in part] for part in lamps])
     np.testing.assert_allclose(places[0], places[1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -42,8 +44,11 @@ def test_a_moved_camera_sees_moved_points_where_it_saw_them():
         np.testing.assert_allclose(b.axis, moved(a.position_mm + a.axis) - moved(a.position_mm), atol=1e-12)
 
 
+RIGS: tuple[dict[str, Any], ...] = ({}, {"mount": {}}, {"mount": MOUNT})
+
+
 def test_a_mount_moves_the_features_and_nothing_else(tmp_path):
-    still, same, tilted = (built("headset", **rig) for rig in ({}, {"mount": {}}, {"mount": MOUNT}))
+    still, same, tilted = (built("headset", **rig) for rig in RIGS)
     a, b, c = (trace(scene.frames()).pupil.centre_px for scene in (still, same, tilted))
     np.testing.assert_array_equal(a, b)
     assert np.nanmin(np.linalg.norm(c - a, axis=1)) > 1.0
