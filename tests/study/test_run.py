@@ -159,7 +159,7 @@ def test_a_turned_camera_changes_no_ray():
 def test_turned_frames_come_back_in_the_scenes_order(monkeypatch):
     scene = guestrin.scene("E1", guestrin.CORRECTED)
     # The image part alone is replaced by the analytic one: what is tested is the order and the index.
-    monkeypatch.setattr(StudyImages, "observe", lambda self, s: trace(s))
+    monkeypatch.setattr(StudyImages, "observe", lambda self, s, noise_seed=None: trace(s))
     seen = Observing("image", StudyImages({})).observe(scene, facing=True)
     direct = trace(scene)
     for name in ("frame", "fixation", "head", "eye", "target_mm"):
