@@ -136,7 +136,9 @@ class Skin(Spec):
     veins: Share = Field(
         default=0.35, description="strength of the veins that show through the thin skin of the lids (chosen)"
     )
-    sheen: Share = Field(default=0.5, description="strength of the rough specular reflection of oily skin (chosen)")
+    sheen: Share = Field(
+        default=0.5, description="strength of the rough specular reflection of lamps by oily skin (chosen)"
+    )
     wet_albedo: float = _number(0.40, 0.25, 0.55, "albedo of the lid margins and the caruncle (chosen)")
     map: Literal["off"] | None = Field(
         default=None,

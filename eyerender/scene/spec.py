@@ -253,7 +253,8 @@ class SceneSpec(FileSpec):
     motion: Motion | None = Field(default=None, description="motion during the exposure; default: none")
     ambient: Ambient = Field(default=Ambient(), description="light other than that of the lamps")
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(
-        default=0, description="selects the draws of the sampler and of the sensor noise"
+        default=0,
+        description="selects the draws of places on lamps and of the sensor noise; the places in a pixel never change",
     )
 
     @model_validator(mode="after")

@@ -4,7 +4,7 @@ Places in the pixel form a rank-1 lattice, x = (k + 1/2) / N, y = frac((k a + 1/
 distance is largest, tiled over the sensor. The edges of a frame are thus sampled by one regular lattice, which places a
 contour far better than the same number of independent samples (Sloan and Joe 1994, chapter 4). Its mean is the pixel's
 centre in every image: a random shift of the whole lattice would move the image, but not the computed glints, by up to 1
-/ (2 N) px.
+/ (2 N) px. All seeds share it, so the mean over seeds keeps the lattice's error.
 
 Places on the lamps: sample k is at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018). The
 shift is a hash of the pixel's place on the whole sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft
