@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import random
 import signal
-import subprocess
 import time
 
 import pytest
@@ -130,34 +128,41 @@ def test_a_killed_worker_loses_what_came_after_the_checkpoint(fresh, whole, tmp_
     assert tree(tmp_path) == tree(whole)
 
 
-def ended(process: subprocess.Popen[str], number: int, seconds: float) -> int | None:
-    """Send a signal after a while; returns the exit code, None where the process ended by itself before."""
-    try:
-        process.communicate(timeout=seconds)
-    except subprocess.TimeoutExpired:
-        process.send_signal(number)
-        process.communicate(timeout=60)
-        return process.returncode
-    assert process.returncode == 0
-    return None
+def pictures(folder):
+    return sum(1 for _ in folder.glob("**/images/**/*.png"))
+
+
+def kept(folder):
+    """Images in finished shards and in checkpoints."""
+    done = [json.loads(path.read_text())["images"] for path in folder.glob("shards/*/done.json")]
+    return sum(done) + sum(partial.checkpoints(folder).values())
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1800)
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_run_that_never_lives_as_long_as_a_shard_gets_finished(tmp_path, number):
-    big = {"count": 200, "shard_size": 100, "subjects": 4, "scene.image.spp": 64}
-    spec, folder = write(tmp_path / "tiny.yaml", **big), tmp_path / "out"
-    draws, rounds = random.Random(1), []
+    """SIGTERM loses at most the picture that is being written; SIGKILL what came after the last checkpoint."""
+    big = {"count": 60, "shard_size": 30, "subjects": 2, "scene.image.spp": 32}
+    spec, folder, rounds, had = write(tmp_path / "tiny.yaml", **big), tmp_path / "out", 0, 0
     while True:
         process = command("generate", str(spec), str(folder), "--workers", "2", start_new_session=True)
-        code = ended(process, number, draws.uniform(12.0, 20.0))
-        if code is None:
+        start = time.monotonic()
+        while process.poll() is None and (kept(folder) <= had or number == signal.SIGTERM):
+            time.sleep(0.2)
+            if number == signal.SIGTERM and pictures(folder) >= had + 12 and time.monotonic() - start > 1.0:
+                break
+        there = pictures(folder)
+        process.send_signal(number)
+        process.communicate(timeout=60)
+        if process.returncode == 0:
             break
-        assert code == (130 if number == signal.SIGTERM else -signal.SIGKILL)
-        time.sleep(1.0)  # workers notice that their parent is gone
-        rounds.append(sum(partial.checkpoints(folder).values()))
-        assert len(rounds) < 60
-    assert len(rounds) > 1
+        assert process.returncode == (130 if number == signal.SIGTERM else -signal.SIGKILL)
+        time.sleep(2.0)  # workers notice that their parent is gone
+        now, rounds = kept(folder), rounds + 1
+        assert now >= (there - 2 if number == signal.SIGTERM else had + 1)
+        had = now
+        assert rounds < 60
+    assert rounds > 1
     make(tmp_path / "undisturbed", plan(**big), workers=2, threads=2)
     assert tree(folder) == tree(tmp_path / "undisturbed")
