@@ -31,6 +31,7 @@ from . import (  # noqa: F401
     observe,
     population,
     realism,
+    rig,
     study,
 )
 from .app import app, option_name

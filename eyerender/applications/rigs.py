@@ -1,0 +1,399 @@
+"""The report on a rig: bound, dropout and coverage over a population, errors of estimators, and eye safety.
+
+Every figure but the errors of estimators is by ray optics alone. The errors are those on exact features, so they are
+what an estimator assumes wrongly about people's eyes (model bias), without any noise.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import repeat
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..analytic.observer import trace
+from ..arrays import Floats
+from ..design.noise import FeatureNoise, sensor_noise
+from ..design.people import CALIBRATION, GRID, LOST, Figures, Survey, figures_of, place_of
+from ..design.safety import NOTE, eye_exposure
+from ..design.unknowns import Unknowns
+from ..errors import InputError
+from ..folders.outfolder import staged
+from ..gaze.estimate import ray_errors_deg
+from ..gaze.store import choose_estimator
+from ..observation import Observations
+from ..progress import Progress
+from ..report.page import Card, Figure, Page, Section, Table, write_page
+from ..report.style import figure, svg
+from ..scene import Scene
+from ..scene.people import Population
+from ..scene.spec import SceneSpec, Targets
+from ..scene.subject import Subject
+from ..storage.files import write_json
+
+SCHEMA = "eyerender/rig/1"
+REPORT, PEOPLE, GAZE, SUMMARY = "report.html", "people.csv", "gaze.csv", "summary.json"
+ESTIMATORS = ("direction-regression", "hennessey", "guestrin-eizenman", "maximum-likelihood")
+NOISE_ONLY = "noise only"
+_PIECE = 20
+_TARGET_MM = 1000.0
+_OUTLINE = 0.6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigSize:
+    """How much is computed.
+
+    Attributes:
+        people: number of people.
+        sample: number of them whose gaze is estimated.
+        workers: processes; None: one for each processor.
+        seed: seed of the people.
+        slippage_mm: standard deviation of people's places.
+        azimuth_deg: half range of gaze.
+        elevation_deg: half range of gaze.
+    """
+
+    people: int = 200
+    sample: int = 5
+    workers: int | None = None
+    seed: int = 0
+    slippage_mm: float = 1.5
+    azimuth_deg: float = 20.0
+    elevation_deg: float = 15.0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range, by the names of the command's options."""
+        for name, low, high in (
+            ("people", 1, 10**6), ("sample", 0, 1000), ("seed", 0, 2**63 - 1), ("slippage_mm", 0, 20),
+            ("azimuth_deg", 1, 60), ("elevation_deg", 1, 60), ("workers", 1, 1024),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(f"must be {low} to {high}, not {value:g}", source=f"--{name.replace('_', '-')}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bias:
+    """Errors of one estimator on exact features: (people, 81) degrees, NaN where there is no estimate; or a reason."""
+
+    name: str
+    error_deg: Floats
+    reason: str = ""
+
+
+def run_rig(
+    scene: Scene,
+    population: Population,
+    output: str | Path,
+    size: RigSize = RigSize(),
+    *,
+    unknowns: Unknowns | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write report.html, summary.json, people.csv and gaze.csv on a scene's rig into a folder.
+
+    Args:
+        scene: its rig, sensor, first eye and first head position.
+        population: the people.
+        output: the folder.
+        size: how many people, where they look.
+        unknowns: what is known beforehand; default: `Unknowns.population()`.
+        overwrite: replace the contents of the folder.
+        progress: called with (people done, people in all, what).
+
+    Raises:
+        InputError: the folder is not empty, or nobody's eye can exist.
+    """
+    survey = Survey(
+        scene=scene.located().to_mapping(),
+        population=population.to_mapping(),
+        seed=size.seed,
+        azimuth_deg=size.azimuth_deg,
+        elevation_deg=size.elevation_deg,
+        slippage_mm=size.slippage_mm,
+        unknowns=(Unknowns.population() if unknowns is None else unknowns).to_mapping(),
+    )
+    noise = sensor_noise(scene)
+    with staged(output, overwrite=overwrite) as folder:
+        found = Figures.joined(list(_figures(survey, noise, size, progress)))
+        if not len(found.subject):
+            raise InputError("nobody's eye can exist", source="--population")
+        biases = estimator_errors(survey, found.subject[: size.sample].tolist(), progress)
+        data = summary(scene, survey, found, biases, noise)
+        write_json(folder / SUMMARY, data)
+        _write_people(folder / PEOPLE, found)
+        _write_gaze(folder / GAZE, survey, found)
+        write_page(folder / REPORT, page_of(scene, survey, found, data))
+    return data
+
+
+def _figures(survey: Survey, noise: FeatureNoise, size: RigSize, progress: Progress | None) -> Iterator[Figures]:
+    """Figures of all people, in pieces that do not depend on the number of processes."""
+    firsts = range(0, size.people, _PIECE)
+    counts = [min(_PIECE, size.people - first) for first in firsts]
+    workers = min(size.workers or os.cpu_count() or 1, len(firsts))
+    if workers == 1:
+        results: Iterator[Figures] = map(partial(figures_of, survey, noise), firsts, counts)
+        yield from _told(results, counts, progress)
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from _told(pool.map(figures_of, repeat(survey), repeat(noise), firsts, counts), counts, progress)
+
+
+def _told(results: Iterator[Figures], counts: Sequence[int], progress: Progress | None) -> Iterator[Figures]:
+    done = 0
+    for part, count in zip(results, counts, strict=True):
+        done += count
+        if progress is not None:
+            progress(done, sum(counts), "people")
+        yield part
+
+
+def estimator_errors(survey: Survey, subjects: Sequence[int], progress: Progress | None = None) -> list[Bias]:
+    """Errors of estimators on exact features of some people, calibrated on nine of 81 targets a metre away."""
+    cells = GRID * GRID
+    chosen = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
+    errors = {name: np.full((len(subjects), cells), np.nan) for name in ESTIMATORS}
+    reasons = dict.fromkeys(ESTIMATORS, "")
+    for k, subject in enumerate(subjects):
+        seen, scene = _features_of(survey, subject)
+        for name in ESTIMATORS:
+            try:
+                fitted = choose_estimator(name).fit(seen.take(np.isin(seen.index.fixation, chosen)), scene.rig)
+                rays = fitted.predict_rays(seen, scene.rig)  # type: ignore[attr-defined]
+            except (InputError, np.linalg.LinAlgError) as error:
+                reasons[name] = str(error) or "the targets do not determine it"
+                continue
+            for camera in range(len(scene.rig.cameras)):
+                rows = np.flatnonzero(seen.index.camera == camera)
+                found = ray_errors_deg(seen.take(rows), _taken(rays, rows))
+                errors[name][k, seen.index.fixation[rows]] = np.fmin(errors[name][k, seen.index.fixation[rows]], found)
+        if progress is not None:
+            progress(k + 1, len(subjects), "estimators")
+    return [Bias(name=name, error_deg=errors[name], reason=reasons[name]) for name in ESTIMATORS]
+
+
+def _taken(rays: Any, rows: Any) -> Any:
+    return type(rays)(rays.origin_mm[rows], rays.direction[rows], rays.reason[rows])
+
+
+def _features_of(survey: Survey, subject: int) -> tuple[Observations, Scene]:
+    """Exact features of a person who looks at 81 targets a metre away."""
+    spec = SceneSpec.from_mapping(survey.scene)
+    person = Population.from_mapping(survey.population).person(subject, survey.seed)
+    base = Scene.of(spec)
+    side = spec.subject.eyes[0]
+    place = place_of(survey, base, person)
+    half = person.ipd_mm / 2.0
+    head = place - np.array([0.0, half if side == "left" else -half, 0.0])
+    azimuth, elevation = np.radians(survey.directions_deg).T
+    way = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
+    )
+    own = Subject.of(
+        person, eyes=(side,), head_positions_mm=(tuple(head.tolist()),), luminance_cd_m2=survey.luminance_cd_m2
+    )
+    scene = Scene(own, spec.rig, targets=Targets.at(place + _TARGET_MM * way), wavelength_nm=spec.wavelength_nm)
+    return trace(scene, boundary_points=30), scene
+
+
+def users_of(values: Floats) -> dict[str, float | None]:
+    """U50E95 and U95E95: the median and the 95th-percentile user's 95th-percentile error; values (people, 81)."""
+    if not values.size or np.isnan(values).all():
+        return {"U50E95": None, "U95E95": None}
+    each = np.quantile(np.where(np.isnan(values), np.inf, values), 0.95, axis=1, method="higher")
+    return {f"U{u}E95": _number(np.quantile(each, u / 100, method="higher")) for u in (50, 95)}
+
+
+def coverage_of(found: Figures) -> dict[str, float]:
+    """Share of people times directions with so many glints and `_OUTLINE` of the outline."""
+    outline = found.outline >= _OUTLINE
+    return {
+        "outline": float(outline.mean()),
+        **{f"outline_and_{k}_glints": float((outline & (found.glints >= k)).mean()) for k in (1, 2, 3)},
+    }
+
+
+def summary(
+    scene: Scene, survey: Survey, found: Figures, biases: Sequence[Bias], noise: FeatureNoise
+) -> dict[str, Any]:
+    """Content of summary.json."""
+    side = scene.spec.subject.eyes[0]
+    place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
+    try:
+        safety: dict[str, Any] = eye_exposure(scene.rig, place, wavelength_nm=scene.spec.wavelength_nm).to_mapping()
+    except InputError as error:
+        safety = {"note": NOTE, "reason": str(error)}
+    lights = len(scene.rig.lights) * len(scene.rig.cameras)
+    return {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "people": len(found.subject),
+        "refused": found.refused.tolist(),
+        "directions": GRID * GRID,
+        "seed": survey.seed,
+        "unknowns": dict(survey.unknowns),
+        "noise": {
+            "outline_px": noise.outline_px.tolist(), "glint_px": [[_number(v) for v in row] for row in noise.glint_px]
+        },
+        "bound_deg": {"note": NOISE_ONLY, "median": _number(np.median(found.bound_deg)), **users_of(found.bound_deg)},
+        "frame_to_frame_deg": {
+            "note": NOISE_ONLY, "median": _number(np.median(found.noise_deg)), **users_of(found.noise_deg)
+        },
+        "coverage": coverage_of(found),
+        "glints_missing": {
+            name: float(found.lost[..., k].mean() / max(lights, 1)) for k, name in enumerate(LOST)
+        },
+        "estimators": {
+            bias.name: {**users_of(bias.error_deg), "people": len(bias.error_deg), "reason": bias.reason or None}
+            for bias in biases
+        },
+        "safety": safety,
+    }  # fmt: skip
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _write_people(path: Path, found: Figures) -> None:
+    """One row per person."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["subject", "bound_e95_deg", "frame_to_frame_e95_deg", "outline", "glints", "covered_2_glints"])
+        for k, subject in enumerate(found.subject):
+            covered = (found.outline[k] >= _OUTLINE) & (found.glints[k] >= 2)
+            e95 = (np.quantile(v[k], 0.95, method="higher") for v in (found.bound_deg, found.noise_deg))
+            means = (found.outline[k].mean(), found.glints[k].mean(), covered.mean())
+            writer.writerow([subject, *(f"{value:.6g}" for value in (*e95, *means))])
+
+
+def _write_gaze(path: Path, survey: Survey, found: Figures) -> None:
+    """One row per direction."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        names = [f"glints_missing_{name}" for name in LOST]
+        writer.writerow(
+            ["azimuth_deg", "elevation_deg", "bound_deg", "frame_to_frame_deg", "outline", "glints", *names]
+        )
+        for k, direction in enumerate(survey.directions_deg):
+            values = [np.median(found.bound_deg[:, k]), np.median(found.noise_deg[:, k]), found.outline[:, k].mean()]
+            values += [found.glints[:, k].mean(), *found.lost[:, k].mean(axis=0)]
+            writer.writerow([f"{value:.6g}" for value in (*direction, *values)])
+
+
+def page_of(scene: Scene, survey: Survey, found: Figures, data: dict[str, Any]) -> Page:
+    """The page of the report."""
+    share = data["coverage"]["outline_and_2_glints"]
+    cards = [
+        Card(_degrees(data["frame_to_frame_deg"]["U50E95"]), "noise of gaze, median person (U50E95, noise only)"),
+        Card(_degrees(data["bound_deg"]["U95E95"]), "after a calibration, worst 5 % of people (U95E95, noise only)"),
+        Card(f"{100 * share:.1f} %", "of people and directions with two glints and 60 % of the outline"),
+        Card(_cornea_share(data["safety"]), f"of the corneal limit ({NOTE})"),
+    ]  # fmt: skip
+    sections = (_gaze_section(survey, found), _who_section(found, data), _bias_section(data), _safety_section(data))
+    lead = [
+        f"{data['people']} people look in {GRID * GRID} directions in front of the rig of '{scene.name}'. "
+        "Everything here follows from ray optics; nothing is rendered.",
+        "The bound is the smallest error that any unbiased estimator can have with these features. It counts noise "
+        "alone. What an estimator assumes wrongly about the eye comes on top.",
+    ]
+    return Page(f"Rig report: {scene.name}", lead, cards, sections)
+
+
+def _degrees(value: float | None) -> str:
+    return "not seen" if value is None else f"{value:.3g}°"
+
+
+def _cornea_share(safety: dict[str, Any]) -> str:
+    return f"{100 * safety['cornea_share']:.1f} %" if "cornea_share" in safety else "not known"
+
+
+def _gaze_section(survey: Survey, found: Figures) -> Section:
+    covered = (found.outline >= _OUTLINE) & (found.glints >= 2)
+    maps = (
+        ("noise of gaze (median, deg; noise only)", np.median(found.noise_deg, axis=0)),
+        ("visible glints (mean)", found.glints.mean(axis=0)),
+        ("visible share of the outline (mean)", found.outline.mean(axis=0)),
+        ("people with 2 glints and 60 % of the outline", covered.mean(axis=0)),
+    )  # fmt: skip
+    a, e = survey.azimuth_deg, survey.elevation_deg
+    drawn = []
+    for title, values in maps:
+        with figure(4.2, 3.2) as (fig, ax):
+            grid = np.where(np.isfinite(values), values, np.nan).reshape(GRID, GRID)
+            image = ax.imshow(grid, extent=(-a, a, -e, e), aspect="auto", cmap="viridis")
+            fig.colorbar(image)
+            ax.set_xlabel("azimuth, to the subject's left (deg)")
+            ax.set_ylabel("elevation (deg)")
+            ax.set_title(title, fontsize=9)
+            drawn.append(Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over the direction of the optic axis."))
+    return Section("Where does the rig see well?", [], drawn)
+
+
+def _who_section(found: Figures, data: dict[str, Any]) -> Section:
+    covered = ((found.outline >= _OUTLINE) & (found.glints >= 2)).mean(axis=1)
+    worst = np.argsort(covered, kind="stable")[:10]
+    noise = np.quantile(found.noise_deg, 0.95, axis=1, method="higher")
+    rows = [
+        [str(found.subject[k]), f"{100 * covered[k]:.0f} %", f"{found.glints[k].mean():.1f}",
+         f"{100 * found.outline[k].mean():.0f} %", _degrees(_number(noise[k]))]
+        for k in worst
+    ]  # fmt: skip
+    shares = data["coverage"]
+    coverage = [
+        ["60 % of the outline", f"{100 * shares['outline']:.1f} %"],
+        *([f"and at least {k} glints", f"{100 * shares[f'outline_and_{k}_glints']:.1f} %"] for k in (1, 2, 3)),
+    ]
+    why = {"ray": "no ray: the mirror point is off the cornea", "sensor": "off the sensor", "lid": "behind a lid"}
+    missing = [[why[name], f"{100 * share:.1f} %"] for name, share in data["glints_missing"].items()]
+    tables = [
+        Table(header=["visible", "people x directions"], rows=coverage, caption="Coverage."),
+        Table(header=["reason", "glints"], rows=missing, caption="Why glints are missing. Lashes are not considered."),
+        Table(header=["person", "covered directions", "glints", "outline", "noise, 95th percentile"], rows=rows,
+              caption="The ten people for whom the rig covers least."),
+    ]  # fmt: skip
+    return Section("For whom does it fail?", [], [], tables)
+
+
+def _bias_section(data: dict[str, Any]) -> Section:
+    rows = [
+        [name, _degrees(v["U50E95"]) if v["U50E95"] is not None else "—",
+         _degrees(v["U95E95"]) if v["U95E95"] is not None else "—", v["reason"] or ""]
+        for name, v in data["estimators"].items()
+    ]  # fmt: skip
+    count = max((v["people"] for v in data["estimators"].values()), default=0)
+    text = (
+        f"Errors on exact features of {count} people, calibrated on nine targets. There is no noise in them: this is "
+        "what each estimator assumes wrongly about the eye."
+    )
+    head = ["estimator", "U50E95", "U95E95", "reason"]
+    return Section("What do estimators add?", [text], [], [Table(header=head, rows=rows, wide=(3,))])
+
+
+def _safety_section(data: dict[str, Any]) -> Section:
+    safety = data["safety"]
+    if "lights" not in safety:
+        return Section("Eye safety", [f"{safety['reason']}. This is {NOTE}."])
+    rows = []
+    for light in safety["lights"]:
+        retina = light["retina"]
+        known = retina if isinstance(retina, str) else f"{100 * retina['share']:.2g} % of its limit"
+        rows.append([str(light["light"]), f"{light['distance_mm']:.1f}", f"{light['cornea_w_m2']:.3g}", known])
+    text = (
+        f"All LEDs together: {safety['cornea_w_m2']:.3g} W/m² at the cornea, limit "
+        f"{safety['cornea_limit_w_m2']:g} W/m² (IEC 62471, ICNIRP 2013; long exposure), at the nearest "
+        f"place of an eye box of 3 mm about the eye. This is {NOTE}."
+    )
+    head = ["LED", "distance (mm)", "cornea (W/m²)", "retina"]
+    return Section("Eye safety", [text], [], [Table(header=head, rows=rows, wide=(3,))])

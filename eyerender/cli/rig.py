@@ -1,0 +1,100 @@
+"""The command rig: how well a rig can see a population's gaze."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from ..errors import InputError
+from .app import app
+from .options import Overwrite, Result
+from .output import emit, progress
+
+
+@app.command(name="rig")
+def rig(
+    scene: str,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    population: str = "adults",
+    people: int = 200,
+    sample: int = 5,
+    workers: int | None = None,
+    seed: int = 0,
+    slippage_mm: float = 1.5,
+    azimuth_deg: float = 20.0,
+    elevation_deg: float = 15.0,
+    unknowns: Path | None = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
+) -> int:
+    """Tell how well gaze can be known with a rig, for whom it fails, and whether its LEDs are safe.
+
+    The folder receives report.html, summary.json, people.csv (one row per person) and gaze.csv (one row per direction):
+    the bound by noise alone, visible outline and glints, errors of estimators on exact features, and eye safety.
+
+    Args:
+        scene: A scene file or the name of a shipped one: its rig, sensor, first eye and first head position.
+        output: The folder to write.
+        population: adults, emmetropic_adults, myopes, children or elderly, or a YAML file with the keys of
+            `population`.
+        people: Number of people.
+        sample: Number of people for the errors of estimators.
+        workers: Number of processes (default: one per processor). Results do not depend on it.
+        seed: The seed of the people.
+        slippage_mm: Standard deviation of people's places about the scene's, along each axis.
+        azimuth_deg: Half range of the directions of gaze, horizontally.
+        elevation_deg: Half range, vertically.
+        unknowns: A YAML file with the keys of `er.Unknowns` (default: priors of a population, 3 mm of slippage).
+    """
+    from ..applications.rigs import REPORT, RigSize, run_rig
+    from ..design.unknowns import Unknowns
+    from ..scene import load_scene
+    from ..scene.people import Population
+    from ..spec import read_yaml
+
+    size = RigSize(
+        people=people,
+        sample=sample,
+        workers=workers,
+        seed=seed,
+        slippage_mm=slippage_mm,
+        azimuth_deg=azimuth_deg,
+        elevation_deg=elevation_deg,
+    )
+    given = None if unknowns is None else Unknowns.from_mapping(read_yaml(unknowns), source=str(unknowns))
+    if population.endswith((".yaml", ".yml")):
+        data = read_yaml(population)
+        everyone = Population.from_mapping(data.get("population", data), source=population)
+    else:
+        try:
+            everyone = Population(population)
+        except InputError as error:
+            raise InputError(error.reason, source="--population") from None
+    with progress("rig") as steps:
+        found = run_rig(load_scene(scene), everyone, output, size, unknowns=given, overwrite=overwrite, progress=steps)
+    emit(found, f"{_text(found)}\n\nreport: {output / REPORT}", json)
+    return 0
+
+
+def _text(found: dict[str, Any]) -> str:
+    def degrees(value: float | None) -> str:
+        return "not seen" if value is None else f"{value:.4f} deg"
+
+    covered = found["coverage"]["outline_and_2_glints"]
+    bound, noise, safety = found["bound_deg"], found["frame_to_frame_deg"], found["safety"]
+    lines = [
+        f"{found['people']} people in {found['directions']} directions",
+        f"frame to frame, noise only:      U50E95 {degrees(noise['U50E95'])}, U95E95 {degrees(noise['U95E95'])}",
+        f"after a calibration, noise only: U50E95 {degrees(bound['U50E95'])}, U95E95 {degrees(bound['U95E95'])}",
+        f"2 glints and 60 % of the outline: {100 * covered:.1f} % of people x directions",
+    ]
+    for name, one in found["estimators"].items():
+        if one["U50E95"] is not None:
+            lines.append(f"{name} on exact features: U50E95 {degrees(one['U50E95'])}")
+    if "cornea_share" in safety:
+        lines.append(f"cornea: {100 * safety['cornea_share']:.2f} % of the limit ({safety['note']})")
+    return "\n".join(lines)

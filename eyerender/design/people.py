@@ -1,0 +1,325 @@
+"""A rig in front of a population: for each person and direction of gaze the bound, and what the cameras see.
+
+Every person is calibrated at nine of the directions. What is learned there about the person,
+
+    S = P^-1 + sum over the calibration of  C - B^T A^-1 B                                                        (7)
+
+with the blocks A (frame), B and C (person) of each frame's information and its prior, joins the information of every
+other frame alone. The bound is that of the line of sight. Points of the outline and glints count where a ray reaches
+the camera, on the sensor, and inside the projected inner margins of the lids. Lashes and frames are not considered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..arrays import ArrayValue, Bools, Floats, Indices, Ints
+from ..errors import InputError
+from ..eye.batch import structure_of
+from ..eye.model import EyeModel
+from ..eye.pose import Poses, rigid_motion
+from ..population.people import Person
+from ..region.anatomy import Region
+from ..region.contour import contour
+from ..region.globe import Globe
+from ..rig.camera import PinholeCamera
+from ..rig.rig import RigGeometry
+from ..scene import Scene
+from ..scene.people import Population
+from ..scene.spec import SceneSpec
+from .information import Case, information_of_views, target_information
+from .noise import FeatureNoise
+from .unknowns import AZIMUTH, COUNT, ELEVATION, LOCAL, PUPIL, Unknowns
+from .varied import Slopes, Views, diameters_mm, gaze_slopes, slopes_of, stacked_eyes
+
+POINTS = 16
+CALIBRATION = (0, 4, 8)
+"""Rows and columns of the 9 x 9 directions that calibrate."""
+GRID = 9
+TOGETHER = 8
+_MARGIN_COLUMNS = 44
+_VAGUE, _LOST_DEG = 1e3, 60.0
+LOST = ("ray", "sensor", "lid")
+"""Why a glint is missing: no ray (off the cornea), off the sensor, behind a lid."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Survey:
+    """What is surveyed.
+
+    Attributes:
+        scene: mapping of the scene; its first eye, first head position, rig and sensor count.
+        population: mapping of the population.
+        seed: seed of the people.
+        azimuth_deg: half range of the optic axis' azimuth.
+        elevation_deg: half range of its elevation.
+        slippage_mm: standard deviation of a person's place about the scene's, along each axis.
+        luminance_cd_m2: luminance of what people see, which sets their pupils.
+        unknowns: mapping of what is known beforehand.
+        lids: whether lids hide features.
+    """
+
+    scene: Mapping[str, Any]
+    population: Mapping[str, Any]
+    seed: int = 0
+    azimuth_deg: float = 20.0
+    elevation_deg: float = 15.0
+    slippage_mm: float = 1.5
+    luminance_cd_m2: float = 20.0
+    unknowns: Mapping[str, Any]
+    lids: bool = True
+
+    @property
+    def directions_deg(self) -> Floats:
+        """Azimuth and elevation (81, 2) of the optic axis, rows from top to bottom."""
+        elevation = np.linspace(self.elevation_deg, -self.elevation_deg, GRID)
+        azimuth = np.linspace(-self.azimuth_deg, self.azimuth_deg, GRID)
+        return np.array([[a, e] for e in elevation for a in azimuth])
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Figures(ArrayValue):
+    """Figures of p people in 81 directions.
+
+    Attributes:
+        subject: (p,) number of the person.
+        bound_deg: (p, 81) standard deviation of the line of sight after a calibration; inf where it is not seen.
+        noise_deg: (p, 81) the same with a person who is known exactly: what differs from frame to frame.
+        outline: (p, 81) share of the outline that is visible, in the camera that sees most.
+        glints: (p, 81) number of lights whose glint is visible in any camera.
+        lost: (p, 81, 3) glints (of any camera) that are missing for the reasons `LOST`.
+        refused: numbers of people whose eye cannot exist.
+    """
+
+    subject: Ints
+    bound_deg: Floats
+    noise_deg: Floats
+    outline: Floats
+    glints: Ints
+    lost: Ints
+    refused: Ints
+
+    @classmethod
+    def joined(cls, parts: list[Figures]) -> Figures:
+        """Join figures of different people."""
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Someone:
+    """A person before the rig: eye, lids, place of the apex."""
+
+    subject: int
+    eye: EyeModel
+    region: Region
+    place_mm: Floats
+
+
+def people_of(survey: Survey, first: int, count: int) -> tuple[list[Someone], list[int]]:
+    """Draw some of the people; returns those with an eye, and the numbers of those whose eye cannot exist.
+
+    A person depends on the seed and the number alone. The distance of the pupils moves the eye against the rig.
+    """
+    scene = Scene.of(SceneSpec.from_mapping(survey.scene))
+    side = scene.spec.subject.eyes[0]
+    drawn = Population.from_mapping(survey.population).draw(count, survey.seed, first=first)
+    found, refused = [], []
+    for row in range(count):
+        person = drawn.person(row)
+        try:
+            spec = person.eye(side, luminance_cd_m2=survey.luminance_cd_m2)
+            eye = spec.build(eye=side, wavelength_nm=scene.spec.wavelength_nm)
+        except InputError:
+            refused.append(person.subject)
+            continue
+        found.append(
+            Someone(subject=person.subject, eye=eye, region=person.region(), place_mm=place_of(survey, scene, person))
+        )
+    return found, refused
+
+
+def place_of(survey: Survey, scene: Scene, person: Person) -> Floats:
+    """Apex (3,) of a person's unrotated eye in the world.
+
+    It is the scene's, moved by half the difference in the distance of the pupils and by a draw of slippage.
+    """
+    side = scene.spec.subject.eyes[0]
+    place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
+    half = (person.ipd_mm - scene.spec.subject.ipd_mm) / 2.0
+    rng = np.random.default_rng((survey.seed, person.subject, 0x51))
+    shift = survey.slippage_mm * rng.standard_normal(3)
+    return np.asarray(place + shift + np.array([0.0, half if side == "left" else -half, 0.0]))
+
+
+def figures_of(survey: Survey, noise: FeatureNoise, first: int, count: int) -> Figures:
+    """Compute the figures of some people."""
+    scene = Scene.of(SceneSpec.from_mapping(survey.scene))
+    everyone, refused = people_of(survey, first, count)
+    kinds: dict[object, list[Someone]] = {}
+    for one in everyone:
+        kinds.setdefault(structure_of(one.eye), []).append(one)
+    parts = [_nobody(refused)]
+    for same in kinds.values():
+        for start in range(0, len(same), TOGETHER):
+            parts.append(_of_group(survey, scene.rig, noise, same[start : start + TOGETHER]))
+    return Figures.joined(parts)
+
+
+def _nobody(refused: list[int]) -> Figures:
+    cells = GRID * GRID
+    return Figures(
+        subject=np.empty(0, np.int64),
+        bound_deg=np.empty((0, cells)),
+        noise_deg=np.empty((0, cells)),
+        outline=np.empty((0, cells)),
+        glints=np.empty((0, cells), np.int64),
+        lost=np.empty((0, cells, len(LOST)), np.int64),
+        refused=np.array(refused, dtype=np.int64),
+    )
+
+
+def _of_group(survey: Survey, rig: RigGeometry, noise: FeatureNoise, people: list[Someone]) -> Figures:
+    """Figures of a few people at once, camera by camera."""
+    case = _case(survey, rig, people)
+    i, m = len(case.theta), len(rig.lights)
+    matrices, outline = np.zeros((i, COUNT, COUNT)), np.zeros(i)
+    glints, lost = np.zeros((i, m), dtype=bool), np.zeros((i, len(LOST)), dtype=np.int64)
+    openings = _openings(survey, people) if survey.lids else None
+    for number, camera in enumerate(rig.cameras):
+        views = replace(case.instants, camera=np.full(i, number))
+        slopes = slopes_of(views, case.theta, POINTS)
+        slopes, why = visible(slopes, camera, openings)
+        matrices += information_of_views(slopes, noise, views.camera)
+        outline = np.maximum(outline, slopes.outline_ok.mean(axis=1))
+        glints |= slopes.glint_ok
+        lost += why
+    cells = GRID * GRID
+    bound, alone = bounds(case, matrices, noise, Unknowns.from_mapping(survey.unknowns))
+    return Figures(
+        subject=np.array([one.subject for one in people]),
+        bound_deg=bound.reshape(-1, cells),
+        noise_deg=alone.reshape(-1, cells),
+        outline=outline.reshape(-1, cells),
+        glints=glints.sum(axis=1).reshape(-1, cells),
+        lost=lost.reshape(-1, cells, len(LOST)),
+        refused=np.empty(0, np.int64),
+    )
+
+
+def _case(survey: Survey, rig: RigGeometry, people: list[Someone]) -> Case:
+    """All directions of some people, each an instant; the camera is set later."""
+    eyes = stacked_eyes([one.eye for one in people])
+    cells = GRID * GRID
+    person = np.repeat(np.arange(len(people)), cells)
+    theta = np.zeros((len(person), COUNT))
+    theta[:, [AZIMUTH, ELEVATION]] = np.radians(np.tile(survey.directions_deg, (len(people), 1)))
+    theta[:, PUPIL] = diameters_mm(eyes)[person]
+    places = np.array([one.place_mm for one in people])[person]
+    views = Views(eyes=eyes, person=person, position_mm=places, camera=np.zeros(len(person), np.int64), rig=rig)
+    nowhere = np.full((len(person), 3), np.nan)
+    return Case(views=views, instant=np.arange(len(person)), instants=views, theta=theta, target_mm=nowhere)
+
+
+def _openings(survey: Survey, people: list[Someone]) -> Floats:
+    """Inner margins of the lids around the eye in the world, (i, columns, 3).
+
+    They follow the elevation above all, so they are computed at three azimuths and interpolated between these.
+    """
+    grid = survey.directions_deg.reshape(GRID, GRID, 2)
+    poses = Poses.from_degrees(*grid[:, list(CALIBRATION)].reshape(-1, 2).T)
+    out = []
+    for one in people:
+        turn, shift = rigid_motion(poses, one.eye)
+        mirror = np.array([1.0, -1.0 if one.eye.side == "left" else 1.0, 1.0])
+        edges = [
+            contour(one.region, _globe(one.eye, turn[k], shift[k]), _MARGIN_COLUMNS).point for k in range(len(poses))
+        ]
+        known = np.array(edges).reshape(GRID, len(CALIBRATION), _MARGIN_COLUMNS, 3) * mirror + one.place_mm
+        for row in known:
+            for column in range(GRID):
+                left = min(column // 4, 1)
+                share = (column - 4 * left) / 4.0
+                out.append((1.0 - share) * row[left] + share * row[left + 1])
+    return np.array(out)
+
+
+def _globe(eye: EyeModel, turn: Floats, shift: Floats) -> Globe:
+    """Globe of an eye in a pose."""
+    return Globe(
+        cornea=eye.front[0],
+        limbus_radius_mm=float(eye.limbus_radius_mm),
+        centre_mm=eye.sclera.centre_mm,
+        radius_mm=float(eye.sclera.radius_mm),
+        M=turn,
+        t=shift,
+        mirrored=eye.side == "left",
+    )
+
+
+def visible(slopes: Slopes, camera: PinholeCamera, openings: Floats | None) -> tuple[Slopes, Ints]:
+    """Features that the lids leave visible, and how many glints (n, 3) are missing for which of `LOST`."""
+    traced = np.isfinite(slopes.images.glints_px).all(axis=2)
+    inside = np.where(traced, slopes.glint_ok, False)
+    hidden_glints = np.zeros_like(inside)
+    outline_ok = slopes.outline_ok
+    if openings is not None:
+        pixels, _ = camera.project(openings)
+        outline_ok = outline_ok & inside_polygon(pixels, slopes.images.outline_px)
+        hidden_glints = inside & ~inside_polygon(pixels, slopes.images.glints_px)
+    why = np.stack([(~traced).sum(axis=1), (traced & ~inside).sum(axis=1), hidden_glints.sum(axis=1)], axis=1)
+    return replace(slopes, outline_ok=outline_ok, glint_ok=inside & ~hidden_glints), why
+
+
+def inside_polygon(polygon_px: Floats, points_px: Floats) -> Bools:
+    """Whether points (n, k, 2) lie inside closed polygons (n, c, 2), by the parity of crossings to the right."""
+    x0, y0 = polygon_px[:, None, :, 0], polygon_px[:, None, :, 1]
+    x1, y1 = np.roll(x0, -1, axis=2), np.roll(y0, -1, axis=2)
+    x, y = points_px[..., 0:1], points_px[..., 1:2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        crosses = (y0 > y) != (y1 > y)
+        right = x < x0 + (y - y0) * (x1 - x0) / (y1 - y0)
+    return np.asarray((crosses & right).sum(axis=2) % 2 == 1)
+
+
+def bounds(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns) -> tuple[Floats, Floats]:
+    """Standard deviation (i,) of the line of sight in degrees, after each person's calibration, equation (7).
+
+    The second one is that of a person who is known exactly.
+    """
+    prior, free = unknowns.precision(), unknowns.free()
+    prior = np.maximum(prior, _VAGUE**-2)  # so that a frame without features has an inverse
+    local, person = np.flatnonzero(free[:LOCAL]), LOCAL + np.flatnonzero(free[LOCAL:])
+    every = np.concatenate([local, person])
+    joint = matrices[:, every[:, None], every] + np.diag(np.where(every < LOCAL, prior[every], 0.0))
+    own = slice(0, len(local))
+    slopes = gaze_slopes(case.instants, case.theta)[:, :, every]
+    alone = _deviation_deg(joint[:, own, own], slopes[:, :, own])
+    shared = _learned(case, matrices, noise, (prior, local, person))
+    joint[:, len(local) :, len(local) :] += np.repeat(shared, GRID * GRID, axis=0)
+    return _deviation_deg(joint, slopes), alone
+
+
+def _learned(case: Case, matrices: Floats, noise: FeatureNoise, parts: tuple[Floats, Indices, Indices]) -> Floats:
+    """Information (p, q, q) on each person after the calibration and with the prior, equation (7)."""
+    prior, local, person = parts
+    chosen = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
+    rows = (GRID * GRID * np.arange(len(matrices) // GRID**2)[:, None] + chosen).ravel()
+    whole = matrices[rows] + target_information(case, noise, rows)
+    a = whole[:, local[:, None], local] + np.diag(prior[local])
+    b = whole[:, local[:, None], person]
+    learned = whole[:, person[:, None], person] - np.swapaxes(b, 1, 2) @ np.linalg.solve(a, b)
+    return np.asarray(np.diag(prior[person]) + learned.reshape(-1, len(chosen), len(person), len(person)).sum(axis=1))
+
+
+def _deviation_deg(matrices: Floats, slopes: Floats) -> Floats:
+    """Standard deviation (i,) in degrees of directions with derivatives (i, 2, q); inf where it is not seen."""
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("iaa->ia", matrices), 1e-12))
+    scaled = matrices * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(matrices.shape[1])
+    slopes = slopes * scale[:, None, :]
+    spread = np.einsum("nca,nac->n", slopes, np.linalg.solve(scaled, np.swapaxes(slopes, 1, 2)))
+    found = np.degrees(np.sqrt(np.maximum(spread, 0.0)))
+    return np.where(found < _LOST_DEG, found, np.inf)

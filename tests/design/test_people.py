@@ -1,0 +1,118 @@
+"""A rig before a population: the bound against `information`, lids that hide features, and reproducible people."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+import eyerender as er
+from eyerender.applications.rigs import users_of
+from eyerender.cli.main import run
+from eyerender.design.information import information
+from eyerender.design.noise import sensor_noise
+from eyerender.design.people import GRID, Survey, figures_of, inside_polygon, people_of
+from eyerender.design.unknowns import Unknowns
+
+
+@pytest.fixture(scope="module")
+def survey():
+    scene = er.load_scene("head_mounted").spec.to_mapping()
+    people = er.Population("adults").to_mapping()
+    return Survey(scene=scene, population=people, unknowns=Unknowns.population().to_mapping(), lids=False)
+
+
+def test_the_noise_of_a_frame_is_that_of_information(survey):
+    """The same person as a scene of its own, with the person known: `er.information` of one frame."""
+    noise = sensor_noise(er.load_scene("head_mounted"))
+    found = figures_of(survey, noise, 3, 1)
+    (someone,), _ = people_of(survey, 3, 1)
+    spec = er.load_scene("head_mounted").spec
+    person = er.Population("adults").person(3, 0)
+    subject = er.Subject.of(
+        person,
+        eyes=("right",),
+        ipd_mm=63.0,
+        luminance_cd_m2=20.0,
+        accommodation_d=0.0,
+        head_positions_mm=(tuple((someone.place_mm - [0.0, -31.5, 0.0]).tolist()),),
+    )
+    cells = [0, 40, 77]
+    poses = er.EyeDirection.listed(survey.directions_deg[cells])
+    frames = er.Scene(subject, spec.rig, poses=poses).frames()
+    known = information(frames, unknowns=Unknowns(slippage_mm=3.0), noise=noise, boundary_points=16)["right"]
+    assert found.noise_deg[0, cells] == pytest.approx(known.gaze_deg, rel=1e-4)
+
+
+def test_people_do_not_depend_on_their_pieces(survey):
+    noise = sensor_noise(er.load_scene("head_mounted"))
+    whole = figures_of(survey, noise, 0, 2)
+    alone = figures_of(survey, noise, 1, 1)
+    assert alone.bound_deg[0] == pytest.approx(whole.bound_deg[1], rel=1e-9)
+    assert (alone.glints[0] == whole.glints[1]).all()
+    # Nine fixations with 0.3 deg per axis leave 0.3 sqrt(2) / 3 deg.
+    assert np.median(whole.bound_deg) == pytest.approx(0.1414, abs=0.005)
+
+
+def test_lids_hide_features_when_they_close(survey, monkeypatch):
+    """Half-closed lids hide a part of the outlines; closed ones hide everything."""
+    from eyerender.design import people
+
+    noise, real = sensor_noise(er.load_scene("head_mounted")), people.people_of
+    data = {**{name: getattr(survey, name) for name in Survey.__slots__}, "lids": True}
+
+    def blinking(amount):
+        def made(survey, first, count):
+            found, refused = real(survey, first, count)
+            closed = [
+                people.Someone(
+                    subject=one.subject,
+                    eye=one.eye,
+                    region=one.region.model_copy(update={"blink": amount}),
+                    place_mm=one.place_mm,
+                )
+                for one in found
+            ]
+            return closed, refused
+
+        monkeypatch.setattr(people, "people_of", made)
+        return figures_of(Survey(**data), noise, 0, 1).outline.mean()
+
+    wide, half, shut = (blinking(amount) for amount in (0.0, 0.6, 1.0))
+    assert wide > 0.8
+    assert 0.0 < half < wide - 0.05
+    assert shut == pytest.approx(0.0, abs=0.01)
+
+
+def test_points_in_polygons():
+    square = np.array([[[0, 0], [4, 0], [4, 4], [0, 4]]], dtype=float)
+    points = np.array([[[1, 1], [5, 1], [3.9, 3.9], [-0.1, 2], [np.nan, 1]]])
+    assert inside_polygon(square, points).tolist() == [[True, False, True, False, False]]
+
+
+def test_industry_figures():
+    """Percentiles of users' percentiles: one user of ten is bad everywhere, the others in 10 % of directions."""
+    errors = np.ones((10, 100))
+    errors[:, :10] = 3.0
+    errors[9] = 7.0
+    assert users_of(errors) == {"U50E95": 3.0, "U95E95": 7.0}
+    errors[9] = np.nan
+    assert users_of(errors) == {"U50E95": 3.0, "U95E95": None}
+
+
+def test_the_command_writes_a_report(tmp_path, capsys):
+    folder = tmp_path / "rig"
+    args = ["rig", "head_mounted", "-o", str(folder), "--people", "2", "--sample", "0", "--workers", "1"]
+    assert run(args) == 0
+    assert "noise only" in capsys.readouterr().out
+    found = json.loads((folder / "summary.json").read_text())
+    assert found["schema"] == "eyerender/rig/1"
+    assert found["people"] + len(found["refused"]) == 2
+    rows = list(csv.DictReader((folder / "gaze.csv").open()))
+    assert len(rows) == GRID * GRID
+    page = (folder / "report.html").read_text()
+    assert "not a conformity test" in page
+    assert "noise only" in page
+    assert run([*args[:4], "--people", "0"]) == 2
