@@ -321,23 +321,26 @@ def _cornea_share(safety: dict[str, Any]) -> str:
 
 def _gaze_section(survey: Survey, found: Figures) -> Section:
     covered = (found.outline >= _OUTLINE) & (found.glints >= 2)
+    most = max(int(found.glints.max()), 1)
     maps = (
-        ("noise of gaze (median, deg; noise only)", np.median(found.noise_deg, axis=0)),
-        ("visible glints (mean)", found.glints.mean(axis=0)),
-        ("visible share of the outline (mean)", found.outline.mean(axis=0)),
-        ("people with 2 glints and 60 % of the outline", covered.mean(axis=0)),
+        ("noise of gaze (median, deg; noise only)", np.median(found.noise_deg, axis=0), (None, None)),
+        ("visible glints (mean)", found.glints.mean(axis=0), (0, most)),
+        ("visible share of the outline (mean)", found.outline.mean(axis=0), (0, 1)),
+        ("people with 2 glints and 60 % of the outline", covered.mean(axis=0), (0, 1)),
     )  # fmt: skip
     a, e = survey.azimuth_deg, survey.elevation_deg
     drawn = []
-    for title, values in maps:
-        with figure(4.2, 3.2) as (fig, ax):
+    for title, values, (low, high) in maps:
+        with figure(3.3, 2.7) as (fig, ax):
             grid = np.where(np.isfinite(values), values, np.nan).reshape(GRID, GRID)
-            image = ax.imshow(grid, extent=(-a, a, -e, e), aspect="auto", cmap="viridis")
+            image = ax.imshow(grid, extent=(-a, a, -e, e), aspect="auto", vmin=low, vmax=high)
             fig.colorbar(image)
-            ax.set_xlabel("azimuth, to the subject's left (deg)")
+            ax.grid(False)
+            ax.set_xlabel("azimuth to the left (deg)")
             ax.set_ylabel("elevation (deg)")
-            ax.set_title(title, fontsize=9)
-            drawn.append(Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over the direction of the optic axis."))
+            drawn.append(
+                Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over azimuth and elevation of the optic axis.")
+            )
     return Section("Where does the rig see well?", [], drawn)
 
 
