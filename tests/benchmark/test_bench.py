@@ -263,7 +263,7 @@ def test_a_mask_of_the_visible_part_gives_the_whole_pupil(hidden):
         cut = mask & (height > np.quantile(height[mask], hidden))
         least = min(least, iou(ellipse_of_mask(cut), true))
     # An outline of whole pixels is known to about 0.3 px; an arc extrapolates that.
-    assert least > {0.05: 0.95, 0.16: 0.95, 0.3: 0.92, 0.5: 0.88}[hidden]
+    assert least > {0.05: 0.95, 0.16: 0.95, 0.3: 0.92, 0.5: 0.8}[hidden]
 
 
 @pytest.mark.parametrize(

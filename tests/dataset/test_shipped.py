@@ -75,6 +75,7 @@ def test_eyes_seen_from_the_side_validate(eye, tmp_path):
 
 def test_all_are_covered():
     assert NAMES == [
-        "blignaut2014", "dataset_quick", "dataset_region", "desktop_tracker", "guestrin2006", "head_mounted", "headset",
-        "people_eyelink", "people_nvgaze", "people_openeds", "people_pupil_core", "quickstart", "stress", "webcam",
+        "bench_world", "blignaut2014", "dataset_quick", "dataset_region", "desktop_tracker", "guestrin2006",
+        "head_mounted", "headset", "people_eyelink", "people_nvgaze", "people_openeds", "people_pupil_core",
+        "quickstart", "stress", "webcam",
     ]  # fmt: skip
