@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import traceback
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -241,7 +242,7 @@ def test_a_refusal_is_shown_without_the_validators_own_error(call, words):
 
 
 def test_what_cannot_be_changed_says_what_to_do():
-    scene = er.load_scene("quickstart")
+    scene: Any = er.load_scene("quickstart")
     with pytest.raises(AttributeError, match=r"scene\.with_\(pupil_diameter_mm=\.\.\.\)"):
         setattr(scene, "pupil_diameter_mm", 3)  # noqa: B010  (mypy knows that it cannot)
     with pytest.raises(AttributeError, match="a Scene cannot be changed"):
