@@ -397,7 +397,7 @@ def mirror_start(kinds, numbers, table, rims, first, count, columns, nodes, out,
         x, y, z = cx + reach * ax, cy + reach * ay, cz + reach * az
         w[Y, lane], w[Z, lane] = y, z
         out[GUESS, i, k], out[GUESS + 1, i, k], out[GUESS + 2, i, k] = x, y, z
-        away = ax * nx + ay * ny + az * nz <= 0.0 or axis_distance(numbers, row, x, y, z) > 1.25 * rim
+        away = not ax * nx + ay * ny + az * nz > 0.0 or axis_distance(numbers, row, x, y, z) > 1.25 * rim
         state[i, k] = OUTSIDE if rim < np.inf and away else LOST
 
 
