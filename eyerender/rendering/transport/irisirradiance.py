@@ -24,7 +24,7 @@ from ..records.irradiancegrid import BENT, IrradianceGrid, unevenness
 from ..records.recording import syntax
 from .directlight import LampPath, behind
 
-_SIDE = 80
+_SIDE = 68
 _NODES = _SIDE * _SIDE
 _SPARE_MM = 0.45  # beyond the root of the iris: two cells
 _STEADY = 0.02  # as BENT, of what enters: without the edges of shadows, cubics are off by a hundredth of this
