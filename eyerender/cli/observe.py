@@ -5,7 +5,7 @@ from __future__ import annotations
 import json as json_module
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from cyclopts import Parameter
@@ -70,6 +70,7 @@ def extract(
     *images: Path,
     scene: str | None = None,
     gamma: float = 1.0,
+    method: Literal["fast", "refined"] = "refined",
     eyes: int = 1,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     overlay: Path | None = None,
@@ -81,20 +82,22 @@ def extract(
     """Find the pupil ellipse and the glints in images or in a video.
 
     An image without a detected pupil is a result with a reason, not an error. In a video the pupil is looked for first
-    where it was in the frame before.
+    where it was in the frame before. Files of a folder that are no images are skipped, and the reasons are printed.
 
     Args:
-        images: Greyscale images, one folder of images that this package wrote, or one video.
+        images: Greyscale images, one folder of images, or one video.
         scene: A scene; its rig assigns the glints to lights, and they are listed in the order of its lights.
         gamma: Encoding gamma of the pixel values; 1 is linear.
+        method: fast: edges and an algebraic fit; refined: also a maximum-likelihood fit.
         eyes: 2 for images of both eyes. The eye on the image's left is then called the right eye.
         output: File for the records, one per line (JSON lines).
         overlay: Draw what was found: a folder for images (PNG), or a file for a video (.mp4, .avi or .mkv).
         processes: Number of images that are worked on at the same time (default: one for each processor).
         record: Version of the records in the JSON, 1 or 2.
     """
+    from ..extraction.settings import ExtractionSettings
     from ..extraction.video import is_video
-    from ..imaging.imageobserver import ImageObserver
+    from ..imaging.imageobserver import ImageObserver, files_of
     from ..imaging.videoobserver import VideoOutput, observe_video
     from ..scene import load_scene
     from ..storage.files import make_folder, refuse_special, written
@@ -109,7 +112,7 @@ def extract(
     heed = Heed(strict)
     loaded = load_scene(scene) if scene is not None else None
     heed(loaded.warnings() if loaded is not None else ())
-    observer = ImageObserver(gamma=gamma)
+    observer = ImageObserver(gamma=gamma, settings=ExtractionSettings(method=method))
     if output is not None:
         refuse_special(output)
     if is_video(images[0]):
@@ -132,8 +135,11 @@ def extract(
         with written(output, sync=False) as file:
             file.writelines(json_module.dumps(one, allow_nan=False).encode() + b"\n" for one in records)
     data = {"schema": "eyerender/features/1", "rig": None, "records": records}
-    names = [str(path) for path in images for _ in range(eyes)]
-    emit(data, _feature_table(observed, names if len(names) == len(observed) else None), json, heed)
+    names = None
+    if observed.index.camera.max() < 0:  # not rendered by this package
+        paths = files_of(images)
+        names = [str(paths[frame]) for frame in observed.index.frame]
+    emit(data, _feature_table(observed, names), json, heed)
     return 0
 
 

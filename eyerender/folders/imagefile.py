@@ -21,6 +21,9 @@ from ..arrays import Bytes
 from ..errors import InputError
 from ..storage.files import opened, written
 
+ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")  # of images in a folder
+MAX_FILES = 1_000_000
+
 # Size of the largest window that can be rendered; it limits the memory that a hostile file can make us allocate.
 MAX_PIXELS = 8192 * 8192
 # More than such an image takes in any of the formats, in addition to the file's descriptive data.
@@ -97,6 +100,25 @@ def compressed(image: Bytes, quality: int) -> Bytes:
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="JPEG", quality=quality)
     return np.asarray(Image.open(buffer, formats=("JPEG",)))
+
+
+def image_files(folder: str | Path) -> list[str]:
+    """Names of the image files in a folder and below it, relative to it and sorted; links are not followed.
+
+    Raises:
+        InputError: there are none, or too many files.
+    """
+    found: list[str] = []
+    seen = 0
+    for place, _, names in os.walk(folder):
+        seen += len(names)
+        if seen > MAX_FILES:
+            raise InputError(f"holds more than {MAX_FILES} files", source=str(folder))
+        images = (name for name in names if name.lower().endswith(ENDINGS))
+        found += [str((Path(place) / name).relative_to(folder)) for name in images]
+    if not found:
+        raise InputError(f"holds no images ({', '.join(ENDINGS)})", source=str(folder))
+    return sorted(found)
 
 
 def read_image(path: str | Path) -> tuple[NDArray[Any], int]:

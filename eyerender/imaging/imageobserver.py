@@ -24,8 +24,8 @@ from ..extraction.overlay import overlay
 from ..extraction.pair import extract_eyes
 from ..extraction.preprocessing import single_threaded
 from ..eye.spec import EyeSpec
-from ..folders.imagefile import read_any_image, write_png
-from ..folders.imagefolder import DATASET, ImageEntry, ImageFolder
+from ..folders.imagefile import image_files, read_any_image, write_png
+from ..folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 from ..progress import Progress, followed, followed_by
 from ..rig.camera import PinholeCamera
@@ -126,9 +126,10 @@ class ImageObserver:
         pictures: Path | None = None,
         warn: Warn | None = None,
     ) -> Observations:
-        """Extract the features of any images, or of one folder that this package wrote.
+        """Extract the features of any images, or of a folder: one that this package wrote, or any with image files.
 
-        Each image is a frame; with a scene its glints are assigned to lights.
+        Each image is a frame; with a scene its glints are assigned to lights. Images of a folder that cannot be
+        used are skipped with a warning; their frames are missing.
 
         Args:
             paths: images, or one folder.
@@ -138,21 +139,35 @@ class ImageObserver:
                 front of the subject sees it.
             processes: how many images are worked on at the same time.
             pictures: folder for a picture of what was found in each image.
-            warn: receives a warning if images have colour.
+            warn: receives a warning if images have colour, and one for each image that is skipped.
         """
-        if len(paths) == 1 and os.path.isdir(paths[0]):
+        lenient = len(paths) == 1 and os.path.isdir(paths[0])
+        if lenient and os.path.isfile(os.path.join(paths[0], METADATA)):
             folder = ImageFolder.load(paths[0])
             return self.observe_folder(folder, scene or scene_of(folder), progress=progress)
+        paths = files_of(paths)
         if pictures is not None:
             _refuse_inputs([_picture_of(path, pictures) for path in paths], paths)
-        parts, coloured = [], 0
-        job = _FileJob(self.settings, self.gamma, eyes, pictures)
+        parts, skipped, coloured = [], [], 0
+        job = _FileJob(settings=self.settings, gamma=self.gamma, eyes=eyes, pictures=pictures, lenient=lenient)
         with _mapper(processes if len(paths) >= LEAST_FOR_POOL else 1) as each:
-            for k, (found, shape, colour) in enumerate(followed_by(each(job, paths), len(paths), progress)):
-                coloured += colour
-                parts.append(self.observe_found(found, k, shape, scene=scene, source=str(paths[k])))
-        if coloured and warn is not None:
-            warn([colour_warning(coloured, "images" if coloured > 1 else "image")])
+            for k, done in enumerate(followed_by(each(job, paths), len(paths), progress)):
+                try:
+                    if isinstance(done, InputError):
+                        raise done
+                    found, shape, colour = done
+                    parts.append(self.observe_found(found, k, shape, scene=scene, source=str(paths[k])))
+                    coloured += colour
+                except InputError as error:
+                    if not lenient:
+                        raise
+                    skipped.append(
+                        InputWarning(code="skipped", reason=f"is skipped: {error.reason}", source=str(paths[k]))
+                    )
+        if warn is not None:
+            warn([*skipped, *([colour_warning(coloured, "images" if coloured > 1 else "image")] if coloured else [])])
+        if not parts:
+            raise InputError(f"holds no image that can be used ({skipped[0].reason})", source=skipped[0].source)
         return concatenate(parts)
 
     def observe_found(
@@ -206,7 +221,7 @@ class ImageObserver:
         return concatenate(parts)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _FileJob:
     """What is done with one image file; a process of its own may do it."""
 
@@ -214,10 +229,16 @@ class _FileJob:
     gamma: float
     eyes: int
     pictures: Path | None
+    lenient: bool
 
-    def __call__(self, path: str | Path) -> tuple[tuple[Extraction, ...], tuple[int, int], bool]:
-        """What was found in a file, its (h, w), and whether it has colour."""
-        image, depth, colour = read_any_image(path)
+    def __call__(self, path: str | Path) -> tuple[tuple[Extraction, ...], tuple[int, int], bool] | InputError:
+        """What was found in a file, its (h, w), and whether it has colour; or why it cannot be read."""
+        try:
+            image, depth, colour = read_any_image(path)
+        except InputError as error:
+            if not self.lenient:
+                raise
+            return error
         options: dict[str, Any] = {
             "bit_depth": depth if depth <= 16 else None,
             "gamma": self.gamma,
@@ -229,6 +250,13 @@ class _FileJob:
             picture = overlay(image, found, full)
             write_png(_picture_of(path, self.pictures), np.ascontiguousarray(picture[..., ::-1]))
         return found, (image.shape[0], image.shape[1]), colour
+
+
+def files_of(paths: Sequence[str | Path]) -> list[Path]:
+    """The files of paths of images, or of one folder."""
+    if len(paths) == 1 and os.path.isdir(paths[0]):
+        return [Path(paths[0]) / name for name in image_files(paths[0])]
+    return [Path(path) for path in paths]
 
 
 def _picture_of(path: str | Path, folder: Path) -> Path:

@@ -17,15 +17,13 @@ from numpy.typing import NDArray
 from ..arrays import Bytes, Singles
 from ..errors import InputError
 from ..extraction import FAST, extract
-from ..folders.imagefile import read_image
+from ..folders.imagefile import image_files, read_image
 from ..folders.imagefolder import IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
 from ..geometry.ellipse import Ellipse
 from ..storage.files import inside
 from .figures import FIGURES, EyePicture
 from .limbus import iris_extent
 
-ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")
-MAX_FILES = 1_000_000
 _LEAST_RADIUS_PX = 8.0
 _LEAST_MASK_PX = 20
 _SKIPPED_SHOWN = 50
@@ -126,27 +124,12 @@ def open_source(path: str | Path, limit: int) -> Source:
         entries = ImageFolder.load(folder).entries
         chosen = tuple(entries[i] for i in _spread(len(entries), limit))
         return Source(folder, tuple(entry.name for entry in chosen), chosen)
-    found = sorted(_image_files(folder))
-    if not found:
-        raise InputError(f"holds no images ({', '.join(ENDINGS)})", source=str(path))
+    found = image_files(folder)
     return Source(folder, tuple(found[i] for i in _spread(len(found), limit)))
 
 
 def _spread(count: int, limit: int) -> list[int]:
     return [k * count // min(count, limit) for k in range(min(count, limit))]
-
-
-def _image_files(folder: Path) -> Iterator[str]:
-    """Names of the image files in a folder and below it; links are not followed."""
-    seen = 0
-    for place, inner, names in os.walk(folder):
-        inner.sort()
-        for name in names:
-            seen += 1
-            if seen > MAX_FILES:
-                raise InputError(f"holds more than {MAX_FILES} files", source=str(folder))
-            if name.lower().endswith(ENDINGS):
-                yield str((Path(place) / name).relative_to(folder))
 
 
 def pictures(source: Source, gamma: float) -> Iterator[EyePicture | Skipped]:

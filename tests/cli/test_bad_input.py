@@ -212,7 +212,7 @@ TABLE = [
     (["extract", "noise.png"], 2, "noise.png: is not a readable image"),
     (["extract", "colour.png", "--strict"], 2, "1 image in colour"),
     (["extract", "good.png", "--eyes", "3"], 2, "--eyes: must be 1 or 2"),
-    (["extract", "hollow"], 2, "hollow: holds no metadata.jsonl"),
+    (["extract", "hollow"], 2, "hollow: holds no images"),
     (["extract", "good.png", "--gamma", "0"], 2, "--gamma: must be between 0.1 and 10"),
     (["extract", "good.png", "--scene", "nonsense"], 2, "nonsense: no such scene file"),
     (["extract", "good.png", "missing.png"], 2, "missing.png: no such file"),
