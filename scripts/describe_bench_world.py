@@ -18,6 +18,11 @@ from eyerender.dataset.realise import sample
 from eyerender.errors import EyerenderError
 
 
+def intensities(spec: Any) -> list[float]:
+    """Radiant intensities of the lamps, mW/sr."""
+    return [light.intensity_mw_sr for light in spec.rig.lights]
+
+
 def describe(found: Any) -> dict[str, float]:
     """Numbers of one sample."""
     scene, truth = found.scene, found.observations
@@ -37,7 +42,7 @@ def describe(found: Any) -> dict[str, float]:
         "px_per_mm": float(scale),
         "speed_deg_s": math.hypot(*spec.motion.eye_deg_s) if spec.motion else 0.0,
         "window": float(bool(spec.ambient and spec.ambient.panels)),
-        "exposure_ms": spec.sensor.exposure_ms,
+        "exposure": spec.sensor.exposure_ms * sum(intensities(spec)) / spec.sensor.full_well_e,
         "psf_px": spec.sensor.psf_sigma_px,
         "jpeg": spec.sensor.jpeg_quality or 100,
         "full_well_e": spec.sensor.full_well_e,
@@ -76,7 +81,7 @@ def main() -> None:
         "a glint within 3 px of the edge": table["glint_from_edge_px"] < 3,
         "a window": table["window"] > 0,
         "motion": table["speed_deg_s"] > 50,
-        "long exposure": table["exposure_ms"] > 30,
+        "clipped skin (exposure x power > 1.5 wells)": table["exposure"] > 1.5,
     }
     print(f"{len(rows)} samples, {len(failed)} cannot be made")
     for line in failed[:5]:
