@@ -43,7 +43,7 @@ PATCHES = IRIS + TURNS * LEVELS
 RAYS = 256  # from each point
 _FAR_MM = 8.0  # distance of what rays that leave the eye meet: so far apart are two rays at an angle of 1
 _ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
-_SAME_MM = 0.02  # chambers of depths and radii that differ by less are one
+_SAME_MM = 0.005  # chambers of depths and radii that differ by less are one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
