@@ -38,6 +38,9 @@ COMMANDS = {
     "study": ["conditions", "--eyes", "E2, eye.yaml"],
     "budget": ["scene.yaml", "--estimator", "regression", "--eye", "eye.yaml"],
     "doctor": [],
+    "fit-eye": ["records.csv", "--rig", "rig.yaml", "--columns", "columns.yaml"],
+    "rig": ["scene.yaml", "--unknowns", "unknowns.yaml"],
+    "status": ["folder"],
 }
 NO_OUTPUT = {"setup-llvm", "schema", "live"}
 OPTIONS = {"output": "-o", "overlay": "--overlay", "json": "--json"}
@@ -85,7 +88,7 @@ def test_every_command_and_every_output_is_in_the_table():
     inputs = {
         "scene", "images", "folder", "other", "spec", "records", "rig", "columns", "calibration", "eye", "eyes", "name",
         "preset", "extractor", "estimator", "reference", "function", "terms_x", "terms_y", "fixations", "side", "shard",
-        "address",
+        "address", "against", "recording", "population", "unknowns", "require",
     }  # fmt: skip
     for name in sorted(names):
         function = (gaze[name[5:]] if " " in name else app[name]).default_command

@@ -37,8 +37,13 @@ def made(spec, tmp_path_factory):
 
 def test_a_spec_built_in_python_makes_the_same_images_as_its_file(tiny, made):
     assert er.validate(made)["ok"]
-    for mine, theirs in zip(er.ImageFolder.load(made), er.ImageFolder.load(tiny), strict=False):
-        assert mine.line == theirs.line
+    by_sample = {theirs.line["sample"]: theirs for theirs in er.ImageFolder.load(tiny)}
+    for mine in er.ImageFolder.load(made):
+        theirs = by_sample[mine.line["sample"]]
+        places = {"file_name", "mask_file_name"}  # they name the shard, and shorter runs have other ones
+        assert {k: v for k, v in mine.line.items() if k not in places} == {
+            k: v for k, v in theirs.line.items() if k not in places
+        }
         np.testing.assert_array_equal(mine.image(), theirs.image())
         np.testing.assert_array_equal(mine.mask(), theirs.mask())
 
@@ -79,7 +84,7 @@ def test_a_sample_is_the_same_from_spec_plan_and_file(spec, tmp_path, tiny):
 
 def test_an_estimate_plans_without_rendering(spec):
     found = er.estimate(spec, count=6, workers=2, threads=2)
-    assert (found["samples"], found["shards"], found["workers"], found["threads_per_worker"]) == (6, 2, 2, 1)
+    assert (found["samples"], found["shards"], found["workers"], found["threads_per_worker"]) == (6, 4, 2, 1)
 
 
 @pytest.mark.parametrize("given", ["spec", "plan", "scene"])

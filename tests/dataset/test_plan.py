@@ -25,7 +25,7 @@ PEOPLE = ("people_eyelink", "people_nvgaze", "people_openeds", "people_pupil_cor
 
 
 def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
-    assert sorted(shipped_datasets()) == ["dataset_quick", "dataset_region", *PEOPLE]
+    assert sorted(shipped_datasets()) == ["bench_world", "dataset_quick", "dataset_region", *PEOPLE]
     for name, path in shipped_datasets().items():
         spec = DatasetSpec.load(path)
         spec.dump(tmp_path / "copy.yaml")

@@ -71,7 +71,11 @@ def test_lids_behind_the_camera_have_no_margins_in_its_picture():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"image": {"spp": 65536, "window_px": [8192, 8192]}}, "image.spp: 8192 x 8192 pixels with 65536 samples"),
+        (
+            {"image": {"spp": 65536, "window_px": [8192, 8192]}, "lens": {}},
+            "image.spp: 8192 x 8192 pixels with 65536 samples",
+        ),
+        ({"lens": {"glare": 0.05}}, "rig.cameras.0.resolution_px: 4294967296 pixels are too many for lens.glare"),
         (
             {"image": {}, "subject": {"eyes": ["left"]}},
             "rig.cameras.0.resolution_px: 65536 x 65536 pixels are too",
