@@ -198,6 +198,7 @@ def test_the_set_up_script_refuses_what_it_does_not_know(tmp_path):
     assert not (tmp_path / "eyerender" / "pupil-detectors").exists()
 
 
+@pytest.mark.packaging
 def test_own_images_with_a_table_or_masks(drawn, tmp_path):
     """The drawn images again, labelled in the two ways that people label their own, give the same outcome."""
     known = load_labelled(drawn)

@@ -56,6 +56,7 @@ def test_identical_runs_are_byte_equal_and_ask_nothing_again(drawn, counting, tm
     assert json.loads((out[2] / "times.json").read_text())["extractors"][0]["round_trip_ms"]["n"] == 6
 
 
+@pytest.mark.packaging
 def test_only_what_is_new_is_asked(drawn, counting, tmp_path):
     first, asked_first = counting("first")
     bench_extractors(drawn, tmp_path / "a", [first])
@@ -105,6 +106,7 @@ def test_a_misspelt_reference_is_refused_at_once(reference, words, drawn, tmp_pa
     assert not out.exists()
 
 
+@pytest.mark.packaging
 def test_required_figures_decide_the_exit_code(drawn, counting, tmp_path, capsys):
     blind, _ = counting("blind", a=90.0)
     argv = ["bench-extractors", str(drawn), "--extractor", "opencv-contour", "--extractor", f"blind={blind}"]
@@ -173,6 +175,7 @@ def test_errors_count_only_where_checks_are_asked_for():
     assert problems_of(data, gated=True) == ["it: gave no usable answer to 1 of 2 images"]
 
 
+@pytest.mark.packaging
 def test_against_an_earlier_bench(drawn, counting, tmp_path, capsys):
     argv = ["bench-extractors", str(drawn), "--extractor", "opencv-contour"]
     assert run([*argv, "-o", str(tmp_path / "a")]) == 0
@@ -200,6 +203,7 @@ def table_of(drawn, folder):
     (folder / "labels.csv").write_text("\n".join(lines) + "\n")
 
 
+@pytest.mark.packaging
 def test_the_gamma_is_given_stated_or_assumed_and_said(drawn, tmp_path, capsys):
     own = tmp_path / "own"
     table_of(drawn, own)

@@ -37,6 +37,7 @@ def test_a_sample_written_as_a_scene_has_the_datasets_features(tiny, spec, capsy
         assert record["glints"] == expected["glints"]
 
 
+@pytest.mark.packaging
 def test_a_count_makes_the_same_bytes_as_the_whole_dataset(tiny, spec, capsys):
     # The samples are spread over the subjects, and so over shards.
     assert run(["generate", spec, "part", "--count", "5", "--workers", "1", "--threads", "1"]) == 0

@@ -201,6 +201,7 @@ def test_paths_start_at_the_spec_wherever_the_command_and_its_workers_run(made, 
     assert run(["validate", str(made / "out")]) == 0
 
 
+@pytest.mark.packaging
 @pytest.mark.render
 def test_an_actor_in_another_folder_makes_the_same_shard(made, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -126,6 +126,7 @@ def test_a_warning_may_stop_a_run(spec, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.packaging
 def test_a_script_without_a_guard_can_generate(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(

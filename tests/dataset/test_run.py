@@ -91,6 +91,7 @@ def test_two_workers_make_the_same_bytes(tiny, tmp_path):
     assert tree(tmp_path / "two") == tree(tiny)
 
 
+@pytest.mark.packaging
 def test_parts_make_the_same_bytes_and_the_last_puts_them_together(tiny, tmp_path):
     folder = tmp_path / "parts"
     first = make(folder, plan(), part=(2, 2))
@@ -138,6 +139,7 @@ def test_other_versions_are_refused_with_the_difference(tiny, tmp_path):
         make(folder, plan())
 
 
+@pytest.mark.packaging
 def test_overwrite_replaces_and_other_folders_are_left_alone(tmp_path):
     folder = tmp_path / "thesis"
     folder.mkdir()

@@ -46,6 +46,7 @@ def seen_from(angle_deg: float, eyes: list[EyeModel]) -> Features:
     return features(eyes, every, poses, zero, [camera], np.zeros(len(eyes), dtype=int), np.zeros((0, 3)))
 
 
+@pytest.mark.slow
 def test_eyes_traced_together_give_what_each_gives_alone():
     """So far to the side, some rays are only found by the search from the pupil, done for many eyes at once."""
     eyes = wide_pupils(4, 0.003)

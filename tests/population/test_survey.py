@@ -41,6 +41,7 @@ def test_the_summary_agrees_with_the_draw(folder):
     assert "chosen" in page
 
 
+@pytest.mark.slow
 def test_errors_are_standard_errors():
     """Over many seeds, mean and spread in units of their errors have a variance of 1."""
     population = er.Population("adults")
