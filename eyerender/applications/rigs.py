@@ -339,7 +339,7 @@ def _gaze_section(survey: Survey, found: Figures) -> Section:
             ax.set_xlabel("azimuth to the left (deg)")
             ax.set_ylabel("elevation (deg)")
             drawn.append(
-                Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over azimuth and elevation of the optic axis.")
+                Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over azimuth and elevation of the optic axis.", True)
             )
     return Section("Where does the rig see well?", [], drawn)
 

@@ -26,10 +26,11 @@ class Card:
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """An <svg> element and its caption."""
+    """An <svg> element and its caption; `small` ones stand side by side."""
 
     svg: str
     caption: str
+    small: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
