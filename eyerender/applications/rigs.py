@@ -180,6 +180,12 @@ def estimator_errors(survey: Survey, subjects: Sequence[int], progress: Progress
                 errors[name][k, seen.index.fixation[rows]] = np.fmin(errors[name][k, seen.index.fixation[rows]], found)
         if progress is not None:
             progress(k + 1, len(subjects), "estimators")
+    for name, found in errors.items():
+        without = float(np.isnan(found).mean(axis=1).max(initial=0.0))
+        if not reasons[name] and without > 0.05:
+            reasons[name] = (
+                f"no estimate in up to {100 * without:.0f} % of a person's directions, where features are missing"
+            )
     return [Bias(name=name, error_deg=errors[name], reason=reasons[name]) for name in ESTIMATORS]
 
 
@@ -194,7 +200,7 @@ def _features_of(survey: Survey, subject: int) -> tuple[Observations, Scene]:
     base = Scene.of(spec)
     side = spec.subject.eyes[0]
     place = place_of(survey, base, person)
-    half = person.ipd_mm / 2.0
+    half = person.apex_distance_mm / 2.0
     head = place - np.array([0.0, half if side == "left" else -half, 0.0])
     azimuth, elevation = np.radians(survey.directions_deg).T
     way = np.stack(
