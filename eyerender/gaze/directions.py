@@ -104,11 +104,7 @@ class DirectionRegression:
             InputError: the rig has no screen; `predict_rays` works without one.
         """
         screen = screen_of(rig.build(), "predict_rays gives rays without one")
-        rays = self.predict_rays(observations, rig)
-        on_screen, meets = screen.intersect(rays.origin_mm, rays.direction)
-        reason = rays.reason.copy()
-        reason[(reason == None) & ~meets] = "the gaze ray does not meet the screen"  # noqa: E711
-        return GazePoints.of(screen.world(on_screen), reason)
+        return self.predict_rays(observations, rig).on_screen(screen)
 
     def features(self, observations: Observations, rig: RigLike) -> tuple[Floats, Objects]:
         """Features (n, 2) px, and the reasons why there are none (n,), None where there are."""

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from ..arrays import ArrayValue, Bools, Floats, Objects, Statuses, frozen
 from ..observation import Observations
 from ..rig.rig import RigLike
+from ..rig.screen import ScreenPlane
 from ..status import Status
 
 
@@ -72,6 +73,13 @@ class GazeRays(ArrayValue):
         return cls(
             frozen(np.where(ok, origin_mm, np.nan)), frozen(np.where(ok, direction, np.nan)), frozen(reason, object)
         )
+
+    def on_screen(self, screen: ScreenPlane, name: str = "the gaze ray") -> GazePoints:
+        """Points where the rays meet the screen's plane; `name` says in reasons what the rays are."""
+        points, hits = screen.intersect(self.origin_mm, self.direction)
+        reason = self.reason.copy()
+        reason[(reason == None) & ~hits] = f"{name} does not meet the screen"  # noqa: E711
+        return GazePoints.of(screen.world(points), reason)
 
 
 @runtime_checkable

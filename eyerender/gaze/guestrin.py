@@ -99,11 +99,7 @@ class GuestrinEizenman:
         """Estimate gaze points on the screen's plane."""
         rig = rig.build()
         screen = screen_of(rig, "predict_rays gives rays without one")
-        rays = self.visual_axes(observations, rig)
-        on_screen, hits = screen.intersect(rays.origin_mm, rays.direction)
-        reason = rays.reason.copy()
-        reason[(reason == None) & ~hits] = "the visual axis does not meet the screen"  # noqa: E711
-        return GazePoints.of(screen.world(on_screen), reason)
+        return self.visual_axes(observations, rig).on_screen(screen, "the visual axis")
 
     def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
         """Estimate rays of gaze; no screen is needed."""

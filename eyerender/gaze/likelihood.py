@@ -61,11 +61,7 @@ class MaximumLikelihood:
         """Estimate gaze points on the screen's plane."""
         rig = rig.build()
         screen = screen_of(rig, "predict_rays gives rays without one")
-        rays = self.predict_rays(observations, rig)
-        on_screen, hits = screen.intersect(rays.origin_mm, rays.direction)
-        reason = rays.reason.copy()
-        reason[(reason == None) & ~hits] = "the line of sight does not meet the screen"  # noqa: E711
-        return GazePoints.of(screen.world(on_screen), reason)
+        return self.predict_rays(observations, rig).on_screen(screen, "the line of sight")
 
     def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
         """Estimate lines of sight; no screen is needed."""
