@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -11,6 +11,31 @@ from ..errors import InputError
 from .app import app
 from .options import Backend, Overwrite, Result, Threads
 from .output import emit, progress
+
+if TYPE_CHECKING:
+    from ..scene.people import Population
+
+
+def read_population(given: str, argument: str) -> Population:
+    """Read a population: the name of a preset, or a YAML file with the keys of `population`.
+
+    Args:
+        given: what the user gave.
+        argument: the argument that messages name.
+
+    Raises:
+        InputError: there is no such preset, or the file does not fit.
+    """
+    from ..scene.people import Population
+    from ..spec import read_yaml
+
+    if given.endswith((".yaml", ".yml")):
+        data = read_yaml(given)
+        return Population.from_mapping(data.get("population", data), source=given)
+    try:
+        return Population(given)
+    except InputError as error:
+        raise InputError(error.reason, source=argument) from None
 
 
 @app.command(name="population")
@@ -43,18 +68,10 @@ def population(
         spp: Samples per pixel of the faces.
         seed: The seed of the draw.
     """
-    from ..applications.survey import REPORT, Population, SurveySize, run_survey
-    from ..spec import read_yaml
+    from ..applications.survey import REPORT, SurveySize, run_survey
 
     size = SurveySize(seed=seed, count=count, check=check, faces=faces, spp=spp)
-    if preset.endswith((".yaml", ".yml")):
-        data = read_yaml(preset)
-        people = Population.from_mapping(data.get("population", data), source=preset)
-    else:
-        try:
-            people = Population(preset)
-        except InputError as error:
-            raise InputError(error.reason, source="PRESET") from None
+    people = read_population(preset, "PRESET")
     with progress("drawing") as steps:
         found = run_survey(people, output, size, backend=backend, threads=threads, overwrite=overwrite, progress=steps)
     emit(found, f"{_text(found)}\n\nreport: {output / REPORT}", json)

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from ..errors import InputError
 from .app import app
 from .options import Overwrite, Result
 from .output import emit, progress
+from .population import read_population
 
 
 @app.command(name="rig")
@@ -53,7 +53,6 @@ def rig(
     from ..applications.rigs import REPORT, RigSize, run_rig
     from ..design.unknowns import Unknowns
     from ..scene import load_scene
-    from ..scene.people import Population
     from ..spec import read_yaml
 
     size = RigSize(
@@ -66,14 +65,7 @@ def rig(
         elevation_deg=elevation_deg,
     )
     given = None if unknowns is None else Unknowns.from_mapping(read_yaml(unknowns), source=str(unknowns))
-    if population.endswith((".yaml", ".yml")):
-        data = read_yaml(population)
-        everyone = Population.from_mapping(data.get("population", data), source=population)
-    else:
-        try:
-            everyone = Population(population)
-        except InputError as error:
-            raise InputError(error.reason, source="--population") from None
+    everyone = read_population(population, "--population")
     with progress("rig") as steps:
         found = run_rig(load_scene(scene), everyone, output, size, unknowns=given, overwrite=overwrite, progress=steps)
     emit(found, f"{_text(found)}\n\nreport: {output / REPORT}", json)
