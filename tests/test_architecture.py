@@ -197,10 +197,9 @@ LARGE = {
 # Records that are rebuilt from a tuple of their fields (batches of surfaces, results of compiled functions), or whose
 # first fields users give in order.
 POSITIONAL = {
-    "Biconic", "Budget", "Descent", "EyeImage", "EyePicture", "FeatureDifference", "Finding", "GazeDifference",
-    "GradientMedium", "GridSurface", "GuestrinEizenman", "GuestrinPart", "LabelledImage", "LashPlan", "ModelResults",
-    "Moments", "Outcome", "Patch", "Pixels", "Place", "Quadric", "Reference", "Regression", "Scene", "Score", "Stop",
-    "Sums", "Surface", "Term", "Visible", "ZernikeSurface", "_Table",
+    "Biconic", "Descent", "EyeImage", "EyePicture", "Finding", "GradientMedium", "GridSurface", "GuestrinEizenman",
+    "LabelledImage", "LashPlan", "Outcome", "Patch", "Pixels", "Place", "Quadric", "Regression", "Scene", "Score",
+    "Stop", "Sums", "Surface", "Visible", "ZernikeSurface", "_Table",
 }  # fmt: skip
 
 

@@ -33,7 +33,7 @@ SIDES: tuple[Side, Side] = ("right", "left")
 _NODES, _ORDERS = 200, 16  # r^16 is below 1e-11 for the correlations of refraction and age
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Reference:
     """The table's reference population: moments of its predictors, its regressions, the latent correlations.
 
@@ -78,7 +78,8 @@ class Reference:
         for k in (subjects, subjects + len(eye)):
             whole[age, k + eye.index("refraction_d")] = whole[k + eye.index("refraction_d"), age] = table.age_r
         nearest = nearest_correlation(whole)
-        return cls(table, found, asked, nearest, float(np.linalg.norm(nearest - whole)))
+        distance = float(np.linalg.norm(nearest - whole))
+        return cls(table=table, distributions=found, correlation=asked, latent=nearest, distance=distance)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ BINS = 48
 _REACH = 4.0  # histograms reach so many standard deviations on either side of the mean
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Moments:
     """Mean and standard deviation of a quantity as drawn, with standard errors, and as expected.
 
@@ -137,9 +137,10 @@ def survey(population: PopulationSpec, n: int, seed: int = 0) -> Survey:
     plain = not population.where
     moments = tuple(
         Moments(
-            name, n, float(centre[k] + spread[k] * m1[k]), float(spread[k] * np.sqrt(variance[k] / n)),
-            float(spread[k] * np.sqrt(variance[k])), float(spread[k] * sd_error[k]),
-            *_expected(model, name, plain), edges[k], counts[k],
+            name=name, n=n, mean=float(centre[k] + spread[k] * m1[k]),
+            mean_error=float(spread[k] * np.sqrt(variance[k] / n)), sd=float(spread[k] * np.sqrt(variance[k])),
+            sd_error=float(spread[k] * sd_error[k]), edges=edges[k], counts=counts[k],
+            **dict(zip(("expected_mean", "expected_sd"), _expected(model, name, plain), strict=True)),
         )
         for k, name in enumerate(names)
     )  # fmt: skip

@@ -35,7 +35,7 @@ ALGORITHM, EYE, IMAGE, NOISE, BOTH = "algorithm", "eye model", "image", "noise",
 _STEPS = ("image-noiseless", "image")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Term:
     """A contribution in degrees.
 
@@ -62,7 +62,7 @@ class Term:
     seeds: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Budget:
     """Terms of one eye model's error with one estimator; they add up to `total_deg`."""
 
@@ -102,7 +102,13 @@ def budgets(parts: Sequence[ModelResults]) -> list[Budget]:
         steps = [_Step(k[3], errors[k], vectors.get(k), noisy if k[3] == "image" else None) for k in keys]
         budget = _budget(steps, _eyes(parts, protocol, len(errors[first])))
         if budget is not None:
-            out.append(Budget(protocol, name, model, reference, *budget))
+            n, terms, total = budget
+            out.append(
+                Budget(
+                    protocol=protocol, estimator=name, eye_model=model, reference=reference, n=n, terms=terms,
+                    total_deg=total,
+                )
+            )  # fmt: skip
     return out
 
 
@@ -143,25 +149,27 @@ def _budget(steps: Sequence[_Step], eye: Ints) -> tuple[int, tuple[Term, ...], f
         return None
     observers = [step.observer for step in steps]
     start = _Step("", np.zeros(len(rows)), None if steps[0].vectors is None else np.zeros((len(rows), 2)))
-    terms = [Term(ALGORITHM, float(steps[0].errors[rows].mean()), None, None, *_moved(start, steps[0], rows, eye))]
+    whole = float(steps[0].errors[rows].mean())
+    terms = [Term(name=ALGORITHM, deg=whole, **_moved(start, steps[0], rows, eye))]
     for before, after in pairwise(steps):
-        net = mean_interval((after.errors - before.errors)[rows])
-        terms.append(Term(_name(after.observer, observers), *net, *_moved(before, after, rows, eye)))
+        net, low, high = mean_interval((after.errors - before.errors)[rows])
+        moved = _moved(before, after, rows, eye)
+        terms.append(Term(name=_name(after.observer, observers), deg=net, low_deg=low, high_deg=high, **moved))
     return n, tuple(terms), float(steps[-1].errors[rows].mean())
 
 
-def _moved(before: _Step, after: _Step, rows: Bools, eye: Ints) -> tuple[Any, ...]:
-    """Rms angle, shift, pattern and scatter of a displacement, and the number of exposures."""
+def _moved(before: _Step, after: _Step, rows: Bools, eye: Ints) -> dict[str, Any]:
+    """The part of a `Term` that tells of a displacement: rms angle, shift, pattern, and scatter over exposures."""
     if before.vectors is None or after.vectors is None:
-        return ()
+        return {}
     vectors = after.vectors[None] if after.seeds is None else after.seeds
     rows = rows & np.isfinite(vectors).all(axis=(0, 2))
     if not rows.any():
-        return ()
+        return {}
     rms, shift, pattern, scatter = displacement(before.vectors[None, rows], vectors[:, rows], eye[rows])
     common = sum(float(np.mean(eye[rows] == k)) * float(v @ v) for k, v in shift.items())
-    several = () if after.seeds is None else (scatter, len(after.seeds))
-    return rms, float(np.sqrt(common)), pattern, *several
+    several = {} if after.seeds is None else {"scatter_deg": scatter, "seeds": len(after.seeds)}
+    return {"rms_deg": rms, "shift_deg": float(np.sqrt(common)), "pattern_deg": pattern, **several}
 
 
 def _name(observer: str, steps: Sequence[str]) -> str:

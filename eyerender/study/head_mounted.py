@@ -52,7 +52,7 @@ def calibration_rows() -> Bools:
 def head_mounted_part(eye: str, observings: Sequence[Observing]) -> ModelResults:
     """Compute the results of one eye model with the given observers."""
     own = scene(eye)
-    out = ModelResults(eye)
+    out = ModelResults(eye_model=eye)
     learnt = calibration_rows()
     for observing in observings:
         seen = observing.observe(own)

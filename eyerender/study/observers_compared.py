@@ -20,7 +20,7 @@ from ..rig.rig import RigGeometry
 ALL_GLINTS = "all glints"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FeatureDifference:
     """Difference, image-derived minus analytic, of one kind of feature, in x and y px, and in mm at the eye."""
 
@@ -30,16 +30,16 @@ class FeatureDifference:
     feature: str
     n: int
     missing: int
-    bias_x_px: float | None
-    bias_y_px: float | None
-    sd_x_px: float | None
-    sd_y_px: float | None
-    median_distance_px: float | None
-    bias_mm: float | None
-    sd_mm: float | None
+    bias_x_px: float | None = None
+    bias_y_px: float | None = None
+    sd_x_px: float | None = None
+    sd_y_px: float | None = None
+    median_distance_px: float | None = None
+    bias_mm: float | None = None
+    sd_mm: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GazeDifference:
     """Paired difference of gaze errors (deg), image minus analytic, by estimator."""
 
@@ -81,7 +81,9 @@ def features(
         vectors, scales = (np.concatenate(part) for part in zip(*every, strict=True))
         compared.append((ALL_GLINTS, vectors, scales))
     return [
-        FeatureDifference(protocol, observer, eye_model, feature, *_difference(vectors, scale))
+        FeatureDifference(
+            protocol=protocol, observer=observer, eye_model=eye_model, feature=feature, **_difference(vectors, scale)
+        )
         for feature, vectors, scale in compared
     ]
 
@@ -95,22 +97,28 @@ def gaze(
     if n < 2:
         return None
     d = image_deg[both] - analytic_deg[both]
+    difference, low, high = mean_interval(d)
     return GazeDifference(
-        protocol, observer, eye_model, estimator, n, float(analytic_deg[both].mean()), float(image_deg[both].mean()),
-        *mean_interval(d),
+        protocol=protocol, observer=observer, eye_model=eye_model, estimator=estimator, n=n,
+        analytic_deg=float(analytic_deg[both].mean()), image_deg=float(image_deg[both].mean()),
+        difference_deg=difference, low_deg=low, high_deg=high,
     )  # fmt: skip
 
 
-def _difference(vectors: Floats, mm_per_px: Floats) -> tuple[Any, ...]:
-    """Numbers of a `FeatureDifference`, from n on."""
+def _difference(vectors: Floats, mm_per_px: Floats) -> dict[str, Any]:
+    """Numbers of a `FeatureDifference`; too few vectors have no mean and no scatter."""
     good = np.isfinite(vectors).all(axis=1)
     v = vectors[good]
-    counts = len(v), int((~good).sum())
+    counts = {"n": len(v), "missing": int((~good).sum())}
     if len(v) < 2:
-        return (*counts, *(None,) * 7)
+        return counts
     at_eye = v * mm_per_px[good, None]
-    return (
-        *counts, float(v[:, 0].mean()), float(v[:, 1].mean()), float(v[:, 0].std(ddof=1)), float(v[:, 1].std(ddof=1)),
-        float(np.median(np.linalg.norm(v, axis=1))), float(np.linalg.norm(at_eye.mean(axis=0))),
-        float(np.sqrt(at_eye.var(axis=0, ddof=1).sum())),
-    )  # fmt: skip
+    return counts | {
+        "bias_x_px": float(v[:, 0].mean()),
+        "bias_y_px": float(v[:, 1].mean()),
+        "sd_x_px": float(v[:, 0].std(ddof=1)),
+        "sd_y_px": float(v[:, 1].std(ddof=1)),
+        "median_distance_px": float(np.median(np.linalg.norm(v, axis=1))),
+        "bias_mm": float(np.linalg.norm(at_eye.mean(axis=0))),
+        "sd_mm": float(np.sqrt(at_eye.var(axis=0, ddof=1).sum())),
+    }

@@ -19,7 +19,7 @@ from .observing import Observing
 from .results import ModelResults, WaterfallStep, over_seeds
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class GuestrinPart(ModelResults):
     """Results of one eye model: calibrations with restarts; means and errors at H1 by (protocol, observer)."""
 
@@ -30,7 +30,7 @@ class GuestrinPart(ModelResults):
     misprints: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class BlignautPart(ModelResults):
     """Results of one eye model: outcomes and feature clouds by (protocol, observer), the waterfall."""
 
@@ -82,7 +82,7 @@ def guestrin_part(
     """Replicate [28] with one eye model and one observer."""
     scenes = _Scenes(guestrin, eye, observing)
     analytic = observing.kind == "analytic"
-    out = GuestrinPart(eye)
+    out = GuestrinPart(eye_model=eye)
     exposures = [_Scenes(guestrin, eye, one) for one in observing.exposures()]
     for protocol in protocols:
         departures = departures_of(guestrin, protocol)
@@ -124,7 +124,7 @@ def _guestrin_vectors(scenes: _Scenes, departures: frozenset[str]) -> dict[str, 
 def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> BlignautPart:
     """Replicate [29] with one eye model and one observer."""
     scenes = _Scenes(blignaut, eye, observing)
-    out = BlignautPart(eye)
+    out = BlignautPart(eye_model=eye)
     exposures = [_Scenes(blignaut, eye, one) for one in observing.exposures()]
     for protocol in protocols:
         departures = departures_of(blignaut, protocol)

@@ -46,7 +46,7 @@ class Row:
     solution: str | None = None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class ModelResults:
     """Results of a study for one eye model.
 
