@@ -181,7 +181,8 @@ def _meet(
     view = appearance(frame, view, hit, d)
     # One of the four patches about a point stands for it, each as often as linear interpolation gives it weight.
     s, t = sequence(index * mi.UInt32(SHUFFLED))
-    at = frame.point_to_scene(view.point)
+    # Where nothing is met, the point is not a number, which would be read as an index far outside the tables.
+    at = dr.select(view.met, frame.point_to_scene(view.point), 0)
     if frame.region is None:
         other, matte = _patch_on_background(frame, field, tables, view, at, s, t)
         on_skin = mi.Bool(False)
