@@ -2,7 +2,8 @@
 Your own rig
 ============
 
-A rig is made of cameras, LEDs and a screen. Here a camera with a ring of LEDs looks at an eye, and one LED is moved.
+A rig is made of cameras, LEDs and a screen. Here a camera with a ring of eight LEDs looks at an eye from 5 cm, and one
+LED is moved.
 """
 
 import matplotlib.pyplot as plt
@@ -10,31 +11,47 @@ import numpy as np
 
 import eyerender as er
 
-camera = er.Camera.looking_at((0, 0, 0), position_mm=(45, -10, -25), focal_length_px=700, size_px=(400, 400))
+SAMPLES = 16  # small: 2
+
+camera = er.Camera.looking_at((0, 0, 0), position_mm=(45, -10, -25), focal_length_px=1500, size_px=(480, 400))
 ring = er.Led(ring=er.LedRing(radius_mm=14, count=8), intensity_mw_sr=2)
 rig = er.Rig(cameras=[camera], lights=[ring])
+changed = rig.with_light(2, moved_mm=(0, 4, 0))
 
 # %%
-# Every LED of the ring has a glint. Moving one LED by 4 mm moves one glint; the other LEDs stay where they are.
+# Every LED of the ring has a glint. Moving one LED by 4 mm moves its glint and no other.
 frames = er.Subject.one_eye(er.Eye("E4")).looking([(0, 0)], rig)
-before = er.trace(frames)
-after = er.trace(frames, rig.with_light(2, moved_mm=(0, 4, 0)))
-moved = np.linalg.norm(after.glints.xy_px - before.glints.xy_px, axis=-1)[0]
-print("the glints moved by (px):", moved.round(3))
+before = er.trace(frames).glints.xy_px[0]
+after = er.trace(frames, changed).glints.xy_px[0]
+print("the glints moved by (px):", np.linalg.norm(after - before, axis=-1).round(2))
 
 # %%
-# A mistake names what is wrong with it, in one line.
+# A mistake gives one line that says what is wrong.
 try:
     er.Led((600, 0, 0), radius_mm=-1)
 except er.InputError as error:
     print(error)
 
 # %%
-figure, axes = plt.subplots(figsize=(5, 5))
-axes.plot(*before.pupil.points_px[0].T, color="black", lw=1, label="pupil boundary")
-axes.plot(*before.glints.xy_px[0].T, "o", mfc="none", label="glints")
-axes.plot(*after.glints.xy_px[0].T, "x", label="glints, one LED moved")
-axes.set(xlabel="x (px)", ylabel="y (px)", aspect="equal")
-axes.invert_yaxis()
-axes.legend()
+# On the left are the LEDs, seen from behind the camera; on the right is the picture of the changed rig. The cornea is a
+# convex mirror, so each glint lies on the side of its LED.
+image = er.render(frames[0], changed, spp=SAMPLES, sensor=er.Sensor(exposure_ms=3))
+colours = ["tab:red" if number == 2 else "tab:cyan" for number in range(8)]
+figure, (front, eye) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+places = np.array([light.position_mm for light in changed.build().lights])
+old = rig.build().lights[2].position_mm
+front.scatter(places[:, 1], places[:, 2], s=160, c=colours)
+front.scatter(old[1], old[2], s=160, facecolors="none", edgecolors="tab:red", linestyle="--")
+front.plot(*camera.position_mm[1:], "ks", ms=16)
+front.annotate("camera", camera.position_mm[1:], (0, 14), textcoords="offset points", ha="center")
+eye.imshow(image.counts, cmap="gray")
+for number, (place, glint) in enumerate(zip(places, after, strict=True)):
+    front.annotate(str(number), place[1:], ha="center", va="center", fontsize=8)
+    eye.annotate(str(number), glint, (0, 11), textcoords="offset points", ha="center", color="gold")
+eye.plot(*before[2], "o", ms=9, mfc="none", color="tab:red")
+eye.annotate("before the move", before[2], (10, -14), textcoords="offset points", color="tab:red")
+front.set(title="ring of LEDs, one of them moved", xlabel="y (mm)", ylabel="z, up (mm)", aspect="equal")
+front.margins(0.15)
+eye.set(title="their glints in the picture", xlim=(130, 350), ylim=(345, 130))
+eye.axis("off")
 plt.show()

@@ -44,7 +44,7 @@ _Array = TypeVar("_Array", bound=NDArray[Any])
 
 
 def sealed(array: _Array) -> _Array:
-    """Make an array read-only that nobody else holds, without the copy of `frozen`."""
+    """Make an array read-only without the copy of `frozen`, where no other code refers to it."""
     array.flags.writeable = False
     return array
 
@@ -55,7 +55,7 @@ _REMEMBERED = 8
 
 
 def remembered(function: Callable[_Values, _Result]) -> Callable[_Values, _Result]:
-    """Keep a function's results for the last few values, compared by identity: comparing arrays may take longer."""
+    """Cache a function's results for the last few values, compared by identity because comparing arrays may be slow."""
     known: list[tuple[tuple[object, ...], _Result]] = []
 
     @wraps(function)

@@ -92,7 +92,7 @@ class Problems:
         self._count += error.unlisted
 
     def attempt(self, call: Callable[[], Any]) -> Any:
-        """Result of a call; None, and a note, where it raises `InputError`."""
+        """Return the result of a call; where it raises `InputError`, note the error and return None."""
         try:
             return call()
         except InputError as error:
@@ -109,7 +109,7 @@ class Problems:
             raise self.error()
 
     def error(self) -> InputError:
-        """The first error that was noted, which carries the others."""
+        """Return the first error that was noted, which carries the others."""
         first, *others = self._listed
         return InputError(
             first.reason,

@@ -1,4 +1,4 @@
-"""How the compiled functions are compiled. Numba keeps the machine code in $XDG_CACHE_HOME/eyerender/kernels.
+"""Compilation by numba. The machine code is kept in $XDG_CACHE_HOME/eyerender/kernels.
 
 The index of that code is a pickle, so it is kept only in a private folder (`cachefolder`).
 
@@ -43,7 +43,7 @@ njit: Any = numba.njit  # its types lack some options
 
 
 def _folder() -> Path | None:
-    """Folder of the machine code of these files as they are; None where there is no private one to write to."""
+    """Find the folder for the machine code of these files as they are; None where none is private and writable."""
     cache = cache_folder()
     if cache is None or not os.access(cache, os.W_OK):
         return None
@@ -67,11 +67,11 @@ def used(folder: Path) -> Path:
 
 
 FOLDER = None if (_place := _folder()) is None else str(used(_place))
-FUNCTIONS: dict[Any, str] = {}  # what `compiled` made, numba's dispatchers, and the types of their arguments
+FUNCTIONS: dict[Any, str] = {}  # the dispatchers that `compiled` made, and the types of their arguments
 _CODE: Counter[str] = Counter()  # bytes of bytecode per module
 # Helpers are called by compiled functions only.
 HELPER: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-ABOUT_S = 15  # time that compilation takes on two cores, as people are told
+ABOUT_S = 15  # time of compilation on two cores, for the message
 _MOST_WORKERS = 4
 _LOCK = threading.Lock()  # of `ensure_compiled`
 
@@ -80,8 +80,8 @@ class Program(NamedTuple):
     """Functions that are compiled together.
 
     Attributes:
-        title: what people are told.
-        about_s: time that compilation takes on two cores, as people are told.
+        title: name in messages.
+        about_s: time of compilation on two cores, for the message.
         packages: packages of its modules.
         module: module that imports them all, and compiles a share when it is run.
         complete: file in FOLDER that says that all functions were compiled.

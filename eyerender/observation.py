@@ -137,7 +137,7 @@ class GlintFeatures(Columns):
         return np.asarray(self.status == Status.OK)
 
     def of_light(self, light: int) -> tuple[Floats, Bools]:
-        """Place (n, 2) of one light's glint, and whether it was found (n,)."""
+        """Return the place (n, 2) of one light's glint, and whether it was found (n,)."""
         n, m = self.light.shape
         if m == 0:
             return np.full((n, 2), np.nan), np.zeros(n, dtype=bool)
@@ -323,7 +323,7 @@ class _Reader:
         self.problems.check()
 
     def values(self, path: str) -> list[Any]:
-        """One value of each record; None where it is left out."""
+        """List one value of each record; None where it is left out."""
         return [self._value(k, path) for k in range(len(self.records))]
 
     def _value(self, k: int, path: str) -> Any:
@@ -349,7 +349,7 @@ class _Reader:
         return out
 
     def statuses(self, path: str, reasons: Objects, placed: Bools) -> Statuses:
-        """Statuses; where there is none, whether the feature is `placed` (n,) says it."""
+        """Read statuses; where a record has none, `placed` (n,) says whether there is a feature."""
         labels = self.texts(path)
         for k, label in enumerate(labels):
             if label is None and not self.complete:
@@ -377,7 +377,7 @@ class _Reader:
         return frozen(out, np.int64)
 
     def frames(self) -> Ints:
-        """Numbers of the frames; a record's own number where no record has one."""
+        """Read the numbers of the frames; where no record has one, number the records."""
         given = [record.get("frame") is not None for record in self.records]
         if not self.complete and not any(given):
             return frozen(np.arange(len(given)), np.int64)
@@ -397,7 +397,7 @@ class _Reader:
         return frozen(out)
 
     def points(self, path: str, values: list[Any] | None = None, what: str = "points") -> Floats:
-        """Lists of pairs of numbers (n, longest, 2)."""
+        """Read lists of pairs of numbers as (n, longest, 2)."""
         values = self.values(path) if values is None else values
         for k, value in enumerate(values):
             if not (value is None or (isinstance(value, list) and len(value) <= MAX_BOUNDARY_POINTS)):
@@ -416,7 +416,7 @@ class _Reader:
         return frozen(out)
 
     def second(self, path: str) -> list[Any]:
-        """Values of a key that records have from version 2 on; None in those of version 1."""
+        """Read a key that records have from version 2 on; None in those of version 1."""
         return [
             None if record["schema"] == SCHEMAS[1] else self._value(k, path) for k, record in enumerate(self.records)
         ]
@@ -473,7 +473,7 @@ class _Reader:
 
 
 def _arcs_of(pupil: PupilFeatures, i: int) -> dict[str, Any]:
-    """Additional keys of version 2 of the record."""
+    """Make the additional keys of version 2 of the record."""
     ellipse = _numbers(pupil.arc_ellipse[i])
     parts = None if ellipse is None else (ellipse[:2], ellipse[2:4], ellipse[4])
     return {
@@ -541,7 +541,7 @@ def count_heads(head_mm: Floats) -> Ints:
 
 
 def version_of(record: dict[str, Any]) -> int:
-    """Version of a record; raises `KeyError` or `ValueError` where it is not a record."""
+    """Read the version of a record; raises `KeyError` or `ValueError` where it is not a record."""
     return {schema: version for version, schema in SCHEMAS.items()}[str(record["schema"])]
 
 

@@ -1,4 +1,4 @@
-"""Probable mistakes: values that can be computed with but make no sense.
+"""Probable mistakes: values that the computation accepts but that make no sense.
 
 Every function is pure and returns warnings. A scene collects its own (`Scene.warnings`), and a dataset's plan those of
 some of its samples (`Plan.warnings`). The command line prints them, or refuses them with `--strict`.
@@ -51,7 +51,7 @@ _FURTHEST_RAD = np.radians(140.0)
 
 # A lamp that sends less of the intensity on its axis to the nearest eye is probably not aimed.
 _LEAST_AIMED = 0.8
-# Largest distance of a target from the screen's plane: screens are not flat to less.
+# Largest distance of a target from the screen's plane; real screens are no flatter.
 _OFF_PLANE_MM = 1.0
 # An image counts as saturated if more than this share of its pixels is.
 SATURATED_SHARE = 0.2
@@ -102,7 +102,7 @@ def place_warnings(
 ) -> list[InputWarning]:
     """Warn of impossible places: cameras and lamps in a face, in a head or behind the screen, and a screen in a face.
 
-    A lamp that is nowhere of these is told if its axis points past the nearest eye.
+    A lamp in none of these places gets a warning if its axis points past the nearest eye.
 
     Args:
         rig: the rig.
@@ -147,7 +147,7 @@ def view_warnings(
 
 
 def is_saturated(dn: NDArray[Any], sensor: Sensor) -> bool:
-    """Whether more than 20 % of an image's pixels, counts `dn` (h, w), are saturated."""
+    """Return whether more than 20 % of an image's pixels, counts `dn` (h, w), are saturated."""
     return bool(np.count_nonzero(dn >= sensor.saturation_dn) > SATURATED_SHARE * dn.size)
 
 
@@ -193,7 +193,7 @@ def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list
 
 
 def _differences(one: Any, other: Any, path: str) -> Iterator[str]:
-    """Paths at which two values of the same kind differ by more than rounding."""
+    """List the paths at which two values of the same kind differ by more than rounding."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in one:
             yield from _differences(one[key], other.get(key), f"{path}.{key}")
@@ -214,7 +214,7 @@ def _misplaced(
     eyes_mm: Mapping[str, Floats],
     heads_mm: Mapping[str, Floats],
 ) -> tuple[str, str] | None:
-    """Code and reason of a warning about one place, if there is one."""
+    """Find code and reason of a warning about one place, if there is one."""
     if np.linalg.norm(place) < _LEAST_DISTANCE_MM:
         return "metres", f"the {what} is at ({_shown(place)}) mm, in the face; {_METRES}"
     for name, eye in eyes_mm.items():
@@ -234,7 +234,7 @@ def _misplaced(
 
 
 def _unaimed(lamp: Lamp, eyes_mm: Mapping[str, Floats]) -> str | None:
-    """Reason of a warning about a lamp that points past the nearest eye, if it does."""
+    """Find the reason of a warning about a lamp that points past the nearest eye, if it does."""
     ways = {name: eye - lamp.position_mm for name, eye in eyes_mm.items()}
     distances = {name: float(np.linalg.norm(way)) for name, way in ways.items()}
     name = min(distances, key=lambda eye: distances[eye])
@@ -244,7 +244,7 @@ def _unaimed(lamp: Lamp, eyes_mm: Mapping[str, Floats]) -> str | None:
 
 
 def _in_view(camera: PinholeCamera, window: Window, apex: Floats) -> bool:
-    """Whether a window shows any part of an eye's front."""
+    """Return whether a window shows any part of an eye's front."""
     towards = camera.nodal_point_mm - apex
     if towards[0] < np.cos(_FURTHEST_RAD) * np.linalg.norm(towards):
         return False
@@ -260,7 +260,7 @@ _METRES = "lengths are in mm; did you mean metres?"
 
 
 def _values(node: Any, keys: Sequence[str], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value at a dotted path of a mapping, with its own path; `*` stands for each entry of a list."""
+    """Yield every value at a dotted path of a mapping, with its path; `*` stands for each entry of a list."""
     if not keys:
         if node is not None:
             yield path, node

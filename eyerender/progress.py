@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar
 
 Progress = Callable[[int, int, str], None]
-"""Takes how many pieces of work are done, how many there are in all, and a note (often "")."""
+"""Called with the number of finished items, the total, and a note (often "")."""
 Say = Callable[[str], None]
-"""Takes one line of text for the user."""
+"""Called with one line of text for the user."""
 
 T = TypeVar("T")
 
 
 def followed(items: Sequence[T], progress: Progress | None) -> Iterator[T]:
-    """Yield items, and report after each; the first report, of none done, states the total."""
+    """Yield items and report after each; a first report, with 0 items done, states the total."""
     return followed_by(items, len(items), progress)
 
 

@@ -18,7 +18,7 @@ _REFERENCE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*(\.[A-Za-z_]
 
 
 def is_reference(text: str) -> bool:
-    """Whether a text has the form `module:name`; both parts may have dots."""
+    """Return whether a text has the form `module:name`; both parts may have dots."""
     return _REFERENCE.fullmatch(text) is not None
 
 

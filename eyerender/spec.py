@@ -73,7 +73,7 @@ class ByKind:
 
 
 def _kind_tag(value: object) -> str:
-    """Pydantic's name for the member of a union of specs that differ in `kind`."""
+    """Return pydantic's name for the member of a union of specs that differ in `kind`."""
     return f"[{value.get('kind') if isinstance(value, Mapping) else getattr(value, 'kind', None)}]"
 
 
@@ -152,7 +152,7 @@ class Spec(BaseModel):
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The mapping in the order of a file, where Python code may put values elsewhere."""
+        """Arrange the mapping in the order of a file; Python code may put values elsewhere."""
         return data
 
     def to_mapping(self) -> dict[str, Any]:
@@ -172,13 +172,13 @@ class Spec(BaseModel):
             raise InputError(error.reason, source=option) from None
 
     def digest(self) -> str:
-        """SHA-256 of the canonical JSON: equal specs have equal digests on every machine."""
+        """Compute the SHA-256 of the canonical JSON: equal specs have equal digests on every machine."""
         text = json.dumps(self.to_mapping(), sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
 
     @classmethod
     def json_schema(cls) -> dict[str, Any]:
-        """JSON Schema (2020-12) for editors."""
+        """Make the JSON Schema (2020-12) for editors."""
         schema = cls.model_json_schema()
         return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
@@ -216,7 +216,7 @@ class FileSpec(Spec):
 
     @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """The mapping of a file in this folder, with the content of other files that become part of the spec."""
+        """Add the content of other files that become part of the spec to the mapping of a file in this folder."""
         return data
 
     @classmethod
@@ -243,7 +243,7 @@ class FileSpec(Spec):
         Path(path).write_text(self.to_yaml(), encoding="utf-8")
 
     def to_yaml(self) -> str:
-        """YAML text of this spec."""
+        """Write this spec as YAML."""
         return yaml.safe_dump(self.to_mapping(), sort_keys=False, allow_unicode=True, width=100)
 
 
@@ -286,7 +286,7 @@ def parse_yaml(text: str, source: str, *, mapping_tags: tuple[str, ...] = ()) ->
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a regular file's bytes.
+    """Compute the SHA-256 of a regular file's bytes.
 
     Raises:
         InputError: it cannot be read.
@@ -380,7 +380,7 @@ _UniqueKeyLoader.add_implicit_resolver(
 
 
 def _problems(error: ValidationError) -> list[tuple[str, str]]:
-    """Dotted paths and reasons of the problems, the most informative one first.
+    """List dotted paths and reasons of the problems, the most informative one first.
 
     A problem above a deeper one, or at the same place, is often only its consequence, because each branch of a union
     complains. It is left out.
@@ -400,7 +400,7 @@ def _problems(error: ValidationError) -> list[tuple[str, str]]:
 
 
 def _described(problem: Mapping[str, Any], path: str) -> tuple[str, str]:
-    """Dotted path and reason of one problem at a path."""
+    """Describe one problem at a path: dotted path and reason."""
     context = problem.get("ctx", {})
     kind = problem["type"]
     if kind == "extra_forbidden":
@@ -428,7 +428,7 @@ def _described(problem: Mapping[str, Any], path: str) -> tuple[str, str]:
 
 
 def _plain(value: Any) -> Any:
-    """A value of Python code as JSON has it."""
+    """Convert a value of Python code to what JSON holds."""
     if isinstance(value, Spec):
         return value.to_mapping()
     if isinstance(value, np.ndarray | np.generic):
@@ -437,5 +437,5 @@ def _plain(value: Any) -> Any:
 
 
 def _is_branch(part: object) -> bool:
-    """Whether a part of pydantic's location names a union's branch rather than a key of the user's file."""
+    """Return whether a part of pydantic's location names a union's branch rather than a key of the user's file."""
     return isinstance(part, str) and ("[" in part or part.endswith("Spec"))

@@ -54,7 +54,7 @@ class Status(IntEnum):
 
     @classmethod
     def of_record(cls, label: str, reason: str | None = None) -> Status:
-        """Status for a record's word and reason; NOT_FOUND where the reason is unknown here.
+        """Find the status for a record's word and reason; NOT_FOUND where the reason is unknown here.
 
         A reason may be followed by details in parentheses.
         """

@@ -2,12 +2,12 @@
 
 This module needs PyTorch (the extra `torch`). `import eyerender` does not load it; write `import eyerender.torch`.
 
-Both datasets give an image as a mapping with the parts that are asked for:
+Both datasets yield each image as a mapping with the requested parts:
 
 | part | value |
 |---|---|
 | `image`, `noiseless` | float32 (1, h, w): linear counts as a share of the full scale, 0 to 1 |
-| `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 what frames the view |
+| `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the view |
 | `highlight_mask` | int64 (h, w): 1 where wet and oily surfaces mirror a lamp |
 | `pupil`, `iris` | float32 (5,): ellipse of the amodal outline: x, y, a, b in px of the image, angle in rad; or nan |
 | `gaze` | float32 (3,): unit vector of the line of sight in the camera's frame, out of the eye |
@@ -53,7 +53,7 @@ _PICTURES = {
     "highlight_mask": "highlights",
 }
 PARTS = (*_PICTURES, "pupil", "iris", "gaze", "line")
-_STATE = ("start", "batch_size", "lanes")  # what must be equal where a stream goes on
+_STATE = ("start", "batch_size", "lanes")  # settings that must be equal when a stream resumes
 
 
 def collate(items: Sequence[Parts]) -> dict[str, Any]:
@@ -125,7 +125,7 @@ class FolderDataset(Dataset[Any]):
 
 
 class StreamDataset(IterableDataset[Any]):
-    """The samples of a dataset spec, rendered in batches while they are used; nothing is written.
+    """The samples of a dataset spec, rendered in batches on demand; nothing is written to disk.
 
     Sample i is the same pure function of (spec, i) as in `generate`, with the same pixels. A batch holds the images of
     `batch_size` consecutive samples. The samples are divided into `lanes`: stretches of consecutive batches, from which
@@ -152,7 +152,7 @@ class StreamDataset(IterableDataset[Any]):
             order of batches depends on it, so keep it where training goes on with another number of workers.
         split: only the samples of this split, such as "train"; None takes all.
         rank: which of the processes that train together this is; by default torch.distributed knows.
-        ranks: their number; likewise.
+        ranks: number of these processes; by default torch.distributed knows.
         parts: what an image's mapping holds (see the module).
         transform: called with the mapping of each image; it must return a mapping.
         backend: as for `eyerender.generate`.
@@ -242,11 +242,11 @@ class StreamDataset(IterableDataset[Any]):
         self._next = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Where this copy of the stream is: `next` is the number of the batch after its last one."""
+        """Say where this copy of the stream is: `next` is the number of the batch after its last one."""
         return {"digest": self.plan.digest, **{name: getattr(self, name) for name in _STATE}, "next": self._next}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Let the next iteration go on where `state_dict` was called.
+        """Resume iteration from a saved state.
 
         Raises:
             InputError: the state is of another spec, batch size or number of lanes.
@@ -271,7 +271,7 @@ class StreamDataset(IterableDataset[Any]):
 
 
 def place(batch: int, count: int, lanes: int) -> int:
-    """Place in the order of samples of a batch of `count` that are taken from `lanes` stretches in turn."""
+    """Find the place in the order of samples of a batch of `count` that are taken from `lanes` stretches in turn."""
     lane, step = batch % lanes, batch // lanes
     length, longer = divmod(count, lanes)  # the first lanes are longer by one
     return lane * length + min(lane, longer) + step
@@ -285,7 +285,7 @@ def _checked(parts: Sequence[str]) -> tuple[str, ...]:
 
 
 def _samples(plan: Plan, split: str | None) -> Sequence[int]:
-    """Numbers of the samples of a split."""
+    """List the numbers of the samples of a split."""
     spec = plan.spec
     if split is None:
         return spec.selection.samples

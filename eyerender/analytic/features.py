@@ -193,7 +193,7 @@ class View:
 
     @classmethod
     def of(cls, eye: EyeModel, poses: Poses, position_mm: Floats, camera: PinholeCamera) -> View:
-        """View of a camera on turned eyes at places (n, 3) in the world."""
+        """Make the view of a camera on turned eyes at places (n, 3) in the world."""
         turn, shift = rigid_motion(poses, eye)
         whole = shift + position_mm
         rotation, translation, at = np.empty(turn.shape), np.empty(shift.shape), np.empty(shift.shape[::-1])
@@ -207,7 +207,7 @@ class View:
         )
 
     def rows(self, part: slice) -> View:
-        """View of some of the eyes."""
+        """Select the view of some of the eyes."""
         x, y, z = self.camera_mm
         turn, shift = self.motion
         return View(

@@ -21,7 +21,7 @@ from .features import Features, features
 
 ARC_POINTS = 6
 ARC_GAP_DEG = 120.0
-"""What an ellipse of a partial pupil needs: as many points that are seen, and no longer stretch between two of them."""
+"""Requirements for an ellipse of a partial pupil: number of visible points, and longest hidden stretch (degrees)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points
 
 
 def purkinje_records(observed: Observations, seen: Features, orders: Sequence[int]) -> list[dict[str, Any]]:
-    """Purkinje images as plain records: frame, eye, light, image (1 to 4), status, reason, in_image, xy_px."""
+    """List Purkinje images as plain records: frame, eye, light, image (1 to 4), status, reason, in_image, xy_px."""
     index = observed.index
     out = []
     for i, j, p in np.ndindex(seen.glint_status.shape):
@@ -116,7 +116,7 @@ def purkinje_records(observed: Observations, seen: Features, orders: Sequence[in
 
 
 def pupil_features(seen: Features) -> PupilFeatures:
-    """Apparent pupils of a batch.
+    """Compute the apparent pupils of a batch.
 
     A pupil is missing where no boundary point has a ray or no ellipse fits. It is partial where only some points have a
     ray.
@@ -160,7 +160,7 @@ def pupil_features(seen: Features) -> PupilFeatures:
 
 
 def seen_arcs_deg(found: Bools) -> list[tuple[float, float]]:
-    """Visible runs of points (k,) that are evenly spaced around the margin: (from, to) in degrees of its parameter.
+    """Find runs of visible points (k,), evenly spaced around the margin: (from, to) in degrees of its parameter.
 
     `from` lies in [0, 360) and `to` is not below it; an arc over the first point ends beyond 360.
     """
@@ -176,7 +176,7 @@ def seen_arcs_deg(found: Bools) -> list[tuple[float, float]]:
 
 
 def _arc_ellipse(points_px: Floats, arcs: Sequence[tuple[float, float]]) -> Floats:
-    """Ellipse (cx, cy, a, b, angle) of the visible points; NaN where they do not determine it."""
+    """Fit the ellipse (cx, cy, a, b, angle) of the visible points; NaN where they do not determine it."""
     gaps = [following[0] - arc[1] for arc, following in pairwise([*arcs, (arcs[0][0] + 360.0, 0.0)])]
     if len(points_px) < ARC_POINTS or max(gaps) > ARC_GAP_DEG + 1e-9:
         return np.full(5, np.nan)
@@ -187,7 +187,7 @@ def _arc_ellipse(points_px: Floats, arcs: Sequence[tuple[float, float]]) -> Floa
 
 
 def glint_features(seen: Features) -> GlintFeatures:
-    """Glints (first Purkinje images) of a batch."""
+    """Compute the glints (first Purkinje images) of a batch."""
     status = seen.glint_status[:, :, 0]
     reasons = np.full(status.shape, None, dtype=object)
     for i, j in np.argwhere(status != Status.OK):

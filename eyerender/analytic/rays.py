@@ -92,7 +92,7 @@ def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tu
 
 
 def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> Bools:
-    """Whether the camera is behind the tangent planes of the whole cornea, (n,); False in doubt.
+    """Return whether the camera is behind the tangent planes of the whole cornea, (n,); False in doubt.
 
     The rim of a convex cap faces farthest to the back, so points of the limbus are tested. A tenth of the distance is
     allowed for the points between them.
@@ -110,7 +110,7 @@ def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> Bools:
 
 
 def _meets_sclera(eye: EyeModel, exits: Xyz, way: Xyz) -> Bools:
-    """Whether the rays from the exits back along `way` (unit, from the camera) enter the sphere of the sclera."""
+    """Return whether rays that run on from the exits along `way` (unit, from the camera) enter the sclera's sphere."""
     gap = shift(exits, eye.sclera.centre_mm, -1.0)
     along = -dot(gap, way)
     radius = fit(np.asarray(eye.sclera.radius_mm, dtype=np.float64), gap[0].ndim)

@@ -12,7 +12,7 @@ from ..jit import compiled
 def see_all(
     turn: Floats, shift: Floats, R: Floats, t: Floats, rotation: Floats, translation: Floats, camera_mm: Floats
 ) -> None:
-    """Motions from the eyes' frames to that of a camera, and the camera in each eye's frame.
+    """Compute the motions from the eyes' frames to that of a camera, and the camera in each eye's frame.
 
     Args:
         turn: (n, 3, 3) rotation of each eye.
@@ -50,7 +50,7 @@ def project_all(
     behind: int,
     out: Floats,
 ) -> None:
-    """Pixels f_x X/Z + c_x, f_y Y/Z + c_y of points (n, k) of each eye's frame; NaN where the status is not 0.
+    """Project points (n, k) of each eye's frame to pixels f_x X/Z + c_x, f_y Y/Z + c_y; NaN where the status is not 0.
 
     Args:
         rotation: (n, 3, 3) eye to camera.

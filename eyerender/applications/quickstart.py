@@ -1,4 +1,4 @@
-"""The complete job: fixate, render, extract, calibrate on both kinds of features, compare, report."""
+"""The quickstart: fixate, render, extract, calibrate on both observers' features, compare, report."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run_quickstart(
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> Comparison:
-    """Do the complete job in a folder and write `report.html` there.
+    """Render a scene into a folder, compare both observers on it, and write `report.html` there.
 
     Existing images of the same scene, seed and versions in the folder are used again.
 
@@ -103,7 +103,7 @@ def compare_folder(
         path: a folder that `render`, `quickstart` or `generate` wrote.
         estimator: gaze estimator for both; default: `er.gaze.Regression("R3")`.
         name: name of the estimator in the result; default: as for `compare`.
-        progress: called with images done, images in all and "".
+        progress: called with (images done, images in all, "").
 
     Raises:
         InputError: it is not such a folder, or contains an image or a record that cannot be read.

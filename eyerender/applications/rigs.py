@@ -1,7 +1,7 @@
 """The report on a rig: bound, dropout and coverage over a population, errors of estimators, and eye safety.
 
-Every figure but the errors of estimators is by ray optics alone. The errors are those on exact features, so they are
-what an estimator assumes wrongly about people's eyes (model bias), without any noise.
+Ray optics gives all features; nothing is rendered. The features are exact, so the errors of estimators show what an
+estimator assumes wrongly about people's eyes (model bias), without any noise.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _OUTLINE = 0.6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigSize:
-    """How much is computed.
+    """Size of the computation.
 
     Attributes:
         people: number of people.
@@ -138,7 +138,7 @@ def run_rig(
 
 
 def _figures(survey: Survey, noise: FeatureNoise, size: RigSize, progress: Progress | None) -> Iterator[Figures]:
-    """Figures of all people, in pieces that do not depend on the number of processes."""
+    """Compute the figures of all people, in pieces that do not depend on the number of processes."""
     firsts = range(0, size.people, _PIECE)
     counts = [min(_PIECE, size.people - first) for first in firsts]
     workers = min(size.workers or os.cpu_count() or 1, len(firsts))
@@ -160,7 +160,7 @@ def _told(results: Iterator[Figures], counts: Sequence[int], progress: Progress 
 
 
 def estimator_errors(survey: Survey, subjects: Sequence[int], progress: Progress | None = None) -> list[Bias]:
-    """Errors of estimators on exact features of some people, calibrated on nine of 81 targets a metre away."""
+    """Compute errors of estimators on exact features of some people, calibrated on nine of 81 targets a metre away."""
     cells = GRID * GRID
     chosen = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
     errors = {name: np.full((len(subjects), cells), np.nan) for name in ESTIMATORS}
@@ -194,7 +194,7 @@ def _taken(rays: Any, rows: Any) -> Any:
 
 
 def _features_of(survey: Survey, subject: int) -> tuple[Observations, Scene]:
-    """Exact features of a person who looks at 81 targets a metre away."""
+    """Trace the exact features of a person who looks at 81 targets a metre away."""
     spec = SceneSpec.from_mapping(survey.scene)
     person = Population.from_mapping(survey.population).person(subject, survey.seed)
     base = Scene.of(spec)
@@ -214,7 +214,7 @@ def _features_of(survey: Survey, subject: int) -> tuple[Observations, Scene]:
 
 
 def users_of(values: Floats) -> dict[str, float | None]:
-    """U50E95 and U95E95: the median and the 95th-percentile user's 95th-percentile error; values (people, 81)."""
+    """Compute the median (U50E95) and 95th-percentile (U95E95) user's 95th-percentile error; values (people, 81)."""
     if not values.size or np.isnan(values).all():
         return {"U50E95": None, "U95E95": None}
     each = np.quantile(np.where(np.isnan(values), np.inf, values), 0.95, axis=1, method="higher")
@@ -222,7 +222,7 @@ def users_of(values: Floats) -> dict[str, float | None]:
 
 
 def coverage_of(found: Figures) -> dict[str, float]:
-    """Share of people times directions with so many glints and `_OUTLINE` of the outline."""
+    """Compute the share of people times directions with so many glints and `_OUTLINE` of the outline."""
     outline = found.outline >= _OUTLINE
     return {
         "outline": float(outline.mean()),
@@ -233,7 +233,7 @@ def coverage_of(found: Figures) -> dict[str, float]:
 def summary(
     scene: Scene, survey: Survey, found: Figures, biases: Sequence[Bias], noise: FeatureNoise
 ) -> dict[str, Any]:
-    """Content of summary.json."""
+    """Make the content of summary.json."""
     side = scene.spec.subject.eyes[0]
     place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
     try:
@@ -273,7 +273,7 @@ def _number(value: Any) -> float | None:
 
 
 def _write_people(path: Path, found: Figures) -> None:
-    """One row per person."""
+    """Write one row per person."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["subject", "bound_e95_deg", "frame_to_frame_e95_deg", "outline", "glints", "covered_2_glints"])
@@ -285,7 +285,7 @@ def _write_people(path: Path, found: Figures) -> None:
 
 
 def _write_gaze(path: Path, survey: Survey, found: Figures) -> None:
-    """One row per direction."""
+    """Write one row per direction."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = [f"glints_missing_{name}" for name in LOST]
@@ -299,7 +299,7 @@ def _write_gaze(path: Path, survey: Survey, found: Figures) -> None:
 
 
 def page_of(scene: Scene, survey: Survey, found: Figures, data: dict[str, Any]) -> Page:
-    """The page of the report."""
+    """Make the page of the report."""
     share = data["coverage"]["outline_and_2_glints"]
     cards = [
         Card(_degrees(data["frame_to_frame_deg"]["U50E95"]), "noise of gaze, median person (U50E95, noise only)"),

@@ -184,7 +184,7 @@ def _write_csv(path: Path, population: PopulationSpec, count: int, seed: int) ->
 
 
 def face_scene(subject: Subject, spp: int = 16) -> Scene:
-    """A person's both eyes before a camera half a metre away, looking straight ahead."""
+    """Place both eyes of a person before a camera half a metre away, looking straight ahead."""
     spec = SceneSpec.from_mapping(
         {
             "name": "face",
@@ -229,7 +229,7 @@ def _faces(
 
 
 def page_of(found: Result, sheet: Image.Image | None) -> Page:
-    """The report's page."""
+    """Make the report's page."""
     table, s, r = default_table(), found.statistics, found.refused
     told = [m for m in s.moments if np.isfinite(m.expected_mean)]
     worst = max((max(map(abs, m.errors)) for m in told), default=0.0)

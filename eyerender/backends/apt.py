@@ -53,7 +53,7 @@ def fetch_library(package: str, name: str, store: Path) -> None:
 
 
 def _private_options(folder: Path) -> list[str]:
-    """Options that move apt's lists and caches to `folder`, so that it needs neither root nor its system-wide lock.
+    """Write options that move apt's lists and caches to `folder`, so that it needs no root and no system-wide lock.
 
     The machine's own sources and proxies stay, its hooks on system folders do not. The empty status makes the archive's
     versions the candidates, whatever is installed.
@@ -89,6 +89,6 @@ def _run(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def _complaint(done: subprocess.CompletedProcess[str]) -> str:
-    """Last error that apt or dpkg printed."""
+    """Find the last error that apt or dpkg printed."""
     errors = [line for line in done.stderr.splitlines() if line.startswith(("E:", "dpkg-deb:"))]
     return errors[-1].partition(":")[2].strip() if errors else ""

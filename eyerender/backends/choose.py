@@ -148,7 +148,7 @@ def _start(
 
 
 def cuda_state(*, refresh: bool = False) -> BackendState:
-    """Whether an NVIDIA GPU renders here; `refresh` repeats a trial that failed earlier."""
+    """Return whether an NVIDIA GPU renders here; `refresh` repeats a trial that failed earlier."""
     driver = _cuda_driver()
     if driver is None:
         return BackendState("cuda", False, "no NVIDIA driver on this machine", CUDA_FIX)
@@ -159,7 +159,7 @@ def cuda_state(*, refresh: bool = False) -> BackendState:
 
 
 def _cuda_driver() -> str | None:
-    """Text that identifies the driver and the GPUs; None, at no cost, where there is no driver to load."""
+    """Identify the driver and the GPUs by a text; None, at no cost, where there is no driver to load."""
     named = os.environ.get("DRJIT_LIBCUDA_PATH")
     library = named or ("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     try:

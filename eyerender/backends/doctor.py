@@ -30,7 +30,7 @@ class DoctorReport:
 
 
 def backend_states() -> list[BackendState]:
-    """Whether each backend renders on this machine, tried in other processes so that this one is not changed."""
+    """Return whether each backend renders on this machine, tried in other processes so that this one is not changed."""
     return [cuda_state(refresh=True), _llvm_state()]
 
 

@@ -18,7 +18,7 @@ _BESIDE_LLVM = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
 
 
 def runtime_store() -> Path | None:
-    """Folder for the libraries of `RUNTIME` that `setup_llvm` has fetched; None without a private cache folder."""
+    """Find the folder of the libraries that `setup_llvm` has fetched; None without a private cache folder."""
     folder = cache_folder()
     return folder / "lib" if folder else None
 

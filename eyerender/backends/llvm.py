@@ -91,7 +91,7 @@ def ensure_llvm() -> LibLlvm:
 
 
 def version_of(path: Path) -> tuple[int, ...]:
-    """Version in a file's name ("libLLVM-19.so", "libLLVM.so.19.1", "libLLVM.19.1.dylib"), () if there is none."""
+    """Read the version in a file name such as "libLLVM-19.so" or "libLLVM.19.1.dylib"; () if there is none."""
     match = re.match(r"(?:lib)?LLVM(?:-C)?[-.](?:so\.)?(\d+(?:\.\d+)*)", path.name)
     return tuple(int(part) for part in match[1].split(".")) if match else ()
 
@@ -119,7 +119,7 @@ def _activate() -> LibLlvm:
 
 
 def _loaded() -> LibLlvm:
-    """Library that an earlier import of drjit has loaded, if it renders."""
+    """Find the library that an earlier import of drjit has loaded, if it renders."""
     import drjit as dr
 
     if not dr.has_backend(dr.JitBackend.LLVM):
@@ -146,7 +146,7 @@ def _too_late() -> str:
 
 
 def _mapped(version: tuple[int, ...]) -> Path | None:
-    """File of the libLLVM with this version in this process; other packages may have loaded others."""
+    """Find the file of the libLLVM with this version in this process; other packages may have loaded others."""
     try:
         lines = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

@@ -53,7 +53,7 @@ class Verdict:
 
 
 def cpu_name() -> str:
-    """Name of the processor as its maker writes it."""
+    """Read the name of the processor as its maker writes it."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
             for line in lines:
@@ -206,7 +206,7 @@ def _work(variant: str) -> str:
 
 
 def _gpu_name() -> str:
-    """Name of the first GPU, from the driver that the process has just used."""
+    """Read the name of the first GPU, from the driver that the process has just used."""
     driver = ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
     device, name = ctypes.c_int(), ctypes.create_string_buffer(128)
     if driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0) or driver.cuDeviceGetName(name, 128, device):

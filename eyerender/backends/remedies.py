@@ -32,12 +32,12 @@ _ATOMIC_BY_DISTRIBUTION = {
 
 
 def has_archive() -> bool:
-    """Whether packages can be fetched and unpacked as on Debian and Ubuntu."""
+    """Return whether packages can be fetched and unpacked as on Debian and Ubuntu."""
     return sys.platform == "linux" and all(shutil.which(tool) for tool in ("apt-get", "dpkg-deb"))
 
 
 def llvm_fix() -> str:
-    """What to do where no libLLVM renders: install the libraries that Dr.Jit needs, or else a libLLVM."""
+    """Say what to install where no libLLVM renders: the libraries that Dr.Jit needs, or else a libLLVM."""
     try:
         load_runtime()
     except OSError:
@@ -46,17 +46,17 @@ def llvm_fix() -> str:
 
 
 def runtime_command() -> str:
-    """Command of this machine's own package manager that installs libatomic."""
+    """Name the command of this machine's package manager that installs libatomic."""
     return _by_distribution(_ATOMIC_BY_DISTRIBUTION) or "install libatomic (libatomic.so.1)"
 
 
 def llvm_command() -> str:
-    """Command that installs a libLLVM here: pip's where there is a wheel, else the package manager's."""
+    """Name the command that installs a libLLVM here: pip's where there is a wheel, else the package manager's."""
     return _wheel_command() or _system_command()
 
 
 def _wheel_command() -> str:
-    """How to install the wheel with libLLVM; "" where this machine has none, or has it installed in full."""
+    """Say how to install the wheel with libLLVM; "" where this machine has none, or has it installed in full."""
     if sys.platform != "linux" or platform.machine() != "x86_64" or any(path.is_file() for path in wheel_libraries()):
         return ""
     try:
@@ -84,7 +84,7 @@ def _by_distribution(commands: dict[str, str]) -> str:
 
 
 def _distribution() -> list[str]:
-    """Ids of this Linux distribution and of those from which it derives, nearest first."""
+    """List the ids of this Linux distribution and of those from which it derives, nearest first."""
     try:
         text = Path("/etc/os-release").read_text(encoding="utf-8")
     except OSError:

@@ -9,12 +9,12 @@ from ..versions import __version__
 
 
 def option_name(field: str) -> str:
-    """Name of a parameter or field on the command line: `timeout_s` is --timeout, with its unit in the help."""
+    """Name a parameter or field on the command line: `timeout_s` is --timeout, with its unit in the help."""
     return cyclopts.default_name_transform(field).removesuffix("-s")
 
 
 def shown_default(value: object) -> str | None:
-    """A default in the help; that of a switch which is off, or of an option that is not given, says nothing."""
+    """Format a default for the help; a switch that is off and an option that is not given have none."""
     return None if value is None or value is False or value == () else str(value)
 
 

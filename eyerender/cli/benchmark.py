@@ -83,7 +83,7 @@ def bench_extractors(
 
 
 def _table(data: dict[str, Any], times: dict[str, Any]) -> str:
-    """One line per extractor, then the reasons of failures."""
+    """Write one line per extractor, then the reasons of failures."""
     lines = [
         f"{'':<18} {'right':>5} {'wrong':>5} {'none':>5} {'error':>5} {'centre px':>10} {'p95':>8} {'bias x':>8} "
         f"{'bias y':>8} {'eff.':>5} {'axis a':>8} {'axis b':>8} {'bound.':>7} {'IoU':>6} "

@@ -296,7 +296,7 @@ def _size(count: int) -> str:
 
 
 def _short(value: Any) -> str:
-    """A statistic for people: numbers with four digits, the items of lists and mappings side by side."""
+    """Format a statistic for people: numbers with four digits, the items of lists and mappings side by side."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {_short(one)}" for key, one in value.items())
     if isinstance(value, list | tuple):

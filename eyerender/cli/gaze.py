@@ -21,7 +21,7 @@ PLACES = {
     "rays": "estimated as the origin of the estimator's gaze rays",
     "glints": "estimated from the glints, with an average cornea",
 }
-"""Where the place of the eye is from, in words."""
+"""Source of the eye's place -> words for it."""
 
 gaze = App(name="gaze", help="Estimate gaze from records of features, also from real images.")
 app.command(gaze)

@@ -88,7 +88,7 @@ def _called(tokens: Sequence[str]) -> Any:
 
 @contextmanager
 def _one_line_warnings() -> Iterator[None]:
-    """Print what is said about unfinished runs as one line, like other warnings of a command."""
+    """Print warnings about unfinished runs as one line each, like other warnings of a command."""
     with warnings.catch_warnings():
         before = warnings.showwarning
 
@@ -152,7 +152,7 @@ def _terminate_like_interrupt() -> dict[int, Any]:
     previous = {}
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
-        # If a shell or nohup ignores a signal for us, that is intended.
+        # A signal that a shell or nohup made us ignore stays ignored.
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
             try:
                 previous[number] = signal.signal(number, handler)

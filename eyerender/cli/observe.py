@@ -181,7 +181,7 @@ def _check_record(version: int) -> None:
 
 
 def _feature_table(observed: Observations, names: list[str] | None = None) -> str:
-    """One line per observation."""
+    """Write one line per observation."""
     index, pupil, glints = observed.index, observed.pupil, observed.glints
     lines = [f"{'frame':>5} {'eye':<5} {'pupil centre px':>21} {'semi-axes px':>17} {'angle deg':>9}  glints px"]
     for i in range(len(observed)):

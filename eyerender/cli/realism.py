@@ -26,7 +26,7 @@ def realism(
 ) -> int:
     """Measure how real pictures of eyes look: contrasts, edges, texture, highlights, noise.
 
-    With a second folder, for instance of your own camera's frames, the figures of both stand side by side.
+    With a second folder, such as frames of your own camera, the command compares both.
 
     Args:
         folder: A folder of images of one eye each: written by this package, exported by it, or your own.
@@ -49,7 +49,7 @@ def realism(
 
 
 def _table(data: dict[str, Any]) -> str:
-    """One line per figure: median and the middle half of the images of each folder, and the ratio of the medians."""
+    """Write one line per figure: median and middle half of each folder's images, and the ratio of the medians."""
     folders, ratios = data["folders"], data["ratios"]
     lines = []
     for k, f in enumerate(folders):

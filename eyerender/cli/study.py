@@ -47,7 +47,7 @@ def study(
 
 
 def _table(summary: dict[str, Any]) -> str:
-    """Most important means, one line each."""
+    """Write the most important means, one line each."""
     rows = summary["rows"]
     if summary["study"] == "blignaut2014":
         lines = [f"{'protocol':<12} {'observer':<15} {'eye':<18} {'set':<5} {'best':<5} {'mean deg':>9}"]

@@ -1,4 +1,4 @@
-"""Where a command writes: never over one of its inputs, and never to an address or a device."""
+"""Checks of output paths: a command never writes over its inputs, to an address or to a device."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def check_outputs(arguments: Mapping[str, Any]) -> None:
 
 
 def _flattened(arguments: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """The arguments, with the fields of records of options in their place."""
+    """Replace records of options among the arguments by their fields."""
     for name, value in arguments.items():
         if is_dataclass(value):
             yield from ((field.name, getattr(value, field.name)) for field in fields(value))
@@ -70,7 +70,7 @@ def _refuse_inputs(place: Path, state: os.stat_result, given: Sequence[Path], *,
 
 
 def _paths(value: Any) -> Iterator[Path]:
-    """Existing files among the values of an argument, and folders where it is a path and not the name of something."""
+    """List the existing files among the values of an argument, and folders where it is a path and not a name."""
     if isinstance(value, tuple | list):
         for one in value:
             yield from _paths(one)
@@ -81,7 +81,7 @@ def _paths(value: Any) -> Iterator[Path]:
 
 
 def _with_named(paths: Iterable[Path]) -> Iterator[tuple[Path, os.stat_result]]:
-    """Paths that exist, and the files that scenes, specs and manifests among them name, relative to themselves."""
+    """List the paths that exist, and the files that scenes, specs and manifests among them name."""
     seen = set()
     for _ in range(_MAX_DEPTH):
         named: list[Path] = []
@@ -95,7 +95,7 @@ def _with_named(paths: Iterable[Path]) -> Iterator[tuple[Path, os.stat_result]]:
 
 
 def _content(path: Path) -> Any:
-    """What a YAML or JSON file holds; None for other files, and for those that cannot be read."""
+    """Read what a YAML or JSON file holds; None for other files, and for those that cannot be read."""
     from ..spec import MAX_YAML_BYTES, parse_yaml
 
     kind = path.suffix.lower()
@@ -109,7 +109,7 @@ def _content(path: Path) -> Any:
 
 
 def _texts(value: Any) -> set[str]:
-    """Every text in nested lists and mappings."""
+    """Yield every text in nested lists and mappings."""
     found, left = set(), [value]
     while left:
         one = left.pop()

@@ -48,7 +48,7 @@ def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> N
 
 
 def png_bytes(image: NDArray[Any]) -> bytes:
-    """PNG file of (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour (ISO/IEC 15948).
+    """Encode (h, w) uint8 or uint16 as a greyscale PNG, or (h, w, 3) uint8 as a colour one (ISO/IEC 15948).
 
     Noise does not compress, and writing must not cost more than rendering. So every row has the same filter, and no
     repetitions are searched for other than runs, which masks have.
@@ -96,14 +96,14 @@ class Writer:
 
 
 def compressed(image: Bytes, quality: int) -> Bytes:
-    """An 8-bit image (h, w) after compression as JPEG of a quality from 1 to 100."""
+    """Compress an 8-bit image (h, w) as JPEG of a quality from 1 to 100, and decode it again."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="JPEG", quality=quality)
     return np.asarray(Image.open(buffer, formats=("JPEG",)))
 
 
 def image_files(folder: str | Path) -> list[str]:
-    """Names of the image files in a folder and below it, relative to it and sorted; links are not followed.
+    """List the image files in a folder and below it, relative to it and sorted; links are not followed.
 
     Raises:
         InputError: there are none, or too many files.
@@ -187,7 +187,7 @@ def _decoded(file: Image.Image, source: str, colour: bool) -> tuple[NDArray[Any]
 
 
 def _from_colour(file: Image.Image, source: str, colour: bool) -> tuple[Bytes, int, bool]:
-    """Grey levels of a file with colour channels; real colour only where it is allowed."""
+    """Convert a file with colour channels to grey levels; real colour only where it is allowed."""
     if file.has_transparency_data and np.asarray(file.convert("RGBA"))[..., 3].min() < 255:
         raise InputError("has transparent pixels", source=source)
     grey = _same_channels(file)
@@ -199,7 +199,7 @@ def _from_colour(file: Image.Image, source: str, colour: bool) -> tuple[Bytes, i
 
 
 def _same_channels(file: Image.Image) -> Bytes | None:
-    """Grey channel of a colour file whose channels are all equal; None for real colour."""
+    """Return the grey channel of a colour file whose channels are all equal; None for real colour."""
     rgb = np.asarray(file.convert("RGB"))
     equal = np.array_equal(rgb[..., 0], rgb[..., 1]) and np.array_equal(rgb[..., 0], rgb[..., 2])
     return np.ascontiguousarray(rgb[..., 0]) if equal else None

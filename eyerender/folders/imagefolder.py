@@ -97,7 +97,7 @@ class ImageEntry:
         return self.file("mask_file_name")
 
     def file(self, key: str) -> Path | None:
-        """Path of the file that one of `FILE_KEYS` names, None where the line names none.
+        """Find the file that one of `FILE_KEYS` names; None where the line names none.
 
         Raises:
             InputError: it leads out of the folder, is missing, or is not a regular file (a link, a pipe, a folder).
@@ -188,7 +188,7 @@ class ImageEntry:
         return mask
 
     def truth(self) -> Observations:
-        """Records of the analytic observer for this image.
+        """Read the records of the analytic observer for this image.
 
         Raises:
             InputError: naming line and key.
@@ -312,7 +312,7 @@ class ImageFolder:
         return iter(self.entries)
 
     def truth(self) -> Observations:
-        """Records of the analytic observer for every image, in order.
+        """Read the records of the analytic observer for every image, in order.
 
         Raises:
             InputError: a record is wrong.
@@ -332,12 +332,12 @@ class ImageFolder:
 
 
 def shard_name(shard: int) -> str:
-    """Name of a shard's folders."""
+    """Make the name of a shard's folders."""
     return f"{shard:05d}"
 
 
 def finished(folder: Path) -> set[int]:
-    """Shards that have a done.json."""
+    """List the shards that have a done.json."""
     place = folder / SHARDS
     if not place.is_dir():
         return set()
@@ -411,7 +411,7 @@ def _is_whole(value: object) -> TypeGuard[int]:
 
 
 def same_run(path: str | Path, digest: str) -> bool:
-    """Whether a folder already holds the complete result of the same spec made by the same versions."""
+    """Return whether a folder already holds the complete result of the same spec made by the same versions."""
     try:
         found = read_json(Path(path) / DATASET)
     except InputError:
@@ -446,7 +446,7 @@ A change of the code that changes them raises it. A run that was begun with anot
 
 
 def versions() -> dict[str, str]:
-    """Versions on which a result depends."""
+    """List the versions on which a result depends."""
     packages = ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless")
     found = {name: package_version(name) for name in packages}
     return {"python": platform.python_version(), "results": str(RESULTS), **found}

@@ -73,7 +73,7 @@ def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
 
 
 def has_own_name(folder: Path, file: Path) -> bool:
-    """Whether a file in a folder has a name that this package gives there, or is listed as made by it, or is a picture.
+    """Return whether this package names files so, or lists this file as its own, or whether it is a picture.
 
     Args:
         folder: the folder.
@@ -184,7 +184,7 @@ def _mark(folder: Path, names: Set[str]) -> None:
 
 
 def _listed(folder: Path) -> set[str] | None:
-    """Entries of a folder's marker; empty where another file identifies the folder as ours, None where none does.
+    """Read a folder's marker: empty where another file identifies the folder as ours, None where none does.
 
     Names of folders end with a slash.
     """
@@ -207,7 +207,7 @@ def _read_sign(path: Path, schema: str) -> dict[str, Any] | None:
 
 
 def _made_here(folder: Path, listed: Set[str], *, strict: bool) -> Iterator[tuple[str, bool]]:
-    """Name of everything that this package made, and whether it is a folder; a folder comes after its content.
+    """Yield what this package made, by name, and whether it is a folder; a folder comes after its content.
 
     With `strict` anything else raises `InputError`; otherwise it is left out.
     """
@@ -238,7 +238,7 @@ def _made_here(folder: Path, listed: Set[str], *, strict: bool) -> Iterator[tupl
 
 
 def _is_ours(name: str, is_folder: bool, listed: Set[str]) -> bool:
-    """Whether a file or folder has a name that this package gives, or is listed as made by it."""
+    """Return whether a file or folder has a name that this package gives, or is listed as made by it."""
     if is_folder:
         return f"{name}/" in listed or _FOLDERS.fullmatch(name) is not None
     part = _PARTS.fullmatch(name)
@@ -272,7 +272,7 @@ def _remove_stages(folder: Path, keep: str = "") -> None:
 
 
 def _names(folder: Path) -> set[str]:
-    """Everything in a folder, relative to it; names of folders end with a slash."""
+    """List everything in a folder, relative to it; names of folders end with a slash."""
     out = set()
     for place, folders, files in os.walk(folder):
         prefix = "" if Path(place) == folder else f"{Path(place).relative_to(folder).as_posix()}/"

@@ -30,7 +30,7 @@ class Slopes(NamedTuple):
 
 
 def biconic_slopes(constants: tuple[FloatLike, ...], y: Floats, z: Floats) -> Slopes:
-    """Height and slopes of x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - k_y y^2 - k_z z^2)).
+    """Compute height and slopes of x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - k_y y^2 - k_z z^2)).
 
     Args:
         constants: (c_y, c_z, k_y, k_z), c = 1/R and k = (1 + Q) c^2 in the meridians of y and z.
@@ -49,7 +49,7 @@ def biconic_slopes(constants: tuple[FloatLike, ...], y: Floats, z: Floats) -> Sl
 
 
 def biconic_jet(constants: tuple[FloatLike, ...], y: Floats, z: Floats) -> Jet:
-    """Height of `biconic_slopes` with its first and second derivatives.
+    """Compute the height of `biconic_slopes` with its first and second derivatives.
 
     With N = c_y y^2 + c_z z^2 and W the square root, x (1 + W) = -N is differentiated twice.
     """

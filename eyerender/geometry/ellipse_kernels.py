@@ -13,7 +13,7 @@ summed = njit(forceinline=True, fastmath={"reassoc", "contract"}, **HELPER)  # s
 
 @summed
 def moments(x, y, mean_x, mean_y):  # type: ignore[no-untyped-def]
-    """Mean square, product and square of coordinates about their means."""
+    """Compute mean square, mean product and mean square of two coordinates about their means."""
     xx, xy, yy = 0.0, 0.0, 0.0
     for k in range(len(x)):
         u, v = x[k] - mean_x, y[k] - mean_y
@@ -23,7 +23,7 @@ def moments(x, y, mean_x, mean_y):  # type: ignore[no-untyped-def]
 
 @summed
 def means(x, y):  # type: ignore[no-untyped-def]
-    """Means of two coordinates."""
+    """Compute the means of two coordinates."""
     a, b = 0.0, 0.0
     for k in range(len(x)):
         a, b = a + x[k], b + y[k]
@@ -44,7 +44,7 @@ def lean(basis, u, v):  # type: ignore[no-untyped-def]
 
 @summed
 def product(a, b):  # type: ignore[no-untyped-def]
-    """Mean product."""
+    """Compute a mean product."""
     total = 0.0
     for k in range(len(a)):
         total += a[k] * b[k]
@@ -53,7 +53,7 @@ def product(a, b):  # type: ignore[no-untyped-def]
 
 @inlined
 def null_vector(pq, pr, qq, qr, rr, value):  # type: ignore[no-untyped-def]
-    """Null vector of M - value diag(1, -1, -1), normalised to w_p > 0.
+    """Compute the null vector of M - value diag(1, -1, -1), normalised to w_p > 0.
 
     It is the first column of the adjugate: an ellipse has w_p^2 > w_q^2 + w_r^2, so no other column is longer.
     """
@@ -65,7 +65,7 @@ def null_vector(pq, pr, qq, qr, rr, value):  # type: ignore[no-untyped-def]
 
 @inlined
 def positive_eigenvector(pp, pq, pr, qq, qr, rr):  # type: ignore[no-untyped-def]
-    """Eigenvector w of M w = lambda diag(1, -1, -1) w for the largest lambda, M symmetric."""
+    """Find the vector w of M w = lambda diag(1, -1, -1) w for the largest lambda; M is symmetric."""
     # Eigenvalues of diag(1, -1, -1) M, whose characteristic polynomial is x^3 - t x^2 + s x - det = 0.
     t = pp - qq - rr
     s = pq * pq + pr * pr - pp * (qq + rr) + qq * rr - qr * qr
@@ -87,7 +87,7 @@ def positive_eigenvector(pp, pq, pr, qq, qr, rr):  # type: ignore[no-untyped-def
 
 @summed
 def sampson_rms(work, w, quadratic, linear, factor):  # type: ignore[no-untyped-def]
-    """Root mean square sqrt(mean(F^2 / |grad F|^2)), px; L^-T takes the gradient back to pixels."""
+    """Compute the root mean square sqrt(mean(F^2 / |grad F|^2)), px; L^-T takes the gradient back to pixels."""
     u, v, p, q, r = work[0], work[1], work[2], work[3], work[4]
     total = 0.0
     for k in range(len(u)):
@@ -141,7 +141,7 @@ def fit_one(x, y, work, out):  # type: ignore[no-untyped-def]
 
 @inlined
 def axes(g11, g12, g22, out):  # type: ignore[no-untyped-def]
-    """Semi-axes and angle of {x : x^T G^-1 x = 1}: roots of G's eigenvalues, and its first eigenvector."""
+    """Compute semi-axes and angle of {x : x^T G^-1 x = 1} from the eigenvalues and first eigenvector of G."""
     mean, half = 0.5 * (g11 + g22), 0.5 * (g11 - g22)
     major = mean + np.hypot(half, g12)
     # This is det / major because mean - radius cancels for a thin ellipse.

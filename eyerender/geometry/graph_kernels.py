@@ -38,7 +38,7 @@ _biconic_jet = inlined(biconic_jet)
 
 @inlined
 def smooth_jet(p, y, z):  # type: ignore[no-untyped-def]
-    """Height, slopes by y and z and derivatives by yy, yz and zz of a sheet (see `X0`).
+    """Compute height, slopes by y and z, and derivatives by yy, yz and zz of a sheet (see `X0`).
 
     x (h + u) = -N is differentiated twice, where x counts from the plane x_0 + l_y y + l_z z; p are the columns up to
     LEAN.
@@ -67,14 +67,14 @@ def smooth_jet(p, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def jet(kinds, numbers, table, i, s, y, z):  # type: ignore[no-untyped-def]
-    """Height of surface s of eye i and its derivatives, as `smooth_jet`; not numbers where it does not reach."""
+    """Compute height and derivatives of surface s of eye i, as `smooth_jet`; NaN where the surface does not reach."""
     outer = smooth_jet(numbers[i, s], y, z)
     return outer if kinds[s] == SMOOTH else measured_jet(kinds[s], numbers, table, i, s, y, z, outer)
 
 
 @inlined
 def _turned(x, hy, hz, hyy, hyz, hzz, c, s):  # type: ignore[no-untyped-def]
-    """Derivatives by (y, z) of a height whose own axes are (c y + s z, c z - s y)."""
+    """Turn derivatives of a height from its own axes (c y + s z, c z - s y) to (y, z)."""
     return (
         x,
         c * hy - s * hz,
@@ -87,7 +87,7 @@ def _turned(x, hy, hz, hyy, hyz, hzz, c, s):  # type: ignore[no-untyped-def]
 
 @helper
 def measured_jet(kind, numbers, table, i, s, y, z, outer):  # type: ignore[no-untyped-def]
-    """The measured surface M inside its outer biconic B: h = B + w (M - B) (see `surfaces_measured`)."""
+    """Blend the measured surface M into its outer biconic B: h = B + w (M - B) (see `surfaces_measured`)."""
     y, z = y - numbers[i, s, ORIGIN + 1], z - numbers[i, s, ORIGIN + 2]
     width = numbers[i, s, SHAPE + 1]
     share = (y * y + z * z - numbers[i, s, SHAPE]) / width
@@ -114,7 +114,7 @@ def measured_jet(kind, numbers, table, i, s, y, z, outer):  # type: ignore[no-un
 
 @inlined
 def _inner_jet(kind, numbers, table, i, s, y, z, outer):  # type: ignore[no-untyped-def]
-    """The measured surface itself, at a place that counts from its origin."""
+    """Evaluate the measured surface itself, at a place relative to its origin."""
     c, t, x = numbers[i, s, TURN], numbers[i, s, TURN + 1], numbers[i, s, ORIGIN]
     own_y, own_z = c * y + t * z, c * z - t * y
     if kind == ZERNIKE:
@@ -134,7 +134,7 @@ def _inner_jet(kind, numbers, table, i, s, y, z, outer):  # type: ignore[no-unty
 
 @inlined
 def _zernike_jet(numbers, table, i, s, y, z):  # type: ignore[no-untyped-def]
-    """Sum of Chebyshev products (see `zernike`), on a conic."""
+    """Evaluate a Zernike expansion on a conic as a sum of Chebyshev products (see `zernike`)."""
     radius, c, k = numbers[i, s, SHAPE + 2], numbers[i, s, SHAPE + 3], numbers[i, s, SHAPE + 4]
     order, place = int(numbers[i, s, SHAPE + 5]), int(numbers[i, s, SHAPE + 6])
     p, q = y / radius, z / radius
@@ -164,7 +164,7 @@ def _zernike_jet(numbers, table, i, s, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def _grid_jet(numbers, table, i, s, y, z):  # type: ignore[no-untyped-def]
-    """Bicubic B-splines, which stand on the outer biconic."""
+    """Evaluate the bicubic B-splines that are added to the outer biconic."""
     spacing, size = numbers[i, s, SHAPE + 2], int(numbers[i, s, SHAPE + 5])
     u, row = _knot((y - numbers[i, s, SHAPE + 3]) / spacing, size)
     v, column = _knot((z - numbers[i, s, SHAPE + 4]) / spacing, size)
@@ -189,7 +189,7 @@ def _grid_jet(numbers, table, i, s, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def _knot(place, size):  # type: ignore[no-untyped-def]
-    """Place in a knot interval and the first of its four coefficients."""
+    """Find the knot interval of a place: the place in it, and the first of its four coefficients."""
     place += 0.5 * (size - 1)
     # A place that is not a number is in the first interval, where its height is not a number either.
     first = min(max(np.floor(place), 1.0), size - 3.0) if place == place else 1.0
@@ -198,7 +198,7 @@ def _knot(place, size):  # type: ignore[no-untyped-def]
 
 @inlined
 def _splines(t):  # type: ignore[no-untyped-def]
-    """The four cubic B-splines over an interval of unit length, their slopes and second derivatives."""
+    """Evaluate the four cubic B-splines over an interval of unit length, with slopes and second derivatives."""
     r = 1.0 - t
     return (
         (r**3 / 6.0, (4.0 - 3.0 * t * t * (1.0 + r)) / 6.0, (4.0 - 3.0 * r * r * (1.0 + t)) / 6.0, t**3 / 6.0),

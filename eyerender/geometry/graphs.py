@@ -60,13 +60,13 @@ class Graphs:
         return not np.any(self.origin_mm) and bool(np.all(self.rotation == np.eye(3)))
 
     def jets(self, y: Floats, z: Floats) -> list[Jet]:
-        """Heights and derivatives of the surfaces of the first eye at places (k,)."""
+        """Compute heights and derivatives of the surfaces of the first eye at places (k,)."""
         out = np.empty((len(self.kinds), 6, len(y)))
         jets(self.kinds, self.numbers, self.table, np.array(y, dtype=float), np.array(z, dtype=float), out)
         return [Jet(*rows) for rows in out]
 
     def heights(self, y: Floats, z: Floats) -> Floats:
-        """Heights (s, k) of the surfaces of the first eye at places (k,); NaN where they do not reach."""
+        """Compute heights (s, k) of the surfaces of the first eye at places (k,); NaN where they do not reach."""
         out = np.empty((len(self.kinds), len(y)))
         heights(self.kinds, self.numbers, self.table, np.array(y, dtype=float), np.array(z, dtype=float), out)
         return out
@@ -123,7 +123,7 @@ def express(*surfaces: Surface) -> Graphs | None:
 
 
 def _turned_about_x(rotation: Floats) -> bool:
-    """Whether rotations (..., 3, 3) leave the x axis where it is."""
+    """Return whether rotations (..., 3, 3) leave the x axis where it is."""
     return bool(np.all(np.abs(rotation[..., 1:, 0]) <= _AXES)) and bool(np.all(rotation[..., 0, 0] > 0.0))
 
 

@@ -1,4 +1,4 @@
-"""PLY files of strangers: a header that is checked, without comments, for a library that trusts it."""
+"""PLY files made by others: their header is checked and stripped of comments before a library reads them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ..storage.files import shown
 MAX_HEADER_BYTES = 65536
 _WORDS = (b"format", b"element", b"property")
 
-# Trimesh logs what it leaves out; a mesh is read or refused here, in one line.
+# Trimesh logs what it leaves out; here a mesh is either read or refused with one line.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def plain_ply(data: bytes, *, source: str = "") -> bytes:
-    """PLY file whose header holds formats, elements and properties alone; comments may name other files.
+    """Read a PLY file whose header must hold formats, elements and properties alone; comments may name other files.
 
     Raises:
         InputError: it has no such header, or the header counts elements that the file cannot hold.
@@ -37,7 +37,7 @@ def plain_ply(data: bytes, *, source: str = "") -> bytes:
 
 
 def _check(words: list[bytes], left: int, source: str) -> None:
-    """Check a line's count of elements: each takes at least a byte of what is left of the file."""
+    """Check a line's count of elements: each takes at least one byte of the rest of the file."""
     if words[0] == b"element" and not (
         len(words) == 3 and re.fullmatch(rb"[0-9]{1,18}", words[2]) and int(words[2]) <= left
     ):

@@ -98,22 +98,22 @@ class Surface(ABC):
 
     @abstractmethod
     def value_at(self, point: Xyz) -> Floats:
-        """Implicit function F."""
+        """Evaluate the implicit function F."""
 
     @abstractmethod
     def gradient_at(self, point: Xyz) -> Xyz:
-        """Half gradient g, not normalized."""
+        """Compute the half gradient g, not normalized."""
 
     @abstractmethod
     def hessian_at(self, point: Xyz) -> SymmetricMatrix:
-        """Derivative of the half gradient, H with dg = H dp."""
+        """Compute the derivative of the half gradient, H with dg = H dp."""
 
     @abstractmethod
     def local_sag(self, y: Floats, z: Floats) -> Floats:
-        """Depth x of the sheet in the local frame over the local (y, z); NaN where the sheet does not reach."""
+        """Compute the depth x of the sheet over the local (y, z); NaN where the sheet does not reach."""
 
     def take(self, index: Indices) -> Self:
-        """Surfaces of the batch at `index`; a single surface is returned as it is."""
+        """Select surfaces of the batch by `index`; a single surface is returned as it is."""
         return type(self)(*(part[index] for part in self._parts())) if self.batch_shape else self
 
     @classmethod
@@ -122,7 +122,7 @@ class Surface(ABC):
         return cls(*(stacked(parts) for parts in zip(*(s._parts() for s in surfaces), strict=True)))
 
     def placed(self, origin_mm: Floats, rotation: Floats) -> Self:
-        """The surface elsewhere."""
+        """Move the surface to another origin and rotation."""
         return replace(self, origin_mm=origin_mm, rotation=rotation)  # type: ignore[type-var]
 
     def scaled(self, centre_mm: Floats, factor: float) -> Self:
@@ -137,11 +137,11 @@ class Surface(ABC):
 
     @abstractmethod
     def _scaled_shape(self, factor: float) -> dict[str, Floats]:
-        """The parts of the shape that change where all lengths are multiplied by `factor`."""
+        """Scale the parameters of the shape for lengths multiplied by `factor`."""
 
     @abstractmethod
     def _mirrored_shape(self) -> dict[str, Floats]:
-        """The parts of the shape that change where y changes its sign in the local frame too."""
+        """Mirror the parameters of the shape for y with the opposite sign."""
 
     def __eq__(self, other: object) -> bool:
         return type(other) is type(self) and all(
@@ -152,31 +152,31 @@ class Surface(ABC):
         return hash((type(self), *((a + 0.0).tobytes() for a in self._key())))
 
     def _parts(self) -> tuple[Any, ...]:
-        """Arrays from which the surface is made."""
+        """List the arrays from which the surface is made."""
         return tuple([getattr(self, name) for name in _names(type(self))])
 
     def _key(self) -> tuple[Floats, ...]:
-        """Arrays that define the surface."""
+        """List the arrays that define the surface, for comparison."""
         return self._parts()
 
     # -- points (..., 3) ----------------------------------------------------------------------------------------------
 
     def implicit(self, points: npt.ArrayLike) -> Floats:
-        """Implicit function F at points (..., 3); zero on the surface."""
+        """Evaluate the implicit function F at points (..., 3); it is zero on the surface."""
         return self.value_at(components(points))
 
     def gradient(self, points: npt.ArrayLike) -> Floats:
-        """Full gradient of F at points (..., 3), twice the half gradient."""
+        """Compute the full gradient of F at points (..., 3), twice the half gradient."""
         return 2.0 * join(self.gradient_at(components(points)))
 
     def normal(self, points: npt.ArrayLike) -> Floats:
-        """Unit normal g/|g| at points (..., 3), pointing to the air side (+x of the local frame)."""
+        """Compute unit normals g/|g| at points (..., 3), pointing to the air side (+x of the local frame)."""
         gradient = join(self.gradient_at(components(points)))
         unit: Floats = gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
         return unit
 
     def sag(self, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike) -> Floats:
-        """Depth x (mm, local frame) of the sheet over local y and z; NaN where it does not reach."""
+        """Compute the depth x (mm, local frame) of the sheet over local y and z; NaN where it does not reach."""
         return self.local_sag(np.asarray(y_mm, dtype=np.float64), np.asarray(z_mm, dtype=np.float64))
 
     def intersect(self, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Floats, Bools]:
@@ -204,7 +204,7 @@ class Surface(ABC):
         return join(shift(turn(self.rotation, components(points)), self.origin_mm, 1.0))
 
     def axis_distance(self, point: Xyz) -> Floats:
-        """Distance (mm) of points from the local x axis."""
+        """Compute the distance (mm) of points from the local x axis."""
         local_x, local_y, local_z = shift(point, self.origin_mm, -1.0)
         axis_x, axis_y, axis_z = (fit(self.rotation[..., i, 0], point[0].ndim) for i in range(3))
         along = local_x * axis_x + local_y * axis_y + local_z * axis_z
@@ -213,7 +213,7 @@ class Surface(ABC):
 
 @cache
 def _names(kind: type) -> tuple[str, ...]:
-    """Names of the arrays from which surfaces of a kind are made."""
+    """List the names of the arrays from which surfaces of a kind are made."""
     return tuple(f.name for f in fields(kind) if f.init)
 
 

@@ -36,23 +36,23 @@ class Biconic(GraphSurface):
     kind: ClassVar[str] = "biconic"
 
     def slopes(self, y: Floats, z: Floats) -> Slopes:
-        """Height and slopes over the local (y, z)."""
+        """Compute height and slopes over the local (y, z)."""
         return biconic_slopes(self._constants(max(y.ndim, z.ndim)), y, z)
 
     def jet(self, y: Floats, z: Floats) -> Jet:
-        """Height, slopes and second derivatives over the local (y, z)."""
+        """Compute height, slopes and second derivatives over the local (y, z)."""
         return biconic_jet(self._constants(max(y.ndim, z.ndim)), y, z)
 
     def likeness(self) -> tuple[Floats, Floats]:
-        """The conic of mean curvature and mean 1 + Q."""
+        """Return the conic of mean curvature and mean 1 + Q."""
         return np.mean(1.0 / self.radii_mm, axis=-1), 1.0 + np.mean(self.conic_constants, axis=-1)
 
     def _scaled_shape(self, factor: float) -> dict[str, Floats]:
-        """Radii; conic constants stay."""
+        """Scale the radii; conic constants stay."""
         return {"radii_mm": factor * self.radii_mm}
 
     def _mirrored_shape(self) -> dict[str, Floats]:
-        """Nothing, because the sag is even in y."""
+        """Change nothing, because the sag is even in y."""
         return {}
 
     def _constants(self, ndim: int) -> tuple[FloatLike, ...]:

@@ -40,15 +40,15 @@ class GraphSurface(Surface):
 
     @abstractmethod
     def slopes(self, y: Floats, z: Floats) -> Slopes:
-        """Height and slopes over the local (y, z)."""
+        """Compute height and slopes over the local (y, z)."""
 
     @abstractmethod
     def jet(self, y: Floats, z: Floats) -> Jet:
-        """Height, slopes and second derivatives over the local (y, z)."""
+        """Compute height, slopes and second derivatives over the local (y, z)."""
 
     @abstractmethod
     def likeness(self) -> tuple[Floats, Floats]:
-        """Curvature and 1 + Q, (...,), of the conic from whose hit the search starts."""
+        """Return curvature and 1 + Q, (...,), of the conic from whose hit the search starts."""
 
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
         """Solve x - h(y, z) = 0 along the ray by Newton, from the hit on a conic that is like the surface.
@@ -73,7 +73,7 @@ class GraphSurface(Surface):
         return Hit(t, point, self.eye_vector((np.ones_like(sag.y), -sag.y, -sag.z)), ok)
 
     def _conic_hit(self, start: Xyz, way: Xyz, ndim: int, inward: bool) -> tuple[Floats, Bools]:
-        """Distance to the conic of `likeness`, times its curvature: c (y^2 + z^2) + 2 x + c p x^2 = 0."""
+        """Intersect the conic of `likeness`, times its curvature: c (y^2 + z^2) + 2 x + c p x^2 = 0."""
         (ox, oy, oz), (dx, dy, dz) = start, way
         curvature, shape = (fit(value, ndim) for value in self.likeness())
         gx = 1.0 + curvature * shape * ox
@@ -87,7 +87,7 @@ class GraphSurface(Surface):
         return np.where(possible, t, 0.0), possible
 
     def _newton(self, start: Xyz, way: Xyz, guess: Floats, wanted: Bools) -> tuple[Floats, Floats]:
-        """Newton steps from `guess`: the distance, and the error before the last step."""
+        """Take Newton steps from `guess`; return the distance and the error before the last step."""
         (ox, oy, oz), (dx, dy, dz) = start, way
         t, error = guess, np.full_like(guess, np.inf)
         for _ in range(STEPS):
@@ -109,7 +109,7 @@ class GraphSurface(Surface):
         near = np.broadcast_to(guess, shape)[rows]
 
         def side(s: Floats) -> Floats:
-            """Positive before the crossing that is sought, negative behind it; NaN where the sheet does not reach."""
+            """Return a positive number before the crossing that is sought, a negative one behind it, else NaN."""
             value = ox + s * dx - few.local_sag(oy + s * dy, oz + s * dz)
             return value if inward else -value
 
@@ -131,18 +131,18 @@ class GraphSurface(Surface):
         return t.reshape(lost.shape), error.reshape(lost.shape)
 
     def value_at(self, point: Xyz) -> Floats:
-        """Implicit function F = 2 (x - h(y, z))."""
+        """Evaluate the implicit function F = 2 (x - h(y, z))."""
         x, y, z = self.local_point(point)
         return 2.0 * (x - self.slopes(y, z).x)
 
     def gradient_at(self, point: Xyz) -> Xyz:
-        """Half gradient (1, -dh/dy, -dh/dz) of the local frame, rotated to the eye frame."""
+        """Compute the half gradient (1, -dh/dy, -dh/dz) of the local frame, rotated to the eye frame."""
         _, y, z = self.local_point(point)
         sag = self.slopes(y, z)
         return self.eye_vector((np.ones_like(sag.y), -sag.y, -sag.z))
 
     def hessian_at(self, point: Xyz) -> SymmetricMatrix:
-        """Derivative of the half gradient, H with dg = H dp."""
+        """Compute the derivative of the half gradient, H with dg = H dp."""
         _, y, z = self.local_point(point)
         sag = self.jet(y, z)
         if self.untilted:
@@ -156,7 +156,7 @@ class GraphSurface(Surface):
         return SymmetricMatrix(entry(0, 0), entry(1, 1), entry(2, 2), entry(0, 1), entry(0, 2), entry(1, 2))
 
     def local_sag(self, y: Floats, z: Floats) -> Floats:
-        """Height x of the sheet in the local frame over the local (y, z); NaN where it does not reach."""
+        """Compute the height x of the sheet over the local (y, z); NaN where the sheet does not reach."""
         sag = self.slopes(y, z)
         return np.asarray(np.where(sag.inside, sag.x, np.nan))
 

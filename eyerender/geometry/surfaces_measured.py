@@ -43,7 +43,7 @@ class Measured(GraphSurface):
 
     @abstractmethod
     def measured(self, y: Floats, z: Floats, second: bool, outer: Parts | None = None) -> Parts:
-        """Height of the measured surface, its slopes, and (if `second`) its second derivatives, as in a `Jet`.
+        """Compute height, slopes and (if `second`) second derivatives of the measured surface, as in a `Jet`.
 
         Args:
             y: places within the window's end.
@@ -53,7 +53,7 @@ class Measured(GraphSurface):
         """
 
     def slopes(self, y: Floats, z: Floats) -> Slopes:
-        """Height and slopes over the local (y, z)."""
+        """Compute height and slopes over the local (y, z)."""
         y, z = np.broadcast_arrays(y, z)
         share, width = self._share(y, z)
         if not (share > 0.0).any():
@@ -68,7 +68,7 @@ class Measured(GraphSurface):
         return Slopes(outer.x + w * d, outer.y + w * dy + lever * y, outer.z + w * dz + lever * z, outer.inside)
 
     def jet(self, y: Floats, z: Floats) -> Jet:
-        """Height, slopes and second derivatives over the local (y, z)."""
+        """Compute height, slopes and second derivatives over the local (y, z)."""
         y, z = np.broadcast_arrays(y, z)
         share, width = self._share(y, z)
         if not (share > 0.0).any():
@@ -89,13 +89,13 @@ class Measured(GraphSurface):
         )
 
     def outer_slopes(self, y: Floats, z: Floats) -> Slopes:
-        """Height and slopes of the outer biconic."""
+        """Compute height and slopes of the outer biconic."""
         constants, (c, s, x, ly, lz) = self._outer_constants(y.ndim)
         h = biconic_slopes(constants, c * y + s * z, c * z - s * y)
         return Slopes(h.x + x + ly * y + lz * z, c * h.y - s * h.z + ly, s * h.y + c * h.z + lz, h.inside)
 
     def outer_jet(self, y: Floats, z: Floats) -> Jet:
-        """Height, slopes and second derivatives of the outer biconic."""
+        """Compute height, slopes and second derivatives of the outer biconic."""
         constants, (c, s, x, ly, lz) = self._outer_constants(y.ndim)
         h = biconic_jet(constants, c * y + s * z, c * z - s * y)
         return Jet(
@@ -108,17 +108,17 @@ class Measured(GraphSurface):
         )
 
     def likeness(self) -> tuple[Floats, Floats]:
-        """The conic of mean curvature and mean 1 + Q of the outer biconic."""
+        """Return the conic of mean curvature and mean 1 + Q of the outer biconic."""
         return np.mean(1.0 / self.outer[..., :2], axis=-1), 1.0 + np.mean(self.outer[..., 2:4], axis=-1)
 
     def _share(self, y: Floats, z: Floats) -> tuple[Floats, FloatLike]:
-        """Place in the window, 0 where it begins and 1 where it ends, and the width q_o - q_i."""
+        """Compute the place in the window, from 0 where it begins to 1 where it ends, and the width q_o - q_i."""
         begin, end = (fit(self.window_mm[..., k], y.ndim) for k in (0, 1))
         width = end * end - begin * begin
         return np.asarray((y * y + z * z - begin * begin) / width), width
 
     def _difference(self, y: Floats, z: Floats, share: Floats, outer: Parts, second: bool) -> Parts:
-        """M - B and its derivatives; 0 beyond the window, where the measured shape may be huge."""
+        """Compute M - B and its derivatives; 0 beyond the window, where the measured shape may be huge."""
         beyond = share >= 1.0
         y, z = np.where(beyond, 0.0, y), np.where(beyond, 0.0, z)
         inner = self.measured(y, z, second, outer)
@@ -134,7 +134,7 @@ class Measured(GraphSurface):
 
 
 def _window(share: Floats, width: FloatLike) -> tuple[Floats, Floats, Floats]:
-    """Window w over its share s, and its first and second derivatives by the squared radius."""
+    """Compute the window w over its share s, and its first and second derivatives by the squared radius."""
     s = np.clip(share, 0.0, 1.0)
     rest = 1.0 - s
     w = rest**3 * (1.0 + s * (3.0 + 6.0 * s))
@@ -186,7 +186,7 @@ class ZernikeSurface(Measured):
         return order_of(self.coefficients_mm.shape[-1])
 
     def measured(self, y: Floats, z: Floats, second: bool, outer: Parts | None = None) -> Parts:
-        """Height of the expansion and its derivatives (see `Measured`)."""
+        """Compute the height of the expansion and its derivatives (see `Measured`)."""
         count = 6 if second else 3
         radius = fit(self.radius_mm, y.ndim)
         p, q = y / radius, z / radius
@@ -229,7 +229,7 @@ class ZernikeSurface(Measured):
         return cls(*(stacked(parts) for parts in zip(*(s._parts() for s in surfaces), strict=True)))
 
     def with_terms(self, count: int) -> Self:
-        """The same surface with coefficients of 0 up to `count` terms."""
+        """Pad the expansion with coefficients of 0 up to `count` terms."""
         missing = count - self.coefficients_mm.shape[-1]
         return replace(self, coefficients_mm=np.pad(self.coefficients_mm, (0, missing)), table=np.zeros(0))
 
@@ -273,7 +273,7 @@ class GridSurface(Measured):
         return np.asarray(self.table[self.row])
 
     def measured(self, y: Floats, z: Floats, second: bool, outer: Parts | None = None) -> Parts:
-        """Height of the bicubic surface on the outer biconic and its derivatives (see `Measured`)."""
+        """Compute the height of the bicubic surface on the outer biconic and its derivatives (see `Measured`)."""
         if outer is None:
             outer = self.outer_jet(y, z) if second else self.outer_slopes(y, z)[:3]
         size = self.table.shape[-1]
@@ -296,12 +296,12 @@ class GridSurface(Measured):
         )
 
     def take(self, index: Indices) -> Self:
-        """Surfaces of the batch at `index`; a single surface is returned as it is. The table is shared."""
+        """Select surfaces of the batch by `index`, with the same table; a single surface is returned as it is."""
         *parts, table = self._parts()
         return type(self)(*(*(part[index] for part in parts), table)) if self.batch_shape else self
 
     def with_outer(self, outer: Floats) -> Self:
-        """The same bicubic heights on another biconic."""
+        """Move the same bicubic heights to another biconic."""
         return replace(self, outer=outer)
 
     def _scaled_shape(self, factor: float) -> dict[str, Floats]:
@@ -343,7 +343,7 @@ class GridSurface(Measured):
 
 
 def splines(share: Floats, spacing: FloatLike, second: bool) -> tuple[Floats, ...]:
-    """The four cubic B-splines over a knot interval, (..., 4), with their first and (if `second`) second derivatives.
+    """Evaluate the four cubic B-splines over a knot interval, (..., 4), with first and (on request) second derivatives.
 
     Args:
         share: place in the interval, from 0 to 1; outside, the cubics are continued.

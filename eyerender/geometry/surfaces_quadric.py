@@ -58,7 +58,7 @@ class Quadric(Surface):
         origin_mm: npt.ArrayLike = (0.0, 0.0, 0.0),
         rotation: npt.ArrayLike | None = None,
     ) -> Quadric:
-        """Conic y^2 + z^2 + 2 R x + (1 + Q) x^2 = 0, apex at the local origin; R > 0 opens to -x, R < 0 to +x."""
+        """Make the conic y^2 + z^2 + 2 R x + (1 + Q) x^2 = 0 with its apex at the origin; R > 0 opens to -x."""
         radius = np.asarray(radius_mm, dtype=np.float64)
         shape = np.broadcast_shapes(radius.shape, np.shape(conic_constant), np.shape(origin_mm)[:-1])
         sign = np.broadcast_to(np.sign(radius), shape)
@@ -77,7 +77,7 @@ class Quadric(Surface):
         rotation: npt.ArrayLike | None = None,
         front: bool = True,
     ) -> Quadric:
-        """One half of the ellipsoid (x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about `centre_mm`: towards +x (`front`) or -x."""
+        """Make half of the ellipsoid (x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about `centre_mm`, towards +x (`front`) or -x."""
         axes = np.asarray(semi_axes_mm, dtype=np.float64)
         matrix = np.zeros((*axes.shape[:-1], 3, 3))
         scale = axes[..., 1] * axes[..., 2]
@@ -87,7 +87,7 @@ class Quadric(Surface):
 
     @classmethod
     def plane(cls, origin_mm: npt.ArrayLike, rotation: npt.ArrayLike | None = None) -> Quadric:
-        """Plane x = 0 of the local frame."""
+        """Make the plane x = 0 of the local frame."""
         return cls.oriented(np.zeros((3, 3)), np.array([1.0, 0.0, 0.0]), np.array(0.0), 1.0, origin_mm, rotation)
 
     @classmethod
@@ -131,7 +131,7 @@ class Quadric(Surface):
         return Quadric(moved, back @ self.rotation, self.matrix, self.vector, self.constant)
 
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
-        """Root of (d.Ad) t^2 + 2 (d.g(o)) t + F(o) = 0 with the required sign of d.g, as F / (-b -+ sqrt(b^2 - aF))."""
+        """Solve (d.Ad) t^2 + 2 (d.g(o)) t + F(o) = 0 for the required sign of d.g, as F / (-b -+ sqrt(b^2 - aF))."""
         ox, oy, oz = origin
         dx, dy, dz = direction
         xx, yy, zz, xy, xz, yz, bx, by, bz, c = (fit(v, max(ox.ndim, dx.ndim)) for v in self._eye)
@@ -156,7 +156,7 @@ class Quadric(Surface):
         return Hit(t, point, gradient, ok)
 
     def on_sheet(self, gradient: Xyz) -> Bools:
-        """Whether a half gradient in the eye frame points to local +x."""
+        """Return whether a half gradient in the eye frame points to local +x."""
         if self._axial:
             return np.asarray(gradient[0] > 0.0)
         ndim = gradient[0].ndim
@@ -164,14 +164,14 @@ class Quadric(Surface):
         return np.asarray(ax * gradient[0] + ay * gradient[1] + az * gradient[2] > 0.0)
 
     def value_at(self, point: Xyz) -> Floats:
-        """Implicit function F(p) = p^T A p + 2 b.p + c."""
+        """Evaluate the implicit function F(p) = p^T A p + 2 b.p + c."""
         x, y, z = point
         gx, gy, gz = self.gradient_at(point)
         bx, by, bz, c = (fit(v, x.ndim) for v in self._eye[6:])
         return np.asarray((gx + bx) * x + (gy + by) * y + (gz + bz) * z + c)
 
     def gradient_at(self, point: Xyz) -> Xyz:
-        """Half gradient g = A p + b."""
+        """Compute the half gradient g = A p + b."""
         x, y, z = point
         if self._axial:
             return fit(self._eye[0], x.ndim) * x + fit(self._eye[6], x.ndim), y, z
@@ -180,11 +180,11 @@ class Quadric(Surface):
         return gx + bx, gy + by, gz + bz
 
     def hessian_at(self, point: Xyz) -> SymmetricMatrix:
-        """Derivative of the half gradient, the matrix A in the eye frame."""
+        """Return the derivative of the half gradient, the matrix A in the eye frame."""
         return SymmetricMatrix(*(fit(v, point[0].ndim) for v in self._eye[:6]))
 
     def local_sag(self, y: Floats, z: Floats) -> Floats:
-        """Root of A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 on the sheet."""
+        """Solve A_xx x^2 + 2 (A_xy y + A_xz z + b_x) x + F(0, y, z) = 0 for x on the sheet."""
         m, v = self.matrix, self.vector
         ndim = max(y.ndim, z.ndim)
         xx, yy, zz, xy, xz, yz = (fit(m[..., i, j], ndim) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))

@@ -68,7 +68,7 @@ def biconic_through(y: Floats, z: Floats, x: Floats) -> Floats:
 
 
 def spline_coefficients(values: Floats) -> Floats:
-    """Coefficients (n + 2, m + 2) of the cubic B-splines through values (n, m) on a uniform grid.
+    """Compute the coefficients (n + 2, m + 2) of the cubic B-splines through values (n, m) on a uniform grid.
 
     The end condition is the one without a knot beside the end. With the second derivative s'' of that interpolant,
     c_i = s_i - h^2 s''_i / 6 at the knots; the outermost ones follow from c_(i-1) - 2 c_i + c_(i+1) = h^2 s''_i.
@@ -87,7 +87,7 @@ def spline_coefficients(values: Floats) -> Floats:
 def smooth_heights(
     y: Floats, z: Floats, x: Floats, *, half_mm: float, spacing_mm: float, smoothing: float = 0.0
 ) -> Floats:
-    """Heights (n, n) on a grid about the axis, from scattered points: a biconic and penalized cubic B-splines on it.
+    """Fit heights (n, n) on a grid to scattered points: a biconic plus penalized cubic B-splines.
 
     The penalty is on third differences of the deviation from the biconic that fits best (Eilers & Marx 1996, "Flexible
     smoothing with B-splines and penalties").
@@ -129,7 +129,7 @@ def smooth_heights(
 
 
 def _biconic_height(outer: Floats, y: Floats, z: Floats) -> Floats:
-    """Height of an outer biconic (see `Measured.outer`)."""
+    """Compute the height of an outer biconic (see `Measured.outer`)."""
     curvature, (c, s) = 1.0 / outer[:2], (np.cos(outer[4]), np.sin(outer[4]))
     k = (1.0 + outer[2:4]) * curvature**2
     sag = biconic_slopes((curvature[0], curvature[1], k[0], k[1]), c * y + s * z, c * z - s * y)

@@ -31,22 +31,22 @@ def stacked(values: Sequence[Floats]) -> Floats:
 
 
 def rotation_x(angle_rad: npt.ArrayLike) -> Floats:
-    """Rotations about x by angles (...,), as (..., 3, 3)."""
+    """Make rotations about x by angles (...,), as (..., 3, 3)."""
     return _plane_rotation(angle_rad, 1, 2)
 
 
 def rotation_y(angle_rad: npt.ArrayLike) -> Floats:
-    """Rotations about y by angles (...,), as (..., 3, 3)."""
+    """Make rotations about y by angles (...,), as (..., 3, 3)."""
     return _plane_rotation(angle_rad, 2, 0)
 
 
 def rotation_z(angle_rad: npt.ArrayLike) -> Floats:
-    """Rotations about z by angles (...,), as (..., 3, 3)."""
+    """Make rotations about z by angles (...,), as (..., 3, 3)."""
     return _plane_rotation(angle_rad, 0, 1)
 
 
 def tilt_rotation(tilt_rad: npt.ArrayLike) -> Floats:
-    """Rotation Rz(t_z) Ry(t_y) Rx(t_x) for tilts (..., 3) about (x, y, z)."""
+    """Make the rotations Rz(t_z) Ry(t_y) Rx(t_x) of tilts (..., 3) about (x, y, z)."""
     tilt = np.asarray(tilt_rad, dtype=np.float64)
     about_x, about_y, about_z = rotation_x(tilt[..., 0]), rotation_y(tilt[..., 1]), rotation_z(tilt[..., 2])
     whole: Floats = about_z @ about_y @ about_x
@@ -60,13 +60,13 @@ def flip_y(points: npt.ArrayLike) -> Floats:
 
 
 def mirror_rotation(rotation: npt.ArrayLike) -> Floats:
-    """Mirrored rotations S R S (..., 3, 3), where S mirrors y."""
+    """Mirror rotations to S R S (..., 3, 3), where S mirrors y."""
     mirrored: Floats = MIRROR @ np.asarray(rotation, dtype=np.float64) @ MIRROR
     return mirrored
 
 
 def normalize(vectors: npt.ArrayLike) -> Floats:
-    """Unit vectors v / |v| along the last axis."""
+    """Divide vectors by their lengths, along the last axis."""
     array = np.asarray(vectors, dtype=np.float64)
     unit: Floats = array / np.linalg.norm(array, axis=-1, keepdims=True)
     return unit

@@ -8,17 +8,17 @@ from ..arrays import Floats
 
 
 def lengths(v: Floats) -> Floats:
-    """Lengths (...,) of vectors (..., 3)."""
+    """Compute the lengths (...,) of vectors (..., 3)."""
     return np.asarray(np.sqrt(dots(v, v)))
 
 
 def dots(a: Floats, b: Floats) -> Floats:
-    """Scalar products (...,) of vectors (..., 3)."""
+    """Compute scalar products (...,) of vectors (..., 3)."""
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
 
 
 def crosses(a: Floats, b: Floats) -> Floats:
-    """Vector products (..., 3) of vectors (..., 3)."""
+    """Compute vector products (..., 3) of vectors (..., 3)."""
     ax, ay, az, bx, by, bz = (v[..., k] for v in (a, b) for k in range(3))
     out = np.empty(np.broadcast(a, b).shape)
     out[..., 0], out[..., 1], out[..., 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx

@@ -25,12 +25,12 @@ MAX_ORDER = 14
 
 
 def terms(order: int) -> int:
-    """Number of terms up to a radial order."""
+    """Count the terms up to a radial order."""
     return (order + 1) * (order + 2) // 2
 
 
 def order_of(count: int) -> int:
-    """Smallest radial order with at least `count` terms."""
+    """Find the smallest radial order with at least `count` terms."""
     order = 0
     while terms(order) < count:
         order += 1
@@ -38,12 +38,12 @@ def order_of(count: int) -> int:
 
 
 def orders(order: int) -> list[tuple[int, int]]:
-    """(n, m) of all terms up to a radial order, in the standard order."""
+    """List (n, m) of all terms up to a radial order, in the standard order."""
     return [(n, m) for n in range(order + 1) for m in range(-n, n + 1, 2)]
 
 
 def zernike(order: int, p: Floats, q: Floats) -> Floats:
-    """All terms up to a radial order at places (p, q) of the unit disc, (terms, ...)."""
+    """Evaluate all terms up to a radial order at places (p, q) of the unit disc, (terms, ...)."""
     square, angle = p * p + q * q, np.arctan2(q, p)
     rho = np.sqrt(square)
     out = np.empty((terms(order), *np.shape(square)))
@@ -57,14 +57,14 @@ def zernike(order: int, p: Floats, q: Floats) -> Floats:
 
 
 def mirrored(coefficients: Floats) -> Floats:
-    """Coefficients (..., k) of the sum mirrored in the second axis, p -> -p: theta becomes pi - theta."""
+    """Mirror coefficients (..., k) of a sum in the second axis, p -> -p: theta becomes pi - theta."""
     signs = [(-1.0) ** m if m >= 0 else -((-1.0) ** m) for _, m in orders(order_of(coefficients.shape[-1]))]
     return np.asarray(coefficients * np.array(signs[: coefficients.shape[-1]]))
 
 
 @lru_cache(maxsize=MAX_ORDER + 1)
 def products(order: int) -> Floats:
-    """What turns Zernike coefficients into those of Chebyshev products, (6, terms, terms).
+    """Compute the matrices from Zernike coefficients to those of Chebyshev products, (6, terms, terms).
 
     The first axis holds the value and its derivatives by p, q, pp, pq and qq. A product T_i(p) T_j(q) has the place of
     the pair (i, j) in `pairs`.
@@ -91,12 +91,12 @@ def products(order: int) -> Floats:
 
 @lru_cache(maxsize=MAX_ORDER + 1)
 def pairs(order: int) -> tuple[tuple[int, int], ...]:
-    """The pairs (i, j) with i + j <= order."""
+    """List the pairs (i, j) with i + j <= order."""
     return tuple((i, j) for i in range(order + 1) for j in range(order + 1 - i))
 
 
 def product_basis(order: int, p: Floats, q: Floats, axis: int) -> Floats:
-    """Products T_i(p) T_j(q) of `pairs` at places of one shape, along a new axis."""
+    """Evaluate the products T_i(p) T_j(q) of `pairs` at places of one shape, along a new axis."""
     first, second = _chebyshev(order, p), _chebyshev(order, q)
     out = np.empty((*p.shape[:axis], terms(order), *p.shape[axis:]))
     view = np.moveaxis(out, axis, 0)
@@ -106,7 +106,7 @@ def product_basis(order: int, p: Floats, q: Floats, axis: int) -> Floats:
 
 
 def _chebyshev(order: int, x: Floats) -> list[Floats]:
-    """T_0 to T_order by T_(k+1) = 2 x T_k - T_(k-1)."""
+    """Evaluate T_0 to T_order by T_(k+1) = 2 x T_k - T_(k-1)."""
     out = [np.ones_like(x), x]
     double = 2.0 * x
     for _ in range(order - 1):
@@ -115,5 +115,5 @@ def _chebyshev(order: int, x: Floats) -> list[Floats]:
 
 
 def fitted(order: int, p: Floats, q: Floats, values: Floats) -> Floats:
-    """Least-squares coefficients (terms,) of values (n,) at places (n,)."""
+    """Fit coefficients (terms,) to values (n,) at places (n,) by least squares."""
     return np.asarray(np.linalg.lstsq(zernike(order, p, q).T, values, rcond=None)[0], dtype=np.float64)

@@ -107,7 +107,7 @@ def render_windows(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BegunImage:
-    """A row of `frames` that has been traced by `job`; a second thread makes its image."""
+    """The image of a traced row of `frames`, which a second thread makes."""
 
     frames: Frames
     row: int
@@ -135,8 +135,8 @@ class BegunImage:
 def begin_each(many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False) -> Iterator[BegunImage]:
     """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
 
-    The next frames are fetched before the last of these are traced, because what NumPy alone makes of them is made
-    beside that. Where fetching fails, these are traced first.
+    The next frames are fetched before the last ones are traced, so that a second thread can prepare them meanwhile.
+    Where fetching fails, the frames at hand are traced first.
 
     Args:
         many: the frames, one scene after the other.
@@ -173,7 +173,7 @@ class _Step:
 
 
 def _steps(many: Iterable[Frames], highlights: bool) -> Iterator[_Step]:
-    """What to trace, one after the other."""
+    """Make the jobs to trace, one after the other."""
     for frames in many:
         check_windows(frames.scene)
         for row in range(len(frames)):
@@ -182,7 +182,7 @@ def _steps(many: Iterable[Frames], highlights: bool) -> Iterator[_Step]:
 
 
 def render_job(frames: Frames, row: int) -> RenderJob:
-    """Job of the renderer for one row: the eye in its pose, the rig, the window, the seed."""
+    """Make the renderer's job for one row: the eye in its pose, the rig, the window, the seed."""
     from ..rendering.records.job import RenderJob
 
     scene, index = frames.scene, frames.index
@@ -213,10 +213,10 @@ def render_job(frames: Frames, row: int) -> RenderJob:
 
 
 def focus_dpt(frames: Frames, row: int) -> float:
-    """Vergence at which the eye of one row is focused.
+    """Compute the vergence at which the eye of one row is focused.
 
-    Where the scene tells how far the lens accommodates, as for drawn people, it is that much nearer than the far point.
-    Else the eye is focused on its target, or far away without one, unless it is too short-sighted.
+    Where the scene states how far the lens accommodates, as for drawn people, the eye is focused that much nearer than
+    its far point. Otherwise it is focused on its target, or far away without one, unless it is too short-sighted.
     """
     scene, index = frames.scene, frames.index
     far = -at_cornea_d(scene.refraction_d(EYES[index.eye[row]]))
@@ -228,7 +228,7 @@ def focus_dpt(frames: Frames, row: int) -> float:
 
 
 def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:
-    """The same window at evenly spaced moments of the exposure, with moving eye and head; empty where nothing moves."""
+    """Place the job at evenly spaced moments of the exposure, with moving eye and head; empty where nothing moves."""
     scene, pose = frames.scene, frames.pose
     motion = scene.spec.motion
     if motion is None:
@@ -241,7 +241,7 @@ def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...
         M, t = rigid_motion(Poses.listing([azimuth], [elevation]), middle.eye)
         apex = middle.anchor_mm + np.array(motion.head_mm_s) * time_s
         seed = int(np.random.SeedSequence([middle.seed, k]).generate_state(1, np.uint64)[0])
-        # At the middle, the job itself: the renderer sees that it need not be set up again.
+        # The middle moment is the job itself, so the renderer need not set it up again.
         moved = {"M": M[0], "t": t[0] + apex, "apex_mm": apex} if time_s else {}
         out.append(replace(middle, **moved, seed=seed, labels=False))
     return tuple(out)
@@ -290,7 +290,7 @@ def make_renderer(backend: BackendChoice = "auto", threads: int | None = None) -
 
 
 def noiseless(image: EyeImage) -> NDArray[Any]:
-    """Counts of an image without the sensor's noise, as with `sensor.noise: false`."""
+    """Compute the counts of an image without the sensor's noise, as with `sensor.noise: false`."""
     from ..rig.exposure import recorded
 
     spec = image.scene.spec
@@ -310,7 +310,7 @@ def stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
 
 
 def eye_motion(frames: Frames, row: int) -> tuple[Floats, Floats]:
-    """Rigid motion x_world = M x + t of the eye of one row: M (3, 3), t (3,) mm."""
+    """Compute the rigid motion x_world = M x + t of the eye of one row: M (3, 3), t (3,) mm."""
     index, pose = frames.index, frames.pose
     one = slice(row, row + 1)
     poses = Poses(pose.azimuth_rad[one], pose.elevation_rad[one], pose.torsion_rad[one])

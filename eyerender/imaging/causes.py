@@ -84,7 +84,7 @@ def budget_steps(
 def _image_steps(
     frames: Frames, seeds: int, renderer: Renderer, progress: Progress | None
 ) -> dict[str, list[Observations]]:
-    """The steps of images; each image is developed, observed and dropped before the next."""
+    """Observe the steps that need images; each image is developed, observed and dropped before the next."""
     observer, sensor = ImageObserver(), frames.scene.spec.sensor
     ideal, own = ideal_scene(frames.scene), _noiseless_scene(frames.scene)
     apart = ideal.spec != own.spec
@@ -115,7 +115,7 @@ def with_stop_centre(observations: Observations) -> Observations:
 
 
 def ideal_scene(scene: Scene) -> Scene:
-    """The scene as an ideal camera sees it: bare eyes, lamps alone, a lens and a sensor without faults."""
+    """Replace the scene's camera by an ideal one: bare eyes, lamps alone, a lens and a sensor without faults."""
     spec, own = scene.spec, scene.spec.sensor
     sensor = own.model_copy(
         update={
@@ -147,7 +147,7 @@ def _noiseless_scene(scene: Scene) -> Scene:
 
 
 def _with_eye(frames: Frames, model: str) -> Frames:
-    """The same targets, fixated by eyes of another model with the same diameter of the stop where the scene sets it."""
+    """Let eyes of another model fixate the same targets, with the scene's pupil diameter where it sets one."""
     scene = frames.scene
     other = Scene.of(scene.spec, base=scene.base, eye=model, source=scene.source)
     found = other.frames()

@@ -41,7 +41,7 @@ class FeatureErrors(ArrayValue):
     glint_found: Bools
 
     def summary(self) -> dict[str, Any]:
-        """Medians, 95th percentiles, maxima and mean vectors in px, and the counts."""
+        """Summarise medians, 95th percentiles, maxima and mean vectors in px, and the counts."""
         return {
             "pupils": {"expected": int(self.pupil_expected.sum()), "found": int(self.pupil_found.sum())},
             "glints": {"expected": int(self.glint_expected.sum()), "found": int(self.glint_found.sum())},
@@ -116,7 +116,7 @@ class Comparison:
 
 
 def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
-    """Errors of `found` against `truth`, row by row.
+    """Compute the errors of `found` against `truth`, row by row.
 
     Raises:
         InputError: the two are not of the same frames and eyes.

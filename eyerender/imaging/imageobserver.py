@@ -1,4 +1,4 @@
-"""The image observer, which reports features found in pixels in the same form as the analytic observer."""
+"""The image observer: it finds features in pixels and reports them in the form of the analytic observer."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from .capture import EyeImage, render_windows
 # Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
 _PLACE_MM = 1.5
 _BATCH = 256
-# A process takes 1 to 1.5 s to start. Two that share images of 20 ms gain that after 100 to 150.
+# A process takes 1 to 1.5 s to start; two processes gain that after 100 to 150 images of 20 ms each.
 LEAST_FOR_POOL = 128
 
 
@@ -100,7 +100,7 @@ class ImageObserver:
         `exposed` turns each image into what the extractor sees, such as another exposure of it.
         """
         parts: list[Observations] = []
-        few: list[Observations] = []  # observations of one row each take ten times the memory of joined ones
+        few: list[Observations] = []  # single observations take ten times the memory of joined ones
         row = 0
         for entry in followed(entries, progress):
             if len(entry.records) == 0:
@@ -232,7 +232,7 @@ class _FileJob:
     lenient: bool
 
     def __call__(self, path: str | Path) -> tuple[tuple[Extraction, ...], tuple[int, int], bool] | InputError:
-        """What was found in a file, its (h, w), and whether it has colour; or why it cannot be read."""
+        """Extract a file's features, with its (h, w) and whether it has colour; or say why it cannot be read."""
         try:
             image, depth, colour = read_any_image(path)
         except InputError as error:
@@ -253,7 +253,7 @@ class _FileJob:
 
 
 def files_of(paths: Sequence[str | Path]) -> list[Path]:
-    """The files of paths of images, or of one folder."""
+    """List the files of paths of images, or of one folder."""
     if len(paths) == 1 and os.path.isdir(paths[0]):
         return [Path(paths[0]) / name for name in image_files(paths[0])]
     return [Path(path) for path in paths]
@@ -278,7 +278,7 @@ def _refuse_inputs(pictures: Sequence[Path], paths: Sequence[str | Path]) -> Non
 
 
 def colour_warning(count: int, what: str) -> InputWarning:
-    """Warning that images or frames have colour."""
+    """Make a warning that images or frames have colour."""
     return InputWarning(
         code="colour", reason=f"{count} {what} in colour; the luminance is taken, but near-infrared images are grey"
     )
@@ -286,7 +286,7 @@ def colour_warning(count: int, what: str) -> InputWarning:
 
 @contextmanager
 def _mapper(processes: int) -> Iterator[Callable[[_FileJob, Sequence[str | Path]], Iterable[Any]]]:
-    """A map of a job over paths, in this process or in several, in the order of the paths."""
+    """Make a map of a job over paths, in this process or in several; results come in the order of the paths."""
     if processes <= 1:
         yield lambda job, paths: map(job, paths)
         return
@@ -305,9 +305,9 @@ def detect(
     """Recover pupils and glints from rendered images, one row for each.
 
     Args:
-        images: what `render` gave; the truth that they carry is not used.
-        rig: replaces the one that was rendered, to identify the glints by.
-        settings: of the extraction.
+        images: images from `render`; their labels are not used.
+        rig: identifies the glints, in place of the rendered rig.
+        settings: settings of the extraction.
     """
     several = [images] if isinstance(images, EyeImage) else images
     told = (replace(image, frame=image.frame.seen_by(rig)) for image in several)
@@ -315,7 +315,7 @@ def detect(
 
 
 def scene_of(folder: ImageFolder) -> Scene:
-    """Scene from which a folder of images was rendered."""
+    """Rebuild the scene from which a folder of images was rendered."""
     source = str(folder.path / DATASET)
     spec = folder.dataset.get("spec")
     if not isinstance(spec, dict):
@@ -326,7 +326,7 @@ def scene_of(folder: ImageFolder) -> Scene:
 
 
 def _scene_of_samples(folder: ImageFolder) -> Scene:
-    """Scene of a generated dataset's first sample, whose cameras and light positions all others must share."""
+    """Rebuild the scene of a dataset's first sample; all others must share its cameras and lights."""
     first: Scene | None = None
     seen: set[str] = set()
     for entry in folder:
@@ -359,7 +359,7 @@ def _parsed(text: Any, source: str) -> Any:
 
 
 def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float) -> tuple[NDArray[Any], Floats]:
-    """Part of an image within `half_px` of a full-sensor point, and its own first pixel on the sensor."""
+    """Cut out the part of an image within `half_px` of a full-sensor point; also return its first pixel."""
     h, w = image.shape
     x0, y0 = np.clip(np.floor(centre_px - corner - half_px), 0, [w - 16, h - 16]).astype(int)
     x1, y1 = np.clip(np.ceil(centre_px - corner + half_px), [x0 + 16, y0 + 16], [w, h]).astype(int)
@@ -369,7 +369,7 @@ def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: flo
 def _lights(
     found: Extraction, corner: Floats, scene: Scene, camera: PinholeCamera, eye_mm: Floats
 ) -> tuple[list[int], Sequence[str | None]]:
-    """Light of each glint (-1: none) and the reason why it has none, from the rig and a rough position of the eye."""
+    """Assign glints to lights (-1: none, with the reason), from the rig and a rough position of the eye."""
     if not found.glints or found.pupil.ellipse is None:
         return [-1] * len(found.glints), ["no pupil to place the reflections by"] * len(found.glints)
     spots = np.array([g.xy_px for g in found.glints]) + corner
@@ -402,7 +402,7 @@ def _observation(
         known["covariance"] = [pupil.covariance]
     spreads = [np.full((2, 2), np.nan) if g.covariance is None else g.covariance for g in glints]
     why = [g.reason or reason for g, reason in zip(glints, reasons, strict=True)]
-    # What was measured in an image is in the image.
+    # A feature that was measured in an image lies in it.
     return Observations(
         index=index,
         pose=PoseTruth(azimuth_rad=np.array([np.nan])),

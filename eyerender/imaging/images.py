@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 PICTURE_FIELDS = frozenset({"image", "sensor", "look", "region", "lens", "motion", "ambient", "seed"})
 """The fields of a scene that change its pictures alone."""
 
-# A renderer keeps what it compiled and built; one for each way of rendering is enough for a notebook.
+# A renderer keeps compiled kernels and scenes; a notebook needs one for each backend and number of threads.
 _renderer = lru_cache(maxsize=1)(make_renderer)
 
 
@@ -45,7 +45,7 @@ class LabelledImage(EyeImage):
     labels: dict[str, Any]
 
     def _repr_png_(self) -> bytes:
-        """The picture as notebooks show it."""
+        """Encode the picture as PNG, for notebooks."""
         return png_bytes(preview(self.counts, self.scene.spec.sensor.full_scale_dn))
 
 
@@ -75,9 +75,9 @@ def render(
         frames: one frame (`frames[0]`), several, or a scene, which stands for all of its frames.
         rig: replaces the one that the frames were made for.
         spp: samples per pixel.
-        backend: what renders.
-        threads: how many processor threads render; None takes all.
-        progress: hears (done, all, "") after each image.
+        backend: the render backend.
+        threads: number of processor threads for rendering; None: all.
+        progress: called with (done, total, "") after each image.
         picture: fields of the scene that change its pictures alone: `image`, `sensor`, `look`, `region`, `lens`,
             `motion`, `ambient`, `seed`.
 
@@ -195,7 +195,7 @@ def auto_exposed(
     """Give a scene one exposure for all of its images, as a camera's automatic exposure settles for a run.
 
     The exposure time is chosen so that `share` of the pixels of a few of its frames, evenly chosen and rendered with
-    few samples, are at most `level` of full scale (linear, black level included). What frames the view does not count.
+    few samples, are at most `level` of full scale (linear, black level included). Frames around the view do not count.
 
     Args:
         scene: the scene.
@@ -221,7 +221,7 @@ def auto_exposed(
 
 
 def settled_exposure_ms(scene: Scene, level: float, renderer: Renderer, *, share: float = 0.98) -> float | None:
-    """The exposure time of `auto_exposed`, ms; None where the images are dark."""
+    """Find the exposure time of `auto_exposed`, ms; None where the images are dark."""
     sensor = scene.spec.sensor
     frames = scene.with_(spp=4).frames()
     count = min(_LOOKED_AT, len(frames))

@@ -1,4 +1,4 @@
-"""Labels of an image: what ray optics predicts, and what the image shows.
+"""Labels of an image: predictions of ray optics, and measurements in the picture.
 
 They contain ellipses, glints, points and lines in space, and matrices.
 
@@ -30,7 +30,7 @@ from .capture import EyeImage, eye_motion
 
 _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
-_FAR_MM = 1e9  # an observer from whom the entrance pupil is 3e-9 of its size larger than from infinity
+_FAR_MM = 1e9  # a distant observer: the entrance pupil looks larger than from infinity by 3e-9 of its size
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -58,7 +58,7 @@ class EyeInWindow:
 
 
 def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
-    """What the image shows of pupil, iris, glints and lids: the labels of a rendered folder.
+    """Measure pupil, iris, glints and lids in the image: the labels of a rendered folder.
 
     Args:
         image: a rendered image, row `image.row` of `truth`.
@@ -82,7 +82,7 @@ def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
 
 
 def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
-    """All labels of an image, with the same keys for every image; the arguments are those of `seen_labels`."""
+    """Make all labels of an image, with the same keys for every image; the arguments are those of `seen_labels`."""
     part, window, seen = image.parts, image.window, seen_labels(image, truth)
     known = known_labels(image.scene, truth, image)
     return {
@@ -108,7 +108,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
 
 
 def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> dict[str, Any]:
-    """Labels that follow from pose and parameters alone, without an image: a part of `image_labels`."""
+    """Compute labels that follow from pose and parameters alone, without an image: a part of `image_labels`."""
     camera = scene.rig.cameras[view.camera]
     return {
         "pupil": {
@@ -134,7 +134,7 @@ def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | E
 
 
 def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
-    """Ellipse with the moments of a mask's pixels, in full-sensor pixels; null numbers where there are none.
+    """Fit the ellipse with the moments of a mask's pixels, in full-sensor pixels; null numbers where there are none.
 
     `pixels` is their number, `cut` whether they touch the window's edge.
     """
@@ -156,7 +156,7 @@ def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
 def visible_arcs_deg(
     part: Bytes, pupil: int, points_px: Floats, origin_px: tuple[int, int], reach_px: float = 1.5
 ) -> list[list[float]]:
-    """Visible arcs [from, to] of the pupil's outline, in degrees about its centre (image x towards y).
+    """Find the visible arcs [from, to] of the pupil's outline, in degrees about its centre (image x towards y).
 
     A point of the outline counts as visible where a pixel of the pupil lies within reach. Points outside the window do
     not. A whole outline is [[0, 360]].
@@ -192,7 +192,7 @@ def visible_arcs_deg(
 
 
 def iris_outline(scene: Scene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
-    """Ellipse of the apparent limbus (`limbus_px`), with a status and a reason where there is none."""
+    """Fit the ellipse of the apparent limbus (`limbus_px`), with a status and a reason where there is none."""
     nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
     pixels, reason = limbus_px(scene, view, _OUTLINE_POINTS)
     if reason is not None:
@@ -210,7 +210,7 @@ def iris_outline(scene: Scene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
 
 
 def limbus_px(scene: Scene, view: EyeInWindow | EyeImage, count: int) -> tuple[Floats, str | None]:
-    """Apparent limbus as points (count, 2) in full-sensor px.
+    """Project the limbus to points (count, 2) in full-sensor px.
 
     The limbus is the circle of the front cornea whose radius is the limbus radius minus half the limbus' width.
 
@@ -236,7 +236,7 @@ def limbus_px(scene: Scene, view: EyeInWindow | EyeImage, count: int) -> tuple[F
 
 @remembered
 def entrance_diameter_mm(eye: EyeModel) -> float | None:
-    """Diameter of the entrance pupil, as a distant observer on the optic axis sees it (circle of equal area).
+    """Compute the diameter of the entrance pupil (circle of equal area), seen from afar on the optic axis.
 
     It is None if a ray from the stop's margin does not leave the eye.
     """
@@ -247,7 +247,7 @@ def entrance_diameter_mm(eye: EyeModel) -> float | None:
 
 
 def cornea_centre(eye: EyeModel) -> Floats:
-    """Centre of curvature of the front cornea at its apex, eye frame, (3,) mm: apex - R axis, R the mean radius."""
+    """Find the centre of curvature of the front cornea at its apex, eye frame, (3,) mm: apex - mean R times axis."""
     surface = eye.front[0]
     apex = float(surface.sag(0.0, 0.0))
     drop = 2 * apex - float(surface.sag(_SAG_STEP_MM, 0.0)) - float(surface.sag(0.0, _SAG_STEP_MM))
@@ -268,7 +268,7 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
 
 
 def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> list[dict[str, Any]]:
-    """Place of each lamp's glint centre by ray optics."""
+    """Compute the place of each lamp's glint centre by ray optics."""
     glints, row = observations.glints, view.row
     out = []
     for k in range(len(scene.rig.lights)):
@@ -289,7 +289,7 @@ def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeIma
 
 
 def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any]:
-    """Visible part of a lamp's glint; it may be visible where the mirror point of the lamp's centre is not."""
+    """Measure the visible part of a lamp's glint, which may exist without a mirror point of the lamp's centre."""
     table = image.rendered.glints
     spot = table.xy_px[k]
     lit = bool(np.isfinite(spot).all())
@@ -308,7 +308,7 @@ def _share(value: float) -> float | None:
 def _space(
     scene: Scene, observations: Observations, view: EyeInWindow | EyeImage, camera: PinholeCamera
 ) -> dict[str, Any]:
-    """Points (mm) and lines in the world and in the camera's frame, and the rotation centres in the head's frame.
+    """List points (mm) and lines in the world and the camera's frame, and rotation centres in the head's frame.
 
     The rotation centres are fixed in the head: where they are in the unrotated eye. (Azimuth turns the eye last, so it
     carries the eye's elevation axis about the azimuth centre.)
@@ -342,7 +342,7 @@ def _space(
 
 
 def _line_of_sight(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> tuple[Floats, Floats]:
-    """Line of sight of the unturned eye: the fixed chief ray, or that of the entrance window."""
+    """Find the line of sight of the unturned eye: the fixed chief ray, or that of the entrance window."""
     index, row = observations.index, view.row
     if scene.spec.eye.line_of_sight == "entrance_window" and np.isfinite(index.target_mm[row]).all():
         place = index.eye_position_mm[[row]] + index.head_mm[[row]]

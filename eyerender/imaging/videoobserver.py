@@ -22,7 +22,7 @@ from .imageobserver import ImageObserver, colour_warning
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoSummary:
-    """How many frames a video has, how many pupils were looked for in them, and how many were found."""
+    """Numbers of a video's frames, of pupils that were searched, and of pupils that were found."""
 
     source: str
     frames: int
@@ -38,7 +38,7 @@ class VideoSummary:
         }  # fmt: skip
 
     def to_text(self) -> str:
-        """A line for people."""
+        """Write a line for people."""
         where = f"; records in {self.records}" if self.records else ""
         return f"{self.source}: {self.frames} frames, pupil found in {self.found} of {self.pupils}{where}"
 
@@ -73,7 +73,7 @@ def observe_video(
 
     Args:
         path: the video.
-        observer: with its settings and gamma.
+        observer: the image observer, with its settings and gamma.
         output: files to write.
         scene: the scene whose rig took the video.
         eyes: 1, or 2 for frames with both eyes, as in `ImageObserver.observe_files`.

@@ -96,12 +96,12 @@ def strokes(frames: Frames, truth: Observations, row: int) -> Strokes:
 
 
 def apex_mm(frames: Frames, row: int) -> Floats:
-    """Apex of the unrotated eye of a row, (3,) mm in the world."""
+    """Compute the apex of the unrotated eye of a row, (3,) mm in the world."""
     return np.asarray(frames.index.eye_position_mm[row] + frames.index.head_mm[row])
 
 
 def circle(centre: Floats, first: Floats, second: Floats, count: int = 48) -> Floats:
-    """Points (count + 1, 3) of a closed ellipse with the given semi-axes."""
+    """Compute points (count + 1, 3) of a closed ellipse with the given semi-axes."""
     angle = np.linspace(0, 2 * np.pi, count + 1)[:, None]
     return np.asarray(centre + np.cos(angle) * first + np.sin(angle) * second)
 
@@ -127,7 +127,7 @@ def _camera(
 
 
 def _corners(camera: PinholeCamera, window: Window, depth_mm: float) -> Floats:
-    """Corners (5, 3) of a window at a depth before a camera, closed."""
+    """Compute the corners (5, 3) of a window at a depth before a camera, closed."""
     x0, y0, w, h = window
     left, top, right, bottom = x0 - 0.5, y0 - 0.5, x0 + w - 0.5, y0 + h - 0.5
     rays = camera.rays(np.array([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]))
@@ -200,7 +200,7 @@ def _eye(out: Strokes, frames: Frames, row: int, *, shown: bool) -> None:
 
 
 def _globe(eye: EyeModel) -> list[Floats]:
-    """Circles of latitude about the optic axis and half circles of longitude, behind the limbus, eye frame."""
+    """Make circles of latitude about the optic axis and half circles of longitude, behind the limbus, eye frame."""
     centre, radius = np.asarray(eye.sclera.centre_mm, dtype=float), float(eye.sclera.radius_mm)
     start = np.arcsin(min(1.0, float(eye.limbus_radius_mm) / radius))
     out = []
@@ -216,7 +216,7 @@ def _globe(eye: EyeModel) -> list[Floats]:
 
 
 def _on_cornea(eye: EyeModel, points: Floats) -> Floats:
-    """Points of the front cornea over local (y, z), eye frame."""
+    """Compute points of the front cornea over local (y, z), eye frame."""
     front = eye.front[0]
     local = np.array(points, dtype=float)
     local[:, 0] = front.sag(local[:, 1], local[:, 2])
@@ -240,14 +240,14 @@ def _rays(out: Strokes, frames: Frames, truth: Observations, row: int) -> None:
 
 
 def _hit(eye: EyeModel, M: Floats, t: Floats, origin: Floats, direction: Floats) -> Floats:
-    """Where a ray of the world meets the front cornea of a posed eye, (3,) mm; NaN where it does not."""
+    """Find where a ray of the world meets the front cornea of a posed eye, (3,) mm; NaN where it does not."""
     start, way = (origin - t) @ M, direction @ M
     distance, ok = eye.front[0].intersect(start, way)
     return np.asarray(origin + direction * distance if ok else np.full(3, np.nan))
 
 
 def extent_mm(drawn: Strokes, eye_mm: Floats) -> tuple[Floats, float]:
-    """Middle (3,) and radius of a ball that holds the drawing, without what is more than 2 m from an eye."""
+    """Find middle (3,) and radius of a ball around the drawing, without what is more than 2 m from an eye."""
     points = drawn.ends_mm.reshape(-1, 3)
     points = points[np.linalg.norm(points - eye_mm, axis=1) < FAR_MM]
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -255,5 +255,5 @@ def extent_mm(drawn: Strokes, eye_mm: Floats) -> tuple[Floats, float]:
 
 
 def colours_of(names: Sequence[str]) -> Floats:
-    """Colours "#rrggbb" as numbers (n, 3) from 0 to 1."""
+    """Convert colours "#rrggbb" to numbers (n, 3) from 0 to 1."""
     return np.array([[int(name[k : k + 2], 16) / 255 for k in (1, 3, 5)] for name in names]).reshape(-1, 3)

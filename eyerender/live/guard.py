@@ -68,7 +68,7 @@ class Guard:
         await self._app({**scope, "headers": headers, "root_path": f"/{self._token}"}, receive, _hardened(send))
 
     def refusal(self, scope: Scope) -> str | None:
-        """Why a request is refused; None where it may pass."""
+        """Say why a request is refused; None where it may pass."""
         headers: dict[bytes, list[str]] = {}
         for name, value in scope["headers"]:
             headers.setdefault(name.lower(), []).append(value.decode("latin-1"))

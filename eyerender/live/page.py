@@ -175,7 +175,7 @@ class Tab:
             self._loop.call_soon_threadsafe(self._receive, shown)
 
     def wake(self) -> None:
-        """Order a picture: the page has connected, for the first time or again."""
+        """Order a picture, because the page has connected, for the first time or again."""
         self.woken = self._awake = True
         self._studio.painter.open(self.key, self._deliver)
         self._order()
@@ -491,7 +491,7 @@ AXES = ("x, to the screen", "y, to the subject's left", "z, up")
 
 
 def _round_up(value: float) -> float:
-    """The next of 1, 2 or 5 times a power of ten."""
+    """Round up to 1, 2 or 5 times a power of ten."""
     power = 10 ** np.floor(np.log10(value))
     return float(power * next(k for k in (1, 2, 5, 10) if k * power >= value * 0.999))
 
@@ -504,7 +504,7 @@ def _set_place(knobs: list[Knob], place_mm: Any, apex: Any) -> None:
 
 
 def _unplaced(error: EyerenderError) -> EyerenderError:
-    """The error without the file of the scene, which says nothing of what a knob set."""
+    """Remove the file of the scene from an error, because it says nothing about what a knob set."""
     return InputError(error.reason, path=error.path) if isinstance(error, InputError) else error
 
 

@@ -132,7 +132,7 @@ class Pace:
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=3))
 
     def coarse(self, pixels: int) -> int:
-        """Side of the pixels of a preview of a window with so many pixels."""
+        """Choose how many sensor pixels wide the pixels of a preview are, for a window with so many pixels."""
         return math.ceil(math.sqrt(pixels / self.pixels))
 
     def took(self, seconds: float) -> None:
@@ -254,12 +254,12 @@ class Painter:
         return None
 
     def _busy(self, tab: _Tab, canvas: _Canvas) -> bool:
-        """Whether something is more urgent than a pass of this canvas."""
+        """Return whether something is more urgent than a pass of this canvas."""
         with self._changed:
             return self._stopped or tab.canvas is not canvas or any(other.fresh for other in self._tabs.values())
 
     def _preview(self, renderer: Renderer, canvas: _Canvas) -> Iterator[Shown]:
-        """The first picture of an order at once, and then with what was found in it."""
+        """Show the first picture of an order at once, and then with the features that were found in it."""
         frame = canvas.order.frame
         check_windows(frame.scene)
         job = _job(frame, 0)
@@ -279,7 +279,7 @@ class Painter:
             yield replace(shown, found=detect(image))
 
     def _pass(self, renderer: Renderer, tab: _Tab, canvas: _Canvas) -> Iterator[Shown]:
-        """One pass over the window, in bands; nothing where it was interrupted."""
+        """Render one pass over the window, in bands; an interrupted pass changes nothing."""
         frame = canvas.order.frame
         job = _job(frame, canvas.samples + 1)
         x0, y0, width, height = job.window
@@ -305,7 +305,7 @@ class Painter:
 
 
 def coarser(job: RenderJob, side: int) -> RenderJob:
-    """The same window with pixels that are `side` times as wide, as if the sensor had such pixels.
+    """Make pixels of a window `side` times as wide, as if the sensor had such pixels.
 
     Pixel centres lie at integers, so pixel u of the window holds the pixels side u to side u + side - 1.
     """
@@ -328,7 +328,7 @@ def coarser(job: RenderJob, side: int) -> RenderJob:
 
 
 def enlarged(picture: NDArray[Any], side: int, size_px: tuple[int, int]) -> Floats:
-    """A picture (h, w) with coarse pixels in the size of a whole one, smoothly between their centres."""
+    """Enlarge a picture (h, w) with coarse pixels to full size, interpolating between pixel centres."""
     if side == 1:
         return np.asarray(picture, dtype=float)
     width, height = size_px
@@ -338,7 +338,7 @@ def enlarged(picture: NDArray[Any], side: int, size_px: tuple[int, int]) -> Floa
 
 
 def _job(frame: Frames, draw: int) -> RenderJob:
-    """The job of a pass, with samples of its own; what `developed` does to the whole picture is left out."""
+    """Make the job of a pass, with its own samples and without what `developed` does to the whole picture."""
     job = render_job(frame, 0)
     seed = int(np.random.SeedSequence([job.seed, draw]).generate_state(1, np.uint64)[0])
     quiet = job.sensor.model_copy(update={"noise": False, "border_px": (0, 0, 0, 0)})
@@ -347,7 +347,7 @@ def _job(frame: Frames, draw: int) -> RenderJob:
 
 
 def developed(job: RenderJob, irradiance: Floats) -> tuple[Reals, NDArray[np.uint16]]:
-    """Irradiance (h, w) and codes of the sensor for the mean of all passes of a job.
+    """Compute irradiance (h, w) and codes of the sensor from the mean of all passes of a job.
 
     Vignetting, openings, scattered light and the sensor belong to the window as a whole, so bands and coarse pixels
     are rendered without them.
@@ -359,7 +359,7 @@ def developed(job: RenderJob, irradiance: Floats) -> tuple[Reals, NDArray[np.uin
 
 
 def _image(canvas: _Canvas, job: RenderJob, done: RenderedWindow, irradiance: Floats) -> EyeImage:
-    """The picture of a canvas as the sensor stores it, for the extractor."""
+    """Make the picture of a canvas as the sensor stores it, for the extractor."""
     frame = canvas.order.frame
     behind, codes = developed(render_job(frame, 0), irradiance)
     return EyeImage(
@@ -398,7 +398,7 @@ def _shown(
 
 @lru_cache(maxsize=4)
 def _tones(full_scale: int) -> Bytes:
-    """The grey level of the screen for each code of a sensor."""
+    """Compute the grey level of the screen for each code of a sensor."""
     return preview(np.arange(full_scale + 1), full_scale)
 
 
@@ -410,7 +410,7 @@ def _encoded(pixels: Bytes, kind: str) -> bytes:
 
 
 def line_of(error: Exception) -> str:
-    """One line for an error."""
+    """Write one line for an error."""
     if isinstance(error, EyerenderError):
         return one_line(str(error), MAX_REASON)
     if isinstance(error, MemoryError):

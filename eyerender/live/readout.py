@@ -1,4 +1,4 @@
-"""What the page says in numbers and reasons: the table of features, and the error of gaze."""
+"""Numbers and reasons on the page: the table of features, and the gaze error."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def calibrated(setup: Setup) -> Regression | None:
 
 
 def gaze_line(setup: Setup, estimator: Regression | None, truth: Observations, found: Observations | None) -> str:
-    """What a regression that was calibrated on this rig errs at the shown target, from either observer's features."""
+    """State the gaze error of a regression calibrated on this rig at the shown target, for both observers."""
     if estimator is None:
         return "Gaze error: this scene has no screen with targets that determine a regression."
     if not np.isfinite(truth.index.target_mm).all():
@@ -54,12 +54,12 @@ def gaze_line(setup: Setup, estimator: Regression | None, truth: Observations, f
 
 
 def feature_table(truth: Observations, found: Observations | None, hidden: tuple[str, ...]) -> str:
-    """An HTML table of the pupil and the glints of one row: by ray optics, in the rendered scene, and extracted.
+    """Make an HTML table of pupil and glints of one row: by ray optics, in the rendered scene, and extracted.
 
     Args:
         truth: what the analytic observer reports, one row.
         found: what the image observer reports, one row; None where it was not asked.
-        hidden: what hides the glint of each light in the scene ("" or "visible" for nothing).
+        hidden: what hides the glint of each light in the scene ("" or "visible" if nothing does).
     """
     rows = [_pupil_row(truth, found)]
     for k, light in enumerate(truth.glints.light[0]):
@@ -87,7 +87,7 @@ def _glint_row(truth: Observations, found: Observations | None, k: int, light: i
 
 
 def _row(name: str, exact: tuple[Any, Any], hidden: str, seen: tuple[Any, Any]) -> str:
-    """A row: place and reason by ray optics, what hides it in the scene, and place and reason of the extractor."""
+    """Make a row: place and reason by ray optics, what hides it in the scene, place and reason of the extractor."""
     (place, _), (found, _) = exact, seen
     apart = f"{np.hypot(*(np.asarray(found) - place)):.2f}" if place is not None and found is not None else ""
     scene = "" if hidden in ("", "visible") else html.escape(hidden)

@@ -80,7 +80,7 @@ class RigView:
 
 
 def _packed(drawn: Strokes) -> list[str]:
-    """Ends, colours and widths as little-endian single floats in base64."""
+    """Encode ends, colours and widths as little-endian single floats in base64."""
     parts = (_CM * drawn.ends_mm, colours_of(drawn.colours), np.array(drawn.widths))
     return [base64.b64encode(np.ascontiguousarray(part, "<f4").tobytes()).decode() for part in parts]
 

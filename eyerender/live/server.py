@@ -49,7 +49,7 @@ def serve(
         port: the port; 0 takes a free one.
         backend: the render backend.
         threads: processor threads for rendering; None: all.
-        announce: is told the address, with its token, when the page can be opened.
+        announce: called with the address (with its token) as soon as the page can be opened.
 
     Raises:
         InputError: the port is taken.
@@ -82,7 +82,7 @@ def _end() -> NoReturn:
 
 @contextlib.contextmanager
 def _listening(port: int) -> Iterator[socket.socket]:
-    """A socket that listens on the loopback alone."""
+    """Open a socket that listens on the loopback alone."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

@@ -43,7 +43,7 @@ class Setup:
 
     @classmethod
     def of(cls, scene: Scene) -> Self:
-        """The first frame of a scene."""
+        """Start with the first frame of a scene."""
         spec = scene.spec
         # Eyes that respond to all targets must not respond to the one that is shown.
         if spec.person is not None or spec.subject.accommodation_d == "targets":
@@ -65,11 +65,11 @@ class Setup:
         return np.asarray(self.scene.eye_position_mm(self.eye) + head)
 
     def frames(self) -> Frames:
-        """All frames of the shown fixation: a row for each camera and eye."""
+        """Make all frames of the shown fixation: a row for each camera and eye."""
         return self.scene.frames()
 
     def row(self, frames: Frames) -> int:
-        """The row of `frames` that is shown."""
+        """Find the row of `frames` that is shown."""
         index = frames.index
         return int(np.flatnonzero((index.camera == self.camera) & (index.eye == EYES.index(self.eye)))[0])
 
@@ -136,7 +136,7 @@ class Setup:
         return self.changed({f"rig.cameras.{camera}.{key}": focal_length})
 
     def focal_length(self, camera: int) -> tuple[str, float | None]:
-        """Key and value of a camera's focal length; the value is None where a calibration gives the lens."""
+        """Return key and value of a camera's focal length; the value is None where a calibration gives the lens."""
         spec = self.scene.spec.rig.cameras[camera]
         key = "focal_length_px" if spec.focal_length_mm is None else "focal_length_mm"
         return key, getattr(spec, key)
@@ -161,7 +161,7 @@ class Setup:
         )
 
     def saved(self) -> SceneSpec:
-        """The spec to save: what the knobs changed, with all fixations and head positions of the loaded scene.
+        """Make the spec to save: what the knobs changed, with all fixations and head positions of the loaded scene.
 
         A gaze that the user has set takes the place of the fixations. Files are absolute paths, so the scene means the
         same in every folder.
@@ -181,7 +181,7 @@ class Setup:
         return SceneSpec.from_mapping(data)
 
     def with_all_targets(self) -> Scene | None:
-        """The scene with all targets of the loaded one, on the present screen; None where that gives poses."""
+        """Restore all targets of the loaded scene, on the present screen; None where it gives poses."""
         if self.origin.targets is None:
             return None
         spec = self.scene.spec.model_copy(update={"targets": self.origin.targets, "poses": None})
@@ -191,18 +191,18 @@ class Setup:
         return replace(self, scene=self.scene.with_(rig=rig))
 
     def _targets(self) -> Any:
-        """Targets of the loaded scene on the present screen, (f, 3); None where it gives poses."""
+        """List the targets of the loaded scene on the present screen, (f, 3); None where it gives poses."""
         scene = self.with_all_targets()
         return None if scene is None else scene.targets_mm
 
 
 def named(cameras: tuple[Camera, ...]) -> list[str]:
-    """Names of cameras for people: number and name."""
+    """Name cameras for people: number and name."""
     return [f"{k}: {camera.name}" for k, camera in enumerate(cameras)]
 
 
 def directions(setup: Setup) -> EyeDirection:
-    """The direction of the optic axis of the shown eye, rounded to what a knob can show."""
+    """Return the direction of the optic axis of the shown eye, rounded to what a knob can show."""
     frames = setup.frames()
     row = setup.row(frames)
     azimuth, elevation = np.degrees([frames.pose.azimuth_rad[row], frames.pose.elevation_rad[row]])

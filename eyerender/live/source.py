@@ -42,7 +42,7 @@ def python_source(spec: SceneSpec) -> str:
 
 
 def _value(value: Any, depth: int) -> str:
-    """Python text of a value that begins `depth` levels deep."""
+    """Write a value that begins `depth` levels deep as Python text."""
     if isinstance(value, Spec):
         name = type(value).__name__
         if name not in eyerender.__all__:
@@ -64,7 +64,7 @@ def _fields(spec: Spec, depth: int) -> list[str]:
 
 
 def _pairs(spec: Spec, depth: int) -> list[tuple[str, str]]:
-    """(key, "key=value") of the fields that differ from their defaults."""
+    """List (key, "key=value") of the fields that differ from their defaults."""
     out = []
     for key, field in type(spec).model_fields.items():
         value = getattr(spec, key)
@@ -78,7 +78,7 @@ def _call(name: str, values: list[str], fields: list[str], depth: int) -> str:
 
 
 def _joined(start: str, items: list[str], end: str, depth: int) -> str:
-    """Items on one line where they fit, else each on a line of its own."""
+    """Join items on one line where they fit, else write each on its own line."""
     line = start + ", ".join(items) + end
     if len(line) + 4 * depth + 20 <= _WIDTH and "\n" not in line:
         return line

@@ -25,34 +25,34 @@ _TAIL = 60.0  # in units of d, beyond all light
 
 
 def half_space_length_mm(albedo: float, scattering_per_mm: float) -> float:
-    """Length d (mm) of a thick tissue of diffuse reflectance `albedo`: (2.52 rho - 0.045) / mu'."""
+    """Compute the length d (mm) of a thick tissue of diffuse reflectance `albedo`: (2.52 rho - 0.045) / mu'."""
     return max(2.52 * albedo - 0.045, 0.05) / scattering_per_mm
 
 
 def slab_length_mm(albedo: float, scattering_per_mm: float) -> float:
-    """Length d (mm) of a thin layer before a dark one, of diffuse reflectance `albedo`: (2.53 rho - 0.12) / mu'."""
+    """Compute the length d (mm) of a thin layer of reflectance `albedo` before a dark one: (2.53 rho - 0.12) / mu'."""
     return max(2.53 * albedo - 0.12, 0.05) / scattering_per_mm
 
 
 def share_within(r: Floats | float) -> Floats:
-    """Share of the light that leaves within a distance r, in units of d: 1 - exp(-r) / 4 - 3 exp(-r / 3) / 4."""
+    """Compute the share of light that leaves within r, in units of d: 1 - exp(-r) / 4 - 3 exp(-r / 3) / 4."""
     r = np.asarray(r, dtype=float)
     return np.asarray(1 - 0.25 * np.exp(-r) - 0.75 * np.exp(-r / 3))
 
 
 def radius_of(share: float) -> float:
-    """Distance, in units of d, within which a share of the light leaves."""
+    """Find the distance, in units of d, within which a share of the light leaves."""
     return float(brentq(lambda r: float(share_within(r)) - share, 0.0, _TAIL))
 
 
 @lru_cache(maxsize=8)
 def rings(count: int) -> Floats:
-    """Radii (count,), in units of d, of rings that stand for equal shares of the light: each at its own median."""
+    """Compute radii (count,), in units of d, of rings with equal shares of the light, each at its median."""
     return frozen([radius_of((k + 0.5) / count) for k in range(count)])
 
 
 def transmitted(albedo: float, scattering_per_mm: float) -> float:
-    """Coefficient k (1/mm) of the light exp(-k t) that a layer of thickness t passes on to the tissue behind it.
+    """Compute k (1/mm) of the share exp(-k t) of light that a layer of thickness t passes on to the tissue behind it.
 
     Fitted to Monte Carlo simulations of layers 0.5 to 3.5 mm thick, albedos of a half space from 0.3 to 0.7.
     """

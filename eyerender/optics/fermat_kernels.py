@@ -31,18 +31,18 @@ STEPS = 6
 SETTLED_MM = 2e-6
 """Newton is quadratic here, an error e leaves 0.1 to 0.5 e^2: after a last step this small it is some 1e-12 mm."""
 SURE_MM = 1e-11
-"""A path that its traced ray confirms to this is taken as found; rounding stays well below."""
+"""Largest miss (mm) of the traced ray at which a path counts as found; rounding stays well below."""
 RESIDUAL_LIMIT_MM = 1e-9
-"""A ray that misses its end by more is no solution."""
+"""Largest miss (mm) of any solution."""
 FAR_MM = 1000.0
-"""By how much a ray misses an end farther than this from the last surface is measured at this distance.
+"""For an end farther than this (mm) from the last surface, the miss is measured at this distance.
 
 One rounding of the direction moves a ray by 1e-7 mm at 1e9 mm. What counts is the direction: a residual of 1e-9 mm
 is 1e-12 rad for every end that is farther, up to infinity.
 """
 EXIT, WAY, END, RESIDUAL, GUESS, RESULTS = 0, 3, 6, 9, 10, 13
 """Rows of a result: the point on the outermost surface, the direction to it from the viewpoint, the direction in the
-last medium, by how much the traced ray misses (mm), and the point from which a mirror point is searched.
+last medium, the miss of the traced ray (mm), and the first guess of a mirror point.
 """
 FOUND, OUTSIDE, LOST = int(Status.OK), int(Status.OUTSIDE_LIMBUS), int(Status.NOT_CONVERGED)
 """Statuses of a ray: found, beyond the rim of the outermost surface, and not found (yet)."""
@@ -64,7 +64,7 @@ ROWS = COPY + COLUMNS
 
 @inlined
 def point_at(points, i, k):  # type: ignore[no-untyped-def]
-    """Point k of row i of points (3, 1 or n, 1 or m)."""
+    """Return point k of row i of points (3, 1 or n, 1 or m)."""
     row, column = min(i, points.shape[1] - 1), min(k, points.shape[2] - 1)
     return points[0, row, column], points[1, row, column], points[2, row, column]
 
@@ -90,7 +90,7 @@ def load(numbers, ladder, viewpoint, target, first, count, columns, nodes):  # t
 
 @inlined
 def evaluate(kinds, numbers, table, j, first, count, columns, nodes):  # type: ignore[no-untyped-def]
-    """Height, slopes and second derivatives at the (y, z) of node j."""
+    """Compute height, slopes and second derivatives at the (y, z) of node j."""
     w = nodes[j]
     for lane in range(LANES):
         found = smooth_jet(w[COPY:, lane], w[Y, lane], w[Z, lane])
@@ -108,7 +108,7 @@ def evaluate(kinds, numbers, table, j, first, count, columns, nodes):  # type: i
 
 @merged
 def paraxial_start(kinds, numbers, table, first, count, columns, nodes):  # type: ignore[no-untyped-def]
-    """First guesses (y, z) on each surface.
+    """Guess the start (y, z) on each surface.
 
     On the outermost surface the guess is the straight line's point, moved by m = 1 / (1 - d (n - 1) / (n R)) away from
     the line through the viewpoint and the centre of curvature, which is not refracted; d is the object's depth, n its
@@ -156,7 +156,7 @@ def paraxial_start(kinds, numbers, table, first, count, columns, nodes):  # type
 
 @inlined
 def aim(nodes, j):  # type: ignore[no-untyped-def]
-    """Direction and weight of the segment from node j to the next."""
+    """Compute direction and weight of the segment from node j to the next."""
     for lane in range(LANES):
         dx = nodes[j + 1, X, lane] - nodes[j, X, lane]
         dy = nodes[j + 1, Y, lane] - nodes[j, Y, lane]
@@ -168,7 +168,7 @@ def aim(nodes, j):  # type: ignore[no-untyped-def]
 
 @inlined
 def block(nodes, j):  # type: ignore[no-untyped-def]
-    """Gradient and Hessian of the optical length by the (y, z) of node j, less what the node before eliminates."""
+    """Compute gradient and Hessian of the optical length by (y, z) of node j, with the node before eliminated."""
     for lane in range(LANES):
         hy, hz = nodes[j, SLOPE_Y, lane], nodes[j, SLOPE_Z, lane]
         n, m = nodes[j - 1, INDEX, lane], nodes[j, INDEX, lane]
@@ -198,7 +198,7 @@ def block(nodes, j):  # type: ignore[no-untyped-def]
 
 @inlined
 def couple(nodes, j):  # type: ignore[no-untyped-def]
-    """Coupling C of node j with the next one, and K = B^-1 C."""
+    """Compute the coupling C of node j with the next one, and K = B^-1 C."""
     for lane in range(LANES):
         v = nodes[j, WEIGHT, lane]
         dx, dy, dz = nodes[j, D_X, lane], nodes[j, D_Y, lane], nodes[j, D_Z, lane]
@@ -239,7 +239,7 @@ def step(nodes, j, innermost):  # type: ignore[no-untyped-def]
 
 @merged
 def solve(kinds, numbers, table, first, count, columns, nodes):  # type: ignore[no-untyped-def]
-    """Newton on all surfaces: the block-tridiagonal system is eliminated inwards and solved outwards."""
+    """Run Newton on all surfaces: eliminate the block-tridiagonal system inwards and solve it outwards."""
     last = nodes.shape[0] - 1
     moving = LANES
     for turn in range(STEPS + 1):
@@ -331,7 +331,7 @@ def meet(kinds, numbers, table, j, first, count, columns, nodes):  # type: ignor
 
 @inlined
 def axis_distance(numbers, i, x, y, z):  # type: ignore[no-untyped-def]
-    """Distance of a point from the axis of the outermost surface."""
+    """Compute the distance of a point from the axis of the outermost surface."""
     x, y, z = x - numbers[i, 0, ORIGIN], y - numbers[i, 0, ORIGIN + 1], z - numbers[i, 0, ORIGIN + 2]
     along = x * numbers[i, 0, AXIS] + y * numbers[i, 0, AXIS + 1] + z * numbers[i, 0, AXIS + 2]
     return np.sqrt(max(x * x + y * y + z * z - along * along, 0.0))
@@ -368,7 +368,7 @@ def store(numbers, rims, reflects, first, columns, nodes, out, state):  # type: 
 
 @merged
 def mirror_start(kinds, numbers, table, rims, first, count, columns, nodes, out, state):  # type: ignore[no-untyped-def]
-    """First guesses of mirror points: where the bisectors through the apex' centre of curvature meet the surface.
+    """Guess mirror points: where the bisectors through the centre of curvature of the apex meet the surface.
 
     They are exact on a sphere for source and viewpoint at infinity. A ray is OUTSIDE whose guess is far outside the rim
     or on a bisector that does not point to the front: its mirror point cannot be on the surface.

@@ -96,7 +96,7 @@ class GradientMedium(ArrayValue):
         return cls(centre_mm, np.stack(matrices), np.stack(vectors), np.array(core), np.array(core - edge))
 
     def index_at(self, points_mm: npt.ArrayLike) -> Floats:
-        """Refractive index n at points (..., 3) of the lens; (n, ..., 3) for a batch of n media."""
+        """Compute the refractive index n at points (..., 3) of the lens; (n, ..., 3) for a batch of n media."""
         points = np.moveaxis(np.asarray(points_mm, dtype=np.float64), -1, 0)
         front, back = self._halves(points.ndim - 1)
         seen = points - _first(self.centre_mm, points.ndim - 1)
@@ -168,7 +168,7 @@ class GradientMedium(ArrayValue):
         return Passage(hit, _xyz(end), rays.optical_path_mm, out_moves, out_turns)
 
     def _halves(self, ndim: int) -> tuple[_Half, _Half]:
-        """Front and back with parameters that broadcast with components (3, ...) of `ndim` further axes."""
+        """Return front and back with parameters that broadcast with components (3, ...) of `ndim` further axes."""
         core, fall = (np.asarray(fit(value, ndim)) for value in (self.core, self.fall))
         front, back = (
             _Half(
@@ -182,7 +182,7 @@ class GradientMedium(ArrayValue):
         return front, back
 
     def take(self, index: Indices) -> GradientMedium:
-        """Media of the batch at `index`; a single medium is returned as it is."""
+        """Select media of the batch by `index`; a single medium is returned as it is."""
         return self if self.core.ndim == 0 else GradientMedium(*(part[index] for part in self._parts()))
 
     def mirrored(self) -> GradientMedium:
@@ -228,11 +228,11 @@ class _Half(NamedTuple):
         return np.asarray(self.core - self.fall * (here.size * here.size))
 
     def pull(self, here: _Size) -> Floats:
-        """Acceleration grad(n^2 / 2) = -2 n (n_core - n_edge) p grad p."""
+        """Compute the acceleration grad(n^2 / 2) = -2 n (n_core - n_edge) p grad p."""
         return np.asarray(-2.0 * self.fall * self.index_of(here) * here.size * here.slope)
 
     def bend(self, here: _Size, move: Floats) -> Floats:
-        """Derivative of the pull along `move`."""
+        """Compute the derivative of the pull along `move`."""
         index, slope = self.index_of(here), here.slope
         rise = _dot(slope, move)
         # s times (grad grad p) move
@@ -274,13 +274,13 @@ def _to_ridge(rays: _Rays, first: _Half, last: _Half, steps: int) -> _Rays:
 
 
 def _to_go(place: Floats, speed: Floats, first: _Half, last: _Half) -> Floats:
-    """Newton's step in time to the ridge."""
+    """Compute Newton's step in time to the ridge."""
     a, b = first.at(place), last.at(place)
     return np.asarray((b.size - a.size) * _per_time(a.slope - b.slope, speed))
 
 
 def _per_time(slope: Floats, speed: Floats) -> Floats:
-    """Inverse rate 1 / (slope . speed), or 0 where both halves are the same sphere and any point may be the ridge."""
+    """Invert the rate slope . speed; 0 where both halves are the same sphere and any point may be the ridge."""
     rate = _dot(slope, speed)
     return np.where(np.abs(rate) > 1e-9, 1.0 / rate, 0.0)
 

@@ -25,10 +25,10 @@ def reflect(direction: Xyz, normal: Xyz) -> Xyz:
 
 
 def refract(direction: Xyz, normal: Xyz, n_before: FloatLike, n_after: FloatLike) -> tuple[Xyz, Bools]:
-    """Snell's law: w = eta d + (eta c - c2) N, eta = n_before / n_after, c = -d.N, c2 = sqrt(1 - eta^2 (1 - c^2)).
+    """Refract by Snell's law: w = eta d + (eta c - c2) N, c = -d.N, c2 = sqrt(1 - eta^2 (1 - c^2)).
 
     Args:
-        direction: unit directions d of travel.
+        direction: unit directions d of travel. (eta is n_before / n_after.)
         normal: unit normals N to either side; the side against d is used.
         n_before: index before the interface.
         n_after: index behind it.
@@ -61,7 +61,7 @@ class FresnelShares(NamedTuple):
 def fresnel(
     cosine_incidence: npt.ArrayLike, n_before: FloatLike, n_after: FloatLike, n_film: FloatLike | None = None
 ) -> FresnelShares:
-    """Fresnel's R_s = ((n1 c1 - n2 c2) / (n1 c1 + n2 c2))^2, R_p = ((n2 c1 - n1 c2) / (n2 c1 + n1 c2))^2.
+    """Compute R_s = ((n1 c1 - n2 c2) / (n1 c1 + n2 c2))^2 and R_p = ((n2 c1 - n1 c2) / (n2 c1 + n1 c2))^2.
 
     Both are 1 at total reflection. Source: Born & Wolf 1999, Principles of Optics, 1.5.2 eq. (21) and (33).
 
@@ -91,7 +91,7 @@ def fresnel(
 
 
 def _stacked(first: Floats, second: Floats) -> Floats:
-    """Reflected share of two parallel interfaces; exactly 1 where either reflects all."""
+    """Compute the reflected share of two parallel interfaces; exactly 1 where either reflects all."""
     both = first * second
     total = (first >= 1.0) | (second >= 1.0)
     through = np.where(total, 1.0, 1.0 - both)
@@ -99,21 +99,21 @@ def _stacked(first: Floats, second: Floats) -> Floats:
 
 
 def dot(a: Xyz, b: Xyz) -> Floats:
-    """Scalar product a.b."""
+    """Compute the scalar product a.b."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def unit(vector: Xyz) -> Xyz:
-    """Unit vector v / |v|."""
+    """Compute the unit vector v / |v|."""
     scale = 1.0 / np.sqrt(dot(vector, vector))
     return vector[0] * scale, vector[1] * scale, vector[2] * scale
 
 
 def minus(a: Xyz, b: Xyz) -> Xyz:
-    """Difference a - b."""
+    """Compute the difference a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 def moved(point: Xyz, way: Xyz, distance: FloatLike) -> Xyz:
-    """Point p + t w at the distance t along w."""
+    """Compute the point p + t w at the distance t along w."""
     return point[0] + distance * way[0], point[1] + distance * way[1], point[2] + distance * way[2]

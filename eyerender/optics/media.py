@@ -13,7 +13,7 @@ class ConstantMedium:
     n: float
 
     def index(self, wavelength_nm: float) -> float:
-        """Index n, whatever the wavelength."""
+        """Return the index n, whatever the wavelength."""
         del wavelength_nm
         return self.n
 
@@ -28,7 +28,7 @@ class CauchyMedium:
     c3: float
 
     def index(self, wavelength_nm: float) -> float:
-        """Index at a vacuum wavelength (nm)."""
+        """Compute the index at a vacuum wavelength (nm)."""
         inverse = 1.0 / (wavelength_nm * wavelength_nm)
         return self.c0 + inverse * (self.c1 + inverse * (self.c2 + inverse * self.c3))
 
@@ -41,7 +41,7 @@ class SellmeierMedium:
     offset: float = 0.0
 
     def index(self, wavelength_nm: float) -> float:
-        """Index at a vacuum wavelength (nm)."""
+        """Compute the index at a vacuum wavelength (nm)."""
         square = 1e-6 * wavelength_nm * wavelength_nm
         return self.offset + math.sqrt(1.0 + sum(a * square / (square - b) for a, b in self.pairs))
 

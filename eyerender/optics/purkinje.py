@@ -71,7 +71,7 @@ def purkinje_path(
     gradient: GradientMedium | None = None,
     n_outside: float = 1.0,
 ) -> tuple[Crossing, ...]:
-    """Crossings of a ray that the innermost of `surfaces` reflects.
+    """List the crossings of a ray that the innermost of `surfaces` reflects.
 
     Args:
         surfaces: outside in; the last one reflects.
@@ -122,7 +122,7 @@ def purkinje_points(
     gradient: GradientMedium | None = None,
     n_outside: float = 1.0,
 ) -> PurkinjePoints:
-    """Reflection at the innermost of `surfaces`, refraction at the others on the way in and out.
+    """Find rays that the innermost of `surfaces` reflects and the others refract on the way in and out.
 
     The status is NO_MIRROR_POINT where the image, followed from the axis, ends before source and viewpoint reach their
     places, or where it lies beyond the rim of the reflecting surface.
@@ -172,7 +172,7 @@ class _Route:
     source: Floats
 
     def at(self, t: Floats, rows: Indices) -> tuple[Floats, Floats]:
-        """Viewpoints and sources of `rows` at t."""
+        """Compute viewpoints and sources of `rows` at t."""
         apex = np.broadcast_to(self.apex, self.source.shape)[rows]
         axis = np.broadcast_to(self.axis, self.source.shape)[rows]
         along, left = t[:, None], 1.0 - t[:, None]

@@ -175,7 +175,7 @@ class RayTube(NamedTuple):
 
 
 def ray_tube(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction: Xyz, target: Xyz) -> RayTube:
-    """Tube of rays around a known ray (see the module).
+    """Compute the tube of rays around a known ray (see the module).
 
     Args:
         path: the crossings, in order.
@@ -288,7 +288,7 @@ def _shoot(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction:
 
 
 def _stepped(direction: Xyz, shot: _Shot, fraction: Floats | float) -> Xyz:
-    """Newton's next direction, or a fraction of the way to it."""
+    """Compute the next direction: Newton's, or a fraction of the way to it."""
     a1, a2 = shot.tubes
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = fraction / shot.determinant
@@ -338,7 +338,7 @@ def _rescue(
 def _guarded(
     path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, way: Xyz, shot: _Shot, done: Bools
 ) -> tuple[Xyz, _Shot]:
-    """Newton with steps that are halved until the miss shrinks."""
+    """Run Newton with steps that are halved until the miss shrinks."""
     for _ in range(_GUARDED_STEPS):
         active = ~done & (shot.status == Status.OK) & ~_settled(shot, 1.0)
         if not active.any():
@@ -360,7 +360,7 @@ def _guarded(
 
 
 def _settled(shot: _Shot, slack: float) -> Bools:
-    """Whether the miss is at most `slack` times what Newton can reach."""
+    """Return whether the miss is at most `slack` times what Newton can reach."""
     reach = SETTLED_MM + ROUNDING_RAD * np.sqrt(np.abs(shot.determinant)) * nearness(shot.along)
     return np.asarray(shot.residual_mm <= slack * reach)
 
@@ -371,7 +371,7 @@ def _better(trial: _Shot, best: _Shot) -> Bools:
 
 
 def nearness(along_mm: Floats) -> Floats:
-    """Factor by which a miss at `along_mm` behind the last surface is multiplied: FAR_MM / along_mm, at most 1."""
+    """Compute the factor for a miss at `along_mm` behind the last surface: FAR_MM / along_mm, at most 1."""
     return np.asarray(FAR_MM / np.maximum(along_mm, FAR_MM))
 
 
@@ -424,7 +424,7 @@ def _spread(point: Xyz, shape: tuple[int, ...]) -> Xyz:
 
 
 def _basis(direction: Xyz) -> tuple[Xyz, Xyz]:
-    """Two unit vectors orthogonal to a unit direction and to each other (Duff et al. 2017, listing 3)."""
+    """Make two unit vectors orthogonal to a unit direction and to each other (Duff et al. 2017, listing 3)."""
     x, y, z = direction
     # The formula is singular at -z. It is rotated here so that -sign(x) x is the pole.
     sign = np.copysign(1.0, x)
@@ -437,7 +437,7 @@ def _basis(direction: Xyz) -> tuple[Xyz, Xyz]:
 
 
 def _triple(a: Xyz, b: Xyz, c: Xyz) -> Floats:
-    """Triple product a.(b x c)."""
+    """Compute the triple product a.(b x c)."""
     return np.asarray(
         a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     )

@@ -51,8 +51,8 @@ class MirrorPoints(ArrayValue):
     Attributes:
         points_mm: (..., 3) points on the surface.
         directions: (..., 3) unit vectors from there to the viewpoint.
-        residual_mm: (...,) by how much the traced ray misses the source, 1e-9 at most. It is measured at 1000 mm where
-            the source is farther away.
+        residual_mm: (...,) distance by which the traced ray misses the source, 1e-9 at most. It is measured at 1000 mm
+            where the source is farther away.
         status: (...,).
     """
 
@@ -89,7 +89,7 @@ def apparent_points(
     rim_mm: FloatLike = np.inf,
     n_outside: float = 1.0,
 ) -> ApparentPoints:
-    """Refraction of object points to a viewpoint.
+    """Find where rays from object points to a viewpoint leave the outermost surface (refraction).
 
     Args:
         surfaces: outside in.
@@ -114,7 +114,7 @@ def apparent_points(
 def mirror_points(
     surface: Surface, source_mm: npt.ArrayLike, viewpoint_mm: npt.ArrayLike, *, rim_mm: FloatLike = np.inf
 ) -> MirrorPoints:
-    """Reflection of a source to a viewpoint at the outside of a surface: the first Purkinje image.
+    """Find where a surface reflects a source to a viewpoint outside: the first Purkinje image.
 
     Args:
         surface: the mirror.
@@ -164,7 +164,7 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Floa
 def _joined(
     graphs: Graphs, ladder: Floats, rim_mm: FloatLike, viewpoint: Xyz, target: Xyz, *, reflects: bool = False
 ) -> tuple[Rays, Bools, Xyz]:
-    """Rays of the compiled solver, which of them it has found, and the first guesses of mirror points."""
+    """Run the compiled solver: its rays, which of them it found, and the first guesses of mirror points."""
     shape = np.broadcast_shapes(*(p.shape for p in (*viewpoint, *target)))
     full = shape or (1,)
     if not graphs.plain:
@@ -184,7 +184,7 @@ def _joined(
 
 
 def _rows(point: Xyz, full: tuple[int, ...]) -> Floats:
-    """Points (3, 1 or n, 1 or m) of components that broadcast to (n, ...), m being the size of its further axes."""
+    """Arrange components that broadcast to (n, ...) as points (3, 1 or n, 1 or m), m the size of the further axes."""
     own = np.broadcast_shapes(*(axis.shape for axis in point))
     own = (1,) * (len(full) - len(own)) + own
     if any(size != 1 for size in own[1:]):
@@ -234,7 +234,7 @@ def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target
 
 
 def _cone(count: int, reach_rad: float) -> Floats:
-    """Unit directions (count, 3) spread evenly about +x, up to `reach_rad` from it."""
+    """Make unit directions (count, 3) spread evenly about +x, up to `reach_rad` from it."""
     step = np.arange(count) + 0.5
     angle, turn = reach_rad * np.sqrt(step / count), np.pi * (1.0 + np.sqrt(5.0)) * step
     return np.column_stack([np.cos(angle), np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn)])
@@ -282,6 +282,6 @@ def _from_connection(found: Connection) -> Rays:
 
 
 def apex_of(surface: Surface) -> Floats:
-    """Point of the sheet on its local axis, (..., 3)."""
+    """Find the point of the sheet on its local axis, (..., 3)."""
     zero = np.zeros(surface.batch_shape)
     return surface.to_eye(np.stack([surface.sag(zero, zero), zero, zero], axis=-1))

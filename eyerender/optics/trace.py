@@ -60,14 +60,14 @@ class Traced(ArrayValue):
 
 
 def inward_path(surfaces: Sequence[Surface], indices: Sequence[FloatLike]) -> tuple[Crossing, ...]:
-    """Refraction at `surfaces`, listed from outside in, with the index behind each."""
+    """List the refractions at `surfaces`, given from outside in, with the index behind each."""
     return tuple(Crossing(surface=surface, n_after=index) for surface, index in zip(surfaces, indices, strict=True))
 
 
 def outward_path(
     surfaces: Sequence[Surface], indices: Sequence[FloatLike], n_outside: FloatLike = 1.0
 ) -> tuple[Crossing, ...]:
-    """Refraction at the same surfaces (listed from outside in) on the way out."""
+    """List the refractions at the same surfaces (given from outside in) on the way out."""
     behind = [n_outside, *indices[:-1]]
     return tuple(
         Crossing(surface=s, n_after=n, inward=False) for s, n in zip(reversed(surfaces), reversed(behind), strict=True)
@@ -131,7 +131,7 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
 
 
 def cross(crossing: Crossing, gradient: Xyz, direction: Xyz, n_before: FloatLike) -> tuple[FloatLike, Xyz, Bools]:
-    """Index after, direction after, and whether light passes, at a point with half gradient `gradient`."""
+    """Compute index and direction after a crossing with half gradient `gradient`, and whether light passes."""
     with np.errstate(divide="ignore", invalid="ignore"):
         normal = unit(gradient)
         if crossing.reflects:
@@ -144,7 +144,7 @@ def cross(crossing: Crossing, gradient: Xyz, direction: Xyz, n_before: FloatLike
 
 
 def inside_rim(crossing: Crossing, point: Xyz) -> Bools:
-    """Whether points of the surface lie within its rim."""
+    """Return whether points of the surface lie within its rim."""
     rim = crossing.rim_mm
     if isinstance(rim, float) and rim == np.inf:
         return np.ones(point[0].shape, dtype=bool)

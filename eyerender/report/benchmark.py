@@ -142,7 +142,7 @@ def thumbnail_figure(thumbnails: Sequence[Thumbnail]) -> str:
 
 
 def look(names: Sequence[str], name: str) -> tuple[str, str]:
-    """Colour and marker of an extractor among those of the bench."""
+    """Choose colour and marker of an extractor among those of the bench."""
     return _LOOK[list(names).index(name) % len(_LOOK)]
 
 
@@ -262,7 +262,7 @@ def factor_figure(data: Row, name: str) -> str:
 
 
 def _bounds(entries: Sequence[Row], name: str) -> list[float | None]:
-    """Median bound in each bin; it is the same for all extractors, but each states it for the pupils it found right."""
+    """Compute the median bound in each bin, from what each extractor states for the pupils it found right."""
     columns = [[b["efficiency"]["bound_median_px"] for b in e["breakdown"].get(name, [])] for e in entries]
     return [next((v for v in column if v is not None), None) for column in zip(*columns, strict=True)]
 

@@ -93,7 +93,7 @@ def _axis_distance(surface: Surface, x: Floats, s: Floats, across: int) -> Float
 
 
 def _iris_x(eye: EyeModel, s: Floats, across: int) -> Floats:
-    """Coordinate x of the iris' plane over the coordinate across."""
+    """Compute x of the iris' plane over the coordinate across."""
     normal, centre = eye.stop.normal, eye.stop.centre_mm
     return np.asarray(centre[0] - (s - centre[across]) * normal[across] / normal[0])
 

@@ -98,7 +98,7 @@ def feature_marks(seen: Observations, row: int, shift: Floats, *, analytic: bool
 
 
 def _cross(at: Floats, size: float, *, diagonal: bool, scale: float = 1.0) -> str:
-    """A cross with an open centre, so that the marked point stays visible."""
+    """Draw a cross with an open centre, so that the marked point stays visible."""
     x, y = at
     arms = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
     if diagonal:

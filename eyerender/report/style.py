@@ -29,7 +29,7 @@ _RC: dict[Any, Any] = {
 
 @contextmanager
 def figure(width: float, height: float, columns: int = 1, rows: int = 1) -> Iterator[tuple[Any, Any]]:
-    """A matplotlib figure (inches) with `columns` by `rows` axes, in the shared style, never on a display."""
+    """Make a matplotlib figure (inches) with `columns` by `rows` axes, in the shared style, never on a display."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -83,7 +83,7 @@ def _leave_out_empty_panels(fig: Any) -> None:
 
 
 def _has_data(ax: Any) -> bool:
-    """Whether a panel shows any finite value; lines and areas across the whole panel are only references."""
+    """Return whether a panel shows any finite value; lines and areas across the whole panel are only references."""
 
     def in_data(artist: Any) -> bool:
         return all(artist.get_transform().contains_branch_seperately(ax.transData))

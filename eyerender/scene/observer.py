@@ -1,4 +1,4 @@
-"""What every observer does."""
+"""The protocol of observers."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from .scene import Frames
 
 
 class Observer(Protocol):
-    """Whatever reports the pupils and glints of frames: `AnalyticObserver`, `ImageObserver`, or a class of your own."""
+    """A class that reports the pupils and glints of frames: `AnalyticObserver`, `ImageObserver`, or your own."""
 
     def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
-        """Report one observation for each row of `frames`; `rig` replaces the one that they were made for."""
+        """Report one observation for each row of `frames`; `rig` replaces the rig of the frames."""
         ...

@@ -15,11 +15,11 @@ from ..population.people import Person, PopulationSpec
 from .subject import Subject
 
 CHUNK = 4096
-"""People drawn at once: their numbers take 5 MB."""
+"""Number of people drawn at once; their values take 5 MB."""
 
 
 class Population(PopulationSpec):
-    """People: one of the table's populations, with other distributions, and with conditions on anything."""
+    """A population: one of the table's presets, with changed distributions and conditions."""
 
     POSITIONAL: ClassVar[tuple[str, ...]] = ("preset",)
     if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class People:
     """People as arrays: `people["axial_length_mm"]` is (n, 2) for right and left, `people["age_years"]` is (n,).
 
     Attributes:
-        population: whom they are drawn from.
+        population: the population from which they are drawn.
         seed: the seed.
         number: (n,) their numbers as subjects.
         values: name -> (n,) or (n, 2); see `PopulationSpec.numbers`.
@@ -65,7 +65,7 @@ class People:
         return len(self.number)
 
     def __getitem__(self, name: str) -> Floats:
-        """One quantity.
+        """Look up one quantity.
 
         Raises:
             InputError: there is no such quantity.
@@ -75,13 +75,13 @@ class People:
         return self.values[name]
 
     def person(self, row: int) -> Person:
-        """Person of a row."""
+        """Make the person of a row."""
         row = range(len(self))[row]
         numbers = {name: column[row] for name, column in self.values.items()}
         return Person.of(self.population.preset, self.seed, int(self.number[row]), numbers)
 
     def subject(self, row: int, **fields: Any) -> Subject:
-        """Person of a row as the subject of a scene, with lids, face, and an own eye on each side.
+        """Make the subject of a scene from a row, with lids, a face, and a separate eye for each side.
 
         Args:
             row: the row.
@@ -90,7 +90,7 @@ class People:
         return Subject.of(self.person(row), **fields)
 
     def columns(self) -> dict[str, Floats]:
-        """Every number as a column (n,) for a table; those of an eye end with `.right` and `.left`."""
+        """List every number as a column (n,) for a table; those of an eye end with `.right` and `.left`."""
         out: dict[str, Floats] = {}
         for name, column in self.values.items():
             if column.ndim == 1:

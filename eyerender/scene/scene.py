@@ -47,7 +47,7 @@ from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
 _BELOW_SKIN_MM, _FACE_MM = 2.0, 45.0
 
 EYE_WINDOW_MM = (32.0, 24.0)
-"""What a window shows about each of two eyes, where a scene says nothing else: both lids and the corners."""
+"""Default size (mm) of a window about each of two eyes: it shows both lids and the corners."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +70,7 @@ class Frames(ArrayValue):
     @overload
     def __getitem__(self, row: slice | Indices | Bools) -> Frames: ...
     def __getitem__(self, row: int | slice | Indices | Bools) -> Frames:
-        """One row as a `Frame`, or some of them (a slice, indices or a mask)."""
+        """Select one row as a `Frame`, or several (a slice, indices or a mask)."""
         if not isinstance(row, int | np.integer):
             return self.take(row)
         number = range(len(self))[row]  # an index beyond the end is an IndexError, as in a list
@@ -99,12 +99,12 @@ class Frames(ArrayValue):
         return self.of_scene(self.scene.replaced(rig=built))
 
     def of_scene(self, scene: Scene) -> Self:
-        """The same eyes in the same poses, in a scene with another rig or other pictures."""
+        """Move the same eyes in the same poses to a scene with another rig or other pictures."""
         return replace(self, scene=scene)
 
 
 def as_frames(frames: Frames | Scene) -> Frames:
-    """Frames as they are, or those of a scene.
+    """Return frames as they are, or make those of a scene.
 
     Raises:
         TypeError: it is something else.
@@ -131,8 +131,9 @@ class Scene:
         eye_spec: what the eye file says; of a drawn person the right eye's.
         left_eye_spec: the left eye's, written as a right eye; the same object where it is the mirror image.
         rig: the numeric rig.
-        base: what files of its pictures (an HDR map, a head mesh) are relative to, by default the current folder.
-        source: what messages call the scene's file.
+        base: folder to which the files of its pictures (an HDR map, a head mesh) are relative, by default the current
+            one.
+        source: name of the scene's file in messages.
     """
 
     spec: SceneSpec
@@ -150,7 +151,7 @@ class Scene:
         Args:
             subject: who looks, with the eye model.
             rig: cameras, lights and screen.
-            name: what reports call the scene.
+            name: name of the scene in reports.
             fields: the other fields of `SceneSpec`: `targets` or `poses`, `region`, `look`, `sensor`, `lens`,
                 `ambient`, `motion`, `image`, `wavelength_nm`, `seed`, `description`.
 
@@ -172,7 +173,7 @@ class Scene:
         base: Path | None = None,
         source: str = "",
     ) -> Scene:
-        """A scene of parts that are known to fit; without a `rig`, that of the spec.
+        """Make a scene from parts that are known to fit; without a `rig`, that of the spec.
 
         The numbers of calibration files become part of the spec. Without an `eye_spec` the eye is the
         spec's; a drawn person always has its own.
@@ -196,7 +197,7 @@ class Scene:
     def replaced(
         self, spec: SceneSpec | None = None, *, eye_spec: EyeSpec | None = None, rig: RigGeometry | None = None
     ) -> Scene:
-        """The scene with another spec (and its rig), another eye or another rig."""
+        """Replace the spec (and its rig), the eye or the rig."""
         return Scene.compiled(
             spec or self.spec,
             eye_spec or self.eye_spec,
@@ -224,7 +225,7 @@ class Scene:
         return cls.compiled(spec, eye_spec, base=base, source=source)._checked()
 
     def _checked(self) -> Scene:
-        """The scene itself, whose eye can be built and whose files exist."""
+        """Check that the eye can be built and that all files exist; return the scene."""
         try:
             for side in EYES if self.spec.person is not None else EYES[:1]:
                 self.eye(side)
@@ -245,12 +246,12 @@ class Scene:
         spp: int | None = None,
         **fields: Any,
     ) -> Scene:
-        """The scene with other values.
+        """Make a scene with other values.
 
         Args:
             changes: values by the path that error messages name, such as `{"rig.lights.1.radius_mm": 2.5}`; a None
                 takes a key away.
-            pupil_diameter_mm: of the anatomical pupil.
+            pupil_diameter_mm: diameter of the anatomical pupil.
             gaze_deg: azimuth and elevation of the optic axis, (2,) or (n, 2), instead of the targets.
             target_mm: world points that are fixated, (3,) or (n, 3), instead of the targets.
             spp: samples per pixel.
@@ -292,14 +293,14 @@ class Scene:
         return self.stop_diameter_mm("right")
 
     def stop_diameter_mm(self, side: str) -> float:
-        """Diameter of the anatomical pupil of one eye, which differs between the eyes of a drawn person."""
+        """Return the diameter of the anatomical pupil of one eye; the eyes of a drawn person differ."""
         if self.spec.person is None:
             return float(2 * self.eye("right").stop.semi_axes_mm[0])
         given = self.spec.eye.pupil_diameter_mm
         return self.eye_file(side).stop.diameter_mm if given is None else given
 
     def person_numbers(self, side: str) -> dict[str, dict[str, float | int | str]]:
-        """`person` as images record it: who it is, and the numbers of the person and of this eye.
+        """Describe the person as images record it: who it is, and the numbers of the person and of this eye.
 
         It is {} where no person is drawn. Dots in the names of numbers become underscores, as names of columns need it.
         """
@@ -315,11 +316,11 @@ class Scene:
         return {"person": {**who, "sex": person.sex, **numbers}}
 
     def eye_file(self, side: str) -> EyeSpec:
-        """Eye file of one side, written as a right eye."""
+        """Return the eye file of one side, written as a right eye."""
         return self.left_eye_spec if side == "left" else self.eye_spec
 
     def warnings(self) -> list[InputWarning]:
-        """Probable mistakes in the scene: a pupil of 0.4 mm, lengths in metres, a lamp in the head, ...
+        """List probable mistakes in the scene: a pupil of 0.4 mm, lengths in metres, a lamp in the head, ...
 
         Nothing is traced or rendered for this. An empty list does not mean that the scene is good.
         """
@@ -376,7 +377,7 @@ class Scene:
         return list(found.values())
 
     def digest(self) -> str:
-        """SHA-256 of everything on which the scene's images depend, including the content of the eye file."""
+        """Compute the SHA-256 of everything on which the scene's images depend, including the eye file's content."""
         eyes = {id(eye): eye.digest() for eye in (self.eye_spec, self.left_eye_spec)}
         parts = [self.spec.digest(), *eyes.values(), *(file_digest(file) for file in self.files)]
         return hashlib.sha256("".join(parts).encode()).hexdigest()
@@ -410,38 +411,38 @@ class Scene:
         return tuple(Path(name) for name in named)
 
     def located(self) -> SceneSpec:
-        """Spec with its files as absolute paths and a head's manifest read, which means the same in every folder."""
+        """Make the spec independent of its folder: absolute paths, and the manifest of a head read in."""
         return self.spec.model_copy(update={"ambient": self.ambient, "region": self.region})
 
     def eye(self, side: Literal["right", "left"] | str) -> EyeModel:
-        """Numeric eye of one side at the scene's wavelength, with the scene's pupil size and margin."""
+        """Build the numeric eye of one side at the scene's wavelength, with the scene's pupil size and margin."""
         eye, same = self.spec.eye, _Same(self.eye_file(side))
         if self.spec.person is None and (state := _state_of(self.spec, self.rig)) is not None:
             same = _responded(same, state, self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
         return _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
 
     def eyes_of(self, index: Index) -> tuple[list[EyeModel], Indices]:
-        """Numeric eyes of an index, and which of them each row is; an eye that is not observed is not built."""
+        """Build the numeric eyes of an index, and say which of them each row is; only observed eyes are built."""
         sides, which = np.unique(index.eye, return_inverse=True)
         return [self.eye(EYES[side]) for side in sides], which
 
     @property
     def accommodation_d(self) -> float | None:
-        """Dioptres to which the eyes accommodate; None where each frame's target is in focus, as far as it can be."""
+        """Accommodation of the eyes (D); None where each eye focuses on its target, as far as it can."""
         person, state = self.spec.person, _state_of(self.spec, self.rig)
         if person is not None:
             return person.accommodation_d(demand_d(self.spec, self.targets_mm))
         return None if state is None or self.spec.subject.accommodation_d is None else state.accommodation_d
 
     def refraction_d(self, side: str) -> float:
-        """Spectacle refraction of one eye, for its focus: the look's, or that of a drawn person; else 0."""
+        """Return the spectacle refraction of one eye, for its focus: the look's, or that of a drawn person; else 0."""
         given, person = self.spec.look.fundus.refraction_d, self.spec.person
         if given is None and person is not None:
             return person.number("refraction_d", "left" if side == "left" else "right")
         return given or 0.0
 
     def eye_position_mm(self, side: str) -> Floats:
-        """Apex of the unrotated eye in the world, (3,) mm, head at its reference position."""
+        """Compute the apex of the unrotated eye in the world, (3,) mm, head at its reference position."""
         return np.array([0.0, self.spec.subject.ipd_mm / 2 * (1 if side == "left" else -1), 0.0])
 
     @property
@@ -450,7 +451,7 @@ class Scene:
         return targets_of(self.spec, self.rig)
 
     def index(self) -> Index:
-        """Index of all (frame, eye) of the scene, in order; n rows."""
+        """Make the index of all (frame, eye) of the scene, in order; n rows."""
         spec = self.spec
         targets = self.targets_mm
         fixations = len(targets) if targets is not None else len(spec.poses or ())
@@ -528,7 +529,7 @@ class Scene:
         )
 
     def windows(self) -> dict[tuple[int, int, int], Window]:
-        """Rendered window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
+        """Place the window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
 
         A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze; it is kept on
         the sensor. Without `image.window_px` it is the whole sensor for one eye, and `EYE_WINDOW_MM` for two.
@@ -541,7 +542,7 @@ class Scene:
         }
 
     def window(self, camera: int, head: int, eye: int) -> Window:
-        """One of the `windows`: that of a camera, a head position and an eye (0 right, 1 left)."""
+        """Look up one of the `windows`: that of a camera, a head position and an eye (0 right, 1 left)."""
         view = self.rig.cameras[camera]
         (w, h), (ww, wh) = view.resolution_px, self.window_size_px(camera)
         position = self.eye_position_mm(EYES[eye]) + np.array(self.spec.subject.head_positions_mm[head])
@@ -552,7 +553,7 @@ class Scene:
         return min(max(x0, 0), w - ww), min(max(y0, 0), h - wh), ww, wh
 
     def window_size_px(self, camera: int) -> tuple[int, int]:
-        """Width and height of a camera's windows."""
+        """Compute width and height of a camera's windows."""
         if self.spec.image.window_px is not None:
             return self.spec.image.window_px
         view = self.rig.cameras[camera]
@@ -592,10 +593,10 @@ def _put(data: dict[str, Any], path: str, value: Any) -> None:
 
 
 def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
-    """Accommodation (D) that a scene asks of its eyes: the given one, or what its targets ask for without glasses.
+    """Compute the accommodation (D) of a scene's eyes: as given, or what its targets demand without glasses.
 
-    The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position. A
-    drawn person needs as much more as both eyes are hyperopic on average, or less; nobody relaxes below 0.
+    The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position. The
+    mean refraction of a drawn person's eyes is added: hyperopes accommodate more, myopes less, and nobody below 0.
     """
     given = spec.subject.accommodation_d
     if given is not None and given != "targets":
@@ -620,7 +621,7 @@ class _State:
 
 
 def _state_of(spec: SceneSpec, rig: RigGeometry) -> _State | None:
-    """What the eyes of a scene respond to; None for an eye as its file has it."""
+    """Collect what the eyes of a scene respond to; None for an eye as its file has it."""
     subject = spec.subject
     if subject.luminance_cd_m2 is None and subject.accommodation_d is None:
         return None
@@ -631,7 +632,7 @@ def _state_of(spec: SceneSpec, rig: RigGeometry) -> _State | None:
 
 
 def targets_of(spec: SceneSpec, rig: RigGeometry) -> Floats | None:
-    """Targets (f, 3) in the world, in fixation order; None where the scene gives poses."""
+    """List the targets (f, 3) in the world, in fixation order; None where the scene gives poses."""
     targets, screen = spec.targets, rig.screen
     if targets is None:
         return None
@@ -645,7 +646,7 @@ def targets_of(spec: SceneSpec, rig: RigGeometry) -> Floats | None:
 
 
 def _eyes_of(spec: SceneSpec, person: Person, rig: RigGeometry) -> tuple[EyeSpec, EyeSpec]:
-    """Right and left eye of a person in the light and at the distance of a scene."""
+    """Make right and left eye of a person in the light and at the distance of a scene."""
     subject = spec.subject
     state = (subject.luminance_cd_m2, subject.field_deg, demand_d(spec, targets_of(spec, rig)))
     try:
@@ -658,7 +659,7 @@ def _eyes_of(spec: SceneSpec, person: Person, rig: RigGeometry) -> tuple[EyeSpec
 def _drawn_eyes(
     person: str, luminance_cd_m2: float | None, field_deg: float | None, demand: float
 ) -> tuple[EyeSpec, EyeSpec]:
-    """Eyes of a person from its JSON, cached because making them takes longer than everything else of a scene."""
+    """Make a person's eyes from its JSON; cached, because this takes longer than the remaining work on a scene."""
     who = Person.from_mapping(json.loads(person))
     right, left = (
         who.eye(side, luminance_cd_m2=luminance_cd_m2, field_deg=field_deg, demand_d=demand) for side in SIDES
@@ -667,7 +668,7 @@ def _drawn_eyes(
 
 
 def _without_person(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A scene's mapping without its person and what it may have brought."""
+    """Remove the person from a scene's mapping, and what the person may have brought."""
     rest = {key: value for key, value in data.items() if key not in ("person", "look", "region")}
     rest["eye"] = {key: value for key, value in data["eye"].items() if key != "model"}
     rest["subject"] = {key: value for key, value in data["subject"].items() if key != "ipd_mm"}
@@ -691,7 +692,7 @@ class _Same:
 def _responded(
     eye: _Same, state: _State, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMargin | None
 ) -> _Same:
-    """Eye file in the light and at the distance of a scene."""
+    """Adapt an eye file to the light and the distance of a scene."""
     spec = eye.spec if margin is None else margin.applied(eye.spec)
     try:
         found = responding(
@@ -712,6 +713,6 @@ def _responded(
 def _built_eye(
     eye: _Same, left: bool, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMargin | None
 ) -> EyeModel:
-    """Numeric eye, cached because observers, renderer and labels request the same one repeatedly."""
+    """Build a numeric eye; cached, because observers, renderer and labels request the same one repeatedly."""
     spec = eye.spec if margin is None else margin.applied(eye.spec)
     return spec.build(eye="left" if left else "right", wavelength_nm=wavelength_nm, pupil_diameter_mm=pupil_diameter_mm)

@@ -19,7 +19,7 @@ def shipped_scenes() -> dict[str, Path]:
 
 @cache
 def is_shipped_dataset(path: Path) -> bool:
-    """Whether a shipped file is a dataset, cached because the file never changes and parsing all of them is slow."""
+    """Return whether a shipped file is a dataset; cached, because the files never change and parsing all is slow."""
     return is_dataset(path)
 
 
@@ -33,7 +33,7 @@ def shipped_files() -> dict[str, Path]:
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether a YAML file declares itself the spec of a dataset (`kind: dataset`) instead of a scene."""
+    """Return whether a YAML file declares itself the spec of a dataset (`kind: dataset`) instead of a scene."""
     try:
         return read_yaml(path).get("kind") == DATASET_KIND
     except InputError:

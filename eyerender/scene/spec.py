@@ -62,7 +62,7 @@ class Eye(Spec):
 
     @classmethod
     def load(cls, model: str | EyeSpec, **fields: Any) -> Self:
-        """An eye that is known to be possible.
+        """Make an eye and check that it is possible.
 
         Args:
             model: a name of the catalogue ("E1" to "E5"), an eye file, or the eye's own record.
@@ -76,14 +76,14 @@ class Eye(Spec):
         return eye
 
     def spec(self, base: Path | None = None) -> EyeSpec:
-        """The eye's surfaces and media; `base` is the folder that an eye file's name is relative to."""
+        """Read the eye's surfaces and media; `base` is the folder that an eye file's name is relative to."""
         if isinstance(self.model, EyeSpec):
             return self.model
         inside = base is not None and self.model.endswith((".yaml", ".yml"))
         return load_eye(str(base / self.model) if base is not None and inside else self.model)
 
     def build(self, side: Side = "right", *, wavelength_nm: float = 850.0) -> EyeModel:
-        """The numeric eye of one side."""
+        """Build the numeric eye of one side."""
         spec = self.spec() if self.margin is None else self.margin.applied(self.spec())
         return spec.build(eye=side, wavelength_nm=wavelength_nm, pupil_diameter_mm=self.pupil_diameter_mm)
 
@@ -155,7 +155,7 @@ class Targets(Spec):
 
     @classmethod
     def at(cls, points_mm: ArrayLike) -> Self:
-        """World points, (3,) or (n, 3) mm."""
+        """Make targets from world points, (3,) or (n, 3) mm."""
         return cls.from_mapping({"world_mm": np.asarray(points_mm, dtype=float).reshape(-1, 3)})
 
     @model_validator(mode="after")
@@ -177,7 +177,7 @@ class EyeDirection(Spec):
 
     @classmethod
     def listed(cls, angles_deg: ArrayLike) -> list[Self]:
-        """Directions of azimuths and elevations, (2,) or (n, 2) degrees."""
+        """Make directions from azimuths and elevations, (2,) or (n, 2) degrees."""
         angles = np.asarray(angles_deg, dtype=float).reshape(-1, 2)
         return [cls(azimuth_deg=azimuth, elevation_deg=elevation) for azimuth, elevation in angles]
 
@@ -285,7 +285,7 @@ class SceneSpec(FileSpec):
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The mapping with what its subject or its population says under the scene's own keys."""
+        """Move what the subject or its population says to the scene's own keys."""
         subject = data.get("subject")
         if isinstance(subject, Spec):
             rest = subject.to_mapping()
@@ -344,7 +344,7 @@ class SceneSpec(FileSpec):
 
 
 def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A scene's mapping with the person of its population; what the scene itself says stays."""
+    """Add the person of its population to a scene's mapping; what the scene itself says stays."""
     eye = data.get("eye")
     if isinstance(eye, Spec) or (isinstance(eye, Mapping) and "model" in eye):
         raise InputError("cannot stand beside a population, which gives the eyes", path="eye.model")
@@ -359,7 +359,7 @@ def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_person(data: Mapping[str, Any], person: Person) -> dict[str, Any]:
-    """A scene's mapping with a person, whose distance of the pupils, look and region hold where the scene has none."""
+    """Add a person to a scene's mapping; its pupil distance, look and region hold where the scene has none."""
     subject = data.get("subject") or {}
     subject = subject.to_mapping() if isinstance(subject, Spec) else subject
     if "ipd_mm" not in subject:

@@ -1,4 +1,4 @@
-"""A subject in Python code: eyes that look at something, and the frames that come of it."""
+"""A subject in Python code: eyes that look at something, and the frames that result."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Subject(SubjectSpec):
 
     @classmethod
     def of(cls, person: Person, **fields: Any) -> Self:
-        """The subject that a drawn person is.
+        """Make the subject of a drawn person.
 
         Args:
             person: the person.
@@ -54,9 +54,9 @@ class Subject(SubjectSpec):
         at_mm: ArrayLike = (0.0, 0.0, 0.0),
         **fields: Any,
     ) -> Self:
-        """A subject of whom one eye is observed.
+        """Make a subject of whom one eye is observed.
 
-        The head is placed so that the apex of this eye, unrotated, is where it shall be.
+        The head is placed so that the apex of this eye, unrotated, lies at `at_mm`.
 
         Args:
             eye: the eye model; default: E2.
@@ -74,7 +74,7 @@ class Subject(SubjectSpec):
         return cls(**{**subject.to_mapping(), "head_positions_mm": heads})
 
     def fixating(self, targets_mm: ArrayLike, rig: Rig, **scene: Any) -> Frames:
-        """The frames in which the subject fixates targets, one after the other.
+        """Make the frames in which the subject fixates targets, one after the other.
 
         Args:
             targets_mm: (n, 3) or (3,) world points.
@@ -82,12 +82,12 @@ class Subject(SubjectSpec):
             scene: further fields of `Scene`: `region`, `look`, `sensor`, `seed`, ...
 
         Raises:
-            InputError: a value does not fit, or a target that no pose of an eye fixates.
+            InputError: a value does not fit, or no pose of an eye fixates a target.
         """
         return Scene(self, rig, targets=Targets.at(targets_mm), **scene).frames()
 
     def looking(self, directions_deg: ArrayLike, rig: Rig, **scene: Any) -> Frames:
-        """The frames in which the optic axes of the eyes have directions, one after the other.
+        """Make the frames in which the optic axes of the eyes have directions, one after the other.
 
         Args:
             directions_deg: (n, 2) or (2,) azimuth (positive to the subject's left) and elevation (positive up).

@@ -29,11 +29,11 @@ _WARNED = "EYERENDER_CACHE_WARNED"  # tells processes that this one starts
 
 
 class _Refused(Exception):
-    """A part of a path is not safe; the message says why."""
+    """An unsafe part of a path; the message says why."""
 
 
 def cache_folder() -> Path | None:
-    """Private folder for what this package found, compiled and fetched; made if it is missing.
+    """Find or make the private folder for what this package compiled, fetched or computed.
 
     Returns:
         The folder; None where the user has no home folder, where the folder cannot be made, and, with one warning on
@@ -135,7 +135,7 @@ def _others_write(state: os.stat_result) -> bool:
 
 
 def _is_private_group(group: int) -> bool:
-    """Whether only this user is in a group: root's, or the one of the user's name that many Linux systems make."""
+    """Return whether a group is root's, or the private one of the user's name that many Linux systems make."""
     import grp
     import pwd
 

@@ -318,7 +318,7 @@ def read_json(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = T
 
 
 def inside(folder: Path, name: object, *, source: str = "", path: str = "") -> Path:
-    """Path of the regular file `name` in a folder that somebody else may have made.
+    """Resolve the path of the regular file `name` in a folder that somebody else may have made.
 
     The name must be relative, with plain parts (no `..`, no control characters), and no part of it may be a link.
 
@@ -342,7 +342,7 @@ def inside(folder: Path, name: object, *, source: str = "", path: str = "") -> P
 
 
 def is_plain(name: object) -> bool:
-    """Whether a name is a relative path of plain parts, with `/` between them."""
+    """Return whether a name is a relative path of plain parts, with `/` between them."""
     return (
         isinstance(name, str)
         and len(name) <= 1024

@@ -107,7 +107,7 @@ def _take(
 
 
 def _is_at(file: int, path: Path) -> bool:
-    """Whether an open file is still the file at a path."""
+    """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(file), os.lstat(path))
     except OSError:

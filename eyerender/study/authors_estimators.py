@@ -37,7 +37,7 @@ class AuthorsGuestrinEizenman(GuestrinEizenman):
     viewing_distance_mm: float = 650.0
 
     def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
-        """Visual axes (..., 3) of optic axes w (..., 3); angles in radians."""
+        """Turn optic axes w (..., 3) to visual axes (..., 3); angles in radians."""
         if self.visual_axis == "angles":
             return GuestrinEizenman.turned(self, w, alpha, beta)
         ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)

@@ -92,12 +92,12 @@ def scene(eye: str, departures: Collection[str]) -> Scene:
 
 
 def scene_key(departures: Collection[str]) -> frozenset[str]:
-    """Departures that change the observations."""
+    """List the departures that change the observations."""
     return frozenset(departures) & {"focal", "screen"}
 
 
 def terms(function: str, departures: Collection[str]) -> tuple[str, str]:
-    """Terms of x and of y of a function of Table 2.
+    """Return the terms of x and of y of a function of Table 2.
 
     In the authors' loop, the different functions of x, and those of y, are numbered in the order of their first
     appearance in Table 2. The number of the function of x is used for both.
@@ -140,13 +140,13 @@ def run(
 
 
 def best(outcomes: list[Outcome], calibration: str) -> Outcome | None:
-    """Function with the smallest mean error for a set; None if there is none."""
+    """Find the function with the smallest mean error for a set; None if there is none."""
     some = [o for o in outcomes if o.calibration == calibration and o.mean_deg is not None]
     return min(some, key=lambda o: o.mean_deg or 0.0) if some else None
 
 
 def rows_of(outcomes: list[Outcome], **keys: Any) -> list[Row]:
-    """One row per function and set."""
+    """Make one row per function and set."""
     keys["eye"] = "both"
     return [
         mean_row(

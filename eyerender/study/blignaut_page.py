@@ -63,7 +63,7 @@ def page(
 
 
 def _best_by_key(parts: Sequence[BlignautPart]) -> dict[tuple[str, str], dict[str, list[float]]]:
-    """Mean error (deg) of the best function with each set: (protocol, observer) -> eye model."""
+    """Collect the mean error (deg) of the best function with each set: (protocol, observer) -> eye model."""
     keys = dict.fromkeys(key for part in parts for key in part.outcomes)
     return {
         key: {p.eye_model: [_best_deg(p.outcomes[key], c) for c in SETS] for p in parts if key in p.outcomes}
@@ -72,7 +72,7 @@ def _best_by_key(parts: Sequence[BlignautPart]) -> dict[tuple[str, str], dict[st
 
 
 def _clouds(parts: Sequence[BlignautPart]) -> list[tuple[str, str, str]]:
-    """(scene, observer, figure) of the clouds of pupils and glints."""
+    """Draw the clouds of pupils and glints: (scene, observer, figure)."""
     observers = list(dict.fromkeys(key for part in parts for key in part.clouds))
     # One reading of the scene suffices for the clouds: the corrected one where there is a choice.
     keys = [k for k in observers if k[0] == "corrected"] or observers
@@ -100,7 +100,7 @@ def _best_rows(parts: Sequence[BlignautPart]) -> list[tuple[str, ...]]:
 
 
 def _functions(parts: Sequence[BlignautPart]) -> list[tuple[str, str, str, list[tuple[str, ...]]]]:
-    """(eye model, protocol, observer, rows): every function with every set."""
+    """Tabulate every function with every set: (eye model, protocol, observer, rows)."""
     out = []
     for part in parts:
         for (protocol, observer), outcomes in part.outcomes.items():

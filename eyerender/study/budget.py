@@ -80,7 +80,7 @@ class Budget:
 
 
 def budgets(parts: Sequence[ModelResults]) -> list[Budget]:
-    """Budget of each protocol, estimator and eye model; none where there are no errors by ray optics.
+    """Compute the budget of each protocol, estimator and eye model; none without errors by ray optics.
 
     The reference is the first eye model of the run, which is E1 by default.
     """
@@ -123,7 +123,7 @@ class _Step:
 
 
 def _by_key(parts: Sequence[ModelResults], kind: str) -> dict[tuple[str, str, str, str], Floats]:
-    """Arrays by (protocol, estimator, eye model, observer)."""
+    """Arrange arrays by (protocol, estimator, eye model, observer)."""
     return {
         (protocol, name, part.eye_model, observer): found
         for part in parts
@@ -133,7 +133,7 @@ def _by_key(parts: Sequence[ModelResults], kind: str) -> dict[tuple[str, str, st
 
 
 def _eyes(parts: Sequence[ModelResults], protocol: str, n: int) -> Ints:
-    """Eye of each error; zeros where an error belongs to a frame of both."""
+    """Return the eye of each error; zeros where an error belongs to a frame of both."""
     for part in parts:
         for (name, _), (_, seen) in part.seen.items():
             if name == protocol and len(seen) == n:
@@ -142,7 +142,7 @@ def _eyes(parts: Sequence[ModelResults], protocol: str, n: int) -> Ints:
 
 
 def _budget(steps: Sequence[_Step], eye: Ints) -> tuple[int, tuple[Term, ...], float] | None:
-    """Number of frames, terms and total error."""
+    """Compute the number of frames, the terms and the total error."""
     rows = np.all([np.isfinite(step.errors) for step in steps], axis=0)
     n = int(rows.sum())
     if n < 2:
@@ -159,7 +159,7 @@ def _budget(steps: Sequence[_Step], eye: Ints) -> tuple[int, tuple[Term, ...], f
 
 
 def _moved(before: _Step, after: _Step, rows: Bools, eye: Ints) -> dict[str, Any]:
-    """The part of a `Term` that tells of a displacement: rms angle, shift, pattern, and scatter over exposures."""
+    """Compute the displacement part of a `Term`: rms angle, shift, pattern, and scatter over exposures."""
     if before.vectors is None or after.vectors is None:
         return {}
     vectors = after.vectors[None] if after.seeds is None else after.seeds
@@ -173,7 +173,7 @@ def _moved(before: _Step, after: _Step, rows: Bools, eye: Ints) -> dict[str, Any
 
 
 def _name(observer: str, steps: Sequence[str]) -> str:
-    """Name of the contribution of the step to an observer."""
+    """Name the contribution of the step to an observer."""
     if observer == "analytic":
         return EYE
     if observer == "image-noiseless":

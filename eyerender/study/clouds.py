@@ -31,20 +31,20 @@ class Cloud:
 
 
 def extent_px(points: Floats) -> float:
-    """Largest distance of a point from the cloud's mean."""
+    """Measure the largest distance of a point from the cloud's mean."""
     good = points[np.isfinite(points).all(axis=1)]
     return float(np.linalg.norm(good - good.mean(axis=0), axis=1).max()) if len(good) else float("nan")
 
 
 def aspect(points: Floats) -> float:
-    """Ratio of the spreads across and along the cloud's long axis (ratio of singular values)."""
+    """Compute the spread across over the spread along the cloud's long axis (ratio of singular values)."""
     good = points[np.isfinite(points).all(axis=1)]
     values = np.linalg.svd(good - good.mean(axis=0), compute_uv=False)
     return float(values[1] / values[0]) if values[0] > 0 else float("nan")
 
 
 def bow(points: Floats) -> float:
-    """Curvature of the rows of targets: the largest distance from the chord over its length, mean over the rows."""
+    """Measure how rows of targets bend: largest distance from the chord over its length, mean over the rows."""
     grid = points.reshape(COLUMNS, ROWS, 2)
     out = []
     for row in range(ROWS):

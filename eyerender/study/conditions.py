@@ -49,7 +49,7 @@ QUALITY = tuple(field.name for field in fields(Quality))
 
 
 def _with_lens(axis: int) -> str:
-    """Paths of the stop's place and of the lens' place, if there is a lens.
+    """List the paths of the stop's place and of the lens' place, if there is a lens.
 
     Both move together, so that the lens does not cross the stop.
     """
@@ -112,19 +112,19 @@ class _Tracker:
     scene: Scene
 
     def points(self, seen: Observations) -> tuple[Observations, Floats]:
-        """Gaze points, by frame."""
+        """Estimate gaze points, by frame."""
         gaze = self.estimator.predict(seen, self.scene.rig)
         if self.name == "interpolation":
             seen, gaze = binocular_average(seen, gaze)
         return seen, np.asarray(gaze.point_mm)
 
     def from_mm(self, seen: Observations) -> Floats:
-        """Points from which the angles are measured, (n, 3)."""
+        """Return the points from which the angles are measured, (n, 3)."""
         place = np.asarray(seen.index.head_mm)
         return place if self.name == "interpolation" else place + seen.index.eye_position_mm
 
     def errors_by_eye_deg(self, seen: Observations) -> dict[str, Floats]:
-        """Errors (n,) of what the tracker reports, and of each single eye where it averages both."""
+        """Compute the errors (n,) of what the tracker reports, and of each single eye where it averages both."""
         index = seen.index
         if self.name == "model-based":
             return {EYES[0]: self.errors_deg(seen)}
@@ -133,7 +133,7 @@ class _Tracker:
         return {"both": self.errors_deg(seen)} | {side: single[index.eye == k] for k, side in enumerate(EYES)}
 
     def errors_deg(self, seen: Observations) -> Floats:
-        """Errors (n,) by frame."""
+        """Compute the errors (n,) by frame."""
         frames, points = self.points(seen)
         return angular_error_deg(points, frames.index.target_mm, self.from_mm(frames))
 
@@ -203,7 +203,7 @@ def people_part() -> PeoplePart:
 def _over_diameters(
     tracker: _Tracker, eye: str, *, sides: Sequence[str], centres: dict[str, dict[str, Any]] | None = None
 ) -> tuple[dict[str, list[float]], list[Row]]:
-    """Mean errors over the diameters by curve, and their rows."""
+    """Compute mean errors over the diameters by curve, and their rows."""
     curves: dict[str, list[float]] = {}
     rows = []
     for centre, keys in (CENTRES if centres is None else centres).items():
@@ -224,12 +224,12 @@ def _over_diameters(
 
 
 def curve(tracker: str, side: str, centre: str) -> str:
-    """Name of a curve of errors over the pupil's diameter."""
+    """Name a curve of errors over the pupil's diameter."""
     return f"{tracker}, {side} {'eyes' if side == 'both' else 'eye'}, {centre}"
 
 
 def _scene(tracker: str, eye: str) -> Scene:
-    """Scene in which a tracker is calibrated: one head position."""
+    """Make the scene in which a tracker is calibrated: one head position."""
     if tracker == "interpolation":
         return blignaut.scene(eye, blignaut.CORRECTED)
     scene = guestrin.scene(eye, guestrin.CORRECTED)
@@ -257,13 +257,13 @@ def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:
 
 
 def _mean(scene: Scene) -> float:
-    """Mean error of the scene's tracker, calibrated on this very eye."""
+    """Compute the mean error of the scene's tracker, calibrated on this very eye."""
     tracker, seen = _calibrated(scene)
     return float(np.nanmean(tracker.errors_deg(seen)))
 
 
 def _over_heads(tracker: _Tracker, keys: dict[str, Any]) -> tuple[Floats, list[Row]]:
-    """Mean errors (depth, sideways) of nine targets over head positions."""
+    """Compute mean errors (depth, sideways) of nine targets over head positions."""
     places = [[x, y, 0.0] for x in HEAD_MM for y in HEAD_MM]
     scene = _changed(tracker.scene, {"targets": {"grid": [3, 3]}, "subject": {"head_positions_mm": places}})
     errors = tracker.errors_deg(trace(scene)).reshape(len(places), -1)
@@ -276,7 +276,7 @@ def _over_heads(tracker: _Tracker, keys: dict[str, Any]) -> tuple[Floats, list[R
 
 
 def _precision(tracker: _Tracker, seen: Observations) -> dict[str, float]:
-    """Accuracy and precision with Gaussian noise on the features; means over the fixations."""
+    """Compute accuracy and precision with Gaussian noise on the features; means over the fixations."""
     rng = np.random.default_rng(SEED)
     samples = []
     for _ in range(SAMPLES):

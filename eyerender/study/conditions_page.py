@@ -26,7 +26,7 @@ _D3 = "largest change of the mean error over pupils of 2 to 8 mm (deg)"
 
 
 def findings(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> list[Finding]:
-    """Effects of the conditions as values; there is no published claim to compare them with."""
+    """State the effects of the conditions as values; there is no published claim to compare them with."""
     out = []
 
     def add(name: str, rule: str, value: float, detail: str) -> None:
@@ -58,7 +58,7 @@ def findings(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ())
 
 
 def more(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> dict[str, Any]:
-    """Content of the summary besides its rows."""
+    """Make the content of the summary besides its rows."""
     return {
         "trackers": _WHO,
         "noise": {"sigma_px": c.NOISE_PX, "samples": c.SAMPLES, "seed": c.SEED},
@@ -151,7 +151,7 @@ def _sensitivity_figure(parts: Sequence[ConditionsPart]) -> str:
 
 
 def _screen_axes(tracker: str, values: Floats) -> tuple[Floats, Floats]:
-    """Screen coordinates of a map's columns and rows; columns run from the subject's left, rows from the top."""
+    """Return the screen coordinates of a map's columns (from the subject's left) and rows (from the top)."""
     w, h = (377.0, 301.0) if tracker == "model-based" else (495.0, 280.0)
     return np.linspace(-w / 2, w / 2, values.shape[1]), np.linspace(h / 2, -h / 2, values.shape[0])
 

@@ -9,7 +9,7 @@ from .results import Erratum
 
 
 def guestrin(misprints: Mapping[str, Mapping[str, Any]]) -> list[Erratum]:
-    """Errata for the replication of [28].
+    """List the errata for the replication of [28].
 
     The effects come from the models' own runs (eye model -> case -> H1, H2, counts).
     """
@@ -52,7 +52,7 @@ def guestrin(misprints: Mapping[str, Mapping[str, Any]]) -> list[Erratum]:
 
 
 def blignaut() -> list[Erratum]:
-    """Errata for the replication of [29]."""
+    """List the errata for the replication of [29]."""
     return [
         Erratum(
             where="Table 5, best functions",

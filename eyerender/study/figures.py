@@ -25,7 +25,7 @@ STYLES = (("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7")
 
 
 def look(model: str, others: Sequence[str] = ()) -> tuple[str, str]:
-    """Colour and marker of an eye model."""
+    """Choose colour and marker of an eye model."""
     if model in _LOOK:
         return _LOOK[model]
     rest = [m for m in others if m not in _LOOK]
@@ -33,7 +33,7 @@ def look(model: str, others: Sequence[str] = ()) -> tuple[str, str]:
 
 
 def clouds_figure(clouds: Mapping[str, Cloud]) -> str:
-    """Figure 3: pupil centres and glints of every fixation by eye model."""
+    """Draw Figure 3: pupil centres and glints of every fixation by eye model."""
     with figure(11.0, 4.9, 2) as (fig, axes):
         for ax, part, title in ((axes[0], "pupil_px", "(a) pupil centre"), (axes[1], "glint_px", "(b) glint")):
             for model, cloud in clouds.items():
@@ -52,7 +52,7 @@ def heads_figure(
     measured: Mapping[str, Floats],
     interval: Mapping[str, tuple[float, float]],
 ) -> str:
-    """Figure 4: errors at H1 and H2 by eye model, beside the paper's and the experiment's.
+    """Draw Figure 4: errors at H1 and H2 by eye model, beside the paper's and the experiment's.
 
     Args:
         own: label -> eye model -> head -> mean (deg).
@@ -95,7 +95,7 @@ def heads_figure(
 def sets_figure(
     sets: Sequence[str], own: Mapping[str, Mapping[str, Sequence[float]]], measured: Sequence[float]
 ) -> str:
-    """Figure 5: the best function's error for each calibration set by eye model; one panel per label of `own`."""
+    """Draw Figure 5: the best function's error for each calibration set by eye model; one panel per label of `own`."""
     columns = min(len(own), 3)
     lines = -(-len(own) // columns)
     with figure(max(5.4, 4.6 * columns), 0.5 + 3.7 * lines, columns, lines) as (fig, axes):

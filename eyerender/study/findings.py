@@ -20,7 +20,7 @@ _TIE_DEG = 0.001  # functions whose means are closer than this count as equally 
 
 
 def t_tests(means: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
-    """Two-tailed one-sample t-tests of the four participants' errors against each simulated mean.
+    """Compare each simulated mean with the four participants' errors by two-tailed one-sample t-tests.
 
     Args:
         means: simulated mean (deg) by eye model and head.
@@ -43,7 +43,7 @@ def t_tests(means: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
 def guestrin(
     means: Mapping[str, Mapping[str, float]], errors: Mapping[str, Floats], protocol: str, observer: str
 ) -> list[Finding]:
-    """Findings G1 to G3, and how close the paper's own figures are.
+    """Test findings G1 to G3, and how close the paper's own figures are.
 
     Args:
         means: mean (deg) by eye model and head.
@@ -119,7 +119,7 @@ def guestrin(
 
 
 def blignaut(outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str) -> list[Finding]:
-    """Findings B1 to B11, by eye model."""
+    """Test findings B1 to B11, by eye model."""
     tested = _Blignaut(outcomes)
     tests = (
         _best_functions, _drops, _spherical, _shares, _five_targets, _alike, _deviations,
@@ -140,14 +140,14 @@ class _Blignaut:
         self.error = {m: {c: _mean(b) for c, b in found.items()} for m, found in self.best.items()}
 
     def determined(self) -> dict[str, dict[str, float]]:
-        """Mean errors of the best among the functions whose terms do not outnumber the targets."""
+        """Compute mean errors of the best among the functions whose terms do not outnumber the targets."""
         return {
             m: {c: _mean(best([o for o in some if _terms(o.function) <= len(t)], c)) for c, t in _SETS}
             for m, some in self.outcomes.items()
         }
 
     def models(self, wanted: Sequence[str]) -> list[str]:
-        """Those of some eye models that were run."""
+        """Select those of the given eye models that were run."""
         return [m for m in wanted if m in self.error]
 
 
@@ -186,12 +186,12 @@ def _mean(outcome: Outcome | None) -> float:
 
 
 def _terms(function: str) -> int:
-    """Largest number of terms of x or y."""
+    """Return the larger number of terms of x and y."""
     return max(len(terms.split("+")) for terms in FUNCTIONS[function])
 
 
 def _best_functions(b: _Blignaut) -> Iterator[_Test]:
-    """B1: C5 has a sentence of its own, and C9 is tested against the function that the paper names."""
+    """Test B1: C5 has a sentence of its own; for C9 the function that the paper names is tested."""
     for c in lit.CALIBRATION_SETS:
         named, (measured, _) = lit.PAPER_BEST[c], lit.blignaut_best(c)
         ties = {m: _ties(b.outcomes[m], c) for m in b.outcomes}
@@ -209,7 +209,7 @@ def _best_functions(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _drops(b: _Blignaut) -> Iterator[_Test]:
-    """B2 and B3: what more targets bring."""
+    """Test B2 and B3: what more targets bring."""
     drop = {m: 1 - e["C9"] / e["C5"] for m, e in b.error.items()}
     least = min(drop.values())
     rule = "errors decrease markedly from C5 to C9: smallest relative decrease"
@@ -221,7 +221,7 @@ def _drops(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _spherical(b: _Blignaut) -> Iterator[_Test]:
-    """B4, with all functions and with those that the targets determine."""
+    """Test B4, with all functions and with those that the targets determine."""
     spherical, other = b.models(lit.SPHERICAL), b.models(("E2", "E4", "E5"))
     if not (spherical and other):
         return
@@ -234,7 +234,7 @@ def _spherical(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _shares(b: _Blignaut) -> Iterator[_Test]:
-    """B5: simulated over measured errors."""
+    """Test B5: simulated over measured errors."""
     for c in lit.CALIBRATION_SETS:
         measured_deg = lit.blignaut_best(c)[1]
         share_of = {m: e[c] / measured_deg for m, e in b.error.items()}
@@ -245,7 +245,7 @@ def _shares(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _five_targets(b: _Blignaut) -> Iterator[_Test]:
-    """B6 and B7: what five targets give."""
+    """Test B6 and B7: what five targets give."""
     errors = {m: e["C5"] for m, e in b.error.items()}
     least = min(errors.values())
     rule = (
@@ -258,7 +258,7 @@ def _five_targets(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _alike(b: _Blignaut) -> Iterator[_Test]:
-    """B8 to B10: models that err alike."""
+    """Test B8 to B10: models that err alike."""
     sets = tuple(lit.CALIBRATION_SETS)
     pairs = [(m, n) for m, n in (("E1", "E3"), ("E2", "E4")) if {m, n} <= set(b.error)]
     if pairs:
@@ -280,7 +280,7 @@ def _alike(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _deviations(b: _Blignaut) -> Iterator[_Test]:
-    """B11: measured minus simulated errors."""
+    """Test B11: measured minus simulated errors."""
     off = {c: [lit.blignaut_best(c)[1] - e[c] for e in b.error.values()] for c in lit.CALIBRATION_SETS}
     detail = ", ".join(f"{c} {min(v):.3f} to {max(v):.3f}" for c, v in off.items())
     most = max(max(v) for v in off.values())
@@ -298,7 +298,7 @@ def _p(one: Outcome | None, other: Outcome | None) -> float:
 
 
 def _ties(outcomes: Sequence[Outcome], calibration: str) -> list[str]:
-    """Functions that are as good as the best one for a set, the best first."""
+    """List the functions that are as good as the best one for a set, the best first."""
     some = sorted((o.mean_deg, o.function) for o in outcomes if o.calibration == calibration and o.mean_deg is not None)
     return [name for mean, name in some if mean - some[0][0] < _TIE_DEG]
 

@@ -116,7 +116,7 @@ class Outcome:
     estimator: AuthorsGuestrinEizenman
 
     def mean_deg(self, head: str) -> float | None:
-        """Mean over the fixations and eyes of H1 or H2."""
+        """Compute the mean over the fixations and eyes of H1 or H2."""
         return known_mean(self.error_deg[self.rows(head)])
 
     @property
@@ -125,7 +125,7 @@ class Outcome:
         return {head: self.mean_deg(head) for head in HEADS}
 
     def rows(self, head: str) -> Any:
-        """Whether observations are at the central head position (H1) or the others (H2), (n,) bool."""
+        """Return whether observations are at the central head position (H1) or the others (H2), (n,) bool."""
         central = self.observations.index.head == 0
         return central if head == "H1" else ~central
 
@@ -152,7 +152,7 @@ def scene(eye: str, departures: Collection[str], changes: dict[str, Any] | None 
 
 
 def scene_key(departures: Collection[str]) -> frozenset[str]:
-    """Departures that change the observations."""
+    """List the departures that change the observations."""
     return frozenset(departures) & {"eyes", "lights", "heads"}
 
 
@@ -174,7 +174,7 @@ def estimator(departures: Collection[str], *, free_index: bool = False) -> Autho
 
 
 def estimation_rig(rig: RigGeometry, departures: Collection[str]) -> RigGeometry:
-    """Rig given to the estimator; in the authors' software its screen is 1 mm too far."""
+    """Make the rig given to the estimator; in the authors' software its screen is 1 mm too far."""
     if "plane" not in departures or rig.screen is None:
         return rig
     centre = frozen(rig.screen.centre_mm + np.array([1.0, 0.0, 0.0]))
@@ -182,7 +182,7 @@ def estimation_rig(rig: RigGeometry, departures: Collection[str]) -> RigGeometry
 
 
 def errors_deg(observations: Observations, gaze: GazePoints, departures: Collection[str]) -> Floats:
-    """Error of each observation (n,), NaN where there is no estimate."""
+    """Compute the error of each observation (n,), NaN where there is no estimate."""
     index = observations.index
     if "error" in departures:
         miss = np.linalg.norm(gaze.point_mm - index.target_mm, axis=1)
@@ -205,7 +205,7 @@ def run(
 
 
 def rows_of(outcome: Outcome, **keys: Any) -> list[Row]:
-    """Rows of H1 and H2 for each eye, and pooled where there are two."""
+    """Make rows of H1 and H2 for each eye, and pooled where there are two."""
     index, pupil, glints = outcome.observations.index, outcome.observations.pupil, outcome.observations.glints
     inside = pupil.in_image & glints.in_image.all(axis=1)
     out = []
@@ -258,7 +258,7 @@ def restarts(
 
 
 def optimiser_settings(protocols: Sequence[str]) -> dict[str, Any]:
-    """Settings of each protocol's calibration: method, start, bounds, tolerance."""
+    """List the settings of each protocol's calibration: method, start, bounds, tolerance."""
     out = {}
     for protocol in protocols:
         e = estimator(PUBLISHED if protocol == "published" else CORRECTED)

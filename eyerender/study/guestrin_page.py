@@ -55,7 +55,7 @@ def page(
 
 
 def _by_key(parts: Sequence[GuestrinPart]) -> dict[tuple[str, str], dict[str, dict[str, float]]]:
-    """Means (deg): (protocol, observer) -> eye model -> head."""
+    """Arrange means (deg): (protocol, observer) -> eye model -> head."""
     keys = dict.fromkeys(key for part in parts for key in part.means)
     return {key: {p.eye_model: p.means[key] for p in parts if key in p.means} for key in keys}
 
@@ -69,7 +69,7 @@ def _cells(parts: Sequence[GuestrinPart]) -> dict[tuple[str, str], dict[str, str
 
 
 def _heads_figure(parts: Sequence[GuestrinPart]) -> str | None:
-    """Figure 4 of the paper; None where every error is too large for it."""
+    """Draw Figure 4 of the paper; None where every error is too large for it."""
     # A variant with errors above 11 deg would flatten everything else.
     shown = {
         f"{protocol}, {observer}": {m: v for m, v in means.items() if max(v.values()) < 3}
@@ -84,7 +84,7 @@ def _heads_figure(parts: Sequence[GuestrinPart]) -> str | None:
 
 
 def _about_e5(parts: Sequence[GuestrinPart]) -> dict[str, str] | None:
-    """Explanation of the paper's 'errors exceeding 11 deg': E5 and its variants, if all of them were run."""
+    """Explain the paper's 'errors exceeding 11 deg': E5 and its variants, if all of them were run."""
     means = {p.eye_model: p.means["published", "analytic"] for p in parts if ("published", "analytic") in p.means}
     told = {m: f"{v['H1']:.2f}/{v['H2']:.2f} deg" for m, v in means.items() if m.startswith("E5")}
     return told if {"E5", *lit.VARIANTS} <= set(told) else None

@@ -44,7 +44,7 @@ def scene(eye: str) -> Scene:
 
 
 def calibration_rows() -> Bools:
-    """Whether each of the 25 directions is one of the shipped scene's nine."""
+    """Return whether each of the 25 directions is one of the shipped scene's nine."""
     a, e = AZIMUTHS_DEG[::2], ELEVATIONS_DEG[::2]
     return np.array([x in a and y in e for y in ELEVATIONS_DEG for x in AZIMUTHS_DEG])
 
@@ -77,12 +77,12 @@ def head_mounted_part(eye: str, observings: Sequence[Observing]) -> ModelResults
 
 
 def directions_deg() -> Floats:
-    """Azimuth and elevation (25, 2) of the optic axis."""
+    """Compute azimuth and elevation (25, 2) of the optic axis."""
     return np.array([(a, e) for e in ELEVATIONS_DEG for a in AZIMUTHS_DEG])
 
 
 def direction_errors_deg(seen: Observations, rig: RigGeometry, name: str) -> Floats:
-    """Errors (25, 2) of estimated directions, to the right and up, deg; NaN where learnt or not estimated.
+    """Compute errors (25, 2) of estimated directions, to the right and up, deg; NaN where learnt or not estimated.
 
     Args:
         seen: observations of the 25 directions.
@@ -103,7 +103,7 @@ def direction_errors_deg(seen: Observations, rig: RigGeometry, name: str) -> Flo
 
 
 def findings(features: Sequence[FeatureDifference], gaze: Sequence[GazeDifference]) -> list[Finding]:
-    """Effects of images on features and directions as values; there is no published claim to compare them with."""
+    """State the effects of images on features and directions; there is no published claim to compare them with."""
     out = []
     for f in features:
         if f.feature in ("pupil centre", ALL_GLINTS):
@@ -119,7 +119,7 @@ def findings(features: Sequence[FeatureDifference], gaze: Sequence[GazeDifferenc
 
 
 def more() -> dict[str, Any]:
-    """Content of the summary besides its rows."""
+    """Make the content of the summary besides its rows."""
     return {
         "scene": SCENE,
         "directions_deg": {"azimuth": list(AZIMUTHS_DEG), "elevation": list(ELEVATIONS_DEG)},

@@ -31,7 +31,7 @@ def page(
 
 
 def _centres(features: Sequence[FeatureDifference]) -> list[tuple[str, str]]:
-    """(distances of the pupil's centre by eye model, observer)."""
+    """Collect (distances of the pupil's centre by eye model, observer)."""
     out = []
     for observer in dict.fromkeys(f.observer for f in features):
         values = {f.eye_model: f for f in features if (f.observer, f.feature) == (observer, "pupil centre")}

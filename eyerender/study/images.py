@@ -53,16 +53,16 @@ class StudyImages:
     auto_exposure: float | None = None
 
     def of(self, scene: Scene) -> tuple[ImageEntry, ...]:
-        """Images of a shot's scene, in frame order; empty where they were not made."""
+        """Look up the images of a shot's scene, in frame order; empty where they were not made."""
         return self.entries.get(_digest(scene, self.auto_exposure is not None), ())
 
     def holds(self, scene: Scene) -> bool:
-        """Whether every image of a shot's scene exists."""
+        """Return whether every image of a shot's scene exists."""
         found = self.of(scene)
         return len(found) == len(scene.index()) and all(entry.path.is_file() for entry in found)
 
     def observe(self, scene: Scene, noise_seed: int | None = None) -> Observations:
-        """Features of a shot's images, or of other exposures of them with the noise of a seed.
+        """Extract the features of a shot's images, or of other exposures of them with the noise of a seed.
 
         Raises:
             InputError: they do not exist.
@@ -83,7 +83,7 @@ class StudyImages:
 
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:
-    """One shot per eye; with `facing` one per eye and head position, the cameras turned to the eye."""
+    """Make one shot per eye; with `facing` one per eye and head position, the cameras turned to the eye."""
     data = scene.spec.with_image(spp=spp).to_mapping()
     data["sensor"]["noise"] = noise
     index, out = scene.index(), []
@@ -101,7 +101,7 @@ def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = 
 
 
 def facing_scene(scene: Scene, head_mm: tuple[float, float, float], side: str) -> Scene:
-    """Scene of one head position and one eye, with every camera turned about its nodal point to face that eye."""
+    """Make the scene of one head position and one eye, with every camera turned on the spot to face that eye."""
     data = scene.spec.to_mapping()
     apex = scene.eye_position_mm(side) + np.array(head_mm)
     data["subject"]["eyes"] = [side]
@@ -158,7 +158,7 @@ def make_images(
 
 
 def dataset_spec(study: str, scenes: Sequence[Scene], auto_exposure: float | None = None) -> Any:
-    """Spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes.
+    """Make the spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes.
 
     A scene without noise that is also needed with noise is no sample of its own; its images are stored with the others.
     """
@@ -197,7 +197,7 @@ def dataset_spec(study: str, scenes: Sequence[Scene], auto_exposure: float | Non
 
 
 def in_sequence(values: Sequence[Any]) -> Any:
-    """Template that yields the values in order: plain where they agree, else a `sequence`, leaf by leaf."""
+    """Make a template that yields the values in order: plain where they agree, else a `sequence`, leaf by leaf."""
     first = values[0]
     if all(json.dumps(v) == json.dumps(first) for v in values):
         return first
@@ -209,7 +209,7 @@ def in_sequence(values: Sequence[Any]) -> Any:
 
 
 def read_images(folder: Path) -> StudyImages | None:
-    """Images of a finished dataset that this version made; None where there is none."""
+    """Read the images of a finished dataset that this version made; None where there is none."""
     from ..dataset.done import run_versions
 
     try:
@@ -235,7 +235,7 @@ def read_images(folder: Path) -> StudyImages | None:
 
 
 def _begun(folder: Path, plan: Any) -> bool:
-    """Whether a folder holds a run of this very plan and version, or nothing yet."""
+    """Return whether a folder holds a run of this very plan and version, or nothing yet."""
     from ..dataset.done import run_versions
 
     if not folder.exists():
@@ -254,7 +254,7 @@ def without_noise(scene: Scene) -> Scene:
 
 
 def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Scenes, as JSON, of which a line of metadata has an image, each with the image's name."""
+    """Yield the scenes, as JSON, that the images of a line of metadata show, each with the image's name."""
     scene = line["parameters"]["scene_json"]
     out = [(scene, line["file_name"])]
     if line.get("noiseless_file_name"):
@@ -265,7 +265,7 @@ def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _digest(scene: Scene, auto: bool = False) -> str:
-    """Digest of what a scene's images show, as in a dataset's lines of metadata; with `auto`, whatever the exposure."""
+    """Compute the digest of what a scene's images show, as metadata has it; `auto` leaves out the exposure."""
     eye = {key: value for key, value in scene.eye_spec.to_mapping().items() if key != "sources"}
     return _digest_of(json.dumps(scene.spec.to_mapping(), sort_keys=True), json.dumps(eye, sort_keys=True), auto)
 

@@ -109,11 +109,11 @@ SENTENCES: Final = MappingProxyType(
 
 
 def guestrin_deg(head: str) -> Floats:
-    """Errors of the four participants of [28] as angles at 650 mm, (4,) deg."""
+    """Convert the errors of the four participants of [28] to angles at 650 mm, (4,) deg."""
     return np.asarray(np.degrees(np.arctan(np.array(GUESTRIN_MM[head]) / GUESTRIN_DISTANCE_MM)))
 
 
 def blignaut_best(calibration: str) -> tuple[str, float]:
-    """Best function of [29] for a calibration set, and its error (deg)."""
+    """Look up the best function of [29] for a calibration set, and its error (deg)."""
     column = list(CALIBRATION_SETS).index(calibration)
     return min(((name, row[column]) for name, row in BLIGNAUT_DEG.items()), key=lambda p: p[1])

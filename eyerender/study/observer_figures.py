@@ -100,10 +100,10 @@ def budget_figure(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float, f
 
 
 def _width(panels: Mapping[str, object]) -> float:
-    """Width of a figure, inches."""
+    """Choose the width of a figure, inches."""
     return max(5.4, min(4.4 * len(panels), 13.0))
 
 
 def _shift(i: int, n: int) -> float:
-    """Offset of the i-th of n series from a tick."""
+    """Compute the offset of the i-th of n series from a tick."""
     return (i - (n - 1) / 2) * min(0.16, 0.7 / n)

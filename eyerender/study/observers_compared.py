@@ -58,7 +58,7 @@ class GazeDifference:
 def features(
     truth: Observations, found: Observations, rig: RigGeometry, protocol: str, observer: str, eye_model: str
 ) -> list[FeatureDifference]:
-    """Differences of the pupil's centre, its semi-axes (where both have them) and each light's glint."""
+    """Compare the pupil's centre, its semi-axes (where both have them) and each light's glint."""
     errors = feature_errors(truth, found)
     index = truth.index
     place = index.eye_position_mm + index.head_mm
@@ -91,7 +91,7 @@ def features(
 def gaze(
     analytic_deg: Floats, image_deg: Floats, protocol: str, observer: str, eye_model: str, estimator: str
 ) -> GazeDifference | None:
-    """Paired difference over the frames with estimates by both observers; None for fewer than two."""
+    """Compare gaze in pairs over the frames with estimates by both observers; None for fewer than two."""
     both = np.isfinite(analytic_deg) & np.isfinite(image_deg)
     n = int(both.sum())
     if n < 2:
@@ -106,7 +106,7 @@ def gaze(
 
 
 def _difference(vectors: Floats, mm_per_px: Floats) -> dict[str, Any]:
-    """Numbers of a `FeatureDifference`; too few vectors have no mean and no scatter."""
+    """Compute the numbers of a `FeatureDifference`; too few vectors have no mean and no scatter."""
     good = np.isfinite(vectors).all(axis=1)
     v = vectors[good]
     counts = {"n": len(v), "missing": int((~good).sum())}

@@ -43,7 +43,7 @@ class Observing:
     noise_seed: int | None = None
 
     def exposures(self) -> list[Observing]:
-        """Observers of the same images, exposed again with the noise of one seed each."""
+        """Make observers of the same images, exposed again with the noise of one seed each."""
         return [replace(self, noise_seed=seed) for seed in range(self.noise_seeds)]
 
     def observe(self, scene: Scene, *, facing: bool = False) -> Observations:
@@ -66,7 +66,7 @@ class Observing:
         return concatenate(parts).take(np.argsort(np.concatenate(order)))
 
     def shots(self, scene: Scene, *, facing: bool = False, spp: int | None = None) -> list[Shot]:
-        """Shots that this observer needs of a scene; none for ray optics."""
+        """List the shots that this observer needs of a scene; none for ray optics."""
         return [] if self.kind == "analytic" else shots(scene, noise=self.kind == "image", facing=facing, spp=spp)
 
 

@@ -37,7 +37,7 @@ class Report:
 
 
 def overview(cells: Mapping[tuple[str, str], Mapping[str, str]]) -> Values:
-    """First values of a page, by (protocol, observer) and eye model: cards, or a table for more than four."""
+    """Make the first values of a page, by (protocol, observer) and eye model: cards, or a table for more than four."""
     models = list(dict.fromkeys(m for by_model in cells.values() for m in by_model))
     if len(cells) <= 4:
         cards = [
@@ -49,7 +49,7 @@ def overview(cells: Mapping[tuple[str, str], Mapping[str, str]]) -> Values:
 
 
 def budget_values(made_of: Sequence[Budget], shown: Sequence[str]) -> Values | None:
-    """Composition of the gaze error; `shown` names the estimators drawn. None where there is only one term."""
+    """Describe the composition of the gaze error; `shown` names the estimators drawn. None for a single term."""
     if not any(len(b.terms) > 1 for b in made_of):
         return None
     protocols = list(dict.fromkeys(b.protocol for b in made_of))
@@ -79,7 +79,7 @@ def budget_values(made_of: Sequence[Budget], shown: Sequence[str]) -> Values | N
 
 
 def _bar(term: Term) -> tuple[str, float, float, float]:
-    """Name, height and ends of the whisker, which has no length for a term that is not a difference."""
+    """Return name, height and ends of the whisker, which has no length for a term that is not a difference."""
     low, high = term.low_deg, term.high_deg
     return term.name, term.deg, term.deg if low is None else low, term.deg if high is None else high
 
@@ -96,7 +96,7 @@ def _told(term: Term | None) -> str:
 
 
 def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> Values:
-    """Summary of one estimator: its own error, and the ranges of the terms over the eye models."""
+    """Summarise one estimator: its own error, and the ranges of the terms over the eye models."""
     ranges = []
     for term in terms[1:]:
         values = [t.deg for b in made_of if (t := b.term(term)) is not None]
@@ -108,7 +108,7 @@ def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> Val
 
 
 def observers_values(apart: Apart, shown: Sequence[str] = ()) -> Values | None:
-    """Differences of the observers; None where there is only one. `shown` names the estimators drawn."""
+    """Describe how the observers differ; None where there is only one. `shown` names the estimators drawn."""
     features, gaze = apart
     if not features:
         return None
@@ -135,7 +135,7 @@ def observers_values(apart: Apart, shown: Sequence[str] = ()) -> Values | None:
 
 
 def _panels(names: Sequence[str], series: Sequence[tuple[str, str]], values: Mapping[_Key, T]) -> _Panels[T]:
-    """Values of figures: panel -> series -> eye model."""
+    """Arrange the values of figures: panel -> series -> eye model."""
     several = len({protocol for protocol, _ in series}) > 1
     models = list(dict.fromkeys(model for *_, model in values))
     return {
@@ -169,7 +169,7 @@ def _micrometres(value: float | None) -> str:
 
 
 def findings_values(found: Sequence[Finding]) -> Values:
-    """Every finding with its details, and one row per statement with one column per observer (`together`)."""
+    """List every finding with its details, and one row per statement with one column per observer (`together`)."""
     told = {True: "true", False: "false", None: ""}
     rows = [
         (
@@ -194,7 +194,7 @@ def findings_values(found: Sequence[Finding]) -> Values:
 def waterfall_values(
     steps: Sequence[WaterfallStep], departures: Sequence[Departure], measures: Sequence[str]
 ) -> Values | None:
-    """Steps from published to corrected; None where only one protocol was run."""
+    """List the steps from published to corrected; None where only one protocol was run."""
     if not steps:
         return None
     models = list(dict.fromkeys(s.eye_model for s in steps))
@@ -220,7 +220,7 @@ def waterfall_values(
 
 
 def errata_values(departures: Sequence[Departure], faults: Sequence[Erratum]) -> Values:
-    """Departures of the software, and misprints of the paper."""
+    """List the departures of the software, and the misprints of the paper."""
     return {
         "departures": [(d.title, d.paper, d.software, d.corrected) for d in departures],
         "misprints": [(e.where, e.printed, e.used, e.effect) for e in faults],

@@ -55,23 +55,23 @@ class _Scenes:
         return self._seen[key]
 
     def run(self, departures: Collection[str]) -> Any:
-        """Outcome of the study with some departures."""
+        """Run the study with some departures."""
         scene, seen = self(departures)
         return self.module.run(seen, scene.rig, departures)
 
 
 def departures_of(module: Any, protocol: str) -> frozenset[str]:
-    """Departures of a protocol, given by name."""
+    """List the departures of a protocol, given by name."""
     return frozenset(module.PUBLISHED if protocol == "published" else module.CORRECTED)
 
 
 def facing(module: Any) -> bool:
-    """Whether a study's cameras are turned to the eyes for their images."""
+    """Return whether a study's cameras are turned to the eyes for their images."""
     return module is guestrin
 
 
 def scenes_of(module: Any, eyes: Sequence[str], protocols: Sequence[str]) -> list[Scene]:
-    """Scenes that a study observes in images."""
+    """List the scenes that a study observes in images."""
     keys = dict.fromkeys(module.scene_key(departures_of(module, protocol)) for protocol in protocols)
     return [module.scene(eye, key) for eye in eyes for key in keys]
 
@@ -112,7 +112,7 @@ def guestrin_part(
 
 
 def _guestrin_vectors(scenes: _Scenes, departures: frozenset[str]) -> dict[str, Floats]:
-    """Error vectors (n, 2) by variant."""
+    """Compute error vectors (n, 2) by variant."""
     scene, seen = scenes(departures)
     variants = {"index fixed": False} if "index" in departures else {"index fixed": False, "index free": True}
     return {
@@ -150,18 +150,18 @@ def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> B
 
 
 def _blignaut_vectors(done: list[blignaut.Outcome]) -> dict[str, Floats]:
-    """Error vectors (n, 2) by function and calibration set."""
+    """Compute error vectors (n, 2) by function and calibration set."""
     return {f"{o.function} on {o.calibration}": o.vector_deg for o in done if len(o.error_deg)}
 
 
 def _best_means(done: list[blignaut.Outcome]) -> dict[str, float | None]:
-    """Mean error of the best function for each set."""
+    """Compute the mean error of the best function for each set."""
     found = {c: blignaut.best(done, c) for c in CALIBRATION_SETS}
     return {c: b.mean_deg if b else None for c, b in found.items()}
 
 
 def _waterfall(eye: str, module: Any, measure: Any) -> list[WaterfallStep]:
-    """Steps from `published` to `corrected`, one departure after the other; and each of them corrected alone."""
+    """Step from `published` to `corrected`, one departure after the other; also correct each of them alone."""
     start = measure(module.PUBLISHED)
     steps = [WaterfallStep(eye, "published", start, start)]
     left = set(module.PUBLISHED)
@@ -174,7 +174,7 @@ def _waterfall(eye: str, module: Any, measure: Any) -> list[WaterfallStep]:
 
 
 def _misprints(eye: str) -> dict[str, dict[str, Any]]:
-    """Results of the corrected protocol with each of the misprints of Table 4 or the text."""
+    """Run the corrected protocol with each of the misprints of Table 4 or the text."""
     cases: dict[str, dict[str, Any]] = {
         "camera at x = 315": {"position_mm": [315.0, 0.0, -150.5], "tilt_deg": 13.8},
         "head positions in cm": {

@@ -126,7 +126,7 @@ class WaterfallStep:
 
 
 def mean_row(error_deg: Floats, **keys: Any) -> Row:
-    """Row for errors (n,); NaN counts as missing."""
+    """Make a row for errors (n,); NaN counts as missing."""
     good = error_deg[np.isfinite(error_deg)]
     n = len(good)
     return Row(
@@ -139,7 +139,7 @@ def mean_row(error_deg: Floats, **keys: Any) -> Row:
 
 
 def known_mean(errors: Floats) -> float | None:
-    """Mean of the errors that are known, which are not NaN; None if there are none."""
+    """Average the errors (n,) that are not NaN; None if there are none."""
     good = errors[np.isfinite(errors)]
     return float(good.mean()) if len(good) else None
 
@@ -166,13 +166,13 @@ def write_results(
 
 
 def table(kind: type, items: Sequence[Any]) -> str:
-    """CSV of dataclasses; empty cells where there is no value."""
+    """Write dataclasses as CSV; empty cells where there is no value."""
     names = [f.name for f in fields(kind)]
     return csv_text(names, ([getattr(item, name) for name in names] for item in items))
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """CSV of rows; empty cells for None."""
+    """Write rows as CSV; empty cells for None."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)

@@ -121,7 +121,7 @@ def run_study(
 
 
 def _exposure(level: float | None, observer: str) -> dict[str, float]:
-    """Setting of the automatic exposure, if there is one and it makes sense."""
+    """Check the setting of the automatic exposure, if there is one."""
     if level is None:
         return {}
     if observer == "analytic":
@@ -132,7 +132,7 @@ def _exposure(level: float | None, observer: str) -> dict[str, float]:
 
 
 def _kinds(observer: str, noise: str) -> list[ObserverKind]:
-    """Observers of a run."""
+    """List the observers of a run."""
     kinds: list[ObserverKind] = []
     if observer != "image":
         kinds.append("analytic")
@@ -151,7 +151,7 @@ def _noted(progress: Progress | None) -> Progress | None:
 def _image_scenes(
     name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[ObserverKind], spp: int | None
 ) -> list[Scene]:
-    """Scenes of every image that a study needs."""
+    """List the scenes of every image that a study needs."""
     if name == "observers":
         scenes, turned = [head_mounted.scene(eye) for eye in eyes], False
     else:
@@ -164,7 +164,7 @@ def _image_scenes(
 def _models(
     name: str, eyes: Sequence[str], protocols: Sequence[str], observings: Sequence[Observing]
 ) -> list[tuple[str, tuple[str, ...]]]:
-    """Eye models with their protocols; the published variants of E5 have their own names, never E5."""
+    """List eye models with their protocols; the published variants of E5 have their own names, never E5."""
     out = [(eye, tuple(protocols)) for eye in eyes]
     if name == "guestrin2006" and observings[0].kind == "analytic" and "E5" in eyes and "published" in protocols:
         out += [(v, ("published",)) for v in VARIANTS if v not in eyes]
@@ -185,7 +185,7 @@ def _job(name: str, job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> 
 def _collected(
     job: Callable[[Any], Any], items: list[Any], names: Sequence[str], workers: int, progress: Progress | None
 ) -> list[Any]:
-    """Results of a job for each item, in order."""
+    """Collect the results of a job for each item, in order."""
     out = []
     if progress is not None:
         progress(0, len(items), "")
@@ -199,7 +199,7 @@ def _collected(
 
 @contextmanager
 def _mapper(workers: int) -> Iterator[Callable[..., Any]]:
-    """`map`, or that of a pool of processes; they are spawned, because a fork would copy the parent's threads."""
+    """Choose `map`, or that of a pool of spawned processes, because a fork would copy the parent's threads."""
     if workers <= 1:
         yield map
         return

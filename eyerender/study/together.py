@@ -30,7 +30,7 @@ Results = tuple[list[Row], list[Finding], dict[str, Any], Report]
 
 
 def guestrin_results(parts: Sequence[GuestrinPart], protocols: Sequence[str]) -> Results:
-    """Results of guestrin2006: means tested against the paper's findings and the experiment."""
+    """Combine the results of guestrin2006: means tested against the paper's findings and the experiment."""
     rows = [row for part in parts for row in part.rows]
     found, tests = [], []
     keys = list(dict.fromkeys(key for part in parts for key in part.means))
@@ -57,7 +57,7 @@ def guestrin_results(parts: Sequence[GuestrinPart], protocols: Sequence[str]) ->
 
 
 def blignaut_results(parts: Sequence[BlignautPart], protocols: Sequence[str]) -> Results:
-    """Results of blignaut2014: means and feature clouds tested against the paper's findings."""
+    """Combine the results of blignaut2014: means and feature clouds tested against the paper's findings."""
     rows = [row for part in parts for row in part.rows]
     found: list[Finding] = []
     keys = list(dict.fromkeys(key for part in parts for key in part.outcomes))
@@ -80,7 +80,7 @@ def blignaut_results(parts: Sequence[BlignautPart], protocols: Sequence[str]) ->
 
 
 def conditions_results(parts: Sequence[ConditionsPart | PeoplePart], protocols: Sequence[str] = ()) -> Results:
-    """Results of conditions: values without a published claim."""
+    """Combine the results of conditions: values without a published claim."""
     rows = [row for part in parts for row in part.rows]
     models = [part for part in parts if isinstance(part, ConditionsPart)]
     people = [part for part in parts if isinstance(part, PeoplePart)]
@@ -90,7 +90,7 @@ def conditions_results(parts: Sequence[ConditionsPart | PeoplePart], protocols: 
 
 
 def observers_results(parts: Sequence[ModelResults], protocols: Sequence[str] = ()) -> Results:
-    """Results of observers: effects of images on features and directions."""
+    """Combine the results of observers: effects of images on features and directions."""
     apart, made_of = _observers_apart(parts), _budgets(parts)
     found = head_mounted.findings(*apart)
     more = {**head_mounted.more(), **_as_mappings(apart, made_of)}
@@ -99,7 +99,7 @@ def observers_results(parts: Sequence[ModelResults], protocols: Sequence[str] = 
 
 
 def _observers_apart(parts: Sequence[ModelResults]) -> Apart:
-    """Differences of the observers on the frames that both have seen."""
+    """Compare the observers on the frames that both have seen."""
     features: list[observers_compared.FeatureDifference] = []
     gaze: list[observers_compared.GazeDifference] = []
     seen = {(p.eye_model, *key): (p, key) for p in parts for key in p.seen}
@@ -119,7 +119,7 @@ def _observers_apart(parts: Sequence[ModelResults]) -> Apart:
 
 
 def _budgets(parts: Sequence[ModelResults]) -> list[Budget]:
-    """Error budgets of the eye models; the published variants of E5 are not eyes."""
+    """Compute error budgets of the eye models; the published variants of E5 are not eyes."""
     return budgets([part for part in parts if part.eye_model not in VARIANTS])
 
 
