@@ -65,7 +65,7 @@ class ExtractorProcess:
     def __init__(
         self, argv: Sequence[str], *, start_timeout_s: float, timeout_s: float, env: Mapping[str, str] | None = None
     ) -> None:
-        self._timeout_s = timeout_s
+        self._timeout_s, self._start_timeout_s = timeout_s, start_timeout_s
         self._buffer = b""
         self._closed = False
         try:
@@ -89,6 +89,7 @@ class ExtractorProcess:
         try:
             self.greeting_line = self._line(start_timeout_s, "no greeting")
             self.greeting = Greeting.parse(self.greeting_line)
+            self._cold = self.greeting.warms_up
         except InputError as error:
             self.close()
             raise Failed(f"greeting: {error}") from None
@@ -105,7 +106,9 @@ class ExtractorProcess:
         """Return the answer to one request, and the seconds of the round trip."""
         begin = time.monotonic()
         self._send(request.to_line().encode())
-        line = self._line(self._timeout_s, "no answer")
+        limit_s = self._timeout_s + (self._start_timeout_s if self._cold else 0.0)
+        line = self._line(limit_s, "no answer")
+        self._cold = False
         seconds = time.monotonic() - begin
         try:
             return Reply.parse(line, request.id, self.greeting.conventions), seconds

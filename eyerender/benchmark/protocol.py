@@ -51,11 +51,20 @@ class Extractor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Greeting:
-    """Description that an extractor gives of itself; `reports` lists the features for which it looks."""
+    """Description that an extractor gives of itself.
+
+    Attributes:
+        name: its name and version.
+        conventions: the meaning of its numbers.
+        reports: the features for which it looks.
+        warms_up: whether its first answer takes longer, because it loads libraries or compiles; that answer then has
+            the time limit of the start in addition.
+    """
 
     name: str
     conventions: Conventions
     reports: tuple[str, ...]
+    warms_up: bool = False
 
     @classmethod
     def parse(cls, line: str) -> Greeting:
@@ -72,7 +81,8 @@ class Greeting:
             raise InputError("must be a name", path="name")
         if not isinstance(reports, list) or "pupil" not in reports or any(r not in FEATURES for r in reports):
             raise InputError(f"must name 'pupil' and at most {', '.join(FEATURES)}", path="reports")
-        return cls(name.strip(), Conventions.of(data.get("conventions")), tuple(f for f in FEATURES if f in reports))
+        known = tuple(f for f in FEATURES if f in reports)
+        return cls(name.strip(), Conventions.of(data.get("conventions")), known, data.get("warms_up") is True)
 
 
 @dataclass(frozen=True, slots=True)

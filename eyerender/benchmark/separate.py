@@ -1,16 +1,19 @@
-"""Pupil Labs' 2D detector behind the protocol; it runs in its own environment and does not import this package.
+"""Detectors of other packages behind the protocol; it runs in their own environment and does not import this package.
 
-    .../bin/python pupil_labs.py
+    .../bin/python separate.py pupil-detectors|PuRe|ElSe|ExCuSe|Swirski2D
 
-It needs pupil-detectors, numpy and Pillow. The detector takes 8-bit images; deeper ones are scaled down.
+The first needs pupil-detectors, the others need cheshm, and all need numpy and Pillow. The detectors take 8-bit images;
+deeper ones are scaled down. All of them report cv2.fitEllipse's rotated rectangles.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import sys
 import time
+from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any
 
@@ -18,40 +21,47 @@ import numpy as np
 from PIL import Image
 
 SCHEMA = "eyerender/extractor/1"
+PUPIL_LABS = "pupil-detectors"
+CHESHM = ("PuRe", "ElSe", "ExCuSe", "Swirski2D")
 
 
-def main() -> int:
+def main(name: str) -> int:
     """Serve requests until the input ends."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    from pupil_detectors import Detector2D  # type: ignore[import-not-found,unused-ignore]
-
+    package = PUPIL_LABS if name == PUPIL_LABS else "cheshm"
+    make = _pupil_labs if name == PUPIL_LABS else lambda radii: _cheshm(name)
     greeting = {
         "schema": SCHEMA,
-        "name": f"pupil-detectors {version('pupil-detectors')}",
-        # cv2.fitEllipse's rotated rectangle, minor axis first.
+        "name": f"{name} {version(package)}" if name == package else f"{name} ({package} {version(package)})",
         "conventions": {"pixel_origin": "centre", "axes": "full", "angle_unit": "deg", "angle_of": "first"},
         "reports": ["pupil"],
+        "warms_up": True,
     }
     print(json.dumps(greeting), file=answers, flush=True)
-    detector: Any = None
+    detect: Callable[[Any], dict[str, Any]] | None = None
     told: Any = None
     for line in sys.stdin:
         request = json.loads(line)
         image = eight_bits(request["image"], request["bit_depth"])
-        radius = request["hints"].get("radius_px")
-        if detector is None or radius != told:
-            told, size = radius, {}
-            if radius is not None:
-                size = {"pupil_size_min": 2 * radius[0], "pupil_size_max": 2 * radius[1]}
-            detector = Detector2D(size)
-            detector.detect(image.copy())
+        radii = request["hints"].get("radius_px")
+        if detect is None or radii != told:
+            told, detect = radii, make(radii)
+            detect(image.copy())
         wall, cpu = time.perf_counter(), time.process_time()
-        found = detector.detect(image)
+        found = detect(image)
         spent = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
-        answer = {"id": request["id"], "record": {"pupil": pupil_of(found)}, **spent}
-        print(json.dumps(answer), file=answers, flush=True)
+        print(json.dumps({"id": request["id"], "record": {"pupil": found}, **spent}), file=answers, flush=True)
     return 0
+
+
+def _pupil_labs(radii: Any) -> Callable[[Any], dict[str, Any]]:
+    """Pupil Labs' detector for a span of radii, px."""
+    from pupil_detectors import Detector2D  # type: ignore[import-not-found,unused-ignore]
+
+    size = {} if radii is None else {"pupil_size_min": 2 * radii[0], "pupil_size_max": 2 * radii[1]}
+    detector = Detector2D(size)
+    return lambda image: pupil_of(detector.detect(image))
 
 
 def pupil_of(found: dict[str, Any]) -> dict[str, Any]:
@@ -59,12 +69,30 @@ def pupil_of(found: dict[str, Any]) -> dict[str, Any]:
     ellipse = found["ellipse"]
     if found["confidence"] <= 0.0 or min(ellipse["axes"]) <= 0.0:
         return {"status": "missing", "reason": "no pupil detected (confidence 0)"}
+    return _rectangle(ellipse["center"], ellipse["axes"], ellipse["angle"], found["confidence"])
+
+
+def _cheshm(name: str) -> Callable[[Any], dict[str, Any]]:
+    """A detector of cheshm with its own settings, which know nothing of the hints."""
+    module: Any = importlib.import_module(f"cheshm.pupil_detectors.{name}")
+    return lambda image: cheshm_pupil(module.detect_pupil(image))
+
+
+def cheshm_pupil(found: dict[str, Any] | None) -> dict[str, Any]:
+    """Pupil of the record; without an ellipse, such as a mere position, there is none."""
+    centre, axes, angle = (found or {}).get("ellipse") or ((0.0, 0.0), (0.0, 0.0), 0.0)
+    if not (min(axes) > 0.0 and np.isfinite([*centre, *axes, angle]).all()):
+        return {"status": "missing", "reason": "no ellipse" if found else "no pupil detected"}
+    return _rectangle(centre, axes, angle, (found or {}).get("confidence"))
+
+
+def _rectangle(centre: Any, axes: Any, angle: Any, confidence: Any) -> dict[str, Any]:
     return {
         "status": "ok",
-        "centre_px": [float(v) for v in ellipse["center"]],
-        "axes_px": [float(v) for v in ellipse["axes"]],
-        "angle": float(ellipse["angle"]),
-        "confidence": float(found["confidence"]),
+        "centre_px": [float(v) for v in centre],
+        "axes_px": [float(v) for v in axes],
+        "angle": float(angle),
+        "confidence": None if confidence is None else float(confidence),
     }
 
 
@@ -78,4 +106,4 @@ def eight_bits(path: str, bit_depth: int) -> Any:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1]))

@@ -1,4 +1,4 @@
-"""Extractors that come with the package: its own fast and refined, the contour baseline, Pupil Labs' detector."""
+"""Extractors that come with the package: its own, the contour baseline, and programs that run detectors of others."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ from ..storage.cachefolder import cache_folder
 from .registry import Command
 
 PUPIL_LABS_PYTHON = "EYERENDER_PUPIL_DETECTORS"
+CHESHM_PYTHON = "EYERENDER_CHESHM"
+PUPIL_LABS = "pupil-detectors"
+# Detectors of cheshm by the name of the object here.
+_CHESHM = {"pure": "PuRe", "else_": "ElSe", "excuse": "ExCuSe", "swirski": "Swirski2D"}
 # Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
 _PLACE_MM = 1.5
 
@@ -52,25 +56,35 @@ def pupil_labs_python() -> Path | None:
 
     EYERENDER_PUPIL_DETECTORS names it; else it is where scripts/setup_pupil_detectors.sh puts it.
     """
-    given = os.environ.get(PUPIL_LABS_PYTHON)
+    return _interpreter(PUPIL_LABS_PYTHON, PUPIL_LABS)
+
+
+def cheshm_python() -> Path | None:
+    """Interpreter of the environment with `cheshm`: EYERENDER_CHESHM, else where scripts/setup_cheshm.sh puts it."""
+    return _interpreter(CHESHM_PYTHON, "cheshm")
+
+
+def _interpreter(variable: str, name: str) -> Path | None:
+    given = os.environ.get(variable)
     if given:
         return Path(given) if os.access(given, os.X_OK) else None
     cache = cache_folder()
-    python = None if cache is None else cache / "pupil-detectors" / "bin" / "python"
+    python = None if cache is None else cache / name / "bin" / "python"
     return python if python is not None and os.access(python, os.X_OK) else None
 
 
-def _pupil_labs() -> Command:
-    python = pupil_labs_python()
+def _separate(python: Path | None, detector: str, script: str) -> Command:
     if python is None:
-        return Command(None, "not set up; scripts/setup_pupil_detectors.sh makes its environment")
-    return Command((str(python), str(Path(__file__).with_name("pupil_labs.py"))))
+        return Command(None, f"not set up; scripts/{script} makes its environment")
+    return Command((str(python), str(Path(__file__).with_name("separate.py")), detector))
 
 
 def __getattr__(name: str) -> Command:
     # It is looked up at each use, because the environment may have been made in the meantime.
     if name == "pupil_detectors":
-        return _pupil_labs()
+        return _separate(pupil_labs_python(), PUPIL_LABS, "setup_pupil_detectors.sh")
+    if name in _CHESHM:
+        return _separate(cheshm_python(), _CHESHM[name], "setup_cheshm.sh")
     raise AttributeError(name)
 
 

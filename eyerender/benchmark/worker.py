@@ -51,6 +51,7 @@ def main(argv: list[str]) -> int:
         "name": argv[1] if len(argv) > 1 else argv[0],
         "conventions": Conventions.of(getattr(extractor, "conventions", None)).to_mapping(),
         "reports": list(getattr(extractor, "reports", FEATURES)),
+        "warms_up": True,
     }
     _send(answers, json.dumps(greeting))
     warm = False

@@ -117,6 +117,18 @@ def test_a_failure_on_one_image_costs_that_image_only(program, images):
     assert run.scores[4].reason == "too many eyes"
 
 
+def test_warming_up_does_not_count_against_the_time_limit(program, images):
+    body = """
+    say({**GREETING, "warms_up": True})
+    for k, line in enumerate(sys.stdin):
+        time.sleep(1.2 if k == 0 else 3600 if k == 2 else 0)
+        ok(json.loads(line))
+    """
+    run = run_extractor(program(body), images[:3], timeout_s=1.0, start_timeout_s=20.0)
+    assert [s.outcome for s in run.scores] == ["none", "none", "error"]
+    assert "no answer within 1 s" in run.scores[2].reason
+
+
 def test_one_that_reads_nothing_is_not_waited_for(program):
     """A pipe holds some 64 KB; after that, writing would wait for a reader."""
     extractor = program("say(GREETING); time.sleep(3600)")
