@@ -77,6 +77,7 @@ from .rig.imaging import Motion as Motion
 from .rig.imaging import Opening as Opening
 from .rig.imaging import Panel as Panel
 from .rig.imaging import RadianceMap as RadianceMap
+from .rig.imaging import Star as Star
 from .rig.imaging import Sun as Sun
 from .rig.light import Led as Led
 from .rig.light import LedRing as LedRing

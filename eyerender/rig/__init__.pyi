@@ -10,6 +10,7 @@ from .imaging import Motion as Motion
 from .imaging import Opening as Opening
 from .imaging import Panel as Panel
 from .imaging import RadianceMap as RadianceMap
+from .imaging import Star as Star
 from .imaging import Sun as Sun
 from .light import Lamp as Lamp
 from .light import Led as Led

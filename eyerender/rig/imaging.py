@@ -37,6 +37,21 @@ class Opening(Spec):
     radiance_w_m2_sr: NonNegative = Field(default=0.0, description="radiance of the rim, within the camera's filter")
 
 
+class Star(Spec):
+    """The star about bright points: light that the straight edges of the aperture's blades diffract.
+
+    Across every edge there is an arm on both sides of the point, whose light falls as 1 / r^2 (Fraunhofer diffraction at
+    a straight edge). An even number of blades makes as many arms, an odd number twice as many.
+    """
+
+    blades: Annotated[int, Field(ge=3, le=12)] = Field(default=6, description="number of the aperture's blades")
+    share: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.02, description="share of the light in the arms")
+    turn_deg: Annotated[float, Field(ge=-180, le=180)] = Field(
+        default=0.0, description="direction of one arm, clockwise from the right of the picture"
+    )
+    reach_px: Annotated[int, Field(ge=2, le=200)] = Field(default=40, description="length at which arms are cut off")
+
+
 class Lens(Spec):
     """A thin lens out of focus, vignetting beyond cos^4, light that the lens scatters, and what frames its view.
 
@@ -69,6 +84,7 @@ class Lens(Spec):
     ghost_blur_px: Annotated[float, Field(ge=0, le=200)] = Field(
         default=6.0, description="standard deviation of the ghost's blur (chosen)"
     )
+    star: Star | None = Field(default=None, description="star about bright points, such as glints")
     openings: Annotated[tuple[Opening, ...], Field(max_length=8)] = Field(
         default=(), description="openings that the camera looks through; the picture is dark outside any of them"
     )

@@ -1,4 +1,4 @@
-"""Light that goes astray between lens and sensor: openings that cut it off, ghosts, veiling glare.
+"""Light that goes astray between lens and sensor: stars about points, openings that cut it off, ghosts, veiling glare.
 
 They change the finished picture in this order. With the shares g of the glare and s of the ghost,
 
@@ -17,16 +17,45 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy import fft, ndimage, special
+from scipy import fft, ndimage, signal, special
 
 from ..arrays import Bools, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
-from .imaging import Lens, Opening
+from .imaging import Lens, Opening, Star
 from .sensor import Sensor
 
 _FADED, _FEW = 14.0, 1 / 3  # r0 k of waves of which the glare leaves a millionth; a share of all waves
 _LARGEST_BLOCK = 16  # px
 _SUMMED = 128  # terms of a sum at a time
+
+
+def starred(picture: Reals, star: Star | None) -> Reals:
+    """Picture (h, w) with the star of the aperture about every point, continued by its mirror image at the borders.
+
+    Light from outside of a window of the sensor has no arms in it.
+    """
+    if star is None or star.share == 0:
+        return picture
+    kernel = star_kernel(star).astype(picture.dtype)
+    arms = signal.oaconvolve(np.pad(picture, star.reach_px, mode="symmetric"), kernel, mode="valid")
+    return np.asarray((1 - star.share) * picture + star.share * np.maximum(arms, 0), dtype=picture.dtype)
+
+
+@lru_cache(maxsize=8)
+def star_kernel(star: Star) -> Reals:
+    """Light (2 n + 1, 2 n + 1) of a point in the arms, n = `reach_px`; its sum is 1."""
+    n, arms = star.reach_px, star.blades * (1 if star.blades % 2 == 0 else 2)
+    angle = np.radians(star.turn_deg) + 2 * np.pi * np.arange(arms)[:, None] / arms
+    r = np.arange(1.0, n + 1e-9, 0.25)
+    x, y = n + r * np.cos(angle), n + r * np.sin(angle)
+    weight = np.broadcast_to(1 / r**2, x.shape)
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    u, v = x - column, y - row
+    out = np.zeros((2 * n + 2, 2 * n + 2))
+    for i, j, share in ((0, 0, (1 - v) * (1 - u)), (0, 1, (1 - v) * u), (1, 0, v * (1 - u)), (1, 1, v * u)):
+        np.add.at(out, (row + i, column + j), weight * share)
+    kernel = out[:-1, :-1]
+    return frozen(kernel / kernel.sum())
 
 
 def framed(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import fft
+from scipy import fft, ndimage
 
 from eyerender.rig.camera import Camera
-from eyerender.rig.imaging import Lens, Opening
+from eyerender.rig.imaging import Lens, Opening, Star
 from eyerender.rig.sensor import Sensor
 from eyerender.rig.stray import (
     block_px,
@@ -18,6 +18,8 @@ from eyerender.rig.stray import (
     misses_light,
     scattered,
     scattered_around,
+    star_kernel,
+    starred,
     transmission,
     veil,
 )
@@ -33,6 +35,25 @@ def picture():
     out = rng.uniform(0.1, 1.0, (240, 320))
     out[rng.integers(30, 210, 9), rng.integers(30, 290, 9)] = 60.0
     return out
+
+
+@pytest.mark.parametrize(("blades", "arms"), [(4, 4), (5, 10), (6, 6)])
+def test_a_star_has_an_arm_on_both_sides_of_every_edge_and_keeps_energy(picture, blades, arms):
+    star = Star(blades=blades, share=0.1, turn_deg=10.0, reach_px=30)
+    assert starred(picture, star).sum() == pytest.approx(picture.sum(), rel=2e-2)  # its border is a mirror image
+    assert starred(np.full((90, 70), 3.0), star) == pytest.approx(np.full((90, 70), 3.0))
+    kernel = star_kernel(star)
+    assert kernel.sum() == pytest.approx(1)
+    turn = np.radians(np.arange(0, 360, 0.5))
+    around = ndimage.map_coordinates(kernel, [30 + 20 * np.sin(turn), 30 + 20 * np.cos(turn)], order=1)
+    lit = around > 0.3 * around.max()
+    assert np.count_nonzero(lit & ~np.roll(lit, 1)) == arms
+    assert lit[20]  # of 10 degrees, where one arm was asked for
+    # Light of an arm falls as 1 / r^2: between 8 and 24 px by nine, up to the pixels' own steps.
+    ring = [ndimage.map_coordinates(kernel, [30 + r * np.sin(turn), 30 + r * np.cos(turn)], order=1).mean() * r
+            for r in (8.0, 24.0)]  # fmt: skip
+    assert ring[0] / ring[1] == pytest.approx(9, rel=0.15)
+    assert starred(picture, None) is picture
 
 
 @pytest.mark.parametrize("radius", [3.0, 40.0, 500.0])

@@ -116,6 +116,7 @@ class RawFrame(ArrayValue):
         # Single precision is finer than the samples' noise, and takes half the time.
         picture = psf.blur(self.blur.of_pictures(self.picture).astype(np.float32), job.sensor.psf_sigma_px)
         add_shines(self.glints, picture, job)
+        picture = stray.starred(picture, job.lens.star)
         seen = (job.lens, job.camera, job.window)
         picture = _framed(picture, *seen)
         if self.around is None:
