@@ -60,7 +60,7 @@ class AnalyticObserver:
         has = eyes[0].purkinje_orders
         if not set(purkinje) <= set(has):
             raise InputError(
-                f"must be among {', '.join(map(str, has))}: {scene.eye_spec.name} has no other Purkinje images",
+                f"must be among {', '.join(map(str, has))}: {scene.eye_name} has no other Purkinje images",
                 path="purkinje",
             )
         seen = features(

@@ -49,7 +49,7 @@ def image_line(
         "records": [{**record, "frame": turn.sample * frames + frame}],
         "labels": labels,
         "parameters": {
-            "eye_model": scene.eye_spec.name,
+            "eye_model": scene.eye_name,
             "pupil_diameter_mm": scene.stop_diameter_mm(side),
             "wavelength_nm": scene.spec.wavelength_nm,
             "spp": scene.spec.image.spp,

@@ -118,7 +118,8 @@ def cornea_patches(eye: EyeModel, rings: int, sectors: int) -> tuple[Patch, ...]
     indices = [1.0, *(float(n) for n in eye.front_indices)]
     patches = [_cap("cornea_front", eye.front[0], limbus, rings, indices[0], indices[1])]
     if len(eye.front) > 1:
-        rho = chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(sectors) / sectors)
+        stop, angle = eye.stop, 2 * np.pi * np.arange(sectors) / sectors
+        rho = chamber_rim(eye.front[-1], stop.centre_mm, stop.normal, float(eye.limbus_radius_mm), angle)
         patches.append(_cap("cornea_back", eye.front[-1], rho, rings, indices[1], indices[2]))
     return tuple(patches)
 
@@ -176,14 +177,14 @@ def _band(
     return Patch(name, vertices, normals, faces, exterior, interior)
 
 
-def chamber_rim(eye: EyeModel, surface: Surface, angle: Floats) -> Floats:
-    """Radius (sectors,) at which the posterior cornea meets the plane of the iris, at most that of the limbus."""
-    low, high = np.zeros_like(angle), np.full_like(angle, float(eye.limbus_radius_mm) * 0.995)
+def chamber_rim(surface: Surface, centre: Floats, normal: Floats, limbus_mm: float, angle: Floats) -> Floats:
+    """Radius (sectors,) mm at which the posterior cornea meets the plane of the iris, less than that of the limbus."""
+    low, high = np.zeros_like(angle), np.full_like(angle, limbus_mm * 0.995)
     for _ in range(60):
         middle = 0.5 * (low + high)
         y, z = middle * np.cos(angle), middle * np.sin(angle)
         x = np.stack([np.asarray(surface.sag(y, z)), y, z], axis=1) @ surface.rotation.T + surface.origin_mm
-        above = (x - eye.stop.centre_mm) @ eye.stop.normal > 0
+        above = (x - centre) @ normal > 0
         low, high = np.where(above, middle, low), np.where(above, high, middle)
     return low
 

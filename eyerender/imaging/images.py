@@ -150,7 +150,7 @@ def render_folder(
                 "records": [records[image.row]],
                 "labels": seen_labels(image, truth),
                 "parameters": {
-                    "eye_model": scene.eye_spec.name,
+                    "eye_model": scene.eye_name,
                     "pupil_diameter_mm": scene.stop_diameter_mm(records[image.row]["eye"]),
                     "wavelength_nm": spec.wavelength_nm,
                     "spp": spec.image.spp,

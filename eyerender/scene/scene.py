@@ -24,12 +24,12 @@ from ..errors import InputError, InputWarning
 from ..eye.fixation import fixations
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
+from ..eye.parts import Side
 from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
 from ..observation import EYES, Index, PoseTruth
 from ..plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings, wavelength_warnings
 from ..population.eyes import amplitude_d
-from ..population.model import SIDES
 from ..population.people import Person
 from ..population.response import REFERENCE_AGE, responding
 from ..population.table import default_table
@@ -128,8 +128,6 @@ class Scene:
 
     Attributes:
         spec: what a scene file says.
-        eye_spec: what the eye file says; of a drawn person the right eye's.
-        left_eye_spec: the left eye's, written as a right eye; the same object where it is the mirror image.
         rig: the numeric rig.
         base: folder to which the files of its pictures (an HDR map, a head mesh) are relative, by default the current
             one.
@@ -137,11 +135,10 @@ class Scene:
     """
 
     spec: SceneSpec
-    eye_spec: EyeSpec
-    left_eye_spec: EyeSpec
     rig: RigGeometry
     base: Path | None = field(compare=False)
     source: str = field(compare=False)
+    _eyes: EyeSpec | _DrawnEyes
 
     def __init__(
         self, subject: SubjectSpec | None = None, rig: Rig | None = None, *, name: str = "scene", **fields: Any
@@ -184,13 +181,13 @@ class Scene:
         if (authored := spec.rig.resolved(base)) is not spec.rig:
             spec = spec.model_copy(update={"rig": authored})
         built = spec.rig.build() if rig is None else rig
+        eyes: EyeSpec | _DrawnEyes
         if spec.person is not None:
-            eyes = _eyes_of(spec, spec.person, built)
+            eyes = _drawn_eyes(spec, spec.person, built)
         else:
-            own = spec.eye.spec(base) if eye_spec is None else eye_spec
-            eyes = own, own
+            eyes = spec.eye.spec(base) if eye_spec is None else eye_spec
         scene = object.__new__(cls)
-        for name, value in zip(cls.__slots__, (spec, *eyes, built, base, source), strict=True):
+        for name, value in zip(cls.__slots__, (spec, built, base, source, eyes), strict=True):
             object.__setattr__(scene, name, value)
         return scene
 
@@ -200,7 +197,7 @@ class Scene:
         """Replace the spec (and its rig), the eye or the rig."""
         return Scene.compiled(
             spec or self.spec,
-            eye_spec or self.eye_spec,
+            eye_spec or (None if isinstance(self._eyes, _DrawnEyes) else self._eyes),
             rig=rig or (self.rig if spec is None else None),
             base=self.base,
             source=self.source,
@@ -280,7 +277,7 @@ class Scene:
         spec = SceneSpec.from_mapping(data)
         # The eye of a scene may be another than its file names: one given instead, or one with drawn parameters.
         same = spec.eye.model == self.spec.eye.model
-        return self.replaced(spec, eye_spec=self.eye_spec if same else spec.eye.spec(self.base))._checked()
+        return self.replaced(spec, eye_spec=None if same else spec.eye.spec(self.base))._checked()
 
     @property
     def name(self) -> str:
@@ -315,9 +312,28 @@ class Scene:
         who: dict[str, float | int | str] = {"preset": person.preset, "seed": person.seed, "subject": person.subject}
         return {"person": {**who, "sex": person.sex, **numbers}}
 
+    @property
+    def eye_spec(self) -> EyeSpec:
+        """Eye file; of a drawn person the right eye's."""
+        return self.eye_file("right")
+
+    @property
+    def left_eye_spec(self) -> EyeSpec:
+        """Eye file of the left eye, written as a right eye; the same object where it is the mirror image."""
+        return self.eye_file("left")
+
+    @property
+    def eye_name(self) -> str:
+        """Name of the eye file, the same for both eyes of a drawn person."""
+        return self.eye_file(self.spec.subject.eyes[0]).name
+
     def eye_file(self, side: str) -> EyeSpec:
-        """Return the eye file of one side, written as a right eye."""
-        return self.left_eye_spec if side == "left" else self.eye_spec
+        """Return the eye file of one side, written as a right eye.
+
+        Raises:
+            InputError: a drawn eye that is not observed cannot exist.
+        """
+        return self._eyes if isinstance(self._eyes, EyeSpec) else self._eyes.of("left" if side == "left" else "right")
 
     def warnings(self) -> list[InputWarning]:
         """List probable mistakes in the scene: a pupil of 0.4 mm, lengths in metres, a lamp in the head, ...
@@ -467,7 +483,7 @@ class Scene:
         n = len(head)
         eye = sides[side]
         model = np.empty(n, dtype=object)
-        model[:] = self.eye_spec.name
+        model[:] = self.eye_name
         return Index(
             frame=(head * fixations + fixation) * cameras + camera,
             fixation=fixation,
@@ -645,26 +661,40 @@ def targets_of(spec: SceneSpec, rig: RigGeometry) -> Floats | None:
     return screen.world(np.array(targets.screen_mm, dtype=float))
 
 
-def _eyes_of(spec: SceneSpec, person: Person, rig: RigGeometry) -> tuple[EyeSpec, EyeSpec]:
-    """Make right and left eye of a person in the light and at the distance of a scene."""
+@dataclass(frozen=True, slots=True)
+class _DrawnEyes:
+    """The eyes of a person (JSON) in the light and at the distance of a scene; each is drawn when it is asked for."""
+
+    person: str
+    luminance_cd_m2: float | None
+    field_deg: float | None
+    demand_d: float
+
+    def of(self, side: Side) -> EyeSpec:
+        """Eye file of one side."""
+        return _drawn_eye(self, side)
+
+
+def _drawn_eyes(spec: SceneSpec, person: Person, rig: RigGeometry) -> _DrawnEyes:
+    """The eyes of a person in the light and at the distance of a scene, of which those that are observed exist."""
     subject = spec.subject
-    state = (subject.luminance_cd_m2, subject.field_deg, demand_d(spec, targets_of(spec, rig)))
+    eyes = _DrawnEyes(
+        person.to_json(), subject.luminance_cd_m2, subject.field_deg, demand_d(spec, targets_of(spec, rig))
+    )
     try:
-        return _drawn_eyes(person.to_json(), *state)
+        for side in subject.eyes:
+            eyes.of(side)
     except InputError as error:
         raise error.placed(under="person") from None
+    return eyes
 
 
-@lru_cache(maxsize=64)
-def _drawn_eyes(
-    person: str, luminance_cd_m2: float | None, field_deg: float | None, demand: float
-) -> tuple[EyeSpec, EyeSpec]:
-    """Make a person's eyes from its JSON; cached, because this takes longer than the remaining work on a scene."""
-    who = Person.from_mapping(json.loads(person))
-    right, left = (
-        who.eye(side, luminance_cd_m2=luminance_cd_m2, field_deg=field_deg, demand_d=demand) for side in SIDES
+@lru_cache(maxsize=128)
+def _drawn_eye(eyes: _DrawnEyes, side: Side) -> EyeSpec:
+    """Eye of a person, cached because making it takes longer than everything else of a scene."""
+    return Person.from_mapping(json.loads(eyes.person)).eye(
+        side, luminance_cd_m2=eyes.luminance_cd_m2, field_deg=eyes.field_deg, demand_d=eyes.demand_d
     )
-    return right, left
 
 
 def _without_person(data: Mapping[str, Any]) -> dict[str, Any]:

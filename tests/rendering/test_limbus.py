@@ -124,7 +124,8 @@ def test_a_flat_iris_before_the_limbus_has_no_black_ring(renderer):
     # A chamber 1.3 mm shallower: the cornea's back ends 0.6 mm behind the plane of the iris.
     eye = eye_of("E4")
     shallow = replace(eye, stop=replace(eye.stop, centre_mm=eye.stop.centre_mm + np.array([1.3, 0.0, 0.0])))
-    reach = chamber_rim(shallow, eye.front[-1], np.linspace(0, 2 * np.pi, 8))
+    stop, angle = shallow.stop, np.linspace(0, 2 * np.pi, 8)
+    reach = chamber_rim(eye.front[-1], stop.centre_mm, stop.normal, float(eye.limbus_radius_mm), angle)
     shallow = replace(shallow, iris_root_radius_mm=float(np.min(reach)) - 0.1)
     rig = remote_rig()
     job = job_of(shallow, rig, rig.window(128, 128), look=PLAIN.model_copy(update={"limbus_albedo": 0.3}))

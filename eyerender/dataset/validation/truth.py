@@ -175,7 +175,7 @@ class SceneTruth:
             **({"gamma": scene.spec.sensor.gamma} if "gamma" in line else {}),
             "records": list(found.take([row]).records(version_of(record))),
             "parameters": {
-                "eye_model": scene.eye_spec.name,
+                "eye_model": scene.eye_name,
                 "pupil_diameter_mm": scene.stop_diameter_mm(record["eye"]),
                 "wavelength_nm": scene.spec.wavelength_nm,
                 "spp": scene.spec.image.spp,

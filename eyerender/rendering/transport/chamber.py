@@ -29,7 +29,6 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from ...arrays import Bools, Floats, Ints, Singles, frozen, remembered
-from ...eye.meshes import chamber_rim
 from ...eye.model import EyeModel, Stop
 from ...geometry.surfaces import Surface
 from ...region.look import LIMBAL_RING, Look
@@ -82,15 +81,12 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
     if np.array_equal(eye.stop.normal, [1.0, 0.0, 0.0]):
         depth, root_mm = (_SAME_MM * round(v / _SAME_MM) for v in (float(eye.stop.centre_mm[0]), root_mm))
         eye = replace(eye, stop=replace(eye.stop, centre_mm=frozen([depth, 0.0, 0.0])))
-    foot = None
-    if len(eye.front) > 1:
-        foot = float(np.mean(chamber_rim(eye, eye.front[-1], 2 * np.pi * np.arange(TURNS) / TURNS)))
     return _chamber(
         ChamberShape(
             front=tuple(eye.front), indices=tuple(float(n) for n in eye.front_indices), film=film,
             centre=tuple(np.asarray(eye.stop.centre_mm).tolist()), normal=tuple(np.asarray(eye.stop.normal).tolist()),
             limbus=float(eye.limbus_radius_mm), root=root_mm, sclera_x=float(eye.sclera.centre_mm[0]),
-            sclera_radius=float(eye.sclera.radius_mm), foot=foot,
+            sclera_radius=float(eye.sclera.radius_mm),
         )
     )  # fmt: skip
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
+from ...eye.meshes import chamber_rim
 from ...geometry.surfaces import Surface, components
 from ...optics.interface import fresnel
 
@@ -16,6 +17,7 @@ _NEAR_MM = 1e-6
 _AHEAD_MM = 1e-4  # hits are looked for from here on: a root cannot be computed from a point of the surface itself
 _BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
 _WALL_MM = 1.0  # thickness of the sclera
+_SECTORS = 16  # over which the foot of the wall is averaged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +34,6 @@ class ChamberShape:
         root: radius of the root of the iris, mm.
         sclera_x: x of the centre of the sclera's sphere, mm.
         sclera_radius: its radius, mm.
-        foot: mean radius (mm) at which the back of the cornea meets the plane of the iris; None without a back.
     """
 
     front: tuple[Surface, ...]
@@ -44,7 +45,6 @@ class ChamberShape:
     root: float
     sclera_x: float
     sclera_radius: float
-    foot: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,8 +73,11 @@ class Walls:
         bottom = centre[0] - _BELOW_MM
         inner_radius = shape.sclera_radius - _WALL_MM
         wide = np.sqrt(max(inner_radius**2 - (bottom - shape.sclera_x) ** 2, limbus**2))
-        if shape.foot is not None:
-            bottom, wide = min(centre[0], top - 0.1), shape.foot
+        if len(shape.front) > 1:
+            # The wall stands where the back of the cornea meets the plane of the iris.
+            angle = 2 * np.pi * np.arange(_SECTORS) / _SECTORS
+            foot = chamber_rim(shape.front[-1], centre, np.array(shape.normal), limbus, angle)
+            bottom, wide = min(centre[0], top - 0.1), float(np.mean(foot))
         return cls(
             front=shape.front, indices=shape.indices, film=shape.film, centre=centre, normal=np.array(shape.normal),
             rim=limbus, top=top, slope=(wide - limbus) / (top - bottom),
