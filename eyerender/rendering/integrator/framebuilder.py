@@ -220,7 +220,8 @@ class FrameBuilder:
         """Find the scene of a subject.
 
         A new subject reuses the scene buffers of an earlier one, so recordings stay valid. A subject that returns after
-        its scene was reused gets its own, or subjects that take turns would refill one scene forever.
+        its scene was reused gets its own, or subjects that take turns would refill one scene forever. So does the other
+        eye of a subject at once, because the first will return.
         """
         assert job.region is not None
         spec, globe = job.region, job.globe
@@ -228,7 +229,8 @@ class FrameBuilder:
         surroundings = self._regions.pop(key, None)
         if surroundings is None:
             full, back = len(self._regions) >= _REGIONS, key in self._replaced
-            oldest = next((k for k, kept in self._regions.items() if kept.takes(spec)), None)
+            sides = {k for k in self._regions if k[0].seed == spec.seed and k[1] != globe.mirrored}
+            oldest = next((k for k, kept in self._regions.items() if kept.takes(spec) and k not in sides), None)
             if oldest is None or (back and not full):
                 if full:
                     self._regions.pop(next(iter(self._regions)))
