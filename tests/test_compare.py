@@ -5,8 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 
 import eyerender as er
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.realise import realise
+from eyerender.dataset.spec import DatasetSpec
+from eyerender.observation import concatenate
+from tests.support.dataset_specs import mapping
 
 
 @dataclass(frozen=True)
@@ -48,3 +54,36 @@ def test_nothing_found_is_said_instead_of_an_empty_table():
     assert "no pupil and no glint was found in the images" in text
     assert "median" not in text
     assert "median" in er.compare(truth, truth, scene.rig, Centre()).to_text()
+
+
+def test_each_subject_is_calibrated_alone():
+    """The mean of pooled people is that of single runs, and their targets count as fixations."""
+    scenes = [er.load_scene("blignaut2014", eye=eye) for eye in ("E1", "E4", "E5")]
+    single = [er.trace(scene) for scene in scenes]
+    alone = [er.compare(one, one, scenes[0].rig, er.gaze.Regression("R3")).gaze_truth.mean_deg for one in single]
+    pooled = concatenate([replace(one, index=replace(one.index, fixation=0 * one.index.fixation)) for one in single])
+    subjects = np.repeat([3, 5, 8], [len(one) for one in single])
+    result = er.compare(pooled, pooled, scenes[0].rig, er.gaze.Regression("R3"), subjects=subjects)
+    people = result.to_mapping()["subjects"]
+    assert people["n"] == 3
+    assert people["analytic"]["mean_deg"] == pytest.approx(dict(zip("358", alone, strict=True)), abs=1e-9)
+    assert people["analytic"]["median_deg"] == pytest.approx(np.median(alone), abs=1e-9)
+    assert result.gaze_truth.mean_deg == pytest.approx(np.mean(alone), abs=1e-9)  # as many targets each
+    assert "3 subjects, each calibrated alone" in result.to_text()
+
+
+def test_two_cameras_of_one_instant_pair_in_a_drawn_dataset():
+    spec = mapping(subjects=3)
+    first = spec["scene"]["rig"]["cameras"][0]
+    spec["scene"]["rig"]["cameras"].append({**first, "position_mm": [615.0, 150.0, -150.5]})
+    made = Plan.of(DatasetSpec.from_mapping(spec))
+    samples = [realise(made, k) for k in range(24)]  # three subjects, eight targets each
+    seen = [
+        replace(one.observations, index=replace(one.observations.index, frame=2 * k + one.observations.index.camera))
+        for k, one in enumerate(samples)
+    ]
+    subjects = np.repeat([made.subject_of(k)[0] for k in range(24)], 2)
+    truth = concatenate(seen)
+    result = er.compare(truth, truth, samples[0].scene.rig, er.gaze.ShihWuLiu(), subjects=subjects)
+    assert result.gaze_truth.ok.all()
+    assert result.gaze_truth.mean_deg < 2.0

@@ -66,7 +66,7 @@ def test_labels_agree_with_the_pixels(folder):
 
 def test_both_observers_agree_within_a_fraction_of_a_pixel(folder):
     data = json.loads((folder.parent / "result.json").read_text())
-    assert data["schema"] == "eyerender/compare/1"
+    assert data["schema"] == "eyerender/compare/2"
     features, gaze = data["features"], data["gaze"]
     assert features["pupils"] == {"expected": 18, "found": 18}
     assert features["glints"] == {"expected": 18, "found": 18}

@@ -5,6 +5,9 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import numpy as np
+
+from ..arrays import Ints
 from ..backends.choose import BackendChoice
 from ..errors import Warn
 from ..folders.imagefolder import ImageFolder, same_run
@@ -117,4 +120,11 @@ def _compared(
 ) -> Comparison:
     truth = images.truth()
     found = ImageObserver().observe_entries(images.entries, truth.index, scene, progress=progress)
-    return compare(truth, found, scene.rig, estimator, name)
+    return compare(truth, found, scene.rig, estimator, name, subjects=_subjects(images))
+
+
+def _subjects(images: ImageFolder) -> Ints | None:
+    """Subject of each record of a dataset; None for a rendered folder."""
+    if images.dataset.get("kind") != "dataset":
+        return None
+    return np.array([int(entry.line["subject"]) for entry in images for _ in entry.records], dtype=np.int64)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
 from ..errors import InputError
 from ..gaze.estimate import GazeEstimator
 from ..gaze.regression import Regression
@@ -15,7 +16,7 @@ from ..gaze.validation import GazeErrors, leave_one_target_out
 from ..observation import Observations
 from ..rig.rig import RigLike
 
-SCHEMA = "eyerender/compare/1"
+SCHEMA = "eyerender/compare/2"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -55,7 +56,9 @@ class FeatureErrors(ArrayValue):
 class Comparison:
     """Analytic and image-derived observations of the same frames, with feature errors and gaze errors of both.
 
-    The gaze errors are None where the scene allows none; `gaze_reason` is then the reason.
+    The gaze errors are None where the scene allows none; `gaze_reason` is then the reason. With several subjects, each
+    is calibrated on its own: `subjects` are their numbers, `subject_errors` the errors of each, by observer as above,
+    and `gaze_truth` and `gaze_found` those of all who can be calibrated.
     """
 
     truth: Observations
@@ -65,9 +68,11 @@ class Comparison:
     gaze_truth: GazeErrors | None
     gaze_found: GazeErrors | None
     gaze_reason: str | None
+    subjects: tuple[int, ...] = ()
+    subject_errors: tuple[tuple[GazeErrors | None, GazeErrors | None], ...] = ()
 
     def to_mapping(self) -> dict[str, Any]:
-        """Convert to the JSON of `compare` (schema eyerender/compare/1)."""
+        """Convert to the JSON of `compare` (schema eyerender/compare/2)."""
         return {
             "schema": SCHEMA,
             "features": self.features.summary(),
@@ -80,7 +85,25 @@ class Comparison:
                 "image": _gaze_summary(self.gaze_found),
             },
             "gaze_reason": self.gaze_reason,
+            "subjects": self._by_subject(),
         }
+
+    def _by_subject(self) -> dict[str, Any] | None:
+        """Mean errors of each subject, with median and 95th percentile over the subjects; None for one subject."""
+        if len(self.subjects) < 2:
+            return None
+        found: dict[str, Any] = {"n": len(self.subjects)}
+        for k, name in enumerate(("analytic", "image")):
+            errors = [pair[k] for pair in self.subject_errors]
+            means = [None if one is None else one.mean_deg for one in errors]
+            known = [mean for mean in means if mean is not None]
+            found[name] = {
+                "n": len(known),
+                "median_deg": float(np.median(known)) if known else None,
+                "p95_deg": float(np.percentile(known, 95)) if known else None,
+                "mean_deg": {str(subject): mean for subject, mean in zip(self.subjects, means, strict=True)},
+            }
+        return found
 
     def to_text(self) -> str:
         """Format the comparison as a few lines of text."""
@@ -112,6 +135,15 @@ class Comparison:
                     lines.append(f"  {key:<10} {d['mean_deg']:>8.4f} {d['max_deg']:>8.4f} {d['n']:>5}")
                 else:
                     lines.append(f"  {key:<10} no frame has an estimate")
+        if (people := data["subjects"]) is not None:
+            lines.append(
+                f"gaze error of {people['n']} subjects, each calibrated alone, degrees   median      p95     n"
+            )
+            lines += [
+                f"  {key:<56} {d['median_deg']:>9.4f} {d['p95_deg']:>8.4f} {d['n']:>5}"
+                for key in ("analytic", "image")
+                if (d := people[key])["n"]
+            ]
         return "\n".join(lines)
 
 
@@ -145,7 +177,13 @@ def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
 
 
 def compare(
-    truth: Observations, found: Observations, rig: RigLike, estimator: GazeEstimator, name: str = ""
+    truth: Observations,
+    found: Observations,
+    rig: RigLike,
+    estimator: GazeEstimator,
+    name: str = "",
+    *,
+    subjects: Ints | None = None,
 ) -> Comparison:
     """Compare two observers' reports of the same frames, in features and in gaze.
 
@@ -155,6 +193,8 @@ def compare(
         rig: the rig of both.
         estimator: gaze estimator for both; every target is estimated by a calibration on the others.
         name: name of the estimator in the result; default: its class, and a regression's function.
+        subjects: (n,) whom each row shows, if they are several or their targets are drawn: each subject is then
+            calibrated on its own, and each of its targets counts as a fixation.
 
     Returns:
         The comparison. Where gaze cannot be estimated it contains the reason.
@@ -164,23 +204,50 @@ def compare(
     """
     if not name:
         name = f"regression {estimator.function}" if isinstance(estimator, Regression) else type(estimator).__name__
-    gaze: list[GazeErrors | None] = []
+    features = feature_errors(truth, found)
+    if subjects is None:
+        subjects = np.zeros(len(truth), dtype=np.int64)
+    else:
+        truth, found = _with_fixations(truth), _with_fixations(found)
+    people = np.unique(subjects)
     reason = None
-    for observations in (truth, found):
-        try:
-            gaze.append(leave_one_target_out(estimator, observations, rig))
-        except InputError as error:
-            gaze.append(None)
-            reason = str(error)
+    pairs: list[list[GazeErrors | None]] = []
+    for person in people:
+        own: list[GazeErrors | None] = []
+        for observations in (truth, found):
+            try:
+                own.append(leave_one_target_out(estimator, observations.take(subjects == person), rig))
+            except InputError as error:
+                own.append(None)
+                reason = str(error)
+        pairs.append(own)
+    gaze = [_joined([own[k] for own in pairs]) for k in range(2)]
     return Comparison(
         truth=truth,
         found=found,
-        features=feature_errors(truth, found),
+        features=features,
         estimator=name,
         gaze_truth=gaze[0],
         gaze_found=gaze[1],
         gaze_reason=reason,
+        subjects=tuple(map(int, people)),
+        subject_errors=tuple((own[0], own[1]) for own in pairs),
     )
+
+
+def _with_fixations(observations: Observations) -> Observations:
+    """Observations of drawn targets, in which each target is a fixation; so cameras of one instant share theirs."""
+    index = observations.index
+    _, fixation = np.unique(index.target_mm, axis=0, return_inverse=True)
+    return replace(observations, index=replace(index, fixation=fixation.reshape(-1).astype(np.int64)))
+
+
+def _joined(errors: Sequence[GazeErrors | None]) -> GazeErrors | None:
+    """Errors of several subjects, without those that have none."""
+    known = [one for one in errors if one is not None]
+    if len(known) < 2:
+        return known[0] if known else None
+    return GazeErrors(**{f.name: np.concatenate([getattr(one, f.name) for one in known]) for f in fields(GazeErrors)})
 
 
 def _distances(errors: Floats) -> dict[str, Any]:
