@@ -117,7 +117,7 @@ class Columns(ArrayValue):
 
 
 def column(*axes: int) -> Any:
-    """Declare an optional field of `Columns` with its axes after the leading ones; 0 stands for any length."""
+    """Declare an optional field of `Columns` with its axes after the leading ones; 0 means any length."""
     return dataclasses.field(default=None, metadata={"axes": axes})
 
 

@@ -24,7 +24,7 @@ class UnfinishedRunWarning(UserWarning):
 class EyerenderError(Exception):
     """Base of every error that this package raises on purpose: the run failed (disk, worker, backend).
 
-    The message is one line of printable characters with a limited length, whatever it quotes.
+    The message is one line of printable characters with a limited length, even if it quotes other text.
     """
 
     exit_code = 1
@@ -58,7 +58,7 @@ class InputError(EyerenderError):
         super().__init__(": ".join(part for part in (shown, self.path, self.reason) if part))
 
     def placed(self, *, source: str = "", under: str = "") -> InputError:
-        """Copy of the error and the others, with `source` where they have none, and with paths below `under`."""
+        """Copy the error and its `others`, with `source` where they have none, and with paths below `under`."""
         return InputError(
             self.reason,
             source=self.source or source,
@@ -80,7 +80,7 @@ class Problems:
         return self._count
 
     def add(self, reason: str, path: str = "") -> None:
-        """Note an error; only the first `MAX_ERRORS` are kept, the others are counted."""
+        """Note an error; only the first `MAX_ERRORS` are kept, further ones are counted."""
         self._count += 1
         if len(self._listed) < MAX_ERRORS:
             self._listed.append(InputError(reason, source=self.source, path=path))

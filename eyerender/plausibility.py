@@ -46,7 +46,7 @@ _BEHIND_MM = 1.0
 # Points of an eye that may be in view: the corneal apex and points of the limbus, within what rotation of the eye
 # moves.
 _LIMBUS_MM = np.array([[0, 0, 0], [-3, 6, 0], [-3, -6, 0], [-3, 0, 6], [-3, 0, -6]], dtype=float)
-# A camera that is farther than this from an eye's axis sees no cornea, whatever the pose of the eye.
+# A camera that is farther than this from an eye's axis sees no cornea in any pose of the eye.
 _FURTHEST_RAD = np.radians(140.0)
 
 # A lamp that sends less of the intensity on its axis to the nearest eye is probably not aimed.

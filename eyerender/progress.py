@@ -19,9 +19,9 @@ def followed(items: Sequence[T], progress: Progress | None) -> Iterator[T]:
 
 
 def one_behind(items: Iterable[T]) -> Iterator[T]:
-    """Yield items, each after the next has been fetched, so that what was begun for it goes on meanwhile.
+    """Yield each item after the next one has been fetched, so that work started for the next one overlaps with it.
 
-    Where fetching fails, the item before is still yielded first.
+    Where fetching fails, the previous item is still yielded first.
     """
     held: list[T] = []
     rest = iter(items)

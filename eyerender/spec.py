@@ -32,8 +32,8 @@ from .errors import InputError, Problems
 from .storage.files import opened, read_text, shown
 
 FORMAT = 1
-# Limits of a YAML file. Nodes are counted as expanded: an alias counts as much as the value it stands for. A scene with
-# a list of 20,000 targets has 80,000 nodes; reading 100,000 takes some five seconds.
+# Limits of a YAML file. Nodes are counted as expanded: an alias counts as much as the value that it repeats. A scene
+# with a list of 20,000 targets has 80,000 nodes; reading 100,000 takes some five seconds.
 MAX_YAML_BYTES, MAX_YAML_NODES, MAX_YAML_DEPTH = 2 * 2**20, 100_000, 64
 # Python's time grows with the square of an integer's digits.
 _LONGEST_NUMBER = 300
@@ -94,11 +94,11 @@ class Spec(BaseModel):
     """The fields that the constructor also takes without their names, in this order."""
 
     def __init__(self, *values: Any, **fields: Any) -> None:
-        """Build a record from Python values; lists and NumPy arrays may stand for tuples, mappings for records.
+        """Build a record from Python values; lists and NumPy arrays are accepted for tuples, mappings for records.
 
         Args:
             values: the first of the fields named in `POSITIONAL`.
-            fields: the others, by name.
+            fields: the remaining ones, by name.
 
         Raises:
             InputError: a value does not fit; the message is the one that a YAML file with this value gets.
@@ -160,7 +160,7 @@ class Spec(BaseModel):
         return self.model_dump(mode="json", exclude_none=True)
 
     def replaced(self, option: str, changes: Mapping[str, Any]) -> Self:
-        """Copy with other top-level values from a command-line option; a None removes a key.
+        """Replace top-level values by those of command-line options; a None removes a key.
 
         Raises:
             InputError: they do not fit. It names the option, because the file itself was read without an error.
@@ -301,8 +301,8 @@ def file_digest(path: Path) -> str:
 class _UniqueKeyLoader(yaml.SafeLoader):
     """The safe loader, with errors for duplicate keys (instead of a silent override) and for too large content.
 
-    Aliases count with the size of what they stand for, because later code processes all of it (ten lines can stand for
-    a thousand million nodes).
+    Aliases count with the size of what they repeat, because later code processes all of it (ten lines can expand to a
+    thousand million nodes).
     """
 
     def __init__(self, stream: str) -> None:

@@ -137,7 +137,7 @@ class StreamDataset(IterableDataset[Any]):
     may get one batch more than another. Samples that were given up are left out of their batch, and a batch without any
     image is left out.
 
-    After `b` batches on each rank, training goes on with `start + b * ranks` as the new `start`. `state_dict` and
+    To resume after `b` batches on each rank, give `start + b * ranks` as the new `start`. `state_dict` and
     `load_state_dict` do the same where the dataset itself is iterated (no workers), and in each worker of a loader that
     keeps the states of its workers.
 
@@ -149,7 +149,7 @@ class StreamDataset(IterableDataset[Any]):
         batch_size: number of samples in a batch.
         start: number of batches to leave out at the beginning, counted over all ranks.
         lanes: number of lanes, a multiple of the number of workers of all ranks; by default this number itself. The
-            order of batches depends on it, so keep it where training goes on with another number of workers.
+            order of batches depends on it, so keep it when you resume with another number of workers.
         split: only the samples of this split, such as "train"; None takes all.
         rank: which of the processes that train together this is; by default torch.distributed knows.
         ranks: number of these processes; by default torch.distributed knows.

@@ -163,7 +163,7 @@ def features(
 
 
 def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> None:
-    """Check the options of `features` for so many eyes.
+    """Check the options of `features` for this number of rows.
 
     Raises:
         InputError: they are out of range.

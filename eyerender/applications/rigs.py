@@ -222,7 +222,7 @@ def users_of(values: Floats) -> dict[str, float | None]:
 
 
 def coverage_of(found: Figures) -> dict[str, float]:
-    """Compute the share of people times directions with so many glints and `_OUTLINE` of the outline."""
+    """Compute the share of people times directions with that number of glints and `_OUTLINE` of the outline."""
     outline = found.outline >= _OUTLINE
     return {
         "outline": float(outline.mean()),

@@ -346,7 +346,7 @@ def _correlations(s: Survey) -> PageTable:
         for p in s.pairs
     ]  # fmt: skip
     header = ("pair", "source", "joint distribution", "drawn", "off by (standard errors)", "where from")
-    caption = "The source's value may be of residuals; the others are of the quantities."
+    caption = "The source's value may be of residuals; all other values are of the quantities themselves."
     return PageTable(header=header, rows=rows, caption=caption, wide=(5,))
 
 

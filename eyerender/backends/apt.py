@@ -33,7 +33,7 @@ def fetch_library(package: str, name: str, store: Path) -> None:
         complaint = ""
         for pause in (0.0, *PAUSES_S):
             time.sleep(pause)
-            # A failing source, for instance a third party's, does not matter as long as the package can be had.
+            # A failing source, for instance a third party's, does not matter as long as another one has the package.
             update = _run(["apt-get", *options, "update"], folder)
             download = _run(["apt-get", *options, "download", package], folder)
             if download.returncode == 0:
@@ -56,7 +56,7 @@ def _private_options(folder: Path) -> list[str]:
     """Write options that move apt's lists and caches to `folder`, so that it needs no root and no system-wide lock.
 
     The machine's own sources and proxies stay, its hooks on system folders do not. The empty status makes the archive's
-    versions the candidates, whatever is installed.
+    versions the candidates, even if other versions are installed.
     """
     for name in ("lists/partial", "cache/archives/partial"):
         (folder / name).mkdir(parents=True)

@@ -23,7 +23,7 @@ def setup_llvm(*, say: Say = _silent) -> LibLlvm:
     """Find a libLLVM that renders, after fetching the libraries of Dr.Jit that this machine lacks.
 
     They come from Debian's or Ubuntu's archive, without root. They are fetched with the machine's own apt settings but
-    into a folder of ours, so nothing on the system changes.
+    into a folder of this package, so nothing on the system changes.
 
     Args:
         say: receives one line for each step that takes time.
@@ -49,7 +49,7 @@ def _fetch_runtime(reason: str, say: Say) -> None:
     store = runtime_store()
     if store is None:
         raise BackendError(
-            f"{reason}; there is no private cache folder to fetch it into: set XDG_CACHE_HOME to a folder of yours"
+            f"{reason}; there is no private cache folder to fetch it into: set XDG_CACHE_HOME to a private folder"
         )
     try:
         for name, (package, _) in RUNTIME.items():

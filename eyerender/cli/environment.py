@@ -13,7 +13,7 @@ from .output import emit, say
 
 @app.command(name="doctor")
 def doctor(*, json: Result = None) -> int:
-    """Show which backends can render here and how to fix the others.
+    """Show which backends can render here, and how to fix those that cannot.
 
     The exit code is 3 if none can render.
     """

@@ -81,8 +81,8 @@ def extract(
 ) -> int:
     """Find the pupil ellipse and the glints in images or in a video.
 
-    An image without a detected pupil is a result with a reason, not an error. In a video the pupil is looked for first
-    where it was in the frame before. Files of a folder that are no images are skipped, and the reasons are printed.
+    An image without a detected pupil is a result with a reason, not an error. In a video, the search starts where the
+    pupil was in the previous frame. Files of a folder that are no images are skipped, and the reasons are printed.
 
     Args:
         images: Greyscale images, one folder of images, or one video.

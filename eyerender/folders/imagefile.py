@@ -50,8 +50,8 @@ def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> N
 def png_bytes(image: NDArray[Any]) -> bytes:
     """Encode (h, w) uint8 or uint16 as a greyscale PNG, or (h, w, 3) uint8 as a colour one (ISO/IEC 15948).
 
-    Noise does not compress, and writing must not cost more than rendering. So every row has the same filter, and no
-    repetitions are searched for other than runs, which masks have.
+    Noise does not compress, and writing must not cost more than rendering. So every row has the same filter, and the
+    encoder searches only for runs, which masks have.
     """
     import cv2
 

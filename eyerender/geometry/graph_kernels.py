@@ -40,8 +40,8 @@ _biconic_jet = inlined(biconic_jet)
 def smooth_jet(p, y, z):  # type: ignore[no-untyped-def]
     """Compute height, slopes by y and z, and derivatives by yy, yz and zz of a sheet (see `X0`).
 
-    x (h + u) = -N is differentiated twice, where x counts from the plane x_0 + l_y y + l_z z; p are the columns up to
-    LEAN.
+    x (h + u) = -N is differentiated twice, where x is measured from the plane x_0 + l_y y + l_z z; p are the columns up
+    to LEAN.
     """
     n = p[1] + y * (p[2] + p[4] * y + p[5] * z) + z * (p[3] + p[6] * z)
     n_y, n_z = p[2] + 2.0 * p[4] * y + p[5] * z, p[3] + p[5] * y + 2.0 * p[6] * z

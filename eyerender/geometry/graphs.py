@@ -81,8 +81,8 @@ def graphs_of(*surfaces: Surface) -> Graphs | None:
 def express(*surfaces: Surface) -> Graphs | None:
     """Express surfaces as graphs over one plane.
 
-    The working frame is the eye's where all surfaces that are graphs of a frame have the eye's x axis; else it is that
-    of the first of them, and the x axes of the others must be parallel to it.
+    Graph surfaces must have parallel x axes. If these are the eye's x axis, the working frame is that of the eye, else
+    that of the first graph surface.
 
     Returns:
         None where the surfaces have no common plane.

@@ -42,4 +42,4 @@ def _check(words: list[bytes], left: int, source: str) -> None:
         len(words) == 3 and re.fullmatch(rb"[0-9]{1,18}", words[2]) and int(words[2]) <= left
     ):
         said = shown(b" ".join(words).decode(errors="replace"))
-        raise InputError(f"is not a PLY file that can be read ({said}: the file cannot hold so many)", source=source)
+        raise InputError(f"is not a PLY file that can be read ({said}: more than the file can hold)", source=source)

@@ -87,7 +87,7 @@ def render_windows(
     """Render every row of `frames` in its own window, in order.
 
     Args:
-        frames: n rows, one eye in one frame each; a scene stands for all of its frames.
+        frames: n rows, one eye in one frame each, or a scene for all of its frames.
         backend: the backend, if no renderer is given.
         threads: number of processor threads for rendering; None: all.
         renderer: an existing renderer (see `make_renderer`).

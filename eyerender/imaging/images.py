@@ -72,7 +72,7 @@ def render(
     """Render frames in memory, each eye in a window of its own.
 
     Args:
-        frames: one frame (`frames[0]`), several, or a scene, which stands for all of its frames.
+        frames: one frame (`frames[0]`), several, or a scene for all of its frames.
         rig: replaces the one that the frames were made for.
         spp: samples per pixel.
         backend: the render backend.

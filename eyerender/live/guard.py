@@ -1,4 +1,4 @@
-"""The guard in front of the live page: who may talk to its server.
+"""The guard in front of the live page: it decides which requests reach the server.
 
 A server on 127.0.0.1 can be reached by every program of the machine, and by every page that a browser on it shows. So
 the guard lets a request through only if all of this holds, for HTTP and for WebSockets alike:
@@ -39,7 +39,7 @@ _HEADERS = [
 
 
 def new_token() -> str:
-    """Make a random token of 256 bits that may stand in an address."""
+    """Make a random token of 256 bits that is valid in an address."""
     return secrets.token_urlsafe(32)
 
 

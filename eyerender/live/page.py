@@ -33,7 +33,7 @@ from .source import python_source
 
 MAX_UNDO = 50
 SETTLED_S = 0.8
-"""Changes that follow each other faster, as of a slider that is dragged, are undone as one."""
+"""Changes in faster succession, such as those of a dragged slider, are undone together."""
 MAX_TABS = 20
 """Pages at a time, those included whose WebSocket has not connected yet. Each takes some megabytes."""
 STYLE = Path(__file__).with_name("page.css")
@@ -311,7 +311,7 @@ class Tab:
             self._refresh()
 
     def _remember(self, setup: Setup) -> None:
-        """Keep the present setup for `_undo`, unless it has been there for less than `SETTLED_S` or stays."""
+        """Keep the present setup for `_undo`, unless it lasted for less than `SETTLED_S` or does not change."""
         now = time.monotonic()
         if setup is not self._setup and now - self._changed > SETTLED_S:
             self._before.append(self._setup)
@@ -319,7 +319,7 @@ class Tab:
         self._undo_button.set_enabled(bool(self._before))
 
     def _undo(self) -> None:
-        """Go back to the setup before the last change; a slider's way is one change."""
+        """Restore the setup before the last change; dragging a slider is one change."""
         if self._before:
             last = self._before.pop()
             self._changed = time.monotonic()  # so that going back is not remembered

@@ -1,11 +1,11 @@
 """The one renderer of the live page, in a thread of its own.
 
-Each tab has at most one order: the frame that it wants to see. A new order takes the place of the old one, so a slider
-that moves faster than frames render leaves no queue behind. A new order is answered with a preview of a few samples,
-with coarser pixels where whole ones would take too long. When the tab has rested for a moment, passes over the whole
-window follow: after the first one, each takes as many samples as all before it, so their mean has 4, 8, 16, 32 and 64.
-A pass goes over the window in bands, and the thread looks for new orders between them. Tabs take turns, and previews
-come before passes.
+Each tab has at most one order: the frame that it wants to see. A new order replaces the old one, so a slider that moves
+faster than frames render leaves no queue behind. A new order is answered with a preview of a few samples, with coarser
+pixels where whole ones would take too long. When the tab has rested for a moment, passes over the whole window follow:
+after the first one, each takes as many samples as all before it, so their mean has 4, 8, 16, 32 and 64. A pass goes
+over the window in bands, and the thread looks for new orders between them. Tabs take turns, and previews come before
+passes.
 """
 
 from __future__ import annotations
@@ -126,17 +126,17 @@ class _Tab:
 
 @dataclass(slots=True)
 class Pace:
-    """How many pixels a preview may have. It follows the times that previews take here."""
+    """The number of pixels that a preview may have, from the measured times of earlier previews."""
 
     pixels: int = PREVIEW_PX[1]
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=3))
 
     def coarse(self, pixels: int) -> int:
-        """Choose how many sensor pixels wide the pixels of a preview are, for a window with so many pixels."""
+        """Choose the width of a preview's pixels, in sensor pixels, for a window of this size."""
         return math.ceil(math.sqrt(pixels / self.pixels))
 
     def took(self, seconds: float) -> None:
-        """Learn from a preview. A single slow one, as the first one, which is compiled, changes nothing."""
+        """Learn from the time of a preview. A single slow one changes nothing, because the first one is compiled."""
         self._times.append(seconds)
         if len(self._times) < 3:
             return
@@ -153,7 +153,7 @@ class Pace:
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Painter:
-    """Renders the orders of all tabs with one renderer; `start` it, and `close` it in the end.
+    """Renders the orders of all tabs with one renderer; call `start` first and `close` at the end.
 
     Args:
         backend: the render backend.
@@ -186,7 +186,7 @@ class Painter:
             raise self._failure
 
     def open(self, key: str, deliver: Deliver) -> None:
-        """Take on a tab; `deliver` is called in the painter's thread."""
+        """Register a tab; `deliver` is called in the painter's thread."""
         with self._changed:
             self._tabs[key] = _Tab(deliver)
 
@@ -202,7 +202,7 @@ class Painter:
         """Forget a tab and its pictures."""
         with self._changed:
             self._tabs.pop(key, None)
-            self._changed.notify()  # a thread that waits holds the tabs that it has looked at
+            self._changed.notify()  # a waiting thread still refers to the tabs that it has seen
 
     def close(self) -> None:
         """Stop after the present band."""
@@ -232,7 +232,7 @@ class Painter:
                 canvas.samples = self.goal
             if fresh:
                 canvas.since = time.monotonic()
-            del work, tab, canvas  # they hold what a tab that is closed while this thread waits should free
+            del work, tab, canvas  # these names would keep what a tab that closes meanwhile should free
 
     def _next(self) -> tuple[_Tab, _Canvas, bool] | None:
         """Wait for work: the oldest order without a preview, else the rested tab with the fewest samples."""

@@ -31,7 +31,7 @@ RECONNECT_S = 20.0
 _CLOSING_S = 0.4
 """How long open connections may take to close at the end."""
 _ENDING_S = 1.2
-"""When the process ends after Ctrl-C at the latest, whatever is connected, computed or rendered."""
+"""Longest time between Ctrl-C and the end of the process, even while it computes, renders or serves a tab."""
 
 
 def serve(
@@ -124,7 +124,7 @@ def _run(studio: Studio, listener: socket.socket, announce: Callable[[str], None
 
 
 class _Server(uvicorn.Server):
-    """A server that tells when it listens, and starts `deadline` when a signal ends it."""
+    """A server that reports when it listens, and starts `deadline` when a signal ends it."""
 
     def __init__(self, config: uvicorn.Config, ready: Callable[[], None], deadline: threading.Timer) -> None:
         super().__init__(config)

@@ -78,7 +78,7 @@ class Setup:
         return replace(self, scene=self.scene.with_(changes))
 
     def looking(self, azimuth_deg: float, elevation_deg: float) -> Self:
-        """Turn the optic axes of the eyes in a direction, whatever the targets."""
+        """Turn the optic axes of the eyes in a direction, without regard to targets."""
         return replace(self, scene=self.scene.with_(gaze_deg=(azimuth_deg, elevation_deg)), fixation=None)
 
     def following(self, fixation: int) -> Self:
@@ -142,7 +142,7 @@ class Setup:
         return key, getattr(spec, key)
 
     def with_camera_at(self, camera: int, position_mm: ArrayLike) -> Self:
-        """Move a camera. One that looks at a point goes on looking at it; others keep their direction."""
+        """Move a camera. One with a target point keeps looking at it; one without keeps its direction."""
         spec = self.scene.spec.rig.cameras[camera]
         place = np.round(np.asarray(position_mm, dtype=float), 6)
         if spec.calibration is None:
@@ -163,7 +163,7 @@ class Setup:
     def saved(self) -> SceneSpec:
         """Make the spec to save: what the knobs changed, with all fixations and head positions of the loaded scene.
 
-        A gaze that the user has set takes the place of the fixations. Files are absolute paths, so the scene means the
+        A gaze set by the user replaces the fixations. Files are absolute paths, so the scene means the
         same in every folder.
         """
         shown = self.scene.located()

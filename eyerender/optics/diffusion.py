@@ -1,11 +1,11 @@
-"""Light that enters a turbid tissue at one point and leaves it at another: how far it goes.
+"""How far light travels in a turbid tissue between the points where it enters and leaves.
 
 The tissue scatters with the reduced coefficient mu' and absorbs. The share of its diffuse reflectance that leaves per
 unit of area at the distance r from where it entered is close to
 
     R(r) = (exp(-r / d) + exp(-r / (3 d))) / (8 pi d r)
 
-whatever the tissue (Burley 2015, "Extending the Disney BRDF to a BSDF with integrated subsurface scattering";
+for any tissue (Burley 2015, "Extending the Disney BRDF to a BSDF with integrated subsurface scattering";
 Christensen and Burley 2015). The length d follows from mu' and the reflectance rho. The lines below were fitted to
 Monte Carlo simulations (isotropic scattering, index 1.4): a half space of absorption 0.005 to 0.25 per mm, and slabs
 0.4 to 1.3 mm thick before a dark layer of reflectance 0.05 to 0.2. With them the light behind the edge of a shadow is

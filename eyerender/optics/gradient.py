@@ -49,8 +49,8 @@ class Passage(NamedTuple):
         hit: the intersection; its `distance` is 0.
         way: unit direction on arrival.
         optical_path_mm: the integral of n ds.
-        moves: differentials of the point on the surface, as many as were given.
-        turns: differentials of the direction, as many as were given.
+        moves: differentials of the point on the surface, one for each that was given.
+        turns: differentials of the direction, one for each that was given.
     """
 
     hit: Hit
@@ -122,8 +122,8 @@ class GradientMedium(ArrayValue):
             inward: whether the rays go from the front to the back.
             point: where they start.
             way: their direction behind the first surface.
-            moves: differentials of `point` (along the surface) to be carried along.
-            turns: differentials of `way` to be carried along.
+            moves: differentials of `point` (along the surface) to propagate.
+            turns: differentials of `way` to propagate.
             steps: steps in each half; None: STEPS.
         """
         steps = STEPS if steps is None else steps

@@ -13,7 +13,7 @@ class ConstantMedium:
     n: float
 
     def index(self, wavelength_nm: float) -> float:
-        """Return the index n, whatever the wavelength."""
+        """Return the index n, which is the same at every wavelength."""
         del wavelength_nm
         return self.n
 

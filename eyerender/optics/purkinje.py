@@ -51,7 +51,7 @@ class PurkinjePoints(ArrayValue):
         directions: (..., 3) unit vectors from there to the viewpoint.
         course_mm: (2 k - 1, ..., 3) all points of the ray on k surfaces, from the exit point over the mirror point back
             to where the light came in.
-        residual_mm: (...,) by how much the ray misses.
+        residual_mm: (...,) miss distance of the ray.
         status: (...,).
     """
 
@@ -122,7 +122,7 @@ def purkinje_points(
     gradient: GradientMedium | None = None,
     n_outside: float = 1.0,
 ) -> PurkinjePoints:
-    """Find rays that the innermost of `surfaces` reflects and the others refract on the way in and out.
+    """Find rays that the innermost of `surfaces` reflects, and that the outer ones refract on the way in and out.
 
     The status is NO_MIRROR_POINT where the image, followed from the axis, ends before source and viewpoint reach their
     places, or where it lies beyond the rim of the reflecting surface.

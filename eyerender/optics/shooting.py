@@ -30,7 +30,7 @@ from .interface import dot, minus, moved, unit
 from .trace import BEHIND_MM, Crossing, inside_rim
 
 SETTLED_MM = 1e-12
-"""Newton stops where a ray misses by no more than this and what one rounding of the direction makes at the target."""
+"""Newton stops at a miss of this plus the effect of one rounding of the direction at the target."""
 ROUNDING_RAD = 4e-16
 
 _Nested = TypeVar("_Nested")
@@ -49,8 +49,8 @@ class Connection:
         last: the point on the last crossing.
         turning: the point where the ray was last reflected; the first point if it never was.
         end: unit direction in the last medium.
-        residual_mm: by how much the traced ray misses the target. For a target more than `FAR_MM` from the last surface
-            it is measured at `FAR_MM`.
+        residual_mm: miss distance of the traced ray at the target. For a target more than `FAR_MM` from the last
+            surface it is measured at `FAR_MM`.
         status: (...,).
     """
 
@@ -312,7 +312,7 @@ def _rescue(
     shot: _Shot,
     left: Bools,
 ) -> tuple[Xyz, _Shot]:
-    """Search the rays that undamped Newton did not find; the others are returned unchanged."""
+    """Search the rays that undamped Newton did not find; the remaining ones are returned unchanged."""
     index = np.nonzero(left)
     frame = index[0] if left.ndim else np.zeros(1, dtype=np.intp)
     few_path = [taken(crossing, frame) for crossing in path]

@@ -33,7 +33,7 @@ class ApparentPoints(ArrayValue):
         exit_points_mm: (..., 3) points on the outermost surface.
         directions: (..., 3) unit vectors from the exit point to the viewpoint.
         inner_directions: (..., 3) unit vectors from the object to the innermost surface.
-        residual_mm: (...,) by how much the traced ray misses.
+        residual_mm: (...,) miss distance of the traced ray.
         status: (...,).
     """
 
@@ -69,7 +69,7 @@ class Rays(NamedTuple):
         exit: the point on the outermost surface.
         way: unit direction from the viewpoint to it.
         end: unit direction in the last medium.
-        residual_mm: by how much the traced ray misses.
+        residual_mm: miss distance of the traced ray.
         status: (...,).
     """
 
@@ -248,7 +248,7 @@ _LAUNCHED_AT_ONCE = 200
 def _searched(
     path: Sequence[Crossing], n_start: FloatLike, viewpoint: Xyz, target: Xyz, aim: Xyz, rays: Rays, left: Bools
 ) -> Rays:
-    """Find the rays at `left` by shooting, and keep the others."""
+    """Find the rays at `left` by shooting, and keep the remaining ones."""
     rows = np.nonzero(left) if left.ndim else (np.zeros(1, dtype=np.intp),)
     shape = left.shape or (1,)
 

@@ -370,7 +370,7 @@ def _glint_table(entries: Sequence[Row]) -> Table:
         header=header,
         rows=rows,
         caption="Glints: a reported glint matches a true one within 2 px. Errors are in px. Swaps: matches with the"
-        " wrong light, of the matches with a light. A dash means that the extractor does not look for glints.",
+        " wrong light, of the matches with a light. A dash means that the extractor does not search for glints.",
     )
 
 
@@ -432,7 +432,7 @@ def _how(data: Row) -> list[str]:
     gammas = "; ".join(f"{g['gamma']:g} for {g['images']} images ({_GAMMA[g['from']]})" for g in data["gamma"])
     return [
         f"Each extractor uses one thread. {versions}.",
-        f"Encoding gamma that the extractors were told: {gammas}.",
+        f"Encoding gamma given to the extractors: {gammas}.",
         "Cramér-Rao bound of the centre, per axis: (s / step) sqrt(2 sigma_b / (sqrt(pi) sqrt(a b))). Here s is "
         "the noise, step the grey-level step from pupil to iris, and sigma_b the blur of the edge, including the "
         "pixel. The median distance is 1.177 times the bound. It holds for a fully visible outline. In rendered "

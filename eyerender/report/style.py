@@ -55,7 +55,7 @@ def svg(fig: Any) -> str:
 
 
 def _leave_out_empty_panels(fig: Any) -> None:
-    """Remove the panels that show no data and move the others together; a figure without any data says so."""
+    """Remove the panels that show no data and close the gaps; a figure without any data says so."""
     panels = [ax for ax in fig.axes if ax.get_subplotspec() is not None]
     full = [ax for ax in panels if _has_data(ax)]
     if len(full) == len(panels):

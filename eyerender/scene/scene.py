@@ -575,7 +575,7 @@ class Scene:
         view = self.rig.cameras[camera]
         w, h = view.resolution_px
         positions = [self.eye_position_mm(side) for side in self.spec.subject.eyes]
-        # Where a camera stands in an eye, no scale is defined.
+        # A camera inside an eye has no defined scale.
         if len(positions) == 1 or any(np.array_equal(position, view.nodal_point_mm) for position in positions):
             return w, h
         scale = max(map(view.scale_at, positions))

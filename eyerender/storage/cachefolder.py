@@ -1,14 +1,14 @@
 """The private folder of caches: `$XDG_CACHE_HOME/eyerender`, by default `~/.cache/eyerender`.
 
 Caches hold code that runs (compiled kernels, a libLLVM, numba's index, which is a pickle), so a folder is used only if
-nobody but this user and root can have put anything into it. The rule covers every part of its path, because whoever can
-write to a parent can put another folder in its place:
+nobody but this user and root can have put anything into it. The rule covers every part of its path, because a user who
+can write to a parent can put another folder in its place:
 
 - It belongs to this user or to root, and so does a symbolic link on the way.
 - Nobody else can write to it. A parent with the sticky bit, such as `/tmp`, may be open to all, because there only
   the owner of an entry can rename it. The private group of a user counts as the user.
 
-Folders that are missing are made for this user alone. A folder of ours that others can read becomes private.
+Missing folders are made for this user alone. A folder of this user that others can read becomes private.
 """
 
 from __future__ import annotations

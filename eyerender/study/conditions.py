@@ -6,7 +6,7 @@ C14). Angles are measured from the right eye (model-based) or the mid-point of b
 
 Pupils are tested twice: widening about a fixed centre, and about a centre that shifts with the diameter (`eye.margin`).
 The eyes of a published model are mirror images of each other, so their horizontal errors cancel in the mean of both.
-The errors of the right eye alone stand beside it, and a few drawn people, whose eyes differ.
+Therefore the report also has the errors of the right eye alone, and those of a few drawn people, whose eyes differ.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def conditions_part(eye: str) -> ConditionsPart:
             try:
                 up, down = (_mean(_scene(name, eye).replaced(eye_spec=spec)) for spec in (more, less))
             except InputError as error:
-                # A changed eye may let no ray through. That is a result for this parameter, not for the others.
+                # A changed eye may let no ray through. That is a result for this parameter alone.
                 entry[name]["reason"] = str(error)
                 continue
             entry[name] |= {"at_plus": up, "at_minus": down, "per_step": 0.5 * (up - down)}

@@ -106,7 +106,7 @@ SOFTWARE_BOUNDS = ParameterBounds(
 class Outcome:
     """One calibration at H1 and its errors: `error_deg` (n,) by observation, `head` (n,) 0 for H1.
 
-    `vector_deg` (n, 2) are the errors to the right and up at the eye, whatever the protocol's own measure.
+    `vector_deg` (n, 2) are the errors to the right and up at the eye; `error_deg` uses the protocol's own measure.
     """
 
     observations: Observations
@@ -167,7 +167,7 @@ def estimator(departures: Collection[str], *, free_index: bool = False) -> Autho
         free_index=free_index and "index" not in departures,
         visual_axis="rotation" if "visual_axis" in departures else "angles",
         objective="sum_of_errors" if software else "least_squares",
-        # A sum of distances has a kink wherever one of them vanishes, and the last digits would cost hundreds of steps
+        # A sum of distances has a kink where one of them vanishes, and the last digits would cost hundreds of steps
         # there.
         tolerance=1e-10 if software else 1e-12,
     )

@@ -160,7 +160,7 @@ def make_images(
 def dataset_spec(study: str, scenes: Sequence[Scene], auto_exposure: float | None = None) -> Any:
     """Make the spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes.
 
-    A scene without noise that is also needed with noise is no sample of its own; its images are stored with the others.
+    If a scene is needed with and without noise, one sample holds both kinds of images.
     """
     from ..dataset.spec import DatasetSpec
 

@@ -34,7 +34,7 @@ class Observing:
     """One of the observers for a study's scenes: ray optics, or images with the sensor's noise or without it.
 
     Only the image observers need images. Images without noise may be exposed again with the noise of `noise_seed`, and
-    `noise_seeds` tells how many such exposures a study compares.
+    `noise_seeds` is the number of such exposures that a study compares.
     """
 
     kind: ObserverKind = "analytic"
