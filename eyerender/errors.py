@@ -144,7 +144,7 @@ class InputWarning:
         return InputError(self.reason, source=self.source, path=self.path)
 
     def at(self, source: str) -> InputWarning:
-        """Copy with a source."""
+        """Copy the warning with a source."""
         return replace(self, source=source)
 
     def to_mapping(self) -> dict[str, str]:

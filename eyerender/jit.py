@@ -2,12 +2,11 @@
 
 The index of that code is a pickle, so it is kept only in a private folder (`cachefolder`).
 
-Numba compiles a function again when its own file changed, but not when another file did from which it calls a
-function. So the machine code is kept in a folder of a name that depends on all files with compiled functions. When such
-a folder is made, those of other versions that nothing has used for thirty days are removed.
+Numba compiles a function again when its own file changes, but not when a file changes whose functions it calls. So the
+machine code is kept in a folder whose name depends on all files with compiled functions. A new folder removes those of
+other versions that have not been used for thirty days.
 
-Numba compiles one function at a time in a process. So where the extractor's machine code is missing, several processes
-make it.
+Numba compiles one function at a time in a process, so several processes share the compilation.
 """
 
 from __future__ import annotations

@@ -206,5 +206,5 @@ def _same_channels(file: Image.Image) -> Bytes | None:
 
 
 def preview(image: NDArray[Any], full_scale: float) -> Bytes:
-    """Make an 8-bit copy for viewing: the codes as they are, as pictures of near-infrared cameras are usually shown."""
+    """Make an 8-bit copy for viewing. The codes are shown unchanged, as is usual for near-infrared cameras."""
     return np.asarray(np.round(255 * np.clip(np.asarray(image, dtype=float) / full_scale, 0, 1)), dtype=np.uint8)

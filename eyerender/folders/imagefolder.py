@@ -381,7 +381,7 @@ def _check_line(line: dict[str, Any], source: str, where: str) -> None:
 
 
 def _check_names(line: dict[str, Any], refuse: Refuse) -> None:
-    """Check what becomes a part of the names of exported files."""
+    """Check the values that become parts of the names of exported files."""
     for key in ("sample", "subject"):
         if key in line and not _is_count(line[key], 2**63):
             refuse(key, "must be a whole number >= 0")

@@ -73,7 +73,7 @@ def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
 
 
 def has_own_name(folder: Path, file: Path) -> bool:
-    """Return whether this package names files so, or lists this file as its own, or whether it is a picture.
+    """Return whether a file has a name that this package gives, is listed as made by it, or is a picture.
 
     Args:
         folder: the folder.
@@ -253,7 +253,7 @@ def _refuse_others(folder: Path, listed: Set[str]) -> None:
 
 
 def _empty(folder: Path, listed: Set[str], keep: str = "") -> None:
-    """Remove what this package made except for the marker, and stages except for `keep`."""
+    """Remove what this package made, except the marker; also remove stages, except `keep`."""
     remove_file(folder / DATASET)
     for name, is_folder in _made_here(folder, listed, strict=False):
         if is_folder:

@@ -89,7 +89,7 @@ class Ellipse:
 
     @staticmethod
     def of(numbers: Sequence[float] | Floats) -> Ellipse:
-        """Make the ellipse of what `numbers` gives."""
+        """Make an ellipse from the result of `numbers`."""
         return Ellipse(np.array(numbers[:2]), np.array(numbers[2:4]), float(numbers[4]))
 
     def conic(self) -> Floats:

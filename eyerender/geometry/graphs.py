@@ -74,7 +74,7 @@ class Graphs:
 
 @remembered
 def graphs_of(*surfaces: Surface) -> Graphs | None:
-    """Express surfaces as graphs over one plane, as `express` does, once for the same objects."""
+    """Express surfaces as graphs over one plane (see `express`), cached for the same objects."""
     return express(*surfaces)
 
 

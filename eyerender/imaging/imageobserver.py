@@ -264,7 +264,7 @@ def _picture_of(path: str | Path, folder: Path) -> Path:
 
 
 def _refuse_inputs(pictures: Sequence[Path], paths: Sequence[str | Path]) -> None:
-    """Check that no picture that will be written is one of the images that will be read."""
+    """Check that no output picture is one of the input images."""
     inputs = set()
     for path in paths:
         with suppress(OSError, ValueError):  # `read_any_image` says so

@@ -82,7 +82,7 @@ class Knob:
         self._quiet = False
 
     def enable(self, on: bool) -> None:
-        """Let the user move it, or not."""
+        """Enable or disable the knob."""
         for part in (self._slider, self._number):
             part.set_enabled(on)
 

@@ -370,8 +370,8 @@ def store(numbers, rims, reflects, first, columns, nodes, out, state):  # type: 
 def mirror_start(kinds, numbers, table, rims, first, count, columns, nodes, out, state):  # type: ignore[no-untyped-def]
     """Guess mirror points: where the bisectors through the centre of curvature of the apex meet the surface.
 
-    They are exact on a sphere for source and viewpoint at infinity. A ray is OUTSIDE whose guess is far outside the rim
-    or on a bisector that does not point to the front: its mirror point cannot be on the surface.
+    The guesses are exact on a sphere for source and viewpoint at infinity. A ray is marked OUTSIDE if its guess is far
+    outside the rim, or if its bisector does not point to the front, because then no mirror point can be on the surface.
     """
     last = nodes.shape[0] - 1
     w = nodes[1]

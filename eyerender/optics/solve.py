@@ -198,7 +198,7 @@ def _rows(point: Xyz, full: tuple[int, ...]) -> Floats:
 def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target: Xyz, rays: Rays) -> Rays:
     """Search from the object for the refracted rays that were not found.
 
-    A cone of rays is launched from the object. Those that leave closest to the viewpoint's direction each start a
+    A cone of rays is launched from the object. Each of those that leave closest to the viewpoint's direction starts a
     search.
     """
     lost = (rays.status != Status.OK) & (rays.status != Status.OUTSIDE_LIMBUS)

@@ -153,7 +153,7 @@ class Scene:
                 `ambient`, `motion`, `image`, `wavelength_nm`, `seed`, `description`.
 
         Raises:
-            InputError: a value does not fit, or an eye that cannot be.
+            InputError: a value does not fit, or an eye is impossible.
         """
         given = {key: value for key, value in {"subject": subject, "rig": rig, **fields}.items() if value is not None}
         made = Scene.of(SceneSpec(name=name, **given))
@@ -247,7 +247,7 @@ class Scene:
 
         Args:
             changes: values by the path that error messages name, such as `{"rig.lights.1.radius_mm": 2.5}`; a None
-                takes a key away.
+                removes a key.
             pupil_diameter_mm: diameter of the anatomical pupil.
             gaze_deg: azimuth and elevation of the optic axis, (2,) or (n, 2), instead of the targets.
             target_mm: world points that are fixated, (3,) or (n, 3), instead of the targets.
@@ -255,7 +255,7 @@ class Scene:
             fields: whole fields of `SceneSpec`, such as `rig`, `region`, `look`, `sensor` or `seed`.
 
         Raises:
-            InputError: a value does not fit, or an eye that cannot be.
+            InputError: a value does not fit, or an eye is impossible.
         """
         data = self.spec.to_mapping()
         if any(path.partition(".")[0] == "population" for path in (*fields, *(changes or {}))):

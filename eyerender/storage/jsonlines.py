@@ -1,4 +1,4 @@
-"""Files of one JSON object per line, read without keeping them: a few bytes per line store its offset."""
+"""Files with one JSON object per line. Only the offset of each line stays in memory, not its content."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Locks of folders, for one writer, or for several runs over disjoint parts of its shards.
 
-Locks are the kernel's (flock), held by an open file: a process that dies in any way releases them.
+The locks are kernel locks (flock) on an open file, so a process that dies in any way releases them.
 
 Why not filelock: its kernel locks are exclusive only, and runs over parts of a folder share the folder's lock. Its
 read-write locks are a SQLite database, or files that outlive a dead process until they expire. The rest of its features

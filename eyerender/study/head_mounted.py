@@ -5,8 +5,8 @@ The direction of the optic axis, in degrees, is a polynomial of second order of 
     azimuth = sum_k a_k m_k(x, y),   elevation = sum_k b_k m_k(x, y),   m = 1, x, y, x^2, xy, y^2
 
 fitted by least squares on the nine directions of the shipped scene and tested on the sixteen between them. The feature
-is the pupil's centre, or its vector from the mean of all glints. (There are no targets: poses are given, and the angle
-between two directions is the error.)
+is the pupil's centre, or its vector from the mean of all glints. There are no targets. The error is the angle between
+the given direction and the estimated one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Combination of the parts of a study: rows, findings, the rest of the summary, the report."""
+"""Combine the parts of a study into rows, findings, the remaining summary and the report."""
 
 from __future__ import annotations
 
