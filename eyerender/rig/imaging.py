@@ -40,8 +40,8 @@ class Opening(Spec):
 class Star(Spec):
     """The star about bright points: light that the straight edges of the aperture's blades diffract.
 
-    Across every edge there is an arm on both sides of the point, whose light falls as 1 / r^2 (Fraunhofer diffraction at
-    a straight edge). An even number of blades makes as many arms, an odd number twice as many.
+    Across every edge there is an arm on both sides of the point, whose light falls as 1 / r^2 (Fraunhofer diffraction
+    at a straight edge). An even number of blades makes as many arms, an odd number twice as many.
     """
 
     blades: Annotated[int, Field(ge=3, le=12)] = Field(default=6, description="number of the aperture's blades")
