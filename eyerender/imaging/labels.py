@@ -3,7 +3,7 @@
 They contain ellipses, glints, points and lines in space, and matrices.
 
 `amodal` ellipses are those of the outline without occluders: that of the pupil seen through the cornea, and that of the
-iris at the circle of the limbus where the cornea is half clear. A `visible` ellipse has the second moments of the
+iris at the curve of the limbus where the cornea is half clear. A `visible` ellipse has the second moments of the
 visible pixels (of pupil, or of iris and pupil together): semi-axes 2 sqrt(eigenvalues of covariance + 1/12).
 """
 
@@ -23,6 +23,7 @@ from ..eye.model import EyeModel
 from ..folders.imagefolder import IRIS, PUPIL
 from ..geometry.ellipse import fit_ellipse_direct
 from ..observation import EYES, Observations
+from ..region.limbus import lower
 from ..rig.camera import PinholeCamera, Window, in_window
 from ..scene import Frames, Scene
 from ..status import Status
@@ -212,15 +213,16 @@ def iris_outline(scene: Scene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
 def limbus_px(scene: Scene, view: EyeInWindow | EyeImage, count: int) -> tuple[Floats, str | None]:
     """Project the limbus to points (count, 2) in full-sensor px.
 
-    The limbus is the circle of the front cornea whose radius is the limbus radius minus half the limbus' width.
+    The limbus is the circle of the front cornea whose radius is the limbus radius minus half the limbus' width, made
+    lower by the look's `limbus_aspect`.
 
     Returns:
-        The projected circle, and the reason why it is not visible as a whole (None where it is).
+        The projected curve, and the reason why it is not visible as a whole (None where it is).
     """
     surface, camera = view.eye.front[0], scene.rig.cameras[view.camera]
     rho = float(view.eye.limbus_radius_mm) - 0.5 * scene.spec.look.limbus_width_mm
     angle = 2 * np.pi * np.arange(count) / count
-    y, z = rho * np.cos(angle), rho * np.sin(angle)
+    y, z = lower(surface, rho * np.cos(angle), rho * np.sin(angle), scene.spec.look.limbus_aspect)
     local = np.stack([np.broadcast_to(surface.sag(y, z), y.shape), y, z], axis=-1)
     points = surface.origin_mm + local @ np.asarray(surface.rotation).T
     eyepoint = view.M.T @ (camera.nodal_point_mm - view.t)

@@ -12,6 +12,7 @@ from ..arrays import Floats
 from ..eye.model import EyeModel
 from ..imaging.capture import eye_motion
 from ..observation import EYES, Observations
+from ..region.limbus import lower
 from ..report.style import ANALYTIC, IMAGE, TARGET
 from ..rig.camera import PinholeCamera, Window
 from ..rig.light import Lamp
@@ -181,7 +182,9 @@ def _eye(out: Strokes, frames: Frames, row: int, *, shown: bool) -> None:
     for wire in wires:
         out.line(world(wire), GLOBE, 1.0)
     rho = float(eye.limbus_radius_mm)
-    out.line(world(_on_cornea(eye, circle(np.zeros(3), np.array([0, rho, 0]), np.array([0, 0, rho])))), LIMBUS, 2.0)
+    limbus = circle(np.zeros(3), np.array([0, rho, 0]), np.array([0, 0, rho]))
+    limbus[:, 1], limbus[:, 2] = lower(eye.front[0], limbus[:, 1], limbus[:, 2], frames.scene.spec.look.limbus_aspect)
+    out.line(world(_on_cornea(eye, limbus)), LIMBUS, 2.0)
     for turn in np.pi * np.arange(4) / 4:
         reach = np.linspace(-rho, rho, 17)[:, None] * np.array([0.0, np.cos(turn), np.sin(turn)])
         out.line(world(_on_cornea(eye, reach)), "#A9BECB", 1.0)

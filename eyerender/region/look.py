@@ -106,6 +106,11 @@ class Look(Spec):
         default=1.0,
         description="width of the transition from clear cornea to opaque sclera, inwards from the limbus (chosen)",
     )
+    limbus_aspect: Annotated[float, Field(ge=0.8, le=1)] = Field(
+        default=1.0,
+        description="height over width of the visible limbus: sclera covers more of the cornea above and below, so "
+        "the iris looks lower than wide (about 0.95; 1, a circle, is that of the published models)",
+    )
     limbus_transmittance: Annotated[float, Field(ge=0, le=0.9)] = Field(
         default=0.4,
         description="share of the light on the limbal tissue that it lets through into the eye (Vogel et al. "

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+import eyerender as er
 from eyerender.eye.meshes import chamber_rim
-from eyerender.folders.imagefolder import IRIS
+from eyerender.folders.imagefolder import IRIS, PUPIL
+from eyerender.imaging.capture import render_job
+from eyerender.imaging.labels import EyeInWindow, iris_outline
+from eyerender.region.look import Look
 from eyerender.rendering.transport.chamber import IRIS as PLANE
 from eyerender.rendering.transport.chamber import RAYS, ROOT_RINGS, TURNS, bundles, chamber_of, through_limbus
 from tests.support.render_rigs import BLACK, PLAIN, eye_of, head_rig, job_of, remote_rig
@@ -137,3 +141,52 @@ def test_a_flat_iris_before_the_limbus_has_no_black_ring(renderer):
     # No light paths are sought to what the cornea is not in front of.
     rig = head_rig(count=8)
     assert renderer.render(job_of(eye_of("E5"), rig, rig.window(160, 120)), spp=4).failed_paths == 0
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_visible_limbus_is_lower_than_wide_in_masks_and_labels(renderer, side):
+    # Without lids. A person's toric cornea is turned about its axis, and the limbus stays upright.
+    person = er.Population(preset="adults").person(0, 3)
+    half = person.apex_distance_mm / 2.0
+    head = (0.0, -half if side == "left" else half, 0.0)
+    camera = er.Camera.looking_at((0, 0, 0), position_mm=(400, 0, 0), focal_length_px=8000, size_px=(320, 320))
+    rig = er.Rig(cameras=(camera,), lights=(er.Led((400, 30, 0), intensity_mw_sr=2),))
+    ratio = {}
+    for aspect in (1.0, 0.95):
+        look = Look(limbus_aspect=aspect)
+        subject = er.Subject.of(person, eyes=(side,), head_positions_mm=(head,), look=look, region=None)
+        frames = subject.looking([(0, 0)], rig)
+        parts = renderer.labels(render_job(frames, 0)).part
+        rows, columns = np.nonzero((parts == IRIS) | (parts == PUPIL))
+        label = iris_outline(frames.scene, EyeInWindow.of(frames, 0))
+        small, large = min(label["semi_axes_px"]), max(label["semi_axes_px"])
+        ratio[aspect] = small / large
+        # The edges of the mask are known to a pixel of 210.
+        assert (np.ptp(rows) + 1) / (np.ptp(columns) + 1) == pytest.approx(ratio[aspect], abs=0.01)
+        assert np.ptp(columns) + 1 == pytest.approx(2 * large, abs=1.5)
+    # The major axis is horizontal. The rim of a toric cornea is not flat, which changes its outline by a thousandth.
+    assert abs(np.sin(label["angle_rad"])) < 0.05
+    assert ratio[0.95] == pytest.approx(0.95, abs=2e-3)
+    # So a circle seems to be tilted by 18 degrees, or by 4 at most where the limbus is one.
+    assert np.degrees(np.arccos(ratio[0.95])) == pytest.approx(18.2, abs=0.5)
+    assert np.degrees(np.arccos(ratio[1.0])) < 4
+
+
+def test_light_passes_the_rim_of_a_lower_limbus_as_it_does_point_by_point():
+    # The same integral over a fine grid of the front cornea, with the opacity of each point.
+    eye, width, aspect = eye_of("E4"), 0.8, 0.9
+    chamber = chamber_of(eye, 1.3314)
+    share = (through_limbus(eye, chamber, width, aspect) - through_limbus(eye, chamber, 0.0)).sum(axis=1)
+    front, rim, step = eye.front[0], float(eye.limbus_radius_mm), 0.03
+    y, z = (v.ravel() for v in np.meshgrid(*2 * [np.arange(-rim, rim, step) + step / 2]))
+    y, z = y[np.hypot(y, z) < rim], z[np.hypot(y, z) < rim]
+    s = np.clip((np.hypot(y, z / aspect) - rim) / width + 1, 0, 1)
+    at = front.origin_mm + np.stack([front.sag(y, z), y, z], axis=-1)
+    normal = front.normal(at)
+    area = s * s * (3 - 2 * s) * step**2 / normal[:, 0]
+    for place in (0, 7 * TURNS, 12 * TURNS + 5):
+        way = at - chamber.points[place]
+        r2 = np.sum(way**2, axis=1)
+        seen = np.maximum(way @ chamber.normals[place], 0) * np.maximum(np.sum(way * normal, axis=1), 0)
+        # Eight points across the rim, and four beyond it, are good to 2 %.
+        assert share[place] == pytest.approx(np.sum(seen / (np.pi * r2**2) * area), rel=0.02)

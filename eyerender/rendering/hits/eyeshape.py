@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..materials.albedo import opacity, stop_coordinates
+from ..materials.albedo import limbal_radius, opacity, stop_coordinates
 from ..records.frame import Frame
 from ..records.recording import syntax
 from .interaction import EPSILON_MM, SurfaceInteraction
@@ -77,7 +77,8 @@ class EyeShape:
         xc, xs = oe + hit.to_cornea * de, oe + hit.to_sclera * de
         si = SurfaceInteraction.blank()
         si.cornea, si.sclera, si.distance, si.point = hit.cornea, hit.sclera, hit.t, dr.select(hit.cornea, xc, xs)
-        si.opacity = dr.select(hit.cornea, opacity(frame, _from_axis(front.point_in(oe) + hit.to_cornea * dl)), 1)
+        local = front.point_in(oe) + hit.to_cornea * dl
+        si.opacity = dr.select(hit.cornea, opacity(frame, limbal_radius(frame, local)), 1)
         si = self._through_cornea(si, hit.facing, xc, dl)
         si.normal = dr.normalize(dr.select(hit.cornea, si.normal, xs - frame.sclera.centre))
         return si

@@ -51,8 +51,17 @@ class Textures:
         return cls(iris=iris, heights=heights, raised=raised, sclera=sclera)
 
 
+def limbal_radius(frame: Frame, local: mi.Vector3f) -> mi.Float:
+    """Radius (mm) of points (the front cornea's frame) about its axis, with their height divided by the limbus' aspect.
+
+    Points of the visible limbus all have the radius of the limbus.
+    """
+    up = local.y * frame.limbus.up[0] + local.z * frame.limbus.up[1]
+    return dr.sqrt(local.y * local.y + local.z * local.z + frame.limbus.lowering * up * up)
+
+
 def opacity(frame: Frame, rho: mi.Float) -> mi.Float:
-    """Share by which the cornea's rim has turned to sclera at radius `rho` (mm): a smooth step up to the limbus."""
+    """Share by which the cornea's rim has turned to sclera at a `limbal_radius`: a smooth step up to the limbus."""
     s = dr.clip((rho - frame.limbus.radius) * frame.limbus.gain + 1, 0, 1)
     return s * s * (3 - 2 * s)
 
@@ -113,8 +122,7 @@ def sclera_albedo(frame: Frame, point: mi.Vector3f) -> mi.Float:
     texture = frame.textures.sclera.eval(globe_map(frame, point))[0]
     sclera = frame.sclera.albedo * dr.maximum(1 + frame.sclera.contrast * (texture - 1), 0.02)
     # The grey ring of the limbus fades into the white over its width, on the side of the sclera.
-    local = frame.surfaces[0].point_in(point)
-    away = dr.sqrt(local.y * local.y + local.z * local.z) - frame.limbus.radius
+    away = limbal_radius(frame, frame.surfaces[0].point_in(point)) - frame.limbus.radius
     s = dr.clip(0.5 + 0.5 * away * frame.limbus.gain, 0, 1)
     s = s * s * (3 - 2 * s)
     return frame.limbus.albedo + s * (sclera - frame.limbus.albedo)

@@ -3,8 +3,8 @@
     mitsuba -m scalar_rgb scene.xml        (or llvm_ad_rgb, cuda_ad_rgb)
 
 Lengths are mm, radiance is mW/mm^2/sr. What stock Mitsuba lacks is left out, and the file says so: textures, the
-relief of the iris, the limbus' soft rim, menisci, light inside tissue, lens distortion, the point-spread function,
-ambient light but the sun, and lamps that are neither Lambertian discs nor isotropic points.
+relief of the iris, the limbus' soft rim and its lower height, menisci, light inside tissue, lens distortion, the
+point-spread function, ambient light but the sun, and lamps that are neither Lambertian discs nor isotropic points.
 """
 
 from __future__ import annotations
@@ -146,7 +146,8 @@ def _notes(job: RenderJob) -> list[str]:
         notes.append(f"The film of tears on the cornea is a dielectric layer of its own, {_FILM_MM} mm thick.")
     if job.ambient.model_copy(update={"sun": None}) != Ambient():
         notes.append("Even light, panels and the surrounding's map are left out.")
-    notes.append("Textures, the relief of the iris, the limbus' soft rim and the point-spread function are left out.")
+    notes.append("Textures, the relief of the iris, the limbus' soft rim and its lower height, and the point-spread")
+    notes.append("function are left out.")
     if job.region is not None:
         notes.append("Sheen, menisci and light inside skin and sclera are left out.")
     return notes

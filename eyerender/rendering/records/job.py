@@ -20,6 +20,7 @@ from ...geometry.surfaces_quadric import Quadric
 from ...optics.media import TEARS
 from ...region.anatomy import Region
 from ...region.globe import Globe
+from ...region.limbus import upwards
 from ...region.look import Look
 from ...rig.camera import PinholeCamera, Window
 from ...rig.imaging import Ambient, Lens
@@ -174,6 +175,8 @@ def parameters_of(job: RenderJob) -> Parameters:
             floor=still.floor,
             gain=1 / max(look.limbus_width_mm, 1e-6),
             albedo=look.limbus_albedo,
+            up=tuple(upwards(eye.front[0])),
+            lowering=1 / look.limbus_aspect**2 - 1,
             bulge=still.bulge,
             bulge_radius=still.bulge_radius,
         ),

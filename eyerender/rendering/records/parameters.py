@@ -77,6 +77,8 @@ class LimbusParameters:
         floor: lowest x of the cornea in that surface's frame, mm.
         gain: 1 / width, 1/mm.
         albedo: of the limbus.
+        up: (2,) direction upwards in that surface's y, z plane.
+        lowering: 1 / aspect^2 - 1, with the height of the visible limbus over its width.
         bulge: (3,) middle of a sphere that contains the cornea's front.
         bulge_radius: its radius, mm.
     """
@@ -85,6 +87,8 @@ class LimbusParameters:
     floor: Number
     gain: Number
     albedo: Number
+    up: tuple[Number, Number]
+    lowering: Number
     bulge: Vector
     bulge_radius: Number
 

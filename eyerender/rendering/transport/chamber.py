@@ -31,6 +31,7 @@ from scipy.sparse import csr_array
 from ...arrays import Bools, Floats, Ints, Singles, frozen, remembered
 from ...eye.model import EyeModel, Stop
 from ...geometry.surfaces import Surface
+from ...region.limbus import lower, upwards
 from ...region.look import LIMBAL_RING, Look
 from .chamberrays import ChamberShape, Walls, air_side, trace_inside
 
@@ -40,6 +41,7 @@ IRIS = IRIS_RINGS * TURNS
 LEVELS = 2  # of points on the wall
 PATCHES = IRIS + TURNS * LEVELS
 RAYS = 256  # from each point
+_ROWS, _FINE = 8, 4  # points on the cornea's rim: across it, and in each sector
 _FAR_MM = 8.0  # distance of what rays that leave the eye meet: so far apart are two rays at an angle of 1
 _ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
 _SAME_MM = 0.005  # chambers of depths and radii that differ by less are one
@@ -91,15 +93,16 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
     )  # fmt: skip
 
 
-def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float) -> Floats:
+def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float, aspect: float = 1.0) -> Floats:
     """Share (PATCHES, TURNS) by which light that comes through each sector of the limbal tissue lights each patch.
 
     Args:
         eye: the eye.
         chamber: its chamber.
         width_mm: width of the cornea's rim that turns to sclera.
+        aspect: height of the visible limbus over its width.
     """
-    return _through_limbus(chamber, eye.front[0], float(eye.limbus_radius_mm), float(width_mm))
+    return _through_limbus(chamber, eye.front[0], float(eye.limbus_radius_mm), float(width_mm), float(aspect))
 
 
 @remembered
@@ -143,27 +146,43 @@ def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
 
 
 @lru_cache(maxsize=64)
-def _through_limbus(chamber: Chamber, front: Surface, limbus: float, width: float) -> Floats:
+def _through_limbus(chamber: Chamber, front: Surface, limbus: float, width: float, aspect: float) -> Floats:
     wall = chamber.exchange[:, IRIS:].reshape(PATCHES, TURNS, LEVELS).sum(axis=2)
     if width == 0:
         return frozen(wall)
-    rows, fine = 8, 4
-    step, turn = width / rows, 2 * np.pi / (TURNS * fine)
-    share = (np.arange(rows) + 0.5) / rows
-    rho, angle = np.meshgrid(limbus - width * (1 - share), (np.arange(TURNS * fine) + 0.5) * turn, indexing="ij")
-    y, z = rho * np.cos(angle), rho * np.sin(angle)
+    y, z, opaque = _rim(front, limbus, width, aspect)
     rotation = np.asarray(front.rotation)
     at = np.asarray(front.origin_mm) + np.stack([front.sag(y, z), y, z], axis=-1) @ rotation.T
     normal = front.normal(at.reshape(-1, 3)).reshape(at.shape)
-    opacity = (share * share * (3 - 2 * share))[:, None]
-    area = opacity * rho * step * turn / np.abs(normal @ rotation[:, 0])
+    area = opaque / np.abs(normal @ rotation[:, 0])
     way = at - chamber.points[:, None, None]
     r2 = np.sum(way * way, axis=-1)
     here = np.einsum("ijkl,il->ijk", way, chamber.normals)
     there = np.einsum("ijkl,jkl->ijk", way, normal)
     seen = np.maximum(here, 0) * np.maximum(there, 0) / (np.pi * r2 * r2) * area
-    sectors = seen.reshape(PATCHES, rows, TURNS, fine).sum(axis=(1, 3))
+    sectors = seen.reshape(PATCHES, len(y), TURNS, _FINE).sum(axis=(1, 3))
     return frozen(wall + np.where(chamber.valid[:, None], sectors, 0))
+
+
+def _rim(front: Surface, limbus: float, width: float, aspect: float) -> tuple[Floats, Floats, Floats]:
+    """Points of the cornea's opaque rim: y and z in its frame, and opacity times the area (mm^2) across its axis.
+
+    The rim is the transition up to the visible limbus, and what is opaque between this ellipse and the round limbus.
+    """
+    turn = 2 * np.pi / (TURNS * _FINE)
+    angle = (np.arange(TURNS * _FINE) + 0.5) * turn
+    share = (np.arange(_ROWS) + 0.5) / _ROWS
+    rho, across = np.meshgrid(limbus - width * (1 - share), angle, indexing="ij")
+    y, z = lower(front, rho * np.cos(across), rho * np.sin(across), aspect)
+    opaque = (share * share * (3 - 2 * share))[:, None] * rho * (width / _ROWS) * turn * aspect
+    if aspect == 1:
+        return y, z, opaque
+    edge = limbus * np.cos(angle), limbus * np.sin(angle)
+    heights = aspect + (1 - aspect) * share[::2]
+    beyond = np.array([lower(front, *edge, height) for height in heights])
+    high = upwards(front) @ np.array(edge)
+    crescents = np.tile(high**2 * turn * (1 - aspect) / len(heights), (len(heights), 1))
+    return np.vstack([y, beyond[:, 0]]), np.vstack([z, beyond[:, 1]]), np.vstack([opaque, crescents])
 
 
 def limbus_points(eye: EyeModel) -> tuple[Floats, Floats]:

@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..hits.eyeshape import EyeShape
 from ..hits.interaction import EPSILON_MM, SurfaceInteraction
 from ..hits.primary import ray_blocked, segment
-from ..materials.albedo import opacity
+from ..materials.albedo import limbal_radius, opacity
 from ..materials.gloss import sheen
 from ..records.frame import ALL, BITS, Frame, Lamp
 from ..records.recording import syntax
@@ -224,11 +224,10 @@ def irradiance_off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: 
         source = lamp.point(u, sine, cosine)
         path = connect(frame.surfaces[:1], source, Target(x, normal, x), reach, mi.Bool(True), mirror=True)
         local = frame.surfaces[0].point_in(path.entry)
-        out = dr.sqrt(local.y * local.y + local.z * local.z)
-        there = path.found & (out < reach)
+        there = path.found & (dr.sqrt(local.y * local.y + local.z * local.z) < reach)
         blocked = lamp_blocked(frame, path.entry, source, True, False, there)
         blocked |= lamp_blocked(frame, path.entry, x, True, False, there & ~blocked)
-        lit = lamp.radiant_intensity(path.leaving) * path.transfer * (1 - opacity(frame, out))
+        lit = lamp.radiant_intensity(path.leaving) * path.transfer * (1 - opacity(frame, limbal_radius(frame, local)))
         total += dr.select(there & ~blocked, lit, 0)
         i += 1
     return total
@@ -261,7 +260,7 @@ class LampPath:
     Attributes:
         gain: irradiance (mW/mm^2) if nothing is in the way.
         whole: the same if all of the cornea were clear.
-        out: radius about the front surface's axis where the path enters, mm.
+        out: `limbal_radius` where the path enters, mm.
         entry: where the path enters the front surface (eye frame).
         enters: whether there is a path, through the clear part of the cornea.
         blocked: whether anything is in its way.
@@ -297,8 +296,7 @@ class LampPath:
         aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
         target = Target(inner, frame.stop.normal if normal is None else normal, aim)
         path = connect(surfaces or frame.surfaces, source, target, frame.limbus.radius, active, ahead_mm=ahead_mm)
-        local = frame.surfaces[0].point_in(path.entry)
-        out = dr.sqrt(local.y * local.y + local.z * local.z)
+        out = limbal_radius(frame, frame.surfaces[0].point_in(path.entry))
         clear = 1 - opacity(frame, out)
         enters = path.found & (clear > 0)
         blocked = lamp_blocked(frame, path.entry, source, True, False, enters)

@@ -71,7 +71,7 @@ class Interior:
         """Compute it for an eye, with its pupil, and a look, with so many halvings of the rays that leave."""
         chamber = chamber_of(eye, film_index)
         albedo = patch_albedo(eye, chamber, look)
-        limbus = through_limbus(eye, chamber, look.limbus_width_mm) * look.limbus_transmittance
+        limbus = through_limbus(eye, chamber, look.limbus_width_mm, look.limbus_aspect) * look.limbus_transmittance
         rows = upload_array(np.column_stack([chamber.points, chamber.normals, chamber.valid]))
         rays, gain = bundles(chamber, halvings)
         return cls(
