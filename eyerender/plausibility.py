@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .arrays import Floats
 from .errors import InputWarning
-from .rig.camera import PinholeCamera, Window
+from .rig.camera import Camera, PinholeCamera, Window
 from .rig.light import Lamp
 from .rig.rig import RigGeometry
 from .rig.screen import ScreenPlane
@@ -129,6 +129,26 @@ def place_warnings(
             code="metres", reason=f"is ({_shown(rig.screen.centre_mm)}) mm; {_METRES}", path=path
         )
     return list(found.values())
+
+
+def mirror_warnings(cameras: Sequence[Camera], eyes_mm: Mapping[str, Floats]) -> list[InputWarning]:
+    """Warn of a mirror that stands between its camera and an eye, where it shows the camera nothing of the eye.
+
+    Args:
+        cameras: the authored cameras.
+        eyes_mm: corneal apexes (3,) in the world by their name in a message.
+    """
+    found = []
+    for k, camera in enumerate(cameras):
+        if camera.mirror is None:
+            continue
+        normal, offset = camera.mirror.plane
+        own = float(normal @ camera.unmirrored().nodal_point_mm) - offset
+        hidden = [name for name, eye in eyes_mm.items() if (float(normal @ eye) - offset) * own < 0]
+        if hidden:
+            reason = f"stands between the camera and {hidden[0]}, so the camera cannot see it in the mirror"
+            found.append(InputWarning(code="mirror", reason=reason, path=f"rig.cameras.{k}.mirror"))
+    return found
 
 
 def view_warnings(

@@ -228,7 +228,11 @@ class View:
         """Project points of the eye frame to pixels (n, k, 2); NaN where the status says there is none."""
         camera, found = self.camera, np.array(status, dtype=np.int8)
         plain = not np.any(camera.distortion)
-        scale = (camera.K[0, 0], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2]) if plain else (1.0, 0.0, 1.0, 0.0)
+        scale = (
+            (camera.across * camera.K[0, 0], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2])
+            if plain
+            else (1.0, 0.0, 1.0, 0.0)
+        )
         seen = np.empty((*found.shape, 2))
         x, y, z = (np.ascontiguousarray(axis) for axis in points)
         ends = np.array(scale), int(Status.BEHIND_CAMERA)

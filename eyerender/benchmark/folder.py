@@ -282,6 +282,7 @@ def _hints(
             "R": camera.R.tolist(),
             "t_mm": camera.t.tolist(),
             "distortion": camera.distortion.tolist(),
+            **({"mirrored": True} if camera.mirrored else {}),
             "lights_mm": lights.tolist(),
             "eye_mm": eye_mm.tolist(),
             "eye_sd_mm": eye_error_mm,
@@ -297,6 +298,7 @@ def _camera_and_lights(
     own, lights = labels.get("camera"), labels.get("lights_mm")
     if own and lights is not None:
         seen = PinholeCamera.of(own["K"], own["R"], own["t_mm"], tuple(own["resolution_px"]), own["distortion"])
+        seen = replace(seen, mirrored=own.get("mirrored") is True)
         return seen, np.asarray(lights, dtype=np.float64).reshape(-1, 3)
     if rig is None or not 0 <= camera < len(rig.cameras):
         return None, np.zeros((0, 3))

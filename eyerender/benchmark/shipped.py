@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -121,13 +122,14 @@ def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None
     if rig is None or not found.glints or found.pupil.ellipse is None:
         return [None] * len(found.glints)
     camera = PinholeCamera.of(rig["K"], rig["R"], rig["t_mm"], (1, 1), rig["distortion"])
+    camera = replace(camera, mirrored=rig.get("mirrored", False))
     spots = np.array([g.xy_px for g in found.glints])
     assigned = identify(
         camera.ideal(spots),
         camera.ideal(found.pupil.ellipse.centre_px),
         K=camera.K,
-        R=camera.R,
-        t_mm=camera.t,
+        R=camera.sensor_axes,
+        t_mm=camera.sensor_offset,
         lights_mm=rig["lights_mm"],
         eye_mm=rig["eye_mm"],
         position_sd_mm=math.hypot(_PLACE_MM, rig.get("eye_sd_mm", 0.0)),

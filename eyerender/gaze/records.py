@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -164,7 +165,11 @@ def _camera(data: Any, array: ReadArray, source: str, at: str) -> PinholeCamera:
         CameraCalibration.from_mapping(calibration)
     except InputError as error:
         raise InputError(error.reason, source=source, path=at) from None
-    return PinholeCamera.of(K, R, t, (int(size[0]), int(size[1])), distortion)
+    mirrored = data.get("mirrored", False)
+    if not isinstance(mirrored, bool):
+        raise InputError("must be true or false", source=source, path=f"{at}.mirrored")
+    camera = PinholeCamera.of(K, R, t, (int(size[0]), int(size[1])), distortion)
+    return replace(camera, mirrored=mirrored)
 
 
 def _screen(data: Any, array: ReadArray, source: str) -> ScreenPlane | None:

@@ -376,7 +376,12 @@ def _lights(
     pupil = np.asarray(found.pupil.ellipse.centre_px) + corner
     places = np.array([light.position_mm for light in scene.rig.lights])
     predicted, px_per_mm = predict_glints(
-        camera.ideal(pupil), K=camera.K, R=camera.R, t_mm=camera.t, lights_mm=places, eye_mm=eye_mm
+        camera.ideal(pupil),
+        K=camera.K,
+        R=camera.sensor_axes,
+        t_mm=camera.sensor_offset,
+        lights_mm=places,
+        eye_mm=eye_mm,
     )
     assigned = assign_lights(camera.ideal(spots), predicted, shift_sd_px=_PLACE_MM * px_per_mm)
     return [int(k) for k in assigned.light], assigned.reasons

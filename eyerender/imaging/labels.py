@@ -128,7 +128,7 @@ def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | E
             "t_mm": camera.t.tolist(),
             "distortion": camera.distortion.tolist(),
             "resolution_px": list(camera.resolution_px),
-            "mirrored": None,
+            "mirrored": True if camera.mirrored else None,
         },
         "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
     }
@@ -332,14 +332,15 @@ def _space(
     }
     world = {k: p + index.head_mm[row] for k, p in head.items()}
     world |= {k: M @ np.asarray(p) + t for k, p in points.items()} | {k: M @ d for k, d in directions.items()}
-    seen = {k: camera.R @ v + (0.0 if k in directions else camera.t) for k, v in world.items()}
+    axes, offset = camera.sensor_axes, camera.sensor_offset  # x to the right of the picture, also behind a mirror
+    seen = {k: axes @ v + (0.0 if k in directions else offset) for k, v in world.items()}
     target = index.target_mm[row]
     there = bool(np.isfinite(target).all())
     return {
         "head": {k: v.tolist() for k, v in head.items()},
         "world": {k: v.tolist() for k, v in world.items()} | {"target_mm": target.tolist() if there else None},
         "camera": {k: v.tolist() for k, v in seen.items()}
-        | {"target_mm": (camera.R @ target + camera.t).tolist() if there else None},
+        | {"target_mm": (axes @ target + offset).tolist() if there else None},
     }
 
 

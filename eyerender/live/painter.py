@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..arrays import Bytes, Floats, Reals
+from ..arrays import Bytes, Floats, Reals, frozen
 from ..backends.choose import BackendChoice
 from ..errors import EyerenderError, one_line
 from ..folders.imagefile import preview
@@ -32,7 +32,7 @@ from ..imaging.capture import EyeImage, check_windows, make_renderer, moments, r
 from ..imaging.imageobserver import detect
 from ..observation import Observations
 from ..plausibility import is_saturated
-from ..rig.camera import PinholeCamera, Window
+from ..rig.camera import Window
 from ..rig.defocus import vignette
 from ..rig.exposure import radiance_to_irradiance, recorded
 from ..rig.stray import framed, scattered
@@ -318,7 +318,7 @@ def coarser(job: RenderJob, side: int) -> RenderJob:
     K[0, 2], K[1, 2] = (np.array([K[0, 2] - x0, K[1, 2] - y0]) + 0.5) / side - 0.5
     K[0, 0], K[1, 1] = K[0, 0] / side, K[1, 1] / side
     size = (-(-width // side), -(-height // side))
-    camera = PinholeCamera.of(K, old.R, old.t, size, old.distortion, old.name)
+    camera = replace(old, K=frozen(K), resolution_px=size)
     sensor = job.sensor.model_copy(
         update={
             "pixel_pitch_um": job.sensor.pixel_pitch_um * side,

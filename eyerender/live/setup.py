@@ -144,10 +144,11 @@ class Setup:
     def with_camera_at(self, camera: int, position_mm: ArrayLike) -> Self:
         """Move a camera. One with a target point keeps looking at it; one without keeps its direction."""
         spec = self.scene.spec.rig.cameras[camera]
-        place = np.round(np.asarray(position_mm, dtype=float), 6)
+        # The place that is shown is that of the mirror image behind a mirror.
+        place = np.round(np.asarray(position_mm if spec.mirror is None else spec.mirror.image_of(position_mm)), 6)
         if spec.calibration is None:
             return self.changed({f"rig.cameras.{camera}.position_mm": place.tolist()})
-        turn = self.scene.rig.cameras[camera].R
+        turn = spec.unmirrored().R
         return self.changed({f"rig.cameras.{camera}.calibration.t_mm": (-turn @ place).tolist()})
 
     def with_camera_aimed(self, camera: int) -> Self:
@@ -156,9 +157,8 @@ class Setup:
         if spec.calibration is not None:
             raise InputError("has a calibration, which fixes its direction", path=f"rig.cameras.{camera}")
         path = f"rig.cameras.{camera}"
-        return self.changed(
-            {f"{path}.look_at_mm": self.apex_mm.tolist(), f"{path}.pan_deg": None, f"{path}.tilt_deg": None}
-        )
+        aim = self.apex_mm if spec.mirror is None else spec.mirror.image_of(self.apex_mm)
+        return self.changed({f"{path}.look_at_mm": aim.tolist(), f"{path}.pan_deg": None, f"{path}.tilt_deg": None})
 
     def saved(self) -> SceneSpec:
         """Make the spec to save: what the knobs changed, with all fixations and head positions of the loaded scene.

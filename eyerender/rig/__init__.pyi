@@ -1,6 +1,7 @@
 from .camera import CalibrationFile as CalibrationFile
 from .camera import Camera as Camera
 from .camera import CameraCalibration as CameraCalibration
+from .camera import Mirror as Mirror
 from .camera import PinholeCamera as PinholeCamera
 from .exposure import electrons as electrons
 from .exposure import expose as expose

@@ -4,12 +4,17 @@
 
 z forward, x right, y down; pixel centres at integers. At rest (no pan, tilt, roll) a camera looks along -x, towards the
 subject, with +z up in the image.
+
+A camera that looks at a plane mirror (the hot mirror of a headset) takes the picture of its mirror image behind the
+plane, turned left to right. The mirror image of a point is X' = S X + s with S = 1 - 2 n n^T and s = 2 (n . p) n, so
+the camera R, t sees S X + s at R S X + (R s + t). R S has the determinant -1. With F = diag(-1, 1, 1), the virtual
+camera F R S, F (R s + t) is a proper one, and its x' is that of the sensor with the other sign.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -73,6 +78,31 @@ AnyCalibration = Annotated[
 ]
 
 
+class Mirror(Spec):
+    """A plane mirror through which a camera sees the eyes; it has no edges, and it mirrors no LEDs."""
+
+    point_mm: Vec3 = Field(description="a point of the plane, in the world")
+    normal: Vec3 = Field(description="vector across the plane, of any length and either sign")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not np.linalg.norm(self.normal) > 1e-9:
+            raise ValueError("normal must not be zero")
+        return self
+
+    @property
+    def plane(self) -> tuple[Floats, float]:
+        """Unit normal n (3,) and offset d: n . x = d on the plane."""
+        normal = np.array(self.normal, dtype=float)
+        normal /= np.linalg.norm(normal)
+        return normal, float(normal @ np.array(self.point_mm, dtype=float))
+
+    def image_of(self, points_mm: ArrayLike) -> Floats:
+        """Mirror images (..., 3) of points (..., 3) in the world."""
+        points, (normal, offset) = np.asarray(points_mm, dtype=float), self.plane
+        return np.asarray(points - 2.0 * (points @ normal - offset)[..., None] * normal)
+
+
 class Camera(Spec):
     """A camera, given by place, direction and focal length, or by `calibration`."""
 
@@ -94,6 +124,11 @@ class Camera(Spec):
         default=None,
         description="OpenCV's calibration, in place of position, direction and lens; beside a calibration file, "
         "position and direction replace the pose of the file",
+    )
+    mirror: Mirror | None = Field(
+        default=None,
+        description="plane mirror (a hot mirror) through which it sees the eyes; place, direction and calibration are "
+        "those of the camera itself",
     )
 
     @classmethod
@@ -135,14 +170,14 @@ class Camera(Spec):
                 f"is for {found.size_px} px, but resolution_px of the camera is {self.resolution_px}", source=str(path)
             )
         if self.position_mm is not None:
-            placed = self.model_copy(update={"calibration": None, "focal_length_px": 1.0}).build()
+            placed = self.model_copy(update={"calibration": None, "focal_length_px": 1.0}).unmirrored()
             R, t = placed.R, placed.t
         elif found.R is None or found.t is None:
             raise InputError("holds no pose; give position_mm and look_at_mm of the camera", source=str(path))
         else:
             R, t = found.R, found.t * self.calibration.unit_mm
         numbers = {"K": found.K, "R": R, "t_mm": t, "distortion": found.distortion}
-        kept = {"name": self.name, "resolution_px": self.resolution_px, "calibration": numbers}
+        kept = {"name": self.name, "resolution_px": self.resolution_px, "calibration": numbers, "mirror": self.mirror}
         return type(self).from_mapping(kept, source=str(path))
 
     @classmethod
@@ -201,9 +236,18 @@ class Camera(Spec):
         return self
 
     def build(self) -> PinholeCamera:
-        """Build the numeric camera."""
+        """Build the numeric camera, which is the virtual one behind a mirror.
+
+        Raises:
+            InputError: the camera lies in the plane of its mirror, or its calibration file cannot be read.
+        """
+        camera = self.unmirrored()
+        return camera if self.mirror is None else camera.seen_in(self.mirror)
+
+    def unmirrored(self) -> PinholeCamera:
+        """Build the numeric camera as it stands, without its mirror."""
         if isinstance(self.calibration, CalibrationFile):
-            return self.resolved().build()
+            return self.resolved().unmirrored()
         if self.calibration is not None:
             c = self.calibration
             return PinholeCamera.of(c.K, c.R, c.t_mm, self.resolution_px, c.distortion, self.name)
@@ -239,6 +283,7 @@ class PinholeCamera(ArrayValue):
         distortion: (k1, k2, p1, p2, k3).
         resolution_px: (w, h).
         name: name of the camera.
+        mirrored: whether it is the virtual camera behind a plane mirror: u is flipped about the principal point.
     """
 
     K: Floats
@@ -247,6 +292,7 @@ class PinholeCamera(ArrayValue):
     distortion: Floats
     resolution_px: tuple[int, int]
     name: str
+    mirrored: bool = False
 
     @classmethod
     def of(
@@ -262,6 +308,37 @@ class PinholeCamera(ArrayValue):
         return cls(
             K=frozen(K), R=frozen(R), t=frozen(t), distortion=frozen(distortion), resolution_px=resolution_px, name=name
         )
+
+    def seen_in(self, mirror: Mirror) -> PinholeCamera:
+        """Virtual camera behind a mirror, which takes the pictures that this camera takes through it.
+
+        Raises:
+            InputError: the camera lies in the plane.
+        """
+        normal, offset = mirror.plane
+        if abs(float(normal @ self.nodal_point_mm) - offset) < 1e-6:
+            raise InputError("lies in the plane of its mirror", path=f"camera {self.name!r}")
+        reflect = np.eye(3) - 2.0 * np.outer(normal, normal)
+        flip = np.array([-1.0, 1.0, 1.0])
+        t = self.R @ (2.0 * offset * normal) + self.t
+        return replace(
+            self, R=frozen(flip[:, None] * (self.R @ reflect)), t=frozen(flip * t), mirrored=not self.mirrored
+        )
+
+    @property
+    def across(self) -> float:
+        """-1 where the picture is turned left to right, else 1: the sign of x on the sensor."""
+        return -1.0 if self.mirrored else 1.0
+
+    @property
+    def sensor_axes(self) -> Floats:
+        """Right, down and forward of the picture in the world, rows (3, 3): R, or left-handed behind a mirror."""
+        return np.asarray(self.R * np.array([[self.across], [1.0], [1.0]])) if self.mirrored else self.R
+
+    @property
+    def sensor_offset(self) -> Floats:
+        """Offset o (3,) of the picture's own frame, x = sensor_axes x_world + o: t, or with the other sign of x."""
+        return np.asarray(self.t * np.array([self.across, 1.0, 1.0])) if self.mirrored else self.t
 
     @property
     def nodal_point_mm(self) -> Floats:
@@ -289,6 +366,7 @@ class PinholeCamera(ArrayValue):
 
     def pixels_of(self, x: Floats, y: Floats) -> Floats:
         """Pixels (..., 2) of undistorted normalised coordinates x = X/Z, y = Y/Z."""
+        x = self.across * x
         if np.any(self.distortion):
             x, y = distort(x, y, self.distortion)
         return np.stack([self.K[0, 0] * x + self.K[0, 2], self.K[1, 1] * y + self.K[1, 2]], axis=-1)
@@ -305,7 +383,7 @@ class PinholeCamera(ArrayValue):
         y = (p[..., 1] - self.K[1, 2]) / self.K[1, 1]
         if np.any(self.distortion):
             x, y = undistort(x, y, self.distortion)
-        d = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.R
+        d = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.sensor_axes
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
     def ideal(self, pixels: ArrayLike) -> Floats:
@@ -316,6 +394,10 @@ class PinholeCamera(ArrayValue):
         (cx, cy), (fx, fy) = self.K[:2, 2], (self.K[0, 0], self.K[1, 1])
         x, y = undistort((p[..., 0] - cx) / fx, (p[..., 1] - cy) / fy, self.distortion)
         return np.stack([fx * x + cx, fy * y + cy], axis=-1)
+
+    def is_imaged(self, x: Floats, y: Floats) -> Bools:
+        """Whether the distortion has not folded back the picture of normalised coordinates x = X/Z, y = Y/Z."""
+        return np.asarray(is_imaged(self.across * x, y, self.distortion))
 
     def in_image(self, pixels: ArrayLike) -> Bools:
         """Whether pixels (..., 2) lie on the sensor; the far edges of its outer pixels are at -0.5 and W - 0.5."""

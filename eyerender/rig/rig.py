@@ -134,7 +134,9 @@ class Rig(Spec):
     def build(self) -> RigGeometry:
         """Build the numeric rig."""
         cameras = tuple(camera.build() for camera in self.cameras)
-        lights = tuple(light for spec in self.lights for light in spec.build(cameras))
+        # A ring of LEDs surrounds the camera itself, not its mirror image.
+        places = tuple(camera.unmirrored() for camera in self.cameras)
+        lights = tuple(light for spec in self.lights for light in spec.build(places))
         if self.mount is not None:
             cameras = tuple(map(self.mount.camera, cameras))
             lights = tuple(map(self.mount.lamp, lights))
@@ -172,6 +174,7 @@ class RigGeometry(ArrayValue):
                     "t": c.t.tolist(),
                     "distortion": c.distortion.tolist(),
                     "resolution_px": list(c.resolution_px),
+                    **({"mirrored": True} if c.mirrored else {}),
                 }
                 for c in self.cameras
             ],

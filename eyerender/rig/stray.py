@@ -13,6 +13,7 @@ Scattered light belongs to the whole sensor. Where a window shows a part of it, 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -91,7 +92,7 @@ def in_blocks(lens: Lens, camera: PinholeCamera, side: int) -> tuple[Lens, Pinho
     openings = tuple(o.model_copy(update={"edge_px": o.edge_px / side}) for o in lens.openings)
     sizes = {"glare_radius_px": lens.glare_radius_px / side, "ghost_blur_px": lens.ghost_blur_px / side}
     coarse = lens.model_copy(update={**sizes, "openings": openings})
-    return coarse, PinholeCamera.of(K, camera.R, camera.t, (width, height), camera.distortion, camera.name)
+    return coarse, replace(camera, K=frozen(K), resolution_px=(width, height))
 
 
 def scattered_around(picture: Reals, around: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:

@@ -28,7 +28,14 @@ from ..eye.parts import Side
 from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
 from ..observation import EYES, Index, PoseTruth
-from ..plausibility import length_warnings, place_warnings, pupil_warnings, view_warnings, wavelength_warnings
+from ..plausibility import (
+    length_warnings,
+    mirror_warnings,
+    place_warnings,
+    pupil_warnings,
+    view_warnings,
+    wavelength_warnings,
+)
 from ..population.eyes import amplitude_d
 from ..population.people import Person
 from ..population.response import REFERENCE_AGE, responding
@@ -367,6 +374,7 @@ class Scene:
             *wavelength_warnings(spec.wavelength_nm),
             *length_warnings(spec.to_mapping()),
             *place_warnings(rig, eyes, heads, cameras, lights),
+            *mirror_warnings(spec.rig.cameras, eyes),
             *self._face_warnings([*zip(cameras, rig.cameras, strict=True)], [*zip(lights, rig.lights, strict=True)]),
             *view_warnings(rig, views, [f"rig.cameras.{i}" for i in range(len(rig.cameras))]),
         ]

@@ -24,7 +24,6 @@ from ...optics.interface import fresnel
 from ...optics.purkinje import purkinje_path, purkinje_points
 from ...optics.shooting import ray_tube
 from ...optics.trace import Crossing, Traced, trace
-from ...rig.camera import is_imaged
 from ...rig.light import Lamp
 from ...status import Status
 from .cutdiscs import Nodes
@@ -59,7 +58,7 @@ def purkinje_images(
         ok &= cam[:, 2] > 0
         z = np.where(ok, cam[:, 2], 1.0)
         x, y = cam[:, 0] / z, cam[:, 1] / z
-        ok &= is_imaged(x, y, camera.distortion)
+        ok &= camera.is_imaged(x, y)
         scale = camera.K[0, 0] * camera.K[1, 1] / z**3
         energy = node.weight * float(lamp.intensity_mw_sr) * lobe * passed * scale / np.where(ok, tube, 1.0)
         entry, leave = traced.points_mm[-1] @ M.T + t, traced.points_mm[1] @ M.T + t

@@ -33,7 +33,7 @@ from ...optics.interface import fresnel
 from ...optics.shooting import ray_tube
 from ...optics.solve import mirrored_rays
 from ...optics.trace import Crossing
-from ...rig.camera import PinholeCamera, is_imaged
+from ...rig.camera import PinholeCamera
 from ...rig.light import Lamp
 from ...status import Status
 from ..hits.meshes import MirrorPoints, SurfaceMesh
@@ -277,7 +277,7 @@ class GlintScene:
         found = r.found & (cam[:, 2] > 0)
         z = np.where(found, cam[:, 2], 1.0)
         x, v = cam[:, 0] / z, cam[:, 1] / z
-        found &= is_imaged(x, v, camera.distortion)
+        found &= camera.is_imaged(x, v)
         scale = camera.K[0, 0] * camera.K[1, 1] / z**3
         y, strength = r.point, emitters.weights * emitters.strength[which]
         there = r.there & found & ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, self._eyepoint - y)

@@ -165,7 +165,7 @@ def _sensor(root: ET.Element, job: RenderJob, spp: int) -> None:
     _value(sensor, "float", "far_clip", 1e5)
     # Mitsuba's camera looks along +z with +x to the left and +y up.
     pose = np.eye(4)
-    pose[:3, :3] = np.stack([-camera.R[0], -camera.R[1], camera.R[2]], axis=1)
+    pose[:3, :3] = (camera.sensor_axes * np.array([[-1.0], [-1.0], [1.0]])).T
     pose[:3, 3] = camera.nodal_point_mm
     _transform(sensor, pose)
     film = ET.SubElement(sensor, "film", type="hdrfilm")

@@ -185,7 +185,7 @@ def parameters_of(job: RenderJob) -> Parameters:
         pose=PoseParameters((job.M[:, 0], job.M[:, 1], job.M[:, 2]), job.t - anchor),
         camera=CameraParameters(
             centre=camera.nodal_point_mm - anchor,
-            right=camera.R[0],
+            right=camera.sensor_axes[0],
             down=camera.R[1],
             forward=camera.R[2],
             focal=(camera.K[0, 0], camera.K[1, 1]),
