@@ -26,7 +26,7 @@ estimators = {
 fitted = {name: estimator.fit(calibration, rig) for name, estimator in estimators.items()}
 
 # %%
-# The head moves sideways; the estimators are not told.
+# The head moves sideways, and the estimators get no information about it.
 offsets = np.arange(0, 60, 10)
 figure, axes = plt.subplots(figsize=(5.5, 4))
 for name, estimator in fitted.items():

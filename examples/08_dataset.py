@@ -2,8 +2,8 @@
 A dataset
 =========
 
-A dataset spec says what is drawn and how often. The run writes labelled images in shards, goes on after an
-interruption, and gives the same images on every machine.
+A dataset spec says which values are random, and how often they are drawn. The run writes labelled images in shards,
+resumes after an interruption, and gives the same images on every machine.
 """
 
 import tempfile
@@ -24,7 +24,7 @@ report = er.validate(out)
 print("valid:", report["ok"])
 
 # %%
-# The folder is read image by image, so it may hold millions.
+# The folder is read image by image, so it may hold millions of images.
 folder = er.ImageFolder.load(out)
 shown = [entry for _, entry in zip(range(12), folder, strict=False)]
 figure, axes = plt.subplots(3, 4, figsize=(9, 5.5))

@@ -2,7 +2,7 @@
 Extracting your own images
 ==========================
 
-The extractor needs an array and nothing else. Here the array comes from a renderer; read yours with any image library.
+The extractor needs only an array. Here the array comes from the renderer; read yours with any image library.
 """
 
 import matplotlib.pyplot as plt
@@ -17,7 +17,7 @@ frames = scene.frames()
 array = er.render(frames[0], spp=SAMPLES).counts
 
 # %%
-# The result has the pupil's ellipse with its covariance and a confidence, and the glints. What is not found has a
+# The result has the pupil's ellipse with its covariance and a confidence, and the glints. A missing feature has a
 # reason.
 found = er.extract(array, bit_depth=scene.spec.sensor.bit_depth)
 print("pupil:", found.pupil.ellipse if found.pupil.ok else found.pupil.reason)

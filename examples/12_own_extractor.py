@@ -2,8 +2,8 @@
 Your own feature extractor
 ==========================
 
-An extractor is a function that takes an image and returns a record. The bench runs each extractor in a process of its
-own and compares its results with the exact labels.
+An extractor is a function that takes an image and returns a record. The bench runs each extractor in a separate
+process and compares its results with the exact labels.
 """
 
 import importlib

@@ -2,8 +2,8 @@
 Comparing rendered pictures with other frames
 =============================================
 
-How real do pictures look? The figures of two folders stand side by side: here of two scenes; put a folder of your own
-camera's frames in the place of the second.
+How real do pictures look? This example compares the figures of two rendered scenes. Replace the second folder by frames
+of your own camera.
 """
 
 import tempfile

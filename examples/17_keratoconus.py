@@ -2,9 +2,9 @@
 A keratoconus, and your own topography
 ======================================
 
-A cornea may be a grid of measured heights. Here a Gaussian cone stands in for a keratoconus: 40 micrometres high at the
+A cornea may be a grid of measured heights. Here a Gaussian cone imitates a keratoconus: 40 micrometres high at the
 front and 60 at the back, so that the cornea is thinnest there, 1.2 mm from the axis towards the temple and the cheek.
-These numbers are chosen. With heights from a topographer, `file:` in the eye file takes their place.
+These numbers are chosen. For heights from a topographer, give `file:` in the eye file instead.
 """
 
 import matplotlib.pyplot as plt
@@ -38,7 +38,7 @@ def eye_with(front_cone_mm, back_cone_mm):
 healthy, ill = eye_with(0.0, 0.0), eye_with(0.040, 0.060)
 
 # %%
-# A headset's ring of LEDs shows the cone: its mirror images leave their circle.
+# A headset's ring of LEDs shows the cone: its glints no longer lie on a circle.
 scale = SIZE[0] / 560
 camera = er.Camera.looking_at((-2, 0, 0), position_mm=(34, -8, -12), focal_length_px=1650 * scale, size_px=SIZE)
 rig = er.Rig(cameras=[camera], lights=[er.Led(ring=er.LedRing(radius_mm=22, count=20), intensity_mw_sr=0.2)])

@@ -235,8 +235,7 @@ class Painter:
             del work, tab, canvas  # these names would keep what a tab that closes meanwhile should free
 
     def _next(self) -> tuple[_Tab, _Canvas, bool] | None:
-        """Wait for work: the oldest order without a preview, else the order with the fewest samples of a tab at
-        rest."""
+        """Wait for work: the oldest order without a preview, else that of a resting tab with the fewest samples."""
         with self._changed:
             while not self._stopped:
                 tabs = [(tab, tab.canvas) for tab in self._tabs.values() if tab.canvas is not None]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..report.style import figure, legend_above, svg
-from .clouds import Cloud
+from .featureclouds import Cloud
 
 _LOOK = {
     "E1": ("#E69F00", "o"),

@@ -169,7 +169,7 @@ def _micrometres(value: float | None) -> str:
 
 
 def findings_values(found: Sequence[Finding]) -> Values:
-    """List every finding with its details, and one row per statement with one column per observer (`together`)."""
+    """List every finding with its details, and one row per statement with one column per observer (`by_statement`)."""
     told = {True: "true", False: "false", None: ""}
     rows = [
         (
@@ -181,14 +181,14 @@ def findings_values(found: Sequence[Finding]) -> Values:
     keys = list(dict.fromkeys((f.protocol, f.observer) for f in found))
     by = {(f.id, f.rule, f.threshold, f.protocol, f.observer): f for f in found}
     sentences = {(f.id, f.rule, f.threshold): f.sentence for f in found}
-    together = []
+    by_statement = []
     for statement in dict.fromkeys((f.id, f.rule, f.threshold) for f in found):
         cells = []
         for key in keys:
             f = by.get((*statement, *key))
             cells.append("" if f is None or f.value is None else f"{told[f.verdict]} {f.value:.3g}".strip())
-        together.append((*statement, *cells, sentences[statement]))
-    return {"rows": rows, "readings": [", ".join(key) for key in keys], "together": together}
+        by_statement.append((*statement, *cells, sentences[statement]))
+    return {"rows": rows, "readings": [", ".join(key) for key in keys], "by_statement": by_statement}
 
 
 def waterfall_values(

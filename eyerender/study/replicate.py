@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..observation import Observations
 from ..scene import Scene
 from . import blignaut, guestrin
-from .clouds import Cloud
+from .featureclouds import Cloud
 from .literature import CALIBRATION_SETS
 from .observing import Observing
 from .results import ModelResults, WaterfallStep, over_seeds

@@ -20,7 +20,7 @@ from ..progress import Progress, Say
 from ..scene import Scene
 from ..storage.files import read_json, write_json, write_text
 from ..storage.lock import writer_lock
-from . import blignaut, guestrin, head_mounted, together
+from . import blignaut, guestrin, head_mounted, summarise
 from .conditions import DRAWN_PEOPLE, conditions_part, people_part
 from .head_mounted import head_mounted_part
 from .images import make_images
@@ -33,11 +33,11 @@ from .results import csv_text, write_results
 STUDIES = ("guestrin2006", "blignaut2014", "observers", "conditions")
 RUN_SCHEMA = "eyerender/study/1"
 MARKER, REPORT, IMAGES = "study.json", "report.html", "images"
-_TOGETHER: dict[str, Callable[..., together.Results]] = {
-    "guestrin2006": together.guestrin_results,
-    "blignaut2014": together.blignaut_results,
-    "observers": together.observers_results,
-    "conditions": together.conditions_results,
+_SUMMARISE: dict[str, Callable[..., summarise.Results]] = {
+    "guestrin2006": summarise.guestrin_results,
+    "blignaut2014": summarise.blignaut_results,
+    "observers": summarise.observers_results,
+    "conditions": summarise.conditions_results,
 }
 
 
@@ -111,7 +111,7 @@ def run_study(
         count = options.workers or len(os.sched_getaffinity(0))
         notes = [f"{eye}, {' and '.join(o.kind for o in observings)}" for observings, eye, _ in jobs]
         parts = _collected(partial(_job, name), jobs, notes, count, progress)
-        rows, found, more, page = _TOGETHER[name](parts, protocols)
+        rows, found, more, page = _SUMMARISE[name](parts, protocols)
         more = {"settings": settings, "seconds": round(time.monotonic() - start, 2), **more}
         summary = write_results(folder, name, rows, found, more)
         if "waterfall" in more:

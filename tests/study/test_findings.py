@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from eyerender.study import clouds, findings
+from eyerender.study import featureclouds, findings
 from eyerender.study import literature as lit
 from eyerender.study.blignaut import Outcome
 
@@ -131,27 +131,29 @@ def grid(bend=0.0, height=0.5):
 
 def test_clouds():
     # A row from x = -10 to 10 that sags by 10 * bend: bend / 2 of its length.
-    assert clouds.bow(grid(0.06)) == pytest.approx(0.03, rel=1e-9)
-    assert clouds.aspect(grid()) == pytest.approx(0.5 * np.std(np.linspace(-1, 1, 9)) / np.std(np.linspace(-1, 1, 15)))
-    assert clouds.extent_px(np.zeros((135, 2))) == 0.0
+    assert featureclouds.bow(grid(0.06)) == pytest.approx(0.03, rel=1e-9)
+    assert featureclouds.aspect(grid()) == pytest.approx(
+        0.5 * np.std(np.linspace(-1, 1, 9)) / np.std(np.linspace(-1, 1, 15))
+    )
+    assert featureclouds.extent_px(np.zeros((135, 2))) == 0.0
     turned = grid(0.06) @ np.array([[0.8, -0.6], [0.6, 0.8]])
-    assert clouds.bow(turned) == pytest.approx(0.03, rel=1e-9)
-    assert clouds.aspect(turned) == pytest.approx(clouds.aspect(grid(0.06)))
+    assert featureclouds.bow(turned) == pytest.approx(0.03, rel=1e-9)
+    assert featureclouds.aspect(turned) == pytest.approx(featureclouds.aspect(grid(0.06)))
 
 
 def test_f_findings_turn_with_the_data():
     def cloud(bend, height=0.5, glint_bend=None):
-        return clouds.Cloud(grid(bend, height), grid(bend if glint_bend is None else glint_bend, height))
+        return featureclouds.Cloud(grid(bend, height), grid(bend if glint_bend is None else glint_bend, height))
 
-    still = clouds.Cloud(grid(), np.full((135, 2), 7.0))
+    still = featureclouds.Cloud(grid(), np.full((135, 2), 7.0))
     good = {
         "E1": still,
         "E2": cloud(0.02),
         "E3": cloud(0.01),
-        "E4": clouds.Cloud(grid(0.01), grid(0.03)),
+        "E4": featureclouds.Cloud(grid(0.01), grid(0.03)),
         "E5": cloud(0.05, 0.3),
     }
-    assert [f.verdict for f in clouds.findings(good, "c", "a")] == [True] * 4
+    assert [f.verdict for f in featureclouds.findings(good, "c", "a")] == [True] * 4
     bad = {**good, "E1": cloud(0), "E4": cloud(0.3, 0.5, 0.001), "E5": cloud(0.05, 0.9)}
-    assert [f.verdict for f in clouds.findings(bad, "c", "a")] == [False] * 4
-    assert clouds.findings({"E2": cloud(0)}, "c", "a") == []
+    assert [f.verdict for f in featureclouds.findings(bad, "c", "a")] == [False] * 4
+    assert featureclouds.findings({"E2": cloud(0)}, "c", "a") == []

@@ -9,9 +9,9 @@ from typing import Any
 from . import (
     blignaut,
     blignaut_page,
-    clouds,
     conditions_page,
     errata,
+    featureclouds,
     findings,
     guestrin,
     guestrin_page,
@@ -64,7 +64,7 @@ def blignaut_results(parts: Sequence[BlignautPart], protocols: Sequence[str]) ->
     for protocol, observer in keys:
         here = {p.eye_model: p for p in parts if (protocol, observer) in p.outcomes}
         found += findings.blignaut({m: p.outcomes[protocol, observer] for m, p in here.items()}, protocol, observer)
-        found += clouds.findings({m: p.clouds[protocol, observer] for m, p in here.items()}, protocol, observer)
+        found += featureclouds.findings({m: p.clouds[protocol, observer] for m, p in here.items()}, protocol, observer)
         if protocol == "corrected":
             centred = {m: p.centred[protocol, observer] for m, p in here.items()}
             found += findings.blignaut(centred, "corrected, centred vector", observer)
