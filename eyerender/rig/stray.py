@@ -18,7 +18,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy import fft, ndimage, signal, special
+from scipy import fft, ndimage, special
 
 from ..arrays import Bools, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
@@ -38,13 +38,15 @@ def starred(picture: Reals, star: Star | None) -> Reals:
     if star is None or star.share == 0:
         return picture
     kernel = star_kernel(star).astype(picture.dtype)
-    arms = signal.oaconvolve(np.pad(picture, star.reach_px, mode="symmetric"), kernel, mode="valid")
+    from scipy.signal import oaconvolve  # which takes a second, and few lenses have a star
+
+    arms = oaconvolve(np.pad(picture, star.reach_px, mode="symmetric"), kernel, mode="valid")
     return np.asarray((1 - star.share) * picture + star.share * np.maximum(arms, 0), dtype=picture.dtype)
 
 
 @lru_cache(maxsize=8)
 def star_kernel(star: Star) -> Reals:
-    """Light (2 n + 1, 2 n + 1) of a point in the arms, n = `reach_px`; its sum is 1."""
+    """Compute the light (2 n + 1, 2 n + 1) of a point in the arms, n = `reach_px`; its sum is 1."""
     n, arms = star.reach_px, star.blades * (1 if star.blades % 2 == 0 else 2)
     angle = np.radians(star.turn_deg) + 2 * np.pi * np.arange(arms)[:, None] / arms
     r = np.arange(1.0, n + 1e-9, 0.25)
@@ -60,7 +62,7 @@ def star_kernel(star: Star) -> Reals:
 
 
 def framed(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """Picture (h, w) behind the lens' openings, in its own precision; radiances in mW/mm^2/sr."""
+    """Compute the picture (h, w) behind the lens' openings, in its own precision; radiances in mW/mm^2/sr."""
     for opening in lens.openings:
         rim = 1e-3 * opening.radiance_w_m2_sr
         picture = (picture - rim if rim else picture) * transmission(opening, camera, window)
@@ -70,20 +72,20 @@ def framed(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) ->
 
 
 def misses_light(lens: Lens, camera: PinholeCamera, window: Window) -> bool:
-    """Whether a lens scatters light into a window of the sensor from outside of it."""
+    """Return whether a lens scatters light into a window of the sensor from outside of it."""
     (x0, y0, width, height), (w, h) = window, camera.resolution_px
     part = x0 >= 0 and y0 >= 0 and x0 + width <= w and y0 + height <= h and (width, height) != (w, h)
     return part and (lens.ghost > 0 or lens.glare > 0)
 
 
 def block_px(lens: Lens) -> int:
-    """Side of the largest pixels in which a lens' scattered light is smooth."""
+    """Compute the side of the largest pixels in which a lens' scattered light is smooth."""
     sizes = [lens.glare_radius_px / 12] * (lens.glare > 0) + [lens.ghost_blur_px / 3] * (lens.ghost > 0)
     return max(int(min(*sizes, _LARGEST_BLOCK)), 1)
 
 
 def in_blocks(lens: Lens, camera: PinholeCamera, side: int) -> tuple[Lens, PinholeCamera]:
-    """Lens and camera in pixels that are larger by a whole factor."""
+    """Compute the lens and camera in pixels that are larger by a whole factor."""
     width, height = (-(-n // side) for n in camera.resolution_px)
     K = np.array(camera.K)
     K[:2, 2] += 0.5
@@ -96,7 +98,7 @@ def in_blocks(lens: Lens, camera: PinholeCamera, side: int) -> tuple[Lens, Pinho
 
 
 def scattered_around(picture: Reals, around: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """Picture (h, w) of a window with ghost and glare of the light of the whole sensor.
+    """Compute the picture (h, w) of a window with ghost and glare of the light of the whole sensor.
 
     Args:
         picture: the window.
@@ -119,7 +121,7 @@ def scattered_around(picture: Reals, around: Reals, lens: Lens, camera: PinholeC
 
 
 def _enlarged(values: Reals, side: int, first: int, count: int) -> Reals:
-    """Rows (count, k) of pixels from `first` on, interpolated between rows (n, k) of blocks."""
+    """List rows (count, k) of pixels from `first` on, interpolated between rows (n, k) of blocks."""
     place = np.clip((np.arange(first, first + count) + 0.5) / side - 0.5, 0, len(values) - 1)
     low = np.minimum(place.astype(int), max(len(values) - 2, 0))
     share = (place - low)[:, None].astype(values.dtype)
@@ -127,7 +129,7 @@ def _enlarged(values: Reals, side: int, first: int, count: int) -> Reals:
 
 
 def scattered(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """Picture (h, w) with ghost and glare, in its own precision."""
+    """Compute the picture (h, w) with ghost and glare, in its own precision."""
     if lens.ghost > 0:
         picture = (1 - lens.ghost) * picture + lens.ghost * ghost(picture, lens, camera, window)
     if lens.glare > 0:
@@ -139,7 +141,7 @@ def scattered(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window)
 
 
 def transmission(opening: Opening, camera: PinholeCamera, window: Window) -> Singles:
-    """Share (h, w) of the light that an opening lets through to each pixel of a window."""
+    """Compute the share (h, w) of the light that an opening lets through to each pixel of a window."""
     return _transmission(opening, tuple(camera.resolution_px), tuple(window))
 
 
@@ -165,7 +167,7 @@ def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Wind
 
 
 def ghost(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """The picture turned by 180 degrees about the optical axis, scaled by m and blurred.
+    """Return the picture turned by 180 degrees about the optical axis, scaled by m and blurred.
 
     G(x) = I(c + (c - x) / m) / m^2, from the light of the window alone; see `scattered_around`.
     """
@@ -179,7 +181,7 @@ def ghost(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> 
 
 
 def veil(picture: Reals, radius_px: float) -> Reals:
-    """The picture (h, w) convolved with the glare's kernel, continued by its mirror image."""
+    """Return the picture (h, w) convolved with the glare's kernel, continued by its mirror image."""
     # Products of matrices find the long waves that a wide glare leaves in less time than a fast transform takes.
     if is_wide(radius_px):
         down, across, damping = long_waves(picture.shape, radius_px, picture.dtype)
@@ -194,7 +196,7 @@ def veil(picture: Reals, radius_px: float) -> Reals:
 
 
 def is_wide(radius_px: float) -> bool:
-    """Whether a glare leaves few waves of a picture."""
+    """Return whether a glare leaves few waves of a picture."""
     return _FADED / (np.pi * radius_px) < _FEW
 
 
@@ -216,14 +218,14 @@ def _product(a: Reals, b: Reals) -> Reals:
 
 @lru_cache(maxsize=8)
 def _damping(shape: tuple[int, ...], counts: tuple[int, ...], radius_px: float) -> Singles:
-    """Factors of the longest waves of a picture, so many down and across."""
+    """Compute the factors of the longest waves of a picture, for given numbers down and across."""
     rows, columns = (np.pi * np.arange(count) / n for count, n in zip(counts, shape, strict=True))
     return frozen(np.exp(-radius_px * np.hypot(rows[:, None], columns[None, :])), np.float32)
 
 
 @lru_cache(maxsize=8)
 def _cosines(n: int, count: int, dtype: np.dtype[Any]) -> Reals:
-    """The longest waves (count, n) of n pixels, which are mirrored at both ends; orthonormal."""
+    """Return the longest waves (count, n) of n pixels, which are mirrored at both ends; orthonormal."""
     waves = np.cos(np.pi / n * np.outer(np.arange(count), np.arange(n) + 0.5)) * np.sqrt(2 / n)
     waves[0] = np.sqrt(1 / n)
     return frozen(waves, dtype)
@@ -250,7 +252,7 @@ def _covered(
 
 
 def border(sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools:
-    """Pixels (h, w) of a window in the sensor's border, which holds no picture."""
+    """Compute pixels (h, w) of a window in the sensor's border, which holds no picture."""
     return _border(sensor.border_px, tuple(camera.resolution_px), window)
 
 
