@@ -130,7 +130,7 @@ class Renderer:
         return MirrorImages.of(job, self._builder.meshes.of(job.eye, job.mesh_edge_mm)[0])
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
-        """Mean radiance of each pixel times cos^4(theta) / D (mW/mm^2/sr), before lens and glints."""
+        """Compute the mean radiance of each pixel times cos^4(theta) / D (mW/mm^2/sr), before lens and glints."""
         bound, _ = self.bind(job)
         return mean_radiance(bound, job.window, spp or self.spp, job.seed)[0].astype(float)
 

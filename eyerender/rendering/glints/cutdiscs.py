@@ -35,7 +35,7 @@ class Nodes:
     weight: Floats
 
     def join(self, other: Nodes) -> Nodes:
-        """Points of both."""
+        """Compute points of both."""
         return Nodes(np.concatenate([self.point, other.point]), np.concatenate([self.weight, other.weight]))
 
 
@@ -44,7 +44,7 @@ POINT = Nodes(np.zeros((1, 2)), np.ones(1))
 
 @lru_cache(maxsize=64)
 def quadrature(radial: int, angular: int) -> Nodes:
-    """Gauss-Legendre nodes in r^2 and equal angles."""
+    """Compute Gauss-Legendre nodes in r^2 and equal angles."""
     x, weight = np.polynomial.legendre.leggauss(radial)
     angle = 2 * np.pi * (np.arange(angular) + 0.5) / angular
     r = np.sqrt(0.5 * (x + 1))
@@ -53,12 +53,12 @@ def quadrature(radial: int, angular: int) -> Nodes:
 
 @lru_cache(maxsize=4)
 def rim(count: int) -> Nodes:
-    """Points of the unit circle, which have no weight: they show whether an edge cuts the disc."""
+    """Compute points of the unit circle, which have no weight: they show whether an edge cuts the disc."""
     return Nodes(_polar(np.ones(count), 2 * np.pi * np.arange(count) / count), np.zeros(count))
 
 
 def cut_nodes(visible: Visible, radial: int, angular: int) -> Nodes:
-    """Nodes of the visible part of a disc.
+    """Compute nodes of the visible part of a disc.
 
     Args:
         visible: whether points (n, 2) of the unit disc are visible.
@@ -85,7 +85,7 @@ def cut_nodes(visible: Visible, radial: int, angular: int) -> Nodes:
 
 
 def _edges(visible: Visible) -> Floats:
-    """Radii from 0 to 1 between which all circles are alike: hidden, partly visible, or visible."""
+    """Compute radii from 0 to 1 between which all circles are alike: hidden, partly visible, or visible."""
 
     def kind(r: Floats) -> Floats:
         seen = _seen(visible, r, _ANGLES)
@@ -132,7 +132,7 @@ def _arcs(visible: Visible, r: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _seen(visible: Visible, r: Floats, angles: int) -> Bools:
-    """Whether evenly spaced points of circles (n,) are visible, (n, angles)."""
+    """Return whether evenly spaced points of circles (n,) are visible, (n, angles)."""
     angle = 2 * np.pi * np.arange(angles) / angles
     return visible(_polar(*np.broadcast_arrays(r[:, None], angle))).reshape(len(r), angles)
 

@@ -36,7 +36,7 @@ def glint_reason(there: Bools, open_: Bools, blockers: Sequence[str | None]) -> 
 def lid_margins_px(
     region: RegionMesh | LidMargins, camera: PinholeCamera, anchor_mm: Floats
 ) -> dict[str, list[list[float]]] | None:
-    """Landmarks along the inner edges of both lid margins, in full-sensor pixels.
+    """Compute landmarks along the inner edges of both lid margins, in full-sensor pixels.
 
     They run from canthus to canthus, from temple to nose. None for a mesh whose margins are unknown, and where a
     landmark lies behind the camera.

@@ -72,7 +72,7 @@ def purkinje_images(
 
 
 def transmittance(path: Sequence[Crossing], traced: Traced, behind: float, film: float) -> Floats:
-    """Transmittance of paths: F at the mirror, times 1 - F at every other crossing that the rays meet.
+    """Compute the transmittance of paths: F at the mirror, times 1 - F at every other crossing that the rays meet.
 
     `behind` is the index behind the mirror, `film` that of the film on the first surface, which is crossed twice.
     """
@@ -94,7 +94,7 @@ def transmittance(path: Sequence[Crossing], traced: Traced, behind: float, film:
 
 
 def _through_pupil(eye: EyeModel, points: Floats, corneal: int) -> Bools:
-    """Whether rays cross the plane of the stop inside the pupil, on the way in and out."""
+    """Return whether rays cross the plane of the stop inside the pupil, on the way in and out."""
     n, c = eye.stop.normal, eye.stop.centre_mm
     inside = np.ones(points.shape[1], dtype=bool)
     for a, b in ((points[corneal], points[corneal + 1]), (points[-corneal - 1], points[-corneal - 2])):
@@ -106,7 +106,7 @@ def _through_pupil(eye: EyeModel, points: Floats, corneal: int) -> Bools:
 def stack(
     eye: EyeModel, order: int
 ) -> tuple[tuple[Surface, ...], tuple[float, ...], tuple[float, ...], tuple[bool, ...], GradientMedium | None]:
-    """Surfaces down to the mirror, with what a ray needs to pass them.
+    """Compute surfaces down to the mirror, with what a ray needs to pass them.
 
     Returns:
         The surfaces, the indices behind them, their rims, whether a ray may miss them, and the gradient before the

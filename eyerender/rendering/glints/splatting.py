@@ -55,7 +55,7 @@ class Mirrored:
     reasons: tuple[str, ...]
 
     def behind(self, covered: Bools, window: Window) -> Mirrored:
-        """The same where what frames the camera's view covers pixels (height, width) of a window."""
+        """Return the same where what frames the camera's view covers pixels (height, width) of a window."""
         table, (x0, y0, width, height) = self.glints, window
         xy = np.nan_to_num(table.xy_px, nan=-1e6)
         column, row = (np.rint(xy - (x0, y0)).astype(int)).T
@@ -92,7 +92,7 @@ class MirrorImages:
 
     @classmethod
     def of(cls, job: RenderJob, mesh: SurfaceMesh | None) -> MirrorImages:
-        """Find the images, with NumPy alone unless a mesh takes the place of the cornea's front."""
+        """Find the images, with NumPy alone unless a mesh replaces the cornea's front."""
         eye = job.eye
         scene = GlintScene.of(eye, job.film_index, job.M, job.t, job.camera, mesh)
         lamps = (*job.lights, *sun_lamps(job.ambient, job.anchor_mm))
@@ -105,7 +105,7 @@ class MirrorImages:
         return cls(job=job, lamps=lamps, scene=scene, first=first, further=further, nearness=nearness)
 
     def seen(self, place: Background | RegionScene, blur: Blur, share: float = 1.0) -> tuple[Mirrored, list[Shine]]:
-        """What is seen of the images in posed surroundings, and what they add to the blurred picture.
+        """Find the visible parts of the images in posed surroundings, and their contribution to the blurred picture.
 
         The tables and reasons are those of the lamps alone. `share` is that of the exposure for which the job stands.
         """

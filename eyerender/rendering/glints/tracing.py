@@ -106,12 +106,12 @@ class Image:
         return Image(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
 
     def parts(self, counts: Sequence[int]) -> list[Image]:
-        """Split the image into parts with so many points each."""
+        """Split the image into parts with the given number of points."""
         columns = {f.name: _split(getattr(self, f.name), counts) for f in fields(self)}
         return [Image(**{name: part[k] for name, part in columns.items()}) for k in range(len(counts))]
 
     def last(self, count: int) -> Image:
-        """The last points."""
+        """Return the last points."""
         return Image(**{f.name: getattr(self, f.name)[-count:] for f in fields(self)})
 
 
@@ -142,7 +142,7 @@ class Images:
 class GlintScene:
     """Input of the glints: front cornea with its film and rim, pose (x_world = M x + t), and camera.
 
-    What stands in the way is told by a function `clear`. It takes points (n, 3) and (n, 3) of the world, and returns
+    A function `clear` says whether the way is free. It takes points (n, 3) and (n, 3) of the world, and returns
     whether nothing of the scene stands between them.
     """
 
@@ -161,7 +161,7 @@ class GlintScene:
     def of(
         cls, eye: EyeModel, film_index: float, M: Floats, t: Floats, camera: PinholeCamera, mesh: SurfaceMesh | None
     ) -> GlintScene:
-        """The mirrors of an eye; a mesh takes the place of the cornea's front."""
+        """Return the mirrors of an eye; a mesh replaces the cornea's front."""
         return cls(
             surface=eye.front[0], index=float(eye.front_indices[0]), film_index=film_index,
             limbus_radius_mm=float(eye.limbus_radius_mm), sclera_centre_mm=np.asarray(eye.sclera.centre_mm),
@@ -181,7 +181,7 @@ class GlintScene:
         return Images(images, counts)
 
     def glints(self, lights: Sequence[Lamp], images: Images, clear: Visibility) -> list[Glint]:
-        """Glints of lamps from their images, as finely as their edges require."""
+        """Compute glints of lamps from their images, as finely as their edges require."""
         glints = self.seen(images.parts, clear)
         for k, count in images.counts.items():
             visible = glints[k].clear & glints[k].image.there
@@ -190,7 +190,7 @@ class GlintScene:
         return glints
 
     def nearness(self, lights: Sequence[Lamp]) -> Floats:
-        """Inverse depths (1/mm) of the lamps' mirror images for lenses that are wide across and down, (n, 2).
+        """Compute inverse depths (1/mm) of the lamps' mirror images for lenses that are wide across and down, (n, 2).
 
         When the nodal point moves by q, the image of a point at depth z moves by -f q / z. NaN where there is no image.
         """
@@ -204,7 +204,7 @@ class GlintScene:
         return np.stack([(xy[1, k, :, k] - xy[0, k, :, k]) / (2 * _PARALLAX_MM) for k in (0, 1)], axis=1)
 
     def seen(self, images: Sequence[Image], clear: Visibility) -> list[Glint]:
-        """Glints of images, made of their points that the camera sees."""
+        """Compute glints of images, made of their points that the camera sees."""
         out = []
         ways = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm"))
         free = _split(self._clear(clear, *ways), [len(i.energy) for i in images])
@@ -214,7 +214,7 @@ class GlintScene:
         return out
 
     def _cut(self, lamp: Lamp, image: Image, counts: tuple[int, int], clear: Visibility) -> Spots:
-        """Spots of the visible part of a lamp, whose whole `image` is known at some points."""
+        """Compute spots of the visible part of a lamp, whose whole `image` is known at some points."""
         mirror = self._mirror_map(lamp, image)
 
         def visible(points: Floats) -> Bools:
@@ -236,7 +236,7 @@ class GlintScene:
     def _mirror_map(self, lamp: Lamp, image: Image) -> Callable[[Floats], Floats] | None:
         """Polynomial from points of the unit disc to mirror points (eye frame), or None where it is not accurate.
 
-        It only tells which points are visible; their places and energies are exact.
+        It only decides which points are visible; their places and energies are exact.
         """
         if float(ring_radius_mm(lamp)) > 0 or not np.all(image.found):
             return None
@@ -255,17 +255,17 @@ class GlintScene:
         return np.asarray(self.M.T @ (self.camera.nodal_point_mm - self.t))
 
     def _clear(self, clear: Visibility, sources: Floats, entries: Floats, exits: Floats) -> Bools:
-        """Whether nothing of the scene stands between points of lamps and of the eye, and the camera, (k,)."""
+        """Return whether nothing of the scene stands between points of lamps and of the eye, and the camera, (k,)."""
         node = np.broadcast_to(self.camera.nodal_point_mm, exits.shape)
         both = clear(np.concatenate([sources, node]), np.concatenate([entries, exits]))
         return np.asarray(both[: len(sources)] & both[len(sources) :])
 
     def _images_at(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
-        """Images of lamps through the given points of their discs; all lamps in one batch."""
+        """Compute images of lamps through the given points of their discs; all lamps in one batch."""
         return self._images_of(_Emitters.of(lights, nodes))
 
     def _images_of(self, emitters: _Emitters) -> list[Image]:
-        """Images of lamps through points of them."""
+        """Compute images of lamps through points of them."""
         camera, which = self.camera, emitters.which
         sources = (emitters.points - self.t) @ self.M
         r = self._reflect(sources, np.broadcast_to(self._eyepoint, sources.shape))
@@ -316,7 +316,7 @@ class GlintScene:
         )  # fmt: skip
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
-        """Whether the sclera's sphere blocks the way from points of the cornea (eye frame)."""
+        """Return whether the sclera's sphere blocks the way from points of the cornea (eye frame)."""
         d = normalize(towards)
         o = y - self.sclera_centre_mm
         b = _dot(o, d)
@@ -374,12 +374,12 @@ class _Emitters:
 
 @remembered  # lamps are the same from frame to frame
 def _roughly(*lights: Lamp) -> _Emitters:
-    """Few points of lamps and points of their rims."""
+    """Make few points of lamps and points of their rims."""
     return _Emitters.of(lights, [_ROUGH if lamp.radius_mm > 0 else POINT for lamp in lights])
 
 
 def glint_table(glints: Sequence[Glint]) -> GlintTable:
-    """Places, energies and visible shares of the glints of all lamps."""
+    """Compute places, energies and visible shares of the glints of all lamps."""
     place, share = [], []
     for glint in glints:
         xy, energy, whole = glint.spots.xy_px, glint.spots.energy, glint.image.energy.sum()
@@ -393,13 +393,13 @@ def glint_table(glints: Sequence[Glint]) -> GlintTable:
 
 
 def _split(array: NDArray[Any], counts: Sequence[int]) -> list[NDArray[Any]]:
-    """Split an array into parts with so many rows each."""
+    """Split an array into parts with the given number of rows."""
     ends = list(accumulate(counts))
     return [array[end - count : end] for end, count in zip(ends, counts, strict=True)]
 
 
 def _node_counts(xy: Floats, sigma_px: float) -> tuple[int, int]:
-    """Numbers of circles and of points on each that a lamp needs whose rim is seen at pixels (k, 2)."""
+    """List numbers of circles and of points on each that a lamp needs whose rim is seen at pixels (k, 2)."""
     # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
     extent = float(np.max(np.hypot(*(xy - xy.mean(axis=0)).T))) / math.sqrt(2) if len(xy) else 1.0
     radial = min(max(math.ceil(1.5 + 1.5 * extent / math.hypot(sigma_px, 0.29)), 2), 64)
@@ -407,7 +407,7 @@ def _node_counts(xy: Floats, sigma_px: float) -> tuple[int, int]:
 
 
 def disc_basis(light: Lamp) -> tuple[Floats, Floats]:
-    """Two unit vectors (3,) across a lamp's axis."""
+    """Make two unit vectors (3,) across a lamp's axis."""
     return _across(*light.axis.tolist())
 
 
@@ -419,7 +419,7 @@ def _across(x: float, y: float, z: float) -> tuple[Floats, Floats]:
 
 
 def disc_points(light: Lamp, point: Floats) -> Floats:
-    """Points (k, 3) of a lamp's disc or ring in the world, from points (k, 2) of the unit disc."""
+    """Compute points (k, 3) of a lamp's disc or ring in the world, from points (k, 2) of the unit disc."""
     e1, e2 = disc_basis(light)
     outer, inner = float(light.radius_mm), ring_radius_mm(light)
     r2 = _dot(point, point)
@@ -430,7 +430,7 @@ def disc_points(light: Lamp, point: Floats) -> Floats:
 
 
 def _terms(point: Floats) -> Floats:
-    """Monomials (k, 15) up to order 4 of points (k, 2)."""
+    """Compute monomials (k, 15) up to order 4 of points (k, 2)."""
     a, b = point.T
     return np.stack([a**i * b ** (n - i) for n in range(5) for i in range(n + 1)], axis=1)
 

@@ -88,7 +88,7 @@ class EyeShape:
         return self.compute_surface_interaction(o, d, self.ray_intersect_preliminary(o, d))
 
     def ray_test(self, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool) -> mi.Bool:
-        """Whether the eye blocks rays from points x along d (eye frame) within a distance.
+        """Return whether the eye blocks rays from points x along d (eye frame) within a distance.
 
         `sphere` and `cornea` mark the rays that the globe's sphere and the cornea's bulge can block.
         """
@@ -147,7 +147,7 @@ def _refract(frame: Frame, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Ve
 
 
 def _beyond_root(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
-    """Places in the plane of the iris, just beyond its root, that stand for points behind the plane.
+    """Compute places in the plane of the iris, just beyond its root, that stand for points behind the plane.
 
     Where a shallow chamber's cornea ends behind the plane, a real iris bends back to its root. It is lit there about as
     at the end of the flat one.
@@ -159,12 +159,12 @@ def _beyond_root(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
 
 
 def _from_axis(x: mi.Vector3f) -> mi.Float:
-    """Distance from the axis of the surface in whose frame points are given."""
+    """Compute the distance from the axis of the surface in whose frame points are given."""
     return dr.sqrt(x.y * x.y + x.z * x.z)
 
 
 def intersect_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Bool]:
-    """Distance to the near side of a sphere about the origin, and whether it is met from outside."""
+    """Compute the distance to the near side of a sphere about the origin, and whether it is met from outside."""
     b, c = dr.dot(o, d), dr.squared_norm(o) - radius * radius
     disc = b * b - c
     q = dr.sqrt(dr.maximum(disc, 0)) - b

@@ -97,7 +97,7 @@ class SurfaceInteraction:
 
     @syntax
     def nearness(self, frame: Frame, d: mi.Vector3f) -> mi.Float:
-        """Inverse depth (1/mm) of what camera rays along d (scene's frame) show.
+        """Compute the inverse depth (1/mm) of what camera rays along d (scene's frame) show.
 
         Behind the cornea it is the change of direction that keeps a ray on its place in the plane of the iris while the
         pinhole moves across the optical axis. The image is astigmatic, so this is the mean of moves in two directions.
@@ -108,7 +108,7 @@ class SurfaceInteraction:
         return near
 
     def _nearness_inside(self, frame: Frame, d: mi.Vector3f) -> mi.Float:
-        """Inverse depth (1/mm) of the plane of the iris behind the cornea."""
+        """Compute the inverse depth (1/mm) of the plane of the iris behind the cornea."""
         camera, front = frame.camera, frame.surfaces[0]
         cosine = dr.dot(d, camera.forward)
         turned = [frame.vector_to_eye(cosine * (e - d * dr.dot(e, d))) for e in (camera.right, camera.down)]
@@ -129,7 +129,7 @@ class SurfaceInteraction:
 
 @syntax
 def outer_albedo(frame: Frame, si: SurfaceInteraction) -> mi.Float:
-    """Albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
+    """Find the albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
     albedo = mi.Float(si.albedo)
     if dr.hint(~si.other, exclude=[frame, si]):
         albedo = sclera_albedo(frame, si.point)

@@ -87,7 +87,7 @@ def _bent(frame: Frame, hit: TriangleHit, view: View, o: mi.Vector3f, d: mi.Vect
 
 
 def _refracted(d: mi.Vector3f, normal: mi.Vector3f, eta: mi.Float) -> tuple[mi.Vector3f, mi.Bool]:
-    """Directions behind a surface whose normal faces the ray, and whether there are any.
+    """Compute directions behind a surface whose normal faces the ray, and whether there are any.
 
     eta: index before the surface over that behind it.
     """

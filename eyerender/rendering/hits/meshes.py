@@ -86,15 +86,15 @@ class MeshGeometry:
         return cls(scene=scene, faces=mi.UInt32(aligned_copy(corners.ravel())), vertices=upload_array(records))
 
     def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> mi.PreliminaryIntersection3f:
-        """First hit of rays of the surface's frame."""
+        """Compute the first hit of rays of the surface's frame."""
         return self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=True)
 
     def above(self, y: mi.Float, z: mi.Float) -> mi.PreliminaryIntersection3f:
-        """Hit at given (y, z), by rays along the axis from outside."""
+        """Compute the hit at given (y, z), by rays along the axis from outside."""
         return self.hit(mi.Vector3f(_ABOVE_MM, y, z), mi.Vector3f(-1, 0, 0))
 
     def corners(self, hit: mi.PreliminaryIntersection3f) -> tuple[list[mi.Vector3f], list[mi.Vector3f]]:
-        """Places and normals of the corners of the triangles that were hit."""
+        """Compute places and normals of the corners of the triangles that were hit."""
         met = hit.is_valid()
         i = dr.gather(mi.Vector4u, self.faces, hit.prim_index, met)
         rows = [[dr.gather(mi.Vector4f, self.vertices, 2 * k + part, met) for k in (i.x, i.y, i.z)] for part in (0, 1)]
@@ -102,12 +102,12 @@ class MeshGeometry:
         return places, normals
 
     def normal(self, hit: mi.PreliminaryIntersection3f) -> mi.Vector3f:
-        """Interpolated unit normal."""
+        """Compute the interpolated unit normal."""
         _, normals = self.corners(hit)
         return dr.normalize(_mixed(normals, hit.prim_uv))
 
     def form(self, hit: mi.PreliminaryIntersection3f) -> tuple[mi.Float, NormalForm]:
-        """Height x on the axis' direction, and the normal form, whose Hessian is the slope of the normals."""
+        """Find the height x on the axis' direction, and the normal form, whose Hessian is the slope of the normals."""
         places, normals = self.corners(hit)
         n = _mixed(normals, hit.prim_uv)
         inv = dr.rsqrt(dr.squared_norm(n))
@@ -164,7 +164,7 @@ class SurfaceMesh:
         )  # fmt: skip
 
     def _at(self, q: Floats) -> tuple[Floats, Floats, Floats, Floats, Bools]:
-        """Points of the mesh at (y, z) (n, 2).
+        """Compute points of the mesh at (y, z) (n, 2).
 
         Returns:
             Points (n, 3) and normals (n, 3) (not unit), their derivatives by y and z (n, 3, 2), and whether the mesh
@@ -186,7 +186,7 @@ class SurfaceMesh:
 
 
 def _either(which: mi.Bool, one: NormalForm, other: NormalForm) -> NormalForm:
-    """One normal form or the other."""
+    """Return one normal form or the other."""
     return NormalForm(
         dr.select(which, one.normal, other.normal),
         dr.select(which, one.inverse, other.inverse),
@@ -205,7 +205,7 @@ class MeshedSurface(Surface):
         return self.mesh
 
     def meet(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool, mi.Vector3f]:
-        """Distance to the mesh, success, and the interpolated unit normal."""
+        """Compute the distance to the mesh, success, and the interpolated unit normal."""
         hit = self._mesh().hit(o, d)
         N = self._mesh().normal(hit)
         met = hit.is_valid() & (dr.dot(d, N) < 0)
@@ -253,7 +253,7 @@ class Meshes:
 
 
 def resolution(radius_mm: float, edge_mm: float) -> tuple[int, int]:
-    """Rings and sectors of a cap of a radius whose rings and whose rim have edges of at most a length."""
+    """Compute rings and sectors of a cap of a radius whose rings and whose rim have edges of at most a length."""
     return math.ceil(radius_mm / edge_mm), max(8, math.ceil(2 * math.pi * radius_mm / edge_mm))
 
 
@@ -295,7 +295,7 @@ def _unevenness(
 
 
 def _tube(out: Floats, x: Floats, N: Floats, n: Floats, normal_slope: Floats, lamp: Floats, node: Floats) -> Floats:
-    """Cross section at the lamp of a tube of rays from the viewpoint, per solid angle there, (n,)."""
+    """Compute the cross section at the lamp of a tube of rays from the viewpoint, per solid angle there, (n,)."""
     s, rest = np.linalg.norm(x - node, axis=1), np.linalg.norm(lamp - x, axis=1)
     c = -np.sum(N * out, axis=1)
     w = out + 2 * c[:, None] * N

@@ -41,7 +41,7 @@ class TriangleHit:
         return cls(t=dr.select(met, t, dr.inf), prim_index=mi.UInt32(0), prim_uv=uv)
 
     def is_valid(self) -> mi.Bool:
-        """Whether anything is hit."""
+        """Return whether anything is hit."""
         return self.t < dr.inf
 
 
@@ -99,7 +99,7 @@ def region_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> TriangleHit:
 
 
 def hidden(frame: Frame, eye: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
-    """Whether anything of the scene is in front of the globe where the rays of `EyeShape` meet it."""
+    """Return whether anything of the scene is in front of the globe where the rays of `EyeShape` meet it."""
     if not frame.structure.obstacles:
         return eye.globe & TriangleHit.on_plane(frame.backdrop_x, o, d, eye.distance).is_valid()
     return ray_blocked(frame.scene, segment(o, d, eye.distance), eye.globe)
@@ -107,7 +107,7 @@ def hidden(frame: Frame, eye: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f
 
 @syntax
 def ray_blocked(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-    """Whether anything of a scene blocks rays; packets without active rays are skipped."""
+    """Return whether anything of a scene blocks rays; packets without active rays are skipped."""
     found = mi.Bool(False)
     if dr.hint(active, exclude=[scene, ray]):
         found = scene.ray_test(ray, coherent=True, active=True)
@@ -115,7 +115,7 @@ def ray_blocked(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
 
 
 def segment(o: mi.Vector3f, d: mi.Vector3f, length: mi.Float) -> mi.Ray3f:
-    """Rays that end after a length, such as at the globe: what is behind it does not matter."""
+    """Compute rays that end after a length, such as at the globe: what is behind it does not matter."""
     ray = mi.Ray3f(mi.Point3f(o), d)
     ray.maxt = length
     return ray
@@ -134,12 +134,12 @@ def region_interaction(
 def _matte(
     frame: Frame, point: mi.Vector3f, normal: mi.Vector3f, d: mi.Vector3f, active: mi.Bool
 ) -> SurfaceInteraction:
-    """Interaction with matte points of the scene; normals are turned to the viewer."""
+    """Compute the interaction with matte points of the scene; normals are turned to the viewer."""
     place = frame.point_to_eye(point)
     return replace(SurfaceInteraction.blank(), other=active, point=place, normal=_facing(frame, normal, d))
 
 
 def _facing(frame: Frame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
-    """Normals (eye frame) turned to the viewer; normals and rays are given in the scene's frame."""
+    """Compute normals (eye frame) turned to the viewer; normals and rays are given in the scene's frame."""
     normal = frame.vector_to_eye(normal)
     return dr.normalize(dr.select(dr.dot(normal, frame.vector_to_eye(d)) > 0, -normal, normal))

@@ -25,12 +25,12 @@ _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and betw
 
 
 def is_adaptive(request: FilmRequest) -> bool:
-    """Whether even pixels may do with their first four samples."""
+    """Return whether even pixels may do with their first four samples."""
     return not request.layered and request.spp >= _MANY
 
 
 def render_samples(request: FilmRequest, first: int, count: int) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sums over `count` samples of each pixel, from number `first`, and failed light paths."""
+    """Compute sums over `count` samples of each pixel, from number `first`, and failed light paths."""
     index = dr.arange(mi.UInt32, request.window[2] * request.window[3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
@@ -41,7 +41,7 @@ def render_samples(request: FilmRequest, first: int, count: int) -> tuple[list[m
 
 
 def render_adaptively(request: FilmRequest, most: int) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sums over the samples of each pixel, taking all of them only where the first four differ.
+    """Compute sums over the samples of each pixel, taking all of them only where the first four differ.
 
     Where these agree, and their mean is not far from those of the eight neighbours, no edge crosses the pixel, and they
     stand for all samples. The pixels around the window are looked at, too, so that no pixel depends on the window. At
@@ -52,7 +52,7 @@ def render_adaptively(request: FilmRequest, most: int) -> tuple[list[mi.Float], 
     pixels, pattern = Pixels.of((x0 - 1, y0 - 1, width + 2, height + 2)), Pattern.of(request.spp, request.seed)
 
     def radiance_of(pixel: mi.UInt32, numbers: Ints) -> mi.Float:
-        """Radiance of samples with these numbers, those of each pixel side by side."""
+        """Compute the radiance of samples with these numbers, those of each pixel side by side."""
         nonlocal failed
         index = dr.arange(mi.UInt32, dr.width(pixel) * len(numbers))
         each = dr.opaque(mi.UInt32, len(numbers))
@@ -81,7 +81,7 @@ def render_adaptively(request: FilmRequest, most: int) -> tuple[list[mi.Float], 
 
 
 def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[mi.Float, mi.UInt32, mi.UInt32]:
-    """Sums of four samples in the pixels of a window, those of even pixels for all samples, and the uneven pixels.
+    """Find sums of four samples in the pixels of a window, those of even pixels for all samples, and the uneven pixels.
 
     `radiance` holds four samples of each pixel of the window and of a border of one pixel about it. The uneven pixels
     are numbered without and with this border.
@@ -94,7 +94,7 @@ def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[m
     across = width + 2
 
     def upper_left(pixel: mi.UInt32) -> mi.UInt32:
-        """Number of the upper left neighbour."""
+        """Compute the number of the upper left neighbour."""
         return pixel + 2 * (pixel // width)
 
     place = upper_left(dr.arange(mi.UInt32, size[0] * size[1]))
@@ -113,7 +113,7 @@ def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[m
 
 @lru_cache(maxsize=16)
 def _first_samples(count: int) -> Ints:
-    """Numbers of the samples nearest to the middles of a pixel's quarters."""
+    """List numbers of the samples nearest to the middles of a pixel's quarters."""
     k = np.arange(count)
     x, y = (k + 0.5) / count, (k * lattice_generator(count) % count + 0.5) / count
     chosen: list[int] = []
@@ -128,7 +128,7 @@ def _first_samples(count: int) -> Ints:
 def _shade_samples(
     frame: Frame, pixels: Pixels, pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32, layered: bool
 ) -> tuple[list[mi.Float], mi.UInt32]:
-    """What samples k of pixels show, and the number of failed light paths."""
+    """Say what samples k of pixels show, and the number of failed light paths."""
     samples = Samples.of(*pixels.at(pixel), pattern)
     o, d, root = samples.ray(frame, k)
     radiance, failures = shade(frame, o, d, *samples.pair(k, 0))

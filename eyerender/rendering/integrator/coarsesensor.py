@@ -56,6 +56,6 @@ class CoarseSensor:
         return cls(film, blocks, (-(-height // block), -(-width // block)))
 
     def picture(self) -> Singles:
-        """Mean radiance of the blocks times its weight, as of `film.start`, (height, width) in blocks."""
+        """Compute the mean radiance of the blocks times its weight, as of `film.start`, (height, width) in blocks."""
         down, across = self.size
         return self.film.means()[0].repeat(self.blocks, axis=0).repeat(self.blocks, axis=1)[:down, :across]

@@ -62,7 +62,7 @@ class Film:
 
 
 def mean_radiance(bound: BoundFrame, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
-    """Mean radiance of each pixel times cos^4(theta) / D (mW/mm^2/sr), (height, width); failed light paths."""
+    """Find the mean radiance of each pixel times cos^4(theta) / D (mW/mm^2/sr), (height, width); failed light paths."""
     return start(bound, window, spp, seed, layered=False).means()
 
 
@@ -101,7 +101,7 @@ def _in_passes(
 
 
 def _render_groups(request: FilmRequest, first: int, count: int) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sums over some groups of samples of each pixel before an eye region, and failed light paths."""
+    """Compute sums over some groups of samples of each pixel before an eye region, and failed light paths."""
     frame, lamps = request.bound.frame, request.bound.host.lamps
     pattern = Pattern.of(request.spp, request.seed, times=request.times)
     sharp = int(lamps.suns and lamps.widths[-1] < SMALL)
@@ -146,7 +146,7 @@ class _Tiles:
     layered: bool
 
     def group(self, frame: Frame, pattern: Pattern, hits: HitTable, lane: mi.UInt32) -> tuple[PixelGroup, mi.Bool]:
-        """The groups of lanes, and whether their pixels are inside the window."""
+        """Return the groups of lanes, and whether their pixels are inside the window."""
         packet = lane // _TILE**2
         lane = lane - packet * _TILE**2
         tile = packet // self.groups.count
@@ -177,7 +177,7 @@ class _Tiles:
 
     @syntax
     def splat(self, lanes: list[mi.Float], pixels: int) -> list[mi.Float]:
-        """Sum over the groups of each pixel, in the order of the pixels."""
+        """Compute the sum over the groups of each pixel, in the order of the pixels."""
         pixel = dr.arange(mi.UInt32, pixels)
         y = pixel // self.pixels.width
         x = pixel - y * self.pixels.width
@@ -190,7 +190,7 @@ class _Tiles:
 
 
 def _added(sums: list[mi.Float], lanes: list[mi.Float], i: mi.UInt32) -> list[mi.Float]:
-    """Sums to which number `i` of other arrays is added."""
+    """Compute sums to which number `i` of other arrays is added."""
     return [total + dr.gather(mi.Float, lane, i) for total, lane in zip(sums, lanes, strict=True)]
 
 

@@ -42,12 +42,12 @@ class LampTurns:
         return dr.maximum(self.lights.count, 1) - self.lights.suns
 
     def count(self, user: mi.UInt32) -> mi.UInt32:
-        """Number of lamps that a user has."""
+        """Count the lamps of a user."""
         several = quotient(self.users + self.others - 1 - user, self.users)
         return dr.select(self.users < self.others, several, dr.minimum(self.others, 1)) + self.lights.suns
 
     def share(self, user: mi.UInt32, k: mi.UInt32) -> LampShare:
-        """The k-th lamp of a user."""
+        """Return the k-th lamp of a user."""
         sun, lamps = k < self.lights.suns, dr.maximum(self.others, 1)
         which = user - quotient(user, lamps) * lamps + (k - self.lights.suns) * self.users
         weight = mi.Float(self.users) / mi.Float(dr.maximum(quotient(self.users + lamps - 1 - which, lamps), 1))
@@ -91,12 +91,12 @@ class PixelGroup:
     layered: bool
 
     def in_order(self, i: mi.UInt32) -> mi.UInt32:
-        """The i-th sample to look at: the middle one first, then the others in turn."""
+        """Return the i-th sample to examine: the middle one first, then the remaining ones in turn."""
         middle = self.count >> 1
         return dr.select(i == 0, middle, dr.select(i <= middle, i - 1, i))
 
     def of_pixel(self, j: mi.UInt32) -> mi.UInt32:
-        """Number in its pixel of sample j."""
+        """Compute the number of sample j within its pixel."""
         return self.number * self.count + j
 
     def ray(self, frame: Frame, j: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
@@ -106,7 +106,7 @@ class PixelGroup:
 
     @syntax
     def hit(self, frame: Frame, j: mi.UInt32) -> TriangleHit:
-        """What sample j hits of the region."""
+        """Say what sample j hits of the region."""
         hit = self.hits.at(self.first_hit + dr.select(self.plain, 0, j))
         # Now and then a ray slips between two triangles. Then it stands for itself alone.
         if dr.hint(self.plain & ~hit.is_valid(), exclude=[self, frame, j]):
@@ -114,7 +114,7 @@ class PixelGroup:
         return hit
 
     def spot(self, j: mi.UInt32) -> mi.Point2f:
-        """Place of sample j on the lamps' discs, [0, 1)^2."""
+        """Compute the place of sample j on the lamps' discs, [0, 1)^2."""
         return self.samples.pair(self.of_pixel(j), 0)
 
     @property

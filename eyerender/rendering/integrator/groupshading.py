@@ -115,7 +115,7 @@ def _add_globe_sample(frame: Frame, group: PixelGroup, globe: GlobeSamples, j: m
 def _look_through_water(
     frame: Frame, group: PixelGroup, globe: GlobeSamples, view: View, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
 ) -> None:
-    """Add what menisci mirror along sample j's ray, and change the view to what is behind them."""
+    """Add the light that menisci mirror along sample j's ray, and move the view to the surface behind them."""
     if frame.region.water is None:
         return
     hit = water_hit(frame, o, view.d, view.si.distance)
@@ -129,7 +129,7 @@ def _look_through_water(
 
 
 def _globe_radiance(frame: Frame, group: PixelGroup, view: View, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
-    """Radiance of the globe along sample j's ray, and failed light paths."""
+    """Compute the radiance of the globe along sample j's ray, and failed light paths."""
     si = on_relief(frame, replace(view.si, other=mi.Bool(False)))
     inner, failures = irradiance_through_cornea(frame, si.inner, si.lit_inside, *group.spot(j))
     albedo = outer_albedo(frame, si)
@@ -160,11 +160,11 @@ class _LitPoint:
     spot: mi.Point2f
 
     def source(self, lamp: Lamp) -> mi.Vector3f:
-        """Point of a lamp."""
+        """Compute the point of a lamp."""
         return lamp.point(self.spot.x, *dr.sincos(self.spot.y * (2 * dr.pi)))
 
     def radiance(self, lamp: Lamp, albedo: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Radiance towards the viewer when nothing is in the lamp's way, and the irradiance (mW/mm^2)."""
+        """Compute the radiance towards the viewer when nothing is in the lamp's way, and the irradiance (mW/mm^2)."""
         irradiance, shine = direct_light(lamp, self.source(lamp), self.si, (self.normal, self.to_camera))
         return direct(self.si, albedo, irradiance, shine), irradiance
 
@@ -185,7 +185,7 @@ def _highlights_of_globe(frame: Frame, lit: _LitPoint, albedo: mi.Float) -> mi.F
 
 @syntax
 def _lamps_on_globe(frame: Frame, group: PixelGroup, lit: _LitPoint, albedo: mi.Float, j: mi.UInt32) -> mi.Float:
-    """Radiance of the matte globe at sample j: the light of all lamps, less what is kept from it.
+    """Compute the radiance of the matte globe at sample j: the light of all lamps, less what is kept from it.
 
     The samples of a pixel share the rays to the lamps. So only shadows that end within the pixel are noisy.
     """

@@ -117,7 +117,7 @@ class HostData:
         return None if self.posed is None else lid_margins_px(self.posed, self.job.camera, self.job.anchor_mm)
 
     def marks(self, window: Window) -> NDArray[np.uint8]:
-        """Classes of a window's pixels, row by row: sums of `FINE`, `WET` and `PLAIN`.
+        """Compute classes of a window's pixels, row by row: sums of `FINE`, `WET` and `PLAIN`.
 
         A pixel is `FINE` if thin hairs or menisci may show in it, `WET` if menisci may, and `PLAIN` if nothing but the
         sheet of skin does.

@@ -116,7 +116,7 @@ def _weighted_hit(frame: Frame, group: PixelGroup, j: mi.UInt32) -> WeightedHit:
 
 
 def _own_shadow(frame: Frame, group: PixelGroup, sample: WeightedHit, active: mi.Bool) -> mi.Bool:
-    """Whether the group's first lamp is blocked from a sample's own hit."""
+    """Return whether the group's first lamp is blocked from a sample's own hit."""
     lamp, spot = group.turns.share(group.number, mi.UInt32(0)).lamp, group.spot(sample.j)
     source = lamp.point(spot.x, *dr.sincos(spot.y * (2 * dr.pi)))
     o, d, _ = group.ray(frame, sample.j)
@@ -127,7 +127,7 @@ def _own_shadow(frame: Frame, group: PixelGroup, sample: WeightedHit, active: mi
 def blocked_from_region(
     frame: Frame, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, active: mi.Bool
 ) -> mi.Bool:
-    """Whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
+    """Find whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
     # Where the lamp's shadow map shows bare skin alone, only the globe may be in the way.
     clear = shadowless(frame, lamp.number, frame.point_to_scene(x), active & on_sheet)
     return lamp_blocked(frame, x, source, True, True, active & ~clear)

@@ -66,7 +66,7 @@ class Pixels:
         return cls(corner=corner, width=dr.opaque(mi.UInt32, window[2]))
 
     def at(self, pixel: mi.UInt32) -> tuple[mi.Int32, mi.Int32]:
-        """Full-sensor coordinates, as signed integers, of pixels."""
+        """Compute full-sensor coordinates, as signed integers, of pixels."""
         row = pixel // self.width
         return mi.Int32(pixel - row * self.width) + self.corner[0], mi.Int32(row) + self.corner[1]
 
@@ -119,17 +119,17 @@ class Samples:
 
     @classmethod
     def of(cls, u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = False) -> Samples:
-        """The samples of pixels (u, v), which are supersampled where `fine`."""
+        """Return the samples of pixels (u, v), which are supersampled where `fine`."""
         (few, one), (many, other) = pattern.usual, pattern.fine
         return cls(u=u, v=v, count=dr.select(fine, many, few), step=dr.select(fine, other, one), keys=pattern.keys)
 
     def in_pixel(self, k: mi.UInt32) -> mi.Point2f:
-        """Place of sample `k` in the pixel, [0, 1)^2."""
+        """Compute the place of sample `k` in the pixel, [0, 1)^2."""
         scale = dr.rcp(mi.Float(self.count))
         return mi.Point2f((mi.Float(k) + 0.5) * scale, mi.Float((k * self.step) >> 8) * 2.0**-24 + 0.5 * scale)
 
     def pair(self, k: mi.UInt32, call: int) -> mi.Point2f:
-        """Two further numbers of sample `k`, [0, 1)^2: each call of a pixel has its own shift."""
+        """Make two further numbers of sample `k`, [0, 1)^2: each call of a pixel has its own shift."""
         tea: Any = mi.sample_tea_32
         pixel = (self.u & mi.UInt32(0xFFFF)) | (self.v << mi.UInt32(16))
         return mi.Point2f(
@@ -140,13 +140,13 @@ class Samples:
         )
 
     def ray(self, frame: Frame, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
-        """Camera ray of sample `k`, as by `camera_ray`."""
+        """Compute the camera ray of sample `k`, as by `camera_ray`."""
         place = self.in_pixel(k)
         return camera_ray(frame, mi.Float(self.u) + (place.x - 0.5), mi.Float(self.v) + (place.y - 0.5))
 
 
 def camera_ray(frame: Frame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
-    """Ray of the scene's frame through pixel (u, v), centres at integers.
+    """Compute the ray of the scene's frame through pixel (u, v), centres at integers.
 
     Returns:
         Origin, unit direction, and the root of the weight cos^4(theta) / D of its radiance: theta is the angle to the

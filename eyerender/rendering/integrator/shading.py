@@ -23,7 +23,7 @@ _FLAT_MM = 1e-2  # from the plane of the background
 
 
 def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.UInt32]:
-    """Radiance (mW/mm^2/sr) along rays of the scene's frame before a bare eye, and failed light paths.
+    """Compute the radiance (mW/mm^2/sr) along rays of the scene's frame before a bare eye, and failed light paths.
 
     u, v: place on each lamp's disc, [0, 1).
     """
@@ -39,7 +39,7 @@ def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float
 
 
 def direct(si: SurfaceInteraction, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
-    """Radiance of matte surfaces lit by the lamps: from their irradiance, and from their sheen."""
+    """Compute the radiance of matte surfaces lit by the lamps: from their irradiance, and from their sheen."""
     return dr.select(si.met, si.cover * (albedo * outer * dr.inv_pi + shine), 0)
 
 
@@ -59,7 +59,7 @@ def of_surroundings(frame: Frame, si: SurfaceInteraction, known: mi.Bool) -> mi.
 
 @syntax
 def _from_other_surfaces(frame: Frame, other: mi.Bool, x: mi.Vector3f) -> mi.Vector4f:
-    """The same for points x (scene's frame) of the globe, or of something `other`."""
+    """Return the same for points x (scene's frame) of the globe, or of something `other`."""
     radiosity = frame.caches.radiosity
     if dr.hint(other, exclude=[frame, radiosity, x]):
         on_plane = dr.abs(x.x - frame.backdrop_x) < _FLAT_MM
@@ -72,7 +72,7 @@ def _from_other_surfaces(frame: Frame, other: mi.Bool, x: mi.Vector3f) -> mi.Vec
 def indirect(
     frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float, received: mi.Vector4f
 ) -> mi.Float:
-    """Radiance other than `direct`.
+    """Compute the radiance other than `direct`.
 
     Args:
         frame: the frame.
@@ -94,7 +94,7 @@ def indirect(
 
 
 def off_eye(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, received: mi.Vector4f) -> mi.Float:
-    """Radiance as of `indirect` of what is not the clear cornea."""
+    """Compute the radiance as of `indirect` of what is not the clear cornea."""
     even, mirrored = received.x, mi.Float(0)
     if frame.structure.ambient:
         facing = si.normal if si.level is None else si.level
@@ -106,7 +106,7 @@ def off_eye(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Flo
 
 @syntax
 def _radiosity_of_iris(frame: Frame, si: SurfaceInteraction, lit: mi.Float) -> mi.Float:
-    """Radiosity in the plane of the iris, which has the irradiance `lit` from the lamps."""
+    """Compute the radiosity in the plane of the iris, which has the irradiance `lit` from the lamps."""
     radiosity = mi.Float(0)
     if dr.hint(si.lit_inside, exclude=[frame, si, lit]):
         albedo = mi.Float(frame.pupil_albedo)
@@ -117,7 +117,7 @@ def _radiosity_of_iris(frame: Frame, si: SurfaceInteraction, lit: mi.Float) -> m
 
 
 def _mirrored(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f) -> mi.Float:
-    """Radiance that wet surfaces mirror to the camera, but for that of the lamps.
+    """Compute the radiance that wet surfaces mirror to the camera, without that of the lamps.
 
     The front cornea, where it is clear, mirrors the ambient light and the surfaces about it. The film of tears
     elsewhere mirrors the ambient light.
@@ -144,7 +144,7 @@ def _mirrored(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f) -> mi.Float:
 def _mirror_of_scene(
     frame: Frame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
 ) -> mi.Float:
-    """Radiance of the skin that the cornea mirrors; `seen` where a ray meets nothing."""
+    """Compute the radiance of the skin that the cornea mirrors; `seen` where a ray meets nothing."""
     hit = frame.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
     surface, met = mi.Float(0), hit.is_valid()
     if frame.region is not None:
@@ -157,7 +157,7 @@ def _mirror_of_scene(
 def _mirror_of_plane(
     frame: Frame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
 ) -> mi.Float:
-    """Radiance of the background's plane that the cornea mirrors; `seen` where a ray does not meet it."""
+    """Compute the radiance of the background's plane that the cornea mirrors; `seen` where a ray does not meet it."""
     t = (frame.backdrop_x - start.x) / dr.select(way.x < -1e-4, way.x, -1)
     x = start + t * way
     if dr.hint(wet & (way.x < -1e-4) & (t > 0), exclude=[frame, x]):

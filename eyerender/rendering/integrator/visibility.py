@@ -85,7 +85,7 @@ class _Lanes:
     lane_ends: tuple[mi.UInt32, mi.UInt32]
 
     def samples(self, groups: GroupPass) -> tuple[mi.UInt32, mi.UInt32, mi.Bool]:
-        """Pixel and number of each lane's sample, and whether the pixel is supersampled."""
+        """Compute the pixel and number of each lane's sample, and whether the pixel is supersampled."""
         fine, plain = self.lane < self.lane_ends[0], self.lane >= self.lane_ends[1]
         before = dr.select(fine, 0, dr.select(plain, self.pixel_ends[1], self.pixel_ends[0]))
         i = self.lane - dr.select(fine, 0, dr.select(plain, self.lane_ends[1], self.lane_ends[0]))

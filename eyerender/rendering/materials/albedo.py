@@ -67,7 +67,7 @@ def opacity(frame: Frame, rho: mi.Float) -> mi.Float:
 
 
 def stop_coordinates(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-    """Coordinates of points of the stop's plane along its semi-axes, in units of these."""
+    """Compute coordinates of points of the stop's plane along its semi-axes, in units of these."""
     q = x - frame.stop.centre
     a, b = frame.stop.axes
     return dr.dot(q, frame.stop.u) / a, dr.dot(q, frame.stop.v) / b
@@ -100,7 +100,7 @@ def iris_height(frame: Frame, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float
 
 
 def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
-    """Albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
+    """Compute the albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
     s, turn, left, _ = _iris_place(frame, x)
     texture = _on_iris(frame.textures.iris, s, turn)
     albedo = frame.iris.albedo * dr.maximum(1 + frame.iris.contrast * (texture - 1), 0.02)
@@ -110,7 +110,7 @@ def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
 
 
 def globe_map(frame: Frame, point: mi.Vector3f) -> mi.Point2f:
-    """Place in [0, 1]^2 of points of the globe (eye frame) in the azimuthal equidistant map of its front."""
+    """Find the place in [0, 1]^2 of points of the globe (eye frame) in the azimuthal equidistant map of its front."""
     r = point - frame.sclera.centre
     polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / GLOBE_EDGE
     inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))
@@ -118,7 +118,7 @@ def globe_map(frame: Frame, point: mi.Vector3f) -> mi.Point2f:
 
 
 def sclera_albedo(frame: Frame, point: mi.Vector3f) -> mi.Float:
-    """Albedo of the sclera at points of the globe (eye frame), with the grey ring of the limbus."""
+    """Compute the albedo of the sclera at points of the globe (eye frame), with the grey ring of the limbus."""
     texture = frame.textures.sclera.eval(globe_map(frame, point))[0]
     sclera = frame.sclera.albedo * dr.maximum(1 + frame.sclera.contrast * (texture - 1), 0.02)
     # The grey ring of the limbus fades into the white over its width, on the side of the sclera.

@@ -32,19 +32,19 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
 
 
 def _ggx(nh: mi.Float, a: mi.Float) -> mi.Float:
-    """Distribution D (1/sr) of the normals of a surface of roughness a."""
+    """Compute the distribution D (1/sr) of the normals of a surface of roughness a."""
     a2 = a * a
     base = nh * nh * (a2 - 1) + 1
     return a2 * dr.inv_pi / (base * base)
 
 
 def glossy_normal(normal: mi.Vector3f, gloss: mi.Float) -> mi.Vector3f:
-    """Normal (eye frame) of what mirrors: of skin itself, or of the tear film on wet tissue."""
+    """Compute the normal (eye frame) of what mirrors: of skin itself, or of the tear film on wet tissue."""
     return dr.select(gloss > 0.5, film_normal(normal), normal)
 
 
 def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
-    """Normal of the tear film (eye frame); the uneven conjunctiva below it breaks up its highlights."""
+    """Compute the normal of the tear film (eye frame); the uneven conjunctiva below it breaks up its highlights."""
     tilted = normal
     for slope, wave in _RIPPLES:
         p, q = wave * (71 * normal.y + 23 * normal.z), wave * (67 * normal.z - 29 * normal.y)
@@ -53,7 +53,7 @@ def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
 
 
 def film_reflectance(cosine: mi.Float, gloss: mi.Float) -> mi.Float:
-    """Share of the light from wide surroundings that the film of wet tissue mirrors."""
+    """Compute the share of the light from wide surroundings that the film of wet tissue mirrors."""
     return (2 * gloss - 1) * _schlick(dr.clip(cosine, 0, 1), mi.Float(_F0_TEARS))
 
 

@@ -215,7 +215,7 @@ def _lamp(root: ET.Element, k: int, position: Floats, axis: Floats, radius: floa
 
 
 def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
-    """Parts of the eye region, without its menisci, or of the head mesh, each with its mean albedo."""
+    """Return parts of the eye region, without its menisci, or of the head mesh, each with its mean albedo."""
     globe = job.globe
     mesh = region_mesh(spec, globe) if spec.head is None else placed(load_head(spec.head), globe)
     skin = spec.skin
@@ -248,7 +248,7 @@ def _film(front: Patch, index: float, sectors: int) -> tuple[Patch, Patch, Patch
 
 
 def _root(eye: EyeModel, wall: Patch, sectors: int) -> Patch:
-    """Limbal tissue in the plane of the iris, from its root to the chamber's wall."""
+    """Compute the limbal tissue in the plane of the iris, from its root to the chamber's wall."""
     (upper, lower), n, c = np.split(wall.vertices, 2), eye.stop.normal, eye.stop.centre_mm
     above, below = ((ring - c) @ n for ring in (upper, lower))
     share = np.clip(above / np.where(above > below, above - below, 1), 0, 1)[:, None]

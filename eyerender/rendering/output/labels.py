@@ -40,13 +40,13 @@ class PartLabels(ArrayValue):
     amodal: Bytes
 
     def behind(self, covered: Bools) -> PartLabels:
-        """The labels where what frames the camera's view covers the pixels (height, width)."""
+        """Return the labels where what frames the camera's view covers the pixels (height, width)."""
         part = self.part.copy()
         np.copyto(part, FRAME, where=covered)
         return replace(self, part=sealed(part))
 
     def visible_fraction(self, part: int) -> float:
-        """Visible share of the amodal pixels of a part in the window; NaN where there are none."""
+        """Compute the visible share of the amodal pixels of a part in the window; NaN where there are none."""
         whole = int(np.count_nonzero(self.amodal == part))
         both = int(np.count_nonzero((self.amodal == part) & (self.part == part)))
         return both / whole if whole else float("nan")
@@ -61,7 +61,7 @@ def part_labels(bound: BoundFrame, window: Window) -> Callable[[], PartLabels]:
 
 @recorded
 def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8]:
-    """Parts that the centres of pixels show, with and without occluders."""
+    """Return parts that the centres of pixels show, with and without occluders."""
     u, v = pixels.at(dr.arange(mi.UInt32, count))
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
     eye = EyeShape(frame=frame).ray_intersect(o, d)
@@ -74,7 +74,7 @@ def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8
 
 
 def highlights(bound: BoundFrame, window: Window) -> Bools:
-    """Pixels (height, width) whose skin, lids, lashes and tears mirror lamps: more than half of what they scatter.
+    """Find pixels (height, width) whose skin, lids, lashes and tears mirror lamps: more than half of what they scatter.
 
     Both are light of the lamps alone, with its shadows. Lens and sensor do not matter, nor do glints of the cornea.
     Pixels that show mostly cornea are not marked. Without an eye region nothing but the cornea mirrors lamps.
@@ -106,7 +106,7 @@ def _lamps_at(frame: Frame, window: Window, right: float, down: float) -> tuple[
 
 @syntax
 def _shine(frame: Frame, si: SurfaceInteraction, mirror: tuple[mi.Vector3f, mi.Vector3f]) -> tuple[mi.Float, mi.Float]:
-    """Radiance that points mirror of all lamps, and irradiance; `mirror` as of `direct_light`."""
+    """Compute the radiance that points mirror of all lamps, and irradiance; `mirror` as of `direct_light`."""
     shine, irradiance, k = mi.Float(0), mi.Float(0), mi.UInt32(0)
     while dr.hint(k < frame.lights.count, label="highlights", exclude=[frame, si, mirror]):
         lamp = frame.lights[k]

@@ -111,7 +111,7 @@ class RawFrame(ArrayValue):
         )
 
     def _irradiance(self) -> Singles:
-        """Irradiance (height, width) of the window, W/m^2."""
+        """Compute the irradiance (height, width) of the window, W/m^2."""
         job = self.job
         # Single precision is finer than the samples' noise, and takes half the time.
         picture = psf.blur(self.blur.of_pictures(self.picture).astype(np.float32), job.sensor.psf_sigma_px)
@@ -126,7 +126,7 @@ class RawFrame(ArrayValue):
         return np.asarray(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)))
 
     def _around(self, cells: Singles) -> Singles:
-        """The whole sensor in blocks, behind openings, with the mirror images of the lamps."""
+        """Return the whole sensor in blocks, behind openings, with the mirror images of the lamps."""
         job, side = self.job, stray.block_px(self.job.lens)
         lens, camera = stray.in_blocks(job.lens, job.camera, side)
         whole, picture = (0, 0, *camera.resolution_px), cells.copy()
@@ -144,7 +144,7 @@ class RawFrame(ArrayValue):
 
 
 def _framed(picture: Singles, lens: Lens, camera: PinholeCamera, window: Window) -> Singles:
-    """Picture (height, width) of a window behind vignetting and openings; it may be changed."""
+    """Compute the picture (height, width) of a window behind vignetting and openings; it may be changed."""
     if lens.vignetting > 0:
         picture *= defocus.vignette(lens, camera, window)
     return np.asarray(stray.framed(picture, lens, camera, window))

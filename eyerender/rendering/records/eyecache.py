@@ -18,7 +18,7 @@ class EyeCache(Generic[_T]):
         self._known: list[tuple[EyeModel, Any, _T]] = []
 
     def get(self, eye: EyeModel, values: Any, make: Callable[[], _T]) -> _T:
-        """The result for an eye and other values, which `make` computes if they are new."""
+        """Return the result for an eye and other values, which `make` computes if they are new."""
         for known, others, result in self._known:
             if known is eye and others == values:
                 return result

@@ -60,7 +60,7 @@ def _apart(buffer: mi.Float, first: mi.UInt32, count: int) -> list[mi.Float]:
 
 
 def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
-    """Whole part of a / b for numbers below a million: processors divide whole numbers one by one."""
+    """Compute the whole part of a / b for numbers below a million: processors divide whole numbers one by one."""
     return mi.UInt32((mi.Float(a) + 0.5) / mi.Float(b))
 
 
@@ -140,7 +140,7 @@ class Frame(FrameParameters):
         return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, caches=Caches())
 
     def bare(self) -> Frame:
-        """The frame without lamps, textures and light, for recordings that should last when these change."""
+        """Return the frame without lamps, textures and light, for recordings that should last when these change."""
         return replace(self, lights=None, textures=None, caches=Caches())
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
@@ -185,7 +185,7 @@ class PupilBoundary:
 
     @syntax
     def radius(self, x: mi.Float, y: mi.Float) -> mi.Float:
-        """Radius r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
+        """Compute the radius r in the direction (x, y) from the centre, by Horner's rule in e^(i f)."""
         inv = dr.rsqrt(dr.maximum(x * x + y * y, 1e-12))
         c, s = x * inv, y * inv
         k, re, im = mi.UInt32(self.count), mi.Float(0), mi.Float(0)
@@ -242,7 +242,7 @@ class Lamp:
     number: mi.UInt32
 
     def point(self, u: mi.Float, sine: mi.Float, cosine: mi.Float) -> mi.Vector3f:
-        """Point of the emitting disc or ring, uniform by area: u in [0, 1) and a direction in its plane."""
+        """Compute the point of the emitting disc or ring, uniform by area: u in [0, 1) and a direction in its plane."""
         e1, e2 = mi.coordinate_system(self.axis)
         inner = self.inner_radius * self.inner_radius
         r = dr.sqrt(inner + u * (self.radius * self.radius - inner))
@@ -255,7 +255,7 @@ class Lamp:
 
     @syntax
     def radiant_intensity(self, direction: mi.Vector3f) -> mi.Float:
-        """Radiant intensity (mW/sr) into a unit direction that leaves the lamp."""
+        """Compute the radiant intensity (mW/sr) into a unit direction that leaves the lamp."""
         c, m = dr.dot(direction, self.axis), self.exponent
         lobe = dr.maximum(c, 0)
         # A Lambertian lamp, the usual one, needs no power function.

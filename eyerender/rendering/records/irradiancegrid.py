@@ -100,7 +100,7 @@ class IrradianceGrid:
         return Place(cell=j * self.side + i, across=mi.Vector4f(*across), down=mi.Vector4f(*down), inside=inside)
 
     def at(self, place: Place) -> tuple[mi.Float, mi.UInt32]:
-        """Irradiance (mW/mm^2) at places, and the lamps that it lacks: all of them outside the grid."""
+        """Compute the irradiance (mW/mm^2) at places, and the lamps that it lacks: all of them outside the grid."""
         total = mi.Float(0)
         for k in range(4):
             row = dr.gather(mi.Vector4f, self.cells, 4 * place.cell + k, place.inside)
@@ -121,7 +121,7 @@ class Place:
 
 @syntax
 def _sum_of_lamps(nodes: mi.Float, lamps: mi.UInt32, node: mi.UInt32, side: int) -> mi.Float:
-    """Irradiance of nodes from all lamps whose light is known there."""
+    """Compute the irradiance of nodes from all lamps whose light is known there."""
     k, total = mi.UInt32(0), mi.Float(0) * mi.Float(node)
     while dr.hint(k < lamps, label="all lamps", exclude=[nodes, side]):
         total += dr.maximum(dr.gather(mi.Float, nodes, k * side**2 + node), 0)
@@ -143,20 +143,20 @@ def _sum(a: list[mi.Float], b: list[mi.Float]) -> list[mi.Float]:
 
 
 def grid_nodes(side: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Column and row of all nodes of a grid, in row order."""
+    """Compute the column and row of all nodes of a grid, in row order."""
     index = dr.arange(mi.UInt32, side * side)
     row = index // side
     return index - row * side, row
 
 
 def nodes_about(cell: mi.UInt32, side: int) -> list[mi.UInt32]:
-    """Numbers of the sixteen nodes about cells of a grid, row by row."""
+    """List numbers of the sixteen nodes about cells of a grid, row by row."""
     nodes = (mi.Int32(cell) + dv * side + du for dv in range(-1, 3) for du in range(-1, 3))
     return [mi.UInt32(dr.clip(node, 0, side**2 - 1)) for node in nodes]
 
 
 def unevenness(values: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Largest third difference, least and greatest of the values at the `nodes_about` cells."""
+    """Compute the largest third difference, least and greatest of the values at the `nodes_about` cells."""
     bent, least, most = mi.Float(0), values[0], values[0]
     for e in [values[n : n + 4] for n in range(0, 16, 4)] + [values[n::4] for n in range(4)]:
         bent = dr.maximum(bent, dr.abs(e[0] - 3 * e[1] + 3 * e[2] - e[3]))
@@ -166,6 +166,6 @@ def unevenness(values: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float]:
 
 
 def cubic_weights(s: mi.Float) -> tuple[mi.Float, ...]:
-    """Weights of four neighbours at the place s, 0 to 1 between the second and the third (Keys 1981, a = -1/2)."""
+    """Find weights of four neighbours at the place s, 0 to 1 between the second and the third (Keys 1981, a = -1/2)."""
     r = 1 - s
     return -0.5 * s * r * r, 1 + s * s * (1.5 * s - 2.5), 1 + r * r * (1.5 * r - 2.5), -0.5 * r * s * s

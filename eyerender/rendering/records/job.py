@@ -70,7 +70,7 @@ class RenderJob(ArrayValue):
         lens: focus and vignetting.
         ambient: light other than that of the lamps.
         focus_dpt: vergence at which the eye is focused, 1 / distance in metres.
-        mesh_edge_mm: length of the edges of meshes that take the place of the cornea's surfaces; None: closed forms.
+        mesh_edge_mm: edge length of meshes that replace the cornea's surfaces; None: closed forms.
         interreflection: whether surfaces send light to each other.
     """
 
@@ -114,12 +114,12 @@ class RenderJob(ArrayValue):
 
 
 def film_index(eye: EyeModel, look: Look) -> float:
-    """Index of what lies on the front cornea: tears, or the cornea itself where there is no film."""
+    """Compute the index of what lies on the front cornea: tears, or the cornea itself where there is no film."""
     return TEARS.index(eye.wavelength_nm) if look.tear_film else float(eye.front_indices[0])
 
 
 def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
-    """Posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
+    """Compute the posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
     sclera = eye.sclera
     return Globe(
         cornea=eye.front[0],
@@ -133,7 +133,7 @@ def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
 
 
 def kinds(eye: EyeModel) -> tuple[tuple[Kind, bool], ...]:
-    """Kind of each refracting surface in front of the iris, and whether it is tilted."""
+    """Return the kind of each refracting surface in front of the iris, and whether it is tilted."""
     return tuple((_kind(s), not np.array_equal(s.rotation, np.eye(3))) for s in eye.front)
 
 
@@ -142,7 +142,7 @@ def _kind(surface: Surface) -> Kind:
 
 
 def tables(eye: EyeModel) -> tuple[NDArray[np.float32] | None, ...]:
-    """Spline coefficients of the measured surfaces in front of the iris; None for the others."""
+    """Compute spline coefficients of the measured surfaces in front of the iris; None for other surfaces."""
     return tuple(lattice(s, float(eye.limbus_radius_mm)).table if isinstance(s, Measured) else None for s in eye.front)
 
 
@@ -256,7 +256,7 @@ def boundary_waves(eye: EyeModel) -> Floats:
 
 
 def panel_table(ambient: Ambient, anchor: Floats) -> Floats:
-    """Panels in the scene's frame, (n, 13): centre, normal, right, up (over half sizes), radiance."""
+    """Compute panels in the scene's frame, (n, 13): centre, normal, right, up (over half sizes), radiance."""
     rows = []
     for panel in ambient.panels:
         centre = np.asarray(panel.centre_mm, dtype=float) - anchor
@@ -367,7 +367,7 @@ def returned_light(job: RenderJob) -> FundusLight:
 
 
 def ring_radius_mm(lamp: Lamp) -> float:
-    """Radius of the dark middle of a ring-shaped lamp; 0 for points and discs."""
+    """Compute the radius of the dark middle of a ring-shaped lamp; 0 for points and discs."""
     return lamp.inner_radius_mm
 
 
@@ -385,5 +385,5 @@ def _shape(surface: Surface, limbus_mm: float) -> Floats:
 
 
 def apex_of(surface: Surface) -> Floats:
-    """Apex of a surface in the eye frame, (3,) mm."""
+    """Compute the apex of a surface in the eye frame, (3,) mm."""
     return np.asarray(surface.origin_mm + surface.rotation[:, 0] * float(surface.sag(0.0, 0.0)))

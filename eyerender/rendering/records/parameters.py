@@ -210,5 +210,5 @@ def _leaves(node: Any) -> Iterator[Any]:
 
 
 def _is_branch(node: Any) -> bool:
-    """Whether a tuple holds parameters or vectors; a tuple of plain numbers is a leaf."""
+    """Return whether a tuple holds parameters or vectors; a tuple of plain numbers is a leaf."""
     return isinstance(node, tuple) and any(is_dataclass(part) or np.ndim(part) for part in node)

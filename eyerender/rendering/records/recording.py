@@ -89,7 +89,7 @@ _PLAIN = {type(None), bool, int, float, str}
 
 @cache
 def _names(kind: type) -> tuple[str, ...]:
-    """Names of what objects of a class hold that Dr.Jit finds."""
+    """List names of what objects of a class hold that Dr.Jit finds."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
 
 

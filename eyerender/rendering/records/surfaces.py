@@ -73,7 +73,7 @@ class Surface:
     film: mi.Float | None = None
 
     def mirrored(self, c1: mi.Float, c2: mi.Float) -> mi.Float:
-        """Share of the light that is mirrored, from the cosines before and behind the surface."""
+        """Compute the share of the light that is mirrored, from the cosines before and behind the surface."""
         return fresnel(c1, c2, self.eta, self.film)
 
     def point_in(self, x: mi.Vector3f) -> mi.Vector3f:
@@ -94,7 +94,7 @@ class Surface:
         return a * v.x + b * v.y + c * v.z
 
     def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
-        """Distance to the point where a ray from outside enters, and whether it does, in the surface's frame.
+        """Find the distance to the point where a ray from outside enters, and whether it does, in the surface's frame.
 
         The origin must be within some centimetres, or single precision costs more than a micrometre. A measured surface
         is replaced by the conic that is like it, which is enough for shadows and first guesses; `intersect` is exact.
@@ -125,7 +125,7 @@ class Surface:
         return C / q, (D > 0) & (q > 0)
 
     def meet(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool, mi.Vector3f]:
-        """Distance and success as from `hit`, exact for every surface, and the outward unit normal there."""
+        """Find the distance and success as from `hit`, exact for every surface, and the outward unit normal there."""
         t, ok = self._near(o, d)
         if self.kind == "quadric":
             return t, ok, self.normal(o + t * d)
@@ -158,7 +158,7 @@ class Surface:
         return x.x + g, mi.Vector3f(1, gy, gz)
 
     def _sag(self, y: mi.Float, z: mi.Float, order: int = 2) -> tuple[mi.Float, ...]:
-        """Sag g, its two first and three second derivatives (yy, yz, zz); at least those up to `order`."""
+        """Compute the sag g, its two first and three second derivatives (yy, yz, zz); at least those up to `order`."""
         if self.table is not None:
             return self._spline(self.table, y, z, order)
         Ry, Rz, py, pz, _ = self.shape
@@ -178,7 +178,7 @@ class Surface:
         return g, gy, gz, gyy, gyz, gzz
 
     def _spline(self, table: mi.Float, y: mi.Float, z: mi.Float, order: int) -> tuple[mi.Float, ...]:
-        """Sag of a measured surface as in `_sag`."""
+        """Compute the sag of a measured surface as in `_sag`."""
         radius, _, density, count, _ = self.shape
         u, v = y * density + 0.5 * count, z * density + 0.5 * count
         i, j = (dr.clip(dr.floor(place), 0, count - 1) for place in (u, v))
@@ -200,7 +200,7 @@ class Surface:
         return g, gy, gz, gyy, square * _slope(slopes, s), bend + square * _cubic(bends, s)
 
     def normal(self, x: mi.Vector3f) -> mi.Vector3f:
-        """Outward unit normal at a point of the surface, in the surface's frame."""
+        """Compute the outward unit normal at a point of the surface, in the surface's frame."""
         return dr.normalize(self._gradient(x))
 
     def _gradient(self, x: mi.Vector3f) -> mi.Vector3f:
@@ -210,7 +210,7 @@ class Surface:
         return mi.Vector3f(ax * x.x + b, ay * x.y, az * x.z)
 
     def _normal_form(self, x: mi.Vector3f) -> NormalForm:
-        """Normal form at a point of the surface."""
+        """Compute the normal form at a point of the surface."""
         if self.kind != "quadric":
             return _form_of(self._sag(x.y, x.z))
         ax, ay, az, *_ = self.shape
@@ -280,7 +280,7 @@ class Surface:
 
 
 def _form_of(jet: tuple[mi.Float, ...]) -> NormalForm:
-    """Normal form of a graph x + g(y, z) = 0 from g and its derivatives."""
+    """Compute the normal form of a graph x + g(y, z) = 0 from g and its derivatives."""
     _, gy, gz, gyy, gyz, gzz = jet
     G = mi.Vector3f(1, gy, gz)
     inv = dr.rsqrt(dr.squared_norm(G))
@@ -288,17 +288,17 @@ def _form_of(jet: tuple[mi.Float, ...]) -> NormalForm:
 
 
 def _cubic(c: list[mi.Float], s: mi.Float) -> mi.Float:
-    """Cubic c_0 + c_1 s + c_2 s^2 + c_3 s^3."""
+    """Compute cubic c_0 + c_1 s + c_2 s^2 + c_3 s^3."""
     return ((c[3] * s + c[2]) * s + c[1]) * s + c[0]
 
 
 def _slope(c: list[mi.Float], s: mi.Float) -> mi.Float:
-    """Derivative of `_cubic`."""
+    """Compute the derivative of `_cubic`."""
     return (3 * c[3] * s + 2 * c[2]) * s + c[1]
 
 
 def fresnel(c1: mi.Float, c2: mi.Float, eta: mi.Float, film: mi.Float | None = None) -> mi.Float:
-    """Unpolarised Fresnel reflectance of a dielectric: cosines before and behind, eta = n_before / n_behind.
+    """Find the unpolarised Fresnel reflectance of a dielectric: cosines before and behind, eta = n_before / n_behind.
 
     F = (rs^2 + rp^2) / 2,  rs = (eta c1 - c2) / (eta c1 + c2),  rp = (c1 - eta c2) / (c1 + eta c2)   (Born & Wolf 1.5)
 

@@ -81,7 +81,7 @@ class BackgroundGeometry:
         self.map.set_tensor(mi.TensorXf(tile.astype(np.float32)[..., None]))
 
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Matte:
-        """Surface at barycentric coordinates `uv` of triangles."""
+        """Compute the surface at barycentric coordinates `uv` of triangles."""
         corner = dr.gather(mi.Vector4u, self.corners, face, active)
         a, b, c = (dr.gather(mi.Vector4f, self.vertices, i, active) for i in (corner.x, corner.y, corner.z))
         at = a + uv.x * (b - a) + uv.y * (c - a)
@@ -140,7 +140,7 @@ class Background:
 
 
 def _beside_plane(x: float, a: Floats, b: Floats) -> Bools:
-    """Whether the plane at x does not stand between points (n, 3)."""
+    """Return whether the plane at x does not stand between points (n, 3)."""
     table = _between(a, b).astype(float)
     o, d, length = table[:, :3], table[:, 3:6], table[:, 6]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -151,7 +151,7 @@ def _beside_plane(x: float, a: Floats, b: Floats) -> Bools:
 
 
 def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
-    """Whether nothing of a Mitsuba scene stands between points (n, 3) of its frame; ends not included."""
+    """Return whether nothing of a Mitsuba scene stands between points (n, 3) of its frame; ends not included."""
     if not len(a):
         return np.zeros(0, dtype=bool)
     # Some rays more than there are make few numbers of rays, so that recordings are played back.
@@ -163,20 +163,20 @@ def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
 
 @recorded
 def _met(scene: mi.Scene, table: mi.Float, count: int) -> mi.Bool:
-    """Whether rays meet anything; the table holds origin, direction and length of each."""
+    """Return whether rays meet anything; the table holds origin, direction and length of each."""
     met = scene.ray_test(_rays(table, count))
     dr.eval(met)
     return met
 
 
 def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> mi.Ray3f:
-    """Rays from points (n, 3) towards points b, without the last `margin_mm` at both ends."""
+    """Compute rays from points (n, 3) towards points b, without the last `margin_mm` at both ends."""
     table = _between(a, b, margin_mm)
     return _rays(mi.Float(table.ravel()), len(table))
 
 
 def _between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> Singles:
-    """Origin, direction and length (n, 7) of such rays."""
+    """Compute the origin, direction and length (n, 7) of such rays."""
     length = lengths(b - a)
     d = (b - a) / length[:, None]
     return np.column_stack([a + margin_mm * d, d, length - 2 * margin_mm]).astype(np.float32)

@@ -89,7 +89,7 @@ class Blur:
 
 
 def _depths(job: RenderJob, posed: RegionMesh | None) -> Floats:
-    """Depths (mm) of things in the window: nearest and farthest."""
+    """Compute depths (mm) of things in the window: nearest and farthest."""
     camera = job.camera
     middle = float(camera.R[2] @ (np.asarray(job.eye.sclera.centre_mm) @ job.M.T + job.t) + camera.t[2])
     depths = [middle - _GLOBE_MM, middle]

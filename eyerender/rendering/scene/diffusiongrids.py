@@ -110,7 +110,7 @@ class GlobeCells:
 
 @lru_cache(maxsize=4)
 def _globe_cells(radius_mm: float) -> tuple[Floats, Floats]:
-    """Places (y, z) of the cells of the grid over the globe about its middle, mm."""
+    """Compute places (y, z) of the cells of the grid over the globe about its middle, mm."""
     row, column = np.divmod(np.arange(SIDE * SIDE), SIDE)
     a, b = ((k - 0.5 * (SIDE - 1)) * (WIDTH / SIDE) for k in (column, row))
     scale = radius_mm * np.sqrt(np.maximum(1 - 0.25 * (a * a + b * b), 0))
@@ -118,7 +118,7 @@ def _globe_cells(radius_mm: float) -> tuple[Floats, Floats]:
 
 
 def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -> Bools:
-    """Which points (n, 3) are in a window, or beside it by no more than what is spare."""
+    """Say which points (n, 3) are in a window or within its margin."""
     camera, whole = job.camera, misses_light(job.lens, job.camera, job.window)
     x0, y0, width, height = (0, 0, *camera.resolution_px) if whole else job.window
     xy, front = camera.project(points)
@@ -130,7 +130,7 @@ def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -
 
 
 def _grown(marked: Bools) -> Bools:
-    """Marks of a grid, whose columns close, and of all neighbours."""
+    """Compute marks of a grid, whose columns close, and of all neighbours."""
     out = marked | np.roll(marked, 1, axis=1) | np.roll(marked, -1, axis=1)
     grown = out.copy()
     grown[1:] |= out[:-1]

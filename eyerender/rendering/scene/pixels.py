@@ -77,7 +77,7 @@ def supersampled_pixels(
 
 
 def _thin(depth_mm: float, camera: PinholeCamera) -> bool:
-    """Whether hairs at this depth are thin in the picture."""
+    """Return whether hairs at this depth are thin in the picture."""
     focal = float(max(camera.K[0, 0], camera.K[1, 1]))
     return depth_mm >= _NEAREST_MM and _HAIR_MM * focal <= _THICK_PX * depth_mm
 
@@ -175,7 +175,7 @@ def _mark(marked: Bools, pieces: tuple[Floats, Floats], step: float, reach: floa
 
 
 def _winding(xy: Floats, shape: tuple[int, int]) -> Floats:
-    """Winding number of a closed polyline (k + 1, 2) about the middle of each tile (rows, columns)."""
+    """Compute the winding number of a closed polyline (k + 1, 2) about the middle of each tile (rows, columns)."""
     rows, columns = shape
     y = np.arange(rows) + 0.5
     (ax, ay), (bx, by) = xy[:-1].T[..., None], xy[1:].T[..., None]

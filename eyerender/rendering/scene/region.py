@@ -69,7 +69,7 @@ class RegionScene:
         return mi.load_dict(scene)
 
     def _cuts(self, layout: RegionLayout) -> dict[str, tuple[slice, slice]]:
-        """The vertices and faces of each mesh."""
+        """Return the vertices and faces of each mesh."""
         if self.fixed:
             return {"solid": (slice(0, None), slice(0, None))}
         v, f = (int(ends[-2]) for ends in (layout.vertex_ends, layout.face_ends))
@@ -93,7 +93,7 @@ class RegionScene:
         self.subject = self.key(spec, globe)
 
     def takes(self, spec: Region) -> bool:
-        """Whether a subject fits into the scene's meshes."""
+        """Return whether a subject fits into the scene's meshes."""
         return not self.fixed and spec.head is None
 
     def fill(self, spec: Region, globe: Globe, known: RegionMesh | None) -> None:
@@ -122,7 +122,7 @@ class RegionScene:
         return self.posed
 
     def at_rest(self, globe: Globe) -> RegionMesh:
-        """Mesh of the subject with open lids about a globe; the scene keeps its pose."""
+        """Compute the mesh of the subject with open lids about a globe; the scene keeps its pose."""
         assert self._shown is not None
         return self._posed(self._shown[0].model_copy(update={"blink": 0.0}), globe)
 
@@ -154,12 +154,12 @@ class RegionScene:
         return ~sheet_ends()
 
     def clear(self, a: Floats, b: Floats) -> Bools:
-        """Whether nothing of the region stands between points (n, 3) of the scene's frame; ends not included."""
+        """Return whether nothing of the region stands between points (n, 3) of the scene's frame; ends not included."""
         return clear_between(self.scene, a, b)
 
 
 def _mean_slopes(pixels: NDArray[np.float16]) -> dict[int, mi.Float]:
-    """Means of the slopes of a map over the cells of the two grids on which light spreads, by their rows."""
+    """Compute means of the slopes of a map over the cells of the two grids on which light spreads, by their rows."""
     slopes = pixels[:SHEET_ROWS, :, 1:3]
     down, across = len(slopes) // GRID_ROWS, slopes.shape[1] // GRID_COLUMNS
     parts = [slopes[i::down, j::across].astype(np.float32) for i in range(down) for j in range(across)]
@@ -173,7 +173,7 @@ def _floats(values: Floats) -> mi.Float:
 
 
 def _faces(layout: RegionLayout, vertices: slice, faces: slice) -> mi.UInt32:
-    """Some of the triangles, with numbers of some of the vertices."""
+    """Return some of the triangles, with numbers of some of the vertices."""
     triangles = layout.faces[faces] - vertices.start
     return mi.UInt32(aligned_copy(triangles.astype(np.uint32).ravel()))
 
@@ -263,7 +263,7 @@ class SkinGeometry:
         return *(mi.Vector3f(p.x, p.y, p.z) for p in (a, b, c)), corner.w > 0
 
     def sheet_point(self, row: mi.Float, column: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """Points of the sheet's triangles at fractional rows and columns of its grid, and the smooth normals."""
+        """Find points of the sheet's triangles at fractional rows and columns of its grid, and the smooth normals."""
         i, j = mi.UInt32(dr.clip(row, 0, ROWS - 1.001)), mi.UInt32(dr.clip(column, 0, SHEET_COLUMNS - 1.001))
         wide = dr.select(i < FINE, mi.UInt32(1), 2)
         j -= j & (wide - 1)
@@ -279,7 +279,7 @@ class SkinGeometry:
         return mi.Vector3f(place.x, place.y, place.z), dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
 
     def map_place(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Coordinates of the map at barycentric coordinates `uv` of triangles."""
+        """Compute coordinates of the map at barycentric coordinates `uv` of triangles."""
         corner = dr.gather(mi.Vector4u, self.faces, face, active)
         u, v = mi.Float(0), mi.Float(0)
         for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), (corner.x, corner.y, corner.z), strict=True):
@@ -289,24 +289,24 @@ class SkinGeometry:
         return u, v
 
     def tilted(self, normal: mi.Vector3f, slope_y: mi.Float, slope_z: mi.Float) -> mi.Vector3f:
-        """Normals of a relief: n - (g - n (n . g)) for the slope g over the tangent plane of the normal n."""
+        """Compute normals of a relief: n - (g - n (n . g)) for the slope g over the tangent plane of the normal n."""
         g = mi.Vector3f(0, self.mirror * slope_y, slope_z)
         return dr.normalize(normal - (g - normal * dr.dot(normal, g)))
 
     def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
-        """Index of the layout's triangle that was hit."""
+        """Compute the index of the layout's triangle that was hit."""
         return mi.UInt32(hit.prim_index)
 
     def on_water(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
-        """Index of the layout's triangle of the menisci that was hit."""
+        """Compute the index of the layout's triangle of the menisci that was hit."""
         return hit.prim_index + self.film
 
     def on_sheet(self, face: mi.UInt32) -> mi.Bool:
-        """Whether a triangle belongs to the sheet of skin, not to what is in front of it."""
+        """Return whether a triangle belongs to the sheet of skin, not to what is in front of it."""
         return face < self.sheet
 
     def corner(self, face: mi.UInt32, uv: mi.Point2f, u: mi.Float, active: mi.Bool) -> mi.UInt32:
-        """Vertices of triangles, each as often as its barycentric weight for even u in [0, 1)."""
+        """Compute vertices of triangles, each as often as its barycentric weight for even u in [0, 1)."""
         corner = dr.gather(mi.Vector4u, self.faces, face, active)
         return dr.select(u < uv.x, corner.y, dr.select(u < uv.x + uv.y, corner.z, corner.x))
 
@@ -325,7 +325,7 @@ class SkinGeometry:
         return behind & self.on_sheet(face) if self.is_sheet else behind  # hairs are thin, and some are open tubes
 
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> SkinPoint:
-        """Surface at barycentric coordinates `uv` of triangles."""
+        """Compute the surface at barycentric coordinates `uv` of triangles."""
         corner = dr.gather(mi.Vector4u, self.faces, face, active)
         weights = (1 - uv.x - uv.y, uv.x, uv.y)
         place, turned, received = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
@@ -343,7 +343,7 @@ class SkinGeometry:
 
 
 def _sheet_vertex(row: mi.UInt32, column: mi.UInt32) -> mi.UInt32:
-    """Numbers of vertices of the sheet, like those of `mesh.sheet_vertices`."""
+    """List numbers of vertices of the sheet, like those of `mesh.sheet_vertices`."""
     half = COLUMNS // 2
     return dr.select(row > FINE, half * (FINE + 1) + (half + 1) * row + (column >> 1), SHEET_COLUMNS * row + column)
 

@@ -89,18 +89,18 @@ class Walls:
         return max(len(self.front) - 1, 1)
 
     def height(self, p: Floats) -> Floats:
-        """Height (n,) mm of points above the plane of the iris."""
+        """Compute the height (n,) mm of points above the plane of the iris."""
         return np.asarray((p - self.centre) @ self.normal)
 
     def to_plane(self, o: Floats, d: Floats) -> Floats:
-        """Distance (n,) to the plane of the iris, infinite for rays that leave it."""
+        """Compute the distance (n,) to the plane of the iris, infinite for rays that leave it."""
         down = d @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):
             t = -self.height(o) / down
         return np.where((down < -1e-9) & (t > _NEAR_MM), t, np.inf)
 
     def to_wall(self, o: Floats, d: Floats) -> Floats:
-        """Distance (n,) to the wall above the plane, infinite where it is not met."""
+        """Compute the distance (n,) to the wall above the plane, infinite where it is not met."""
         r, s = self.rim + self.slope * (self.top - o[:, 0]), -self.slope * d[:, 0]
         a = d[:, 1] ** 2 + d[:, 2] ** 2 - s * s
         b = o[:, 1] * d[:, 1] + o[:, 2] * d[:, 2] - r * s
@@ -114,7 +114,7 @@ class Walls:
 
 
 def air_side(surface: Surface) -> float:
-    """Sign of the implicit function of a surface on its air side."""
+    """Compute the sign of the implicit function of a surface on its air side."""
     apex = np.asarray(surface.origin_mm) + np.asarray(surface.rotation)[:, 0]
     return float(np.sign(surface.implicit(apex[None])[0]))
 
@@ -223,7 +223,7 @@ def _mirror_at_front(walls: Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tu
 
 
 def _cross(walls: Walls, rays: _Rays, k: int, *, outwards: bool) -> _Rays:
-    """Refract rays at surface k behind the front, with the change of radiance between media; mirror the others."""
+    """Refract rays at surface k behind the front, with the change of radiance between media, or mirror them."""
     n = walls.front[k].normal(rays.o)
     before, after = walls.indices[k - 1], walls.indices[k]
     if outwards:
@@ -239,7 +239,7 @@ def _cross(walls: Walls, rays: _Rays, k: int, *, outwards: bool) -> _Rays:
 
 
 def _distance_outwards(surface: Surface, o: Floats, d: Floats) -> Floats:
-    """Distance (n,) to a surface from inside; infinite where it is missed."""
+    """Compute the distance (n,) to a surface from inside; infinite where it is missed."""
     hit = surface.hit(components(o + _AHEAD_MM * d), components(d), False)
     return np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
 

@@ -87,27 +87,27 @@ class DiffusedLight:
         return _diffused_light(scene, *grids, RingPoints.of(cells.thick_mm), RingPoints.of(cells.thin_mm))
 
     def at_skin(self, u: mi.Float, v: mi.Float) -> mi.Float:
-        """Irradiance (mW/mm^2) at coordinates of the map of the skin."""
+        """Compute the irradiance (mW/mm^2) at coordinates of the map of the skin."""
         return self.size.cells(*self.size.place(u, v), 0).interpolate(mi.Float, self.skin)
 
     def lamps_at_skin(self, u: mi.Float, v: mi.Float) -> Callable[[mi.UInt32], mi.Float]:
-        """Shares of the lamps, by their numbers, that the skin sees at coordinates of its map."""
+        """Compute shares of the lamps, by their numbers, that the skin sees at coordinates of its map."""
         cells = self.size.cells(*self.size.place(u, v), 1)
         return lambda lamp: dr.clip(cells.interpolate(mi.Float, self.skin_seen, self.lamps, lamp), 0, 1)
 
     def at_globe(self, frame: Frame, x: mi.Vector3f) -> mi.Float:
-        """Irradiance (mW/mm^2) at points of the globe (eye frame)."""
+        """Compute the irradiance (mW/mm^2) at points of the globe (eye frame)."""
         return globe_cells(*_place_on_globe(frame, x)).interpolate(mi.Float, self.globe)
 
     def lamps_at_globe(self, frame: Frame, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
-        """Shares of the lamps, by their numbers, that points of the globe (eye frame) see."""
+        """Compute shares of the lamps, by their numbers, that points of the globe (eye frame) see."""
         row, column = (mi.UInt32(dr.clip(p + 0.5, 0, SIDE - 1)) for p in _place_on_globe(frame, x))
         first = (row * SIDE + column) * self.lamps
         return lambda lamp: dr.gather(mi.Float, self.globe_seen, first + lamp)
 
 
 def _place_on_globe(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-    """Row and column of points of the globe (eye frame) in the grid over it."""
+    """Return the row and column of points of the globe (eye frame) in the grid over it."""
     return globe_place(frame.vector_to_scene(x - frame.sclera.centre))
 
 
@@ -151,7 +151,7 @@ class RingPoints:
     def point(
         self, k: mi.UInt32, inner: mi.UInt32, count: mi.UInt32
     ) -> tuple[mi.Point2f, mi.Point2f, mi.Float, mi.Bool]:
-        """Point k of `count` rings from the ring `inner` on, walk by walk.
+        """Compute the point k of `count` rings from the ring `inner` on, walk by walk.
 
         Returns:
             The point, the step to it, its distance from the middle (mm), and whether a walk begins there.
@@ -185,7 +185,7 @@ def spread_in_skin(grid: SheetGrid, skin: SkinGeometry, irradiance: mi.Float, po
 def _gather_on_skin(
     lit: Pyramid, metric: SheetMetric, points: RingPoints, row: mi.Float, column: mi.Float, of_rings: tuple[int, int]
 ) -> mi.Float:
-    """Share that some of the rings have in the mean over all ring points about cells of the skin."""
+    """Compute the share that some of the rings have in the mean over all ring points about cells of the skin."""
     inner, count = mi.UInt32(of_rings[0]), mi.UInt32(of_rings[1] - of_rings[0])
     k, total, i, j = mi.UInt32(0), mi.Float(0) * row, mi.Float(row), mi.Float(column)
     while dr.hint(k < count * _TURNS, label="rings on skin", exclude=[lit, metric, points]):
@@ -206,7 +206,7 @@ def spread_in_globe(grid: GlobeGrid, radius_mm: mi.Float, irradiance: mi.Float, 
 
 @syntax
 def _gather_on_globe(lit: Pyramid, index: mi.UInt32, radius_mm: mi.Float, points: RingPoints) -> mi.Float:
-    """Mean over the ring points about cells of the globe."""
+    """Compute the mean over the ring points about cells of the globe."""
     n = globe_direction(mi.Float(index // SIDE), mi.Float(index % SIDE))
     across = dr.normalize(mi.Vector3f(-n.y, n.x, 0))
     up = dr.cross(n, across)

@@ -21,7 +21,7 @@ from .manifold import Target, connect
 def lamp_blocked(
     frame: Frame, x: mi.Vector3f, lamp: mi.Vector3f, sphere: mi.Bool, cornea: mi.Bool, active: mi.Bool
 ) -> mi.Bool:
-    """Whether anything stands between a point of the eye frame and a lamp.
+    """Return whether anything stands between a point of the eye frame and a lamp.
 
     `sphere` and `cornea` mark the lanes that the globe's sphere and the cornea's bulge can block.
     """
@@ -57,7 +57,7 @@ def _eye_blocks(
 def direct_light(
     lamp: Lamp, source: mi.Vector3f, view: SurfaceInteraction, mirror: tuple[mi.Vector3f, mi.Vector3f] | None = None
 ) -> tuple[mi.Float, mi.Float]:
-    """Light that a lamp gives to matte points in air when nothing stands in the way.
+    """Compute the light that a lamp gives to matte points in air, without shadows.
 
     Args:
         lamp: the lamp.
@@ -77,7 +77,7 @@ def direct_light(
 
 
 def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vector3f) -> mi.Float:
-    """Irradiance (mW/mm^2) that a lamp's point `source` gives to points x when nothing stands in the way."""
+    """Compute the irradiance (mW/mm^2) of points x by a lamp's point `source`, without shadows."""
     to = source - x
     inv2 = dr.rcp(dr.squared_norm(to))
     to *= dr.sqrt(inv2)
@@ -96,7 +96,7 @@ def irradiance_at(
     off_globe: mi.Bool,
     on_sheet: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
-    """Irradiance of points in air straight from all lamps.
+    """Compute the irradiance of points in air straight from all lamps.
 
     Args:
         frame: the frame.
@@ -127,7 +127,7 @@ def irradiance_at(
 
 
 def shadowless(frame: Frame, lamp: mi.UInt32, x: mi.Vector3f, on_sheet: mi.Bool) -> mi.Bool:
-    """Whether the shadow maps show that nothing stands between points of the sheet (scene's frame) and a lamp."""
+    """Find whether the shadow maps show that nothing stands between points of the sheet (scene's frame) and a lamp."""
     maps = frame.caches.shadow_maps
     return mi.Bool(False) if maps is None else maps.at(lamp, x, on_sheet)
 
@@ -135,7 +135,7 @@ def shadowless(frame: Frame, lamp: mi.UInt32, x: mi.Vector3f, on_sheet: mi.Bool)
 def lamp_light(
     frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, known: mi.Bool
 ) -> tuple[mi.Float, mi.Float, mi.UInt32]:
-    """Light of the lamps on a bare eye.
+    """Compute the light of the lamps on a bare eye.
 
     Args:
         frame: the frame.
@@ -154,7 +154,7 @@ def lamp_light(
 
 @syntax
 def _onto_matte(frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, wanted: mi.Bool) -> mi.Float:
-    """Irradiance of the first surface straight from all lamps.
+    """Compute the irradiance of the first surface straight from all lamps.
 
     The cornea is convex: where it faces a lamp it does not shadow itself.
     """
@@ -180,7 +180,7 @@ def irradiance_through_cornea(
     normal: mi.Vector3f | None = None,
     surfaces: tuple[Surface, ...] | None = None,
 ) -> tuple[mi.Float, mi.UInt32]:
-    """Irradiance (mW/mm^2) of all lamps at points behind the cornea, and failed paths.
+    """Compute the irradiance (mW/mm^2) of all lamps at points behind the cornea, and failed paths.
 
     Args:
         frame: the frame.
@@ -246,7 +246,7 @@ def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
 
 
 def on_relief(frame: Frame, view: SurfaceInteraction) -> SurfaceInteraction:
-    """The view with the places on the relief of the iris that the rays meet, as their feet in its plane."""
+    """Return the view with the places on the relief of the iris that the rays meet, as their feet in its plane."""
     if frame.caches.relief is None:
         return view
     seen = view.cornea & ~view.pupil & (view.passed > 0)

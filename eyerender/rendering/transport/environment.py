@@ -110,7 +110,7 @@ class Ambience:
         )  # fmt: skip
 
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Radiance (mW/mm^2/sr) along rays of the scene's frame, without the even light.
+        """Compute the radiance (mW/mm^2/sr) along rays of the scene's frame, without the even light.
 
         Overlapping panels add up, and they do not hide the map behind them.
         """
@@ -125,7 +125,7 @@ class Ambience:
         return self.scale * self.texture.eval(self._place(d, self.rows), active)[0]
 
     def _place(self, v: mi.Vector3f, rows: mi.Float | float) -> mi.Point2f:
-        """Place of directions (scene's frame) in a texture with so many rows, and one more at both ends."""
+        """Compute the place of directions (scene's frame) in a texture with so many rows, and one more at both ends."""
         w = mi.Vector3f(*(dr.dot(axis, v) for axis in self.axes))
         polar = dr.acos(dr.clip(w.z, -1, 1)) * dr.inv_pi
         return mi.Point2f(0.5 - dr.atan2(w.y, w.x) * (0.5 * dr.inv_pi), (1 + polar * rows) / (rows + 2))
@@ -142,7 +142,7 @@ class Ambience:
 
 
 def bright_lamps(spec: RadianceMap | None, maps: Maps, anchor_mm: Floats) -> tuple[Lamp, ...]:
-    """The light of a map that exceeds its soft part, as far lamps.
+    """Return the light of a map that exceeds its soft part, as far lamps.
 
     Args:
         spec: the map.

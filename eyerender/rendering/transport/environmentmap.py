@@ -121,7 +121,7 @@ def _channel(data: NDArray[Any], channel: str) -> NDArray[Any]:
 
 
 def _size(kind: str, head: bytes) -> int | None:
-    """Number of pixels that the header of a map's file declares; None where it declares none.
+    """Compute the number of pixels that the header of a map's file declares; None where it declares none.
 
     The reader allocates all of them before it notices that the file is too short.
     """
@@ -168,7 +168,7 @@ def environment_map(values: Floats) -> EnvironmentMap:
 
 
 def _directions(rows: int) -> tuple[Floats, Floats]:
-    """Directions (rows, 2 rows, 3) of a map's texels in its own frame, and their solid angles (rows, 1)."""
+    """Compute directions (rows, 2 rows, 3) of a map's texels in its own frame, and their solid angles (rows, 1)."""
     edge = np.pi * np.arange(rows + 1) / rows
     polar, turn = 0.5 * (edge[1:] + edge[:-1])[:, None], (np.pi - np.pi * (np.arange(2 * rows) + 0.5) / rows)[None]
     s = np.sin(polar)
@@ -197,7 +197,7 @@ def _median_cut(flux: Floats, cuts: int) -> Floats:
 
 
 def map_rotation(spec: RadianceMap) -> Floats:
-    """Rotation M (3, 3) = Rz(az) Ry(-el) Rx(roll) from the map's frame to the world.
+    """Compute the rotation M (3, 3) = Rz(az) Ry(-el) Rx(roll) from the map's frame to the world.
 
     In the map's frame x is its middle, y to its left, z up.
     """
@@ -210,7 +210,7 @@ def map_rotation(spec: RadianceMap) -> Floats:
 
 
 def map_values(spec: RadianceMap) -> Floats:
-    """Values of a map: those of its file, or painted ones."""
+    """Return values of a map: those of its file, or painted ones."""
     if spec.file is None:
         return paint(str(spec.place), spec.place_seed)
     if spec.sha256 is not None and file_digest(Path(spec.file)) != spec.sha256:
@@ -226,7 +226,7 @@ def _reduce(values: Floats) -> Floats:
 
 
 def _average(values: Floats, count: int) -> Floats:
-    """Means of rows over `count` equal intervals."""
+    """Compute means of rows over `count` equal intervals."""
     running = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     at = np.linspace(0, len(values), count + 1)
     low = np.minimum(at.astype(int), len(values) - 1)

@@ -99,7 +99,7 @@ class PatchRays:
         )  # fmt: skip
 
     def mean(self, values: Reals) -> Floats:
-        """Means (patches,) over the rays of each patch."""
+        """Compute means (patches,) over the rays of each patch."""
         return np.asarray(self.shares @ values)
 
     def form_factors(self, stand_in: Ints) -> csr_array:
@@ -111,7 +111,7 @@ class PatchRays:
         )
 
     def correction(self, direct: Floats, bare: Floats) -> Floats:
-        """What the lamps' light at the points that are met adds to that of the patches there, `direct`.
+        """Say what the lamps' light at the points that are met adds to that of the patches there, `direct`.
 
         `bare` is the lamps' light on the patches if nothing stood in the way. Where that at the very point is not
         known, the same share of it arrives there.
@@ -125,7 +125,7 @@ class PatchRays:
 
 @remembered
 def _shares(count: Ints, gain: csr_array) -> csr_array:
-    """Shares as in `PatchRays`, from the number of rays of each patch and the gain of those that leave the eye."""
+    """Find shares as in `PatchRays`, from the number of rays of each patch and the gain of those that leave the eye."""
     ends = np.append(0, np.cumsum(count))
     return csr_array(
         (
@@ -138,7 +138,7 @@ def _shares(count: Ints, gain: csr_array) -> csr_array:
 
 
 def share_of(part: Floats, whole: Floats) -> Floats:
-    """Share that a part has of the whole, 1 where there is nothing."""
+    """Compute the share that a part has of the whole, 1 where there is nothing."""
     return np.where(whole > 0, part / np.where(whole > 0, whole, 1), 1.0)
 
 
@@ -164,7 +164,7 @@ def trace_rays(frame: Frame, field: RadiosityField, tables: PatchTables, lanes: 
 
 
 def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
-    """Cosine-distributed directions about normals; rays of a patch have consecutive numbers."""
+    """Compute cosine-distributed directions about normals; rays of a patch have consecutive numbers."""
     u, v = sequence(ray)
     s, c = dr.sincos(v * (2 * dr.pi))
     e1, e2 = mi.coordinate_system(normal)
@@ -208,7 +208,7 @@ def _meet(
 def _patch_on_skin(
     frame: Frame, tables: PatchTables, view: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f, s: mi.Float
 ) -> tuple[mi.UInt32, mi.Bool, mi.Bool]:
-    """Patch of a region that is met, whether it sends light back, and whether it is the sheet's outer side."""
+    """Find the patch of a region that is met, whether it sends light back, and whether it is the sheet's outer side."""
     face = frame.region.face(hit)
     inner = frame.region.from_behind(face, hit.prim_uv, d, view.other)
     corner = frame.region.corner(face, hit.prim_uv, s, view.other)
@@ -221,7 +221,7 @@ def _patch_on_background(
     frame: Frame, field: RadiosityField, tables: PatchTables, view: SurfaceInteraction, at: mi.Vector3f,
     s: mi.Float, t: mi.Float,
 ) -> tuple[mi.UInt32, mi.Bool]:  # fmt: skip
-    """Patch of the background that is met at points of the scene's frame, and whether it sends light back."""
+    """Find the patch of the background that is met at points of the scene's frame, and whether it sends light back."""
     ring, turn = field.background_place(at)
     ring, turn = mi.UInt32(dr.clip(ring + s, 0, RINGS - 1)), mi.UInt32(dr.clip(turn + t, 0, TURNS))
     patch = tables.on_globe + ring * TURNS + dr.select(turn < TURNS, turn, 0)
@@ -229,7 +229,7 @@ def _patch_on_background(
 
 
 def _patch_of_iris(field: RadiosityField, view: SurfaceInteraction, s: mi.Float, t: mi.Float) -> mi.UInt32:
-    """Patch of the iris that is met, by its number in the chamber."""
+    """Compute the patch of the iris that is met, by its number in the chamber."""
     ring, turn = field.iris_place(view.inner)
     turn = mi.UInt32(dr.clip(turn + t, 0, IRIS_TURNS))
     return mi.UInt32(dr.clip(ring + s, 0, IRIS_RINGS - 1)) * IRIS_TURNS + dr.select(turn < IRIS_TURNS, turn, 0)

@@ -68,7 +68,7 @@ class Interior:
 
     @classmethod
     def of(cls, eye: EyeModel, film_index: float, look: Look, halvings: int) -> Interior:
-        """Compute it for an eye, with its pupil, and a look, with so many halvings of the rays that leave."""
+        """Compute it for an eye with its pupil and a look; the leaving rays are halved the given number of times."""
         chamber = chamber_of(eye, film_index)
         albedo = patch_albedo(eye, chamber, look)
         limbus = through_limbus(eye, chamber, look.limbus_width_mm, look.limbus_aspect) * look.limbus_transmittance
@@ -107,7 +107,7 @@ class RayPlan:
 
     @classmethod
     def of(cls, on_globe: int, others: int, skin: SkinPatches | None) -> RayPlan:
-        """Plan for so many patches on the globe, and so many others before the limbus."""
+        """Plan for the given numbers of patches on the globe and of other patches before the limbus."""
         count = np.full(on_globe + others + IRIS_TURNS, RAYS)
         stands_for, near, weight = mi.Int32(0), mi.UInt32(0), mi.Float(0)
         if skin is not None:
@@ -143,7 +143,7 @@ class RayPlan:
 def _at_vertices(
     patches: mi.Float, near: mi.UInt32, weight: mi.Float, count: mi.UInt32, vertices: int, each: int
 ) -> mi.Float:
-    """Four numbers of every vertex from those of `each` patches about it."""
+    """Return four numbers of every vertex from those of `each` patches about it."""
     index = dr.arange(mi.UInt32, vertices)
     total = mi.Vector4f(0)
     for k in range(each):
@@ -228,7 +228,7 @@ class Patches:
         self._interiors: EyeCache[Interior] = EyeCache()
 
     def of(self, job: RenderJob, globe: GlobePatches, region: RegionScene | None) -> FramePatches:
-        """The patches of a job, with those of its globe."""
+        """Return the patches of a job, with those of its globe."""
         plan = self._plan(region, job.globe)
         points, normals, plane = _others(job, region, plan.skin)
         return FramePatches(
@@ -236,14 +236,14 @@ class Patches:
         )
 
     def _interior(self, job: RenderJob) -> Interior:
-        """The chamber of a job's eye; more rays leave it where they look for light."""
+        """Return the chamber of a job's eye; more rays leave it where they look for light."""
         ambient = job.ambient
         halvings = _HALVINGS[ambient.map is not None or ambient.irradiance_w_m2 > 0]
         film, look = job.film_index, job.look
         return self._interiors.get(job.eye, (film, look, halvings), lambda: Interior.of(job.eye, film, look, halvings))
 
     def _plan(self, region: RegionScene | None, globe: Globe) -> RayPlan:
-        """Patches and rays, chosen with the eye straight ahead: no earlier pose may change a picture."""
+        """Compute patches and rays, chosen with the eye straight ahead: no earlier pose may change a picture."""
         if region is None:
             self._bare = self._bare or RayPlan.of(MAP_SIDE * MAP_SIDE, RINGS * TURNS, None)
             return self._bare
@@ -260,7 +260,7 @@ class Patches:
 def _others(
     job: RenderJob, region: RegionScene | None, skin: SkinPatches | None
 ) -> tuple[Floats, Floats, tuple[float, float, float]]:
-    """Patches that are not on the eye, their normals, and the rings of the background."""
+    """Compute patches that are not on the eye, their normals, and the rings of the background."""
     if region is not None and skin is not None:
         vertices, normals = (a[skin.vertices] for a in (region.posed.vertices, region.posed.normals))
         both = np.concatenate([vertices, vertices[skin.lids]]), np.concatenate([normals, -normals[skin.lids]])

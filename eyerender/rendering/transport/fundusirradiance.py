@@ -36,7 +36,7 @@ class FundusIrradiance:
         return cls(cells=cells)
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> mi.Float:
-        """Radiance at coordinates of the stop in units of its semi-axes, bilinearly."""
+        """Compute the radiance at coordinates of the stop in units of its semi-axes, bilinearly."""
         x, y = (dr.clip((c * (1 / EDGE) + 1) * (CELLS / 2) - 0.5, 0, CELLS - 1.001) for c in (u, v))
         i, j = mi.UInt32(x), mi.UInt32(y)
         s, t = x - mi.Float(i), y - mi.Float(j)

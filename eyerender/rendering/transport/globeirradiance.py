@@ -60,7 +60,7 @@ class GlobeIrradiance:
         share = dr.select(polar > 0, sine / polar, 0)
         normal = mi.Vector3f(cosine, a * share, b * share)
         x = frame.sclera.centre + frame.sclera.radius * normal
-        # Under the cornea the grid goes on as if there were none, because cells at its rim have nodes there.
+        # Under the cornea the grid continues as if there were none, because cells at its rim have nodes there.
         local = frame.surfaces[0].point_in(x)
         outside = (local.y * local.y + local.z * local.z > dr.square(frame.limbus.radius)) | (normal.x < 0)
         on_globe = _from_lamps(frame, points, x, normal, sphere=mi.Bool(False), cornea=outside)

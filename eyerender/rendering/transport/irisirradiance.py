@@ -101,7 +101,7 @@ def _half(frame: Frame) -> mi.Float:
 
 
 def _four_in_a_row(paths: list[mi.Float], lamps: int, count: mi.UInt32) -> mi.Float:
-    """What passes a clear rim, and the radii where it enters, at each node and the three beside it."""
+    """Say what passes a clear rim, and the radii where it enters, at each node and the three beside it."""
     index = dr.arange(mi.UInt32, _NODES * lamps)
     rows = dr.zeros(mi.Float, 8 * _NODES * lamps)
     last = mi.Int32(dr.minimum(count, BITS) * _NODES) - 1
@@ -113,13 +113,13 @@ def _four_in_a_row(paths: list[mi.Float], lamps: int, count: mi.UInt32) -> mi.Fl
 
 
 def _rows(paths: mi.Float, node: mi.UInt32) -> tuple[mi.Vector4f, mi.Vector4f]:
-    """What passes a clear rim at nodes and the three beside them, and the radii where it enters."""
+    """Say what passes a clear rim at nodes and the three beside them, and the radii where it enters."""
     return dr.gather(mi.Vector4f, paths, 2 * node), dr.gather(mi.Vector4f, paths, 2 * node + 1)
 
 
 @syntax
 def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Irradiance of lamps i at nodes, the same behind a clear rim, and the radius (mm) where it enters.
+    """Compute the irradiance of lamps i at nodes, the same behind a clear rim, and the radius (mm) where it enters.
 
     Where anything may hide the lamps, or a path was not found, irradiances are negative. Behind a clear rim, that of a
     lamp with several points is so, too.
@@ -144,7 +144,7 @@ def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) ->
 
 
 def _shadow(frame: Frame, lamp: mi.UInt32, path: LampPath) -> tuple[mi.Bool, mi.Bool]:
-    """Whether a path is in a shadow or near one, or unknown, and whether a clear rim would let it pass."""
+    """Return whether a path is in a shadow or near one, or unknown, and whether a clear rim would let it pass."""
     if frame.caches.shadow_maps is None:
         return path.failed, ~path.blocked
     free = frame.caches.shadow_maps.at(lamp, frame.point_to_scene(path.entry), path.whole > 0)

@@ -126,7 +126,7 @@ def _refract_all(surfaces: tuple[Surface, ...], b: Bundle) -> tuple[Bundle, mi.F
 
 
 def _newton_step(b: Bundle, miss: mi.Vector3f, ya: mi.Vector3f, yb: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
-    """Motion of the entry point that takes the `miss` away, at most `_STEP_MM` long, and the determinant.
+    """Compute the motion of the entry point that takes the `miss` away, at most `_STEP_MM` long, and the determinant.
 
     Args:
         b: the bundle where it passes the target.
@@ -141,7 +141,7 @@ def _newton_step(b: Bundle, miss: mi.Vector3f, ya: mi.Vector3f, yb: mi.Vector3f)
 
 
 def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vector3f:
-    """First guess of the entry point: where the straight line to `aim` enters.
+    """Compute the first guess of the entry point: where the straight line to `aim` enters.
 
     Where that line misses the surface or enters at grazing incidence, the guess is the point whose normal halves the
     angle between the lamp and the axis. Any lamp in front of the eye lights that point well.

@@ -58,7 +58,7 @@ class Panels:
 
     @syntax
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Radiance (mW/mm^2/sr) along rays of the scene's frame; overlapping panels add up."""
+        """Compute the radiance (mW/mm^2/sr) along rays of the scene's frame; overlapping panels add up."""
         i, total = mi.UInt32(0), mi.Float(0) * d.x
         while dr.hint(i < self.count, label="panels", exclude=[self]):
             panel = self[i]
@@ -72,7 +72,7 @@ class Panels:
 
     @syntax
     def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
-        """Irradiance (mW/mm^2) at points x with unit normals n of the scene's frame, unshadowed."""
+        """Compute the irradiance (mW/mm^2) at points x with unit normals n of the scene's frame, unshadowed."""
         i, total = mi.UInt32(0), mi.Float(0) * n.x
         while dr.hint(i < self.count, label="panel light", exclude=[self]):
             panel = self[i]
@@ -106,7 +106,7 @@ def polygon_irradiance(corners: list[mi.Vector3f], n: mi.Vector3f) -> mi.Float:
 
 
 def _arc(a: mi.Vector3f, b: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
-    """Angle between two directions times n . unit(a x b)."""
+    """Compute the angle between two directions times n . unit(a x b)."""
     c = dr.cross(a, b)
     s = dr.norm(c)
     return dr.atan2(s, dr.dot(a, b)) * dr.dot(n, c) / dr.maximum(s, 1e-20)

@@ -91,7 +91,7 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
 
 
 def _relative_to_globe(globe: Globe, points: Floats) -> Floats:
-    """Points (n, 3) of the scene's frame relative to the centre of a globe at rest."""
+    """Compute points (n, 3) of the scene's frame relative to the centre of a globe at rest."""
     return np.asarray(points - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
 
 
@@ -154,7 +154,7 @@ def globe_patches(globe: Globe, mesh: RegionMesh | None) -> GlobePatches:
 
 
 def _opening(globe: Globe, centre: Floats, mesh: RegionMesh) -> tuple[Floats, Floats, Floats]:
-    """Columns y of the grid and the ends (z) of the opening there, mm."""
+    """Compute the columns y of the grid and the ends (z) of the opening there, mm."""
     if len(mesh.upper_margin) == 0:
         y = centre[1] + np.linspace(-0.9, 0.9, GLOBE_COLUMNS) * min(_HALF_MM, globe.radius_mm)
         return y, np.full_like(y, centre[2] - _HIGH_MM), np.full_like(y, centre[2] + _HIGH_MM)
@@ -188,7 +188,7 @@ PLANE_MM, PLANE_FIRST_MM = 500.0, 1.0
 
 
 def plane_patches(globe: Globe, plane_x: float) -> tuple[Floats, float]:
-    """Points (RINGS * TURNS, 3) of the plane about a bare globe, and the radius (mm) of the first ring.
+    """Compute points (RINGS * TURNS, 3) of the plane about a bare globe, and the radius (mm) of the first ring.
 
     Their distances from the globe grow by a constant factor, from `PLANE_FIRST_MM`.
     """

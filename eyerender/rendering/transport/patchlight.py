@@ -131,7 +131,7 @@ def gather_light(frame: Frame, panels: Lights, field: RadiosityField, tables: Pa
 
 
 def _ambient(frame: Frame, tables: PatchTables, count: int) -> tuple[mi.Float, mi.Float]:
-    """Irradiance of the patches outside the eye from the soft and the hard part of the ambient light."""
+    """Compute the irradiance of the patches outside the eye from the soft and the hard part of the ambient light."""
     n = gather_rows(tables.outer, 6, dr.arange(mi.UInt32, count))
     soft, hard = frame.caches.ambience.soft_and_hard(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
     dr.eval(soft, hard)
@@ -139,7 +139,7 @@ def _ambient(frame: Frame, tables: PatchTables, count: int) -> tuple[mi.Float, m
 
 
 def _onto_outer(frame: Frame, tables: PatchTables, first: mi.UInt32 | None, count: int) -> tuple[mi.Float, mi.Float]:
-    """Irradiance of the patches outside the eye from lamps, with and without shadows; `count` lanes.
+    """Compute the irradiance of the patches outside the eye from lamps, with and without shadows; `count` lanes.
 
     Points on the lamps' discs begin with the number `first`; without it these are their middles.
     """
@@ -167,7 +167,7 @@ def _off_cornea(frame: Frame, rows: mi.Float, first: mi.UInt32, count: int) -> m
 
 
 def _inside(frame: Frame, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
-    """Irradiance of the chamber's patches from lamps; points on their discs begin with the number `first`."""
+    """Find the irradiance of the chamber's patches from lamps; points on their discs begin with the number `first`."""
 
     def of(begin: int, end: int, inner: bool) -> mi.Float:
         index = dr.arange(mi.UInt32, end - begin)

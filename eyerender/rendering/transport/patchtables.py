@@ -20,13 +20,13 @@ _ALPHA = (0.7548776662466927, 0.5698402909980532)
 
 
 def sequence(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Points i of a sequence that fills [0, 1)^2 evenly."""
+    """Compute the points i of a sequence that fills [0, 1)^2 evenly."""
     u, v = ((mi.Float((i * mi.UInt32(round(a * 2**32))) >> 8) * 2.0**-24) for a in _ALPHA)
     return u, v
 
 
 def gather_rows(buffer: mi.Float, width: int, i: mi.UInt32, active: mi.Bool | bool = True) -> list[mi.Float]:
-    """Rows i of a table with so many columns."""
+    """Gather rows i of a table with the given number of columns."""
     return [dr.gather(mi.Float, buffer, i * width + k, active) for k in range(width)]
 
 

@@ -51,11 +51,11 @@ class Pyramid:
         return pyramid
 
     def _first(self, cells: mi.UInt32) -> mi.UInt32:
-        """Number of the first cell of the level that has so many of them."""
+        """Compute the number of the first cell of the level with this number of cells."""
         return (self.rows * self.columns - cells) // 3 * 4
 
     def at(self, row: mi.Float, column: mi.Float, level: mi.UInt32) -> mi.Float:
-        """Numbers of a level at places in units of the finest cells, whose middles are at integers."""
+        """List numbers of a level at places in units of the finest cells, whose middles are at integers."""
         scale = dr.rcp(mi.Float(mi.UInt32(1) << level))
         rows, columns = self.rows >> level, self.columns >> level
         first = self._first(rows * columns)
@@ -73,5 +73,5 @@ class Pyramid:
 
 
 def level_of(size_mm: mi.Float, cell_mm: mi.Float) -> mi.UInt32:
-    """Level whose cells are about so large, where the finest have `cell_mm`."""
+    """Compute the level whose cells are about so large, where the finest have `cell_mm`."""
     return mi.UInt32(dr.clip(dr.log2(dr.maximum(size_mm / cell_mm, 1)) + 0.5, 0, LEVELS - 1))

@@ -156,7 +156,7 @@ def _solve(patches: FramePatches, light: PatchLight, ambient: _Ambient, valid: B
 
 
 def _stand_in(patches: FramePatches, valid: Bools) -> Ints:
-    """Patch that is used for each patch: itself, or the nearest one on the globe that is not covered."""
+    """Compute the patch that is used for each patch: itself, or the nearest one on the globe that is not covered."""
     out, points = np.arange(patches.outside + PATCHES), patches.globe.points
     if np.any(valid) and not np.all(valid):
         nearest = cKDTree(points[valid]).query(points[~valid])[1]

@@ -85,16 +85,16 @@ class RadiosityField:
         )  # fmt: skip
 
     def with_light(self, globe: Floats, background: Floats, iris: Floats) -> RadiosityField:
-        """The same patches with the light that they receive."""
+        """Return the same patches with the light that they receive."""
         return replace(self, globe=upload_array(globe), background=upload_array(background), iris=upload_array(iris))
 
     def at_globe(self, x: mi.Vector3f) -> mi.Vector4f:
-        """Numbers of points of the globe, given in the scene's frame."""
+        """List numbers of points of the globe, given in the scene's frame."""
         beyond = 0.5 if self.between else 0.0  # the last rows are half a row from the lids, where light changes fast
         return _bilinear(self.globe, *self.globe_place(x), self.columns, self.rows, beyond)
 
     def globe_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Column and row of points of the globe in the grid of its patches."""
+        """Compute the column and row of points of the globe in the grid of its patches."""
         if self.between:
             column = dr.clip((x.y - self.first) * self.per_mm, 0, GLOBE_COLUMNS - 1)
             i = mi.UInt32(dr.minimum(column, GLOBE_COLUMNS - 1.001))
@@ -113,7 +113,7 @@ class RadiosityField:
         return _around(self.iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float)
 
     def iris_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Ring and turn of points in the plane of the iris among the patches of the chamber."""
+        """Compute the ring and turn of points in the plane of the iris among the patches of the chamber."""
         turn = dr.atan2(x.z, x.y) * (IRIS_TURNS * 0.5 * dr.inv_pi) - 0.5
         r2 = x.y * x.y + x.z * x.z
         beyond = dr.maximum(r2 - self.root2, 0) * ((IRIS_RINGS - ROOT_RINGS) / (self.reach2 - self.root2))
@@ -121,11 +121,11 @@ class RadiosityField:
         return ring, dr.select(turn < 0, turn + IRIS_TURNS, turn)
 
     def at_background(self, x: mi.Vector3f) -> mi.Vector4f:
-        """Numbers of points of the background's plane, given in the scene's frame."""
+        """List numbers of points of the background's plane, given in the scene's frame."""
         return _around(self.background, *self.background_place(x), RINGS, TURNS, mi.Vector4f)
 
     def background_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Ring and turn of points of the background's plane among its patches."""
+        """Compute the ring and turn of points of the background's plane among its patches."""
         y, z, inner = self.plane
         dy, dz = x.y - y, x.z - z
         out = dr.maximum(dr.sqrt(dy * dy + dz * dz) - inner, 0) / PLANE_FIRST_MM
@@ -135,7 +135,7 @@ class RadiosityField:
 
 
 def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int, beyond: float) -> mi.Vector4f:
-    """Interpolate between columns and rows, and extrapolate by so many rows beyond the last ones."""
+    """Interpolate between columns and rows, and extrapolate by a number of rows beyond the last ones."""
     column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, -beyond, rows - 1.001 + beyond)
     i, j = mi.UInt32(column), mi.UInt32(dr.clip(row, 0, rows - 1.001))
     s, t = column - mi.Float(i), row - mi.Float(j)

@@ -76,18 +76,18 @@ class ReliefGrid:
     count: mi.UInt32
 
     def nodes(self, number: int) -> tuple[mi.UInt32, mi.UInt32]:
-        """Columns and rows of all nodes, of which there are so many, row by row."""
+        """List the columns and rows of all nodes, row by row."""
         index = dr.arange(mi.UInt32, number)
         row = index // self.count
         return index - row * self.count, row
 
     def point(self, column: mi.Float, row: mi.Float) -> mi.Vector3f:
-        """Point of the plane (eye frame) at a place of the grid."""
+        """Compute the point of the plane (eye frame) at a place of the grid."""
         per = 2 * self.half / mi.Float(self.count - 1)
         return self.stop.centre + (column * per - self.half) * self.stop.u + (row * per - self.half) * self.stop.v
 
     def cell(self, x: mi.Vector3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float]:
-        """Column and row of the cell of a point of the plane, and the place in it."""
+        """Compute the column and row of the cell of a point of the plane, and the place in it."""
         q, most = x - self.stop.centre, mi.Float(self.count) - 1.001
         scale = 0.5 * mi.Float(self.count - 1) / self.half
         u, v = (dr.clip((dr.dot(q, axis) + self.half) * scale, 0, most) for axis in (self.stop.u, self.stop.v))
@@ -153,7 +153,7 @@ class IrisRelief:
         return cls(count=side, raised=dr.opaque(mi.Bool, True), heights=shape.corners, shades=shades)
 
     def hit(self, frame: Frame, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-        """Foot in the plane (eye frame) of the place that rays meet.
+        """Compute the foot in the plane (eye frame) of the place that rays meet.
 
         Args:
             frame: the frame.
@@ -168,7 +168,7 @@ class IrisRelief:
         return dr.select(active, x + z * slant, x)
 
     def at(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """The q of the module's docstring at feet `x`."""
+        """Return the q of the module's docstring at feet `x`."""
         active &= self.raised
         return dr.select(active, relief_grid(frame, self.count).interpolate(self.shades, x, active), 1)
 
@@ -190,7 +190,7 @@ class ReliefSize(NamedTuple):
 
 
 def relief_grid(frame: Frame, count: mi.UInt32) -> ReliefGrid:
-    """Make the grid over the iris with so many nodes along a side."""
+    """Make the grid over the iris with the given number of nodes along a side."""
     return ReliefGrid(stop=frame.stop, half=frame.iris.root_radius + _SPARE_MM, count=count)
 
 
@@ -233,7 +233,7 @@ def relief_shape(
 
 @syntax
 def _highest_nearby(heights: mi.Float, side: mi.UInt32, about: mi.UInt32, blocks: int) -> mi.Float:
-    """Largest of the heights in and about every block of cells."""
+    """Compute the largest of the heights in and about every block of cells."""
     index, last = dr.arange(mi.UInt32, blocks * blocks), side - 1
     count = last // _BLOCK + 1  # the same as `blocks`, but no kernel is compiled for it
     down = index // count
@@ -317,7 +317,7 @@ def _shades(
 def _hidden(
     grid: ReliefGrid, corners: mi.Float, x: mi.Vector3f, h: mi.Float, way: mi.Vector3f, above: mi.Float
 ) -> mi.Float:
-    """Share by which heights beside points hide what lies in the direction `way`, 0 to 1.
+    """Compute the share by which heights beside points hide what lies in the direction `way`, 0 to 1.
 
     above: how much higher than the points these heights are at most, mm.
     """
@@ -331,7 +331,7 @@ def _hidden(
 
 
 def _rise(k: mi.UInt32) -> mi.Float:
-    """Height (mm) of step k of a search above its start; the steps grow."""
+    """Compute the height (mm) of step k of a search above its start; the steps grow."""
     part = mi.Float(k + 1) / _STEPS
     return _REACH_MM * part * part
 

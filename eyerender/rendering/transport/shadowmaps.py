@@ -77,7 +77,7 @@ def _marked(
     table: mi.Float, skin: SkinGeometry, hairs: mi.Float, on_device: tuple[mi.UInt32, mi.UInt32],
     counts: tuple[int, int], lamps: int,
 ) -> mi.UInt8:  # fmt: skip
-    """The marks of all lamps, from triangles of the sheet and from pieces of hairs.
+    """Return the marks of all lamps, from triangles of the sheet and from pieces of hairs.
 
     Their `counts` are on the device, too, else they would be compiled into the kernels.
     """
@@ -152,7 +152,7 @@ def _mark(
 
 
 def _pieces(region: RegionMesh) -> Singles:
-    """Straight pieces (n, 2, 4) of the hairs of a region, whose ends have a 0 as a fourth number."""
+    """Compute straight pieces (n, 2, 4) of the hairs of a region, whose ends have a 0 as a fourth number."""
     curves = [c for c in region.strands[:HAIRS] if c.size]
     pieces = np.zeros((sum(c.shape[0] * (c.shape[1] - 1) for c in curves), 2, 4), np.float32)
     first = 0
@@ -220,14 +220,14 @@ class _Edge:
         return cls(*best, area * dr.rsqrt(dr.maximum(size, 1e-12)))
 
     def distance2(self, u: mi.Float, v: mi.Float) -> mi.Float:
-        """Squared distance of points from the edge."""
+        """Compute the squared distance of points from the edge."""
         x, y = u - self._u, v - self._v
         t = dr.clip((x * self._du + y * self._dv) * self._inverse, 0, 1)
         return dr.square(x - t * self._du) + dr.square(y - t * self._dv)
 
 
 def shadow_map_table(lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float) -> Singles:
-    """Numbers of the views of lamps (lamps, 16), with NumPy alone.
+    """List numbers of the views of lamps (lamps, 16), with NumPy alone.
 
     Args:
         lights: the lamps.
@@ -239,7 +239,7 @@ def shadow_map_table(lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float)
 
 
 def _frame(lamp: Lamp, anchor_mm: Floats, reach_mm: float) -> list[float]:
-    """Numbers of a lamp's view, in the scene's frame."""
+    """List numbers of a lamp's view, in the scene's frame."""
     origin = np.asarray(lamp.position_mm - anchor_mm, dtype=float)
     distance = float(np.linalg.norm(origin))
     axis = -origin / distance if distance > 0 else np.array([-1.0, 0.0, 0.0])

@@ -32,7 +32,7 @@ class Bilinear:
     down: mi.Float
 
     def interpolate(self, kind: Any, buffer: mi.Float, each: mi.UInt32 | int = 1, which: mi.UInt32 | int = 0) -> Any:
-        """Interpolate the numbers of cells, each of which has so many."""
+        """Interpolate the numbers of cells; each cell has the same number of them."""
         a, b, c, d = (dr.gather(kind, buffer, n * each + which) for n in self.numbers)
         high, low = a + self.across * (b - a), c + self.across * (d - c)
         return high + self.down * (low - high)
@@ -55,12 +55,12 @@ class SheetSize:
     columns: mi.UInt32
 
     def place(self, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Row and column at coordinates of the map of the skin."""
+        """Return the row and column at coordinates of the map of the skin."""
         rows, columns = (mi.Float(n) for n in (self.rows, self.columns))
         return v * ((SHEET_ROWS + BANDS) / SHEET_ROWS) * rows - 0.5, u * columns - 0.5
 
     def cells(self, row: mi.Float, column: mi.Float, level: int) -> Bilinear:
-        """Cells of the grid reduced by 2^level, about places in units of its finest cells."""
+        """Return cells of the grid reduced by 2^level, about places in units of its finest cells."""
         rows, columns, scale = self.rows >> level, self.columns >> level, 1 / (1 << level)
         u = (column + 0.5) * scale - 0.5
         u = dr.select(u < 0, u + mi.Float(columns), u)
@@ -98,7 +98,7 @@ class SheetGrid:
         return cls(rows=cells.rows, columns=cells.columns, size=size, cells=numbers, edges=edges, middles=middles)
 
     def vertex_row(self, row: mi.UInt32, share: mi.Float) -> mi.Float:
-        """Row of the sheet's vertices at a share of the grid's rows."""
+        """Return the row of the sheet's vertices at a share of the grid's rows."""
         a, b = (dr.gather(mi.Float, self.edges, row + k) for k in (0, 1))
         return a + share * (b - a)
 
@@ -175,7 +175,7 @@ class GlobeGrid:
 
 
 def globe_cells(row: mi.Float, column: mi.Float) -> Bilinear:
-    """Cells of the grid over the globe about places."""
+    """Return cells of the grid over the globe about places."""
     u = dr.clip(column, 0, SIDE - 1.001)
     j = mi.UInt32(u)
     return _between_rows(row, SIDE, SIDE, (j, j + 1), u - mi.Float(j))
@@ -189,7 +189,7 @@ def globe_place(n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
 
 
 def globe_direction(row: mi.Float, column: mi.Float) -> mi.Vector3f:
-    """Directions (scene's frame) of places of the grid over the globe."""
+    """Compute directions (scene's frame) of places of the grid over the globe."""
     a, b = ((k - 0.5 * (SIDE - 1)) * (WIDTH / SIDE) for k in (column, row))
     q = a * a + b * b
     k = dr.sqrt(dr.maximum(1 - 0.25 * q, 0))

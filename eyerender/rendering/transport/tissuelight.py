@@ -66,7 +66,7 @@ class _Cells:
 
 
 def light_on_skin(scene: TissueScene, grid: SheetGrid) -> tuple[mi.Float, mi.Float]:
-    """Irradiance of the grid over the skin, and the share of each lamp that coarse cells see, cell by cell."""
+    """Find the irradiance of the grid over the skin, and the share of each lamp that coarse cells see, cell by cell."""
     flux, seen = _flux_on_skin(scene, grid)
     skin, index, columns = scene.frame.region, grid.cells[0], grid.size.columns
     row, column = index // columns, index % columns
@@ -112,7 +112,7 @@ def _coarse_cells(frame: Frame, grid: SheetGrid) -> _Cells:
 def _skin_point(
     frame: Frame, grid: SheetGrid, row: mi.UInt32, column: mi.UInt32, s: mi.Float, t: mi.Float
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Point and normal (scene's frame) at shares s and t of the way through a coarse cell, across and down.
+    """Compute the point and normal (scene's frame) at shares s and t of the way through a coarse cell, across and down.
 
     The conjunctiva dips into the globe where both join. Neither shades the other there.
     """
@@ -126,7 +126,7 @@ def _skin_point(
 
 @syntax
 def _lamp_on_skin(scene: TissueScene, grid: SheetGrid, cells: _Cells, i: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
-    """Vector F (eye frame) of lamp i at coarse cells, and the share of the lamp that they see."""
+    """Compute the vector F (eye frame) of lamp i at coarse cells, and the share of the lamp that they see."""
     frame, lamp = scene.frame, scene.frame.lights[i]
     before = scene.wide | (dr.dot(lamp.position - cells.x, cells.normal) > 0)
     clear = frame.caches.shadow_maps.at(i, cells.middle, before)
@@ -150,7 +150,7 @@ def _lamp_on_skin(scene: TissueScene, grid: SheetGrid, cells: _Cells, i: mi.UInt
 
 
 def light_on_globe(scene: TissueScene, grid: GlobeGrid, size: SheetSize, skin: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Irradiance of the grid over the globe, and the share of each lamp that cells see, cell by cell.
+    """Compute the irradiance of the grid over the globe, and the share of each lamp that cells see, cell by cell.
 
     Args:
         scene: the scene.
@@ -185,7 +185,7 @@ def _lamps_on_globe(scene: TissueScene, index: mi.UInt32) -> tuple[mi.Float, mi.
 
 @syntax
 def _lamp_on_globe(scene: TissueScene, index: mi.UInt32, i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Irradiance of cells of the globe from lamp i, and the share of the lamp that they see."""
+    """Compute the irradiance of cells of the globe from lamp i, and the share of the lamp that they see."""
     frame, lamp = scene.frame, scene.frame.lights[i]
     k, total, free = mi.UInt32(0), mi.Float(0), mi.Float(0)
     while dr.hint(k < scene.globe_rays, label="in cells", exclude=[scene, frame, lamp]):
@@ -207,7 +207,7 @@ def _lamp_on_globe(scene: TissueScene, index: mi.UInt32, i: mi.UInt32) -> tuple[
 
 
 def _globe_surface(frame: Frame, n: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Point and normal (eye frame) of the globe along directions (scene's frame) from its centre."""
+    """Compute the point and normal (eye frame) of the globe along directions (scene's frame) from its centre."""
     away = 8.0
     d = frame.vector_to_eye(n)
     o = frame.sclera.centre + (frame.sclera.radius + away) * d
@@ -237,7 +237,7 @@ def _through_lids(scene: TissueScene, index: mi.UInt32, size: SheetSize, lit: mi
 def _next_surface(
     frame: Frame, o: mi.Vector3f, d: mi.Vector3f, first: mi.Float, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """First hit along rays beyond a distance and within a lid's thickness; its t counts from the start."""
+    """Compute the first hit along rays beyond a distance and within a lid's thickness; its t counts from the start."""
     ray = mi.Ray3f(mi.Point3f(o + first * d), d)
     ray.maxt = _LID_MM - first
     hit = frame.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
@@ -246,7 +246,7 @@ def _next_surface(
 
 
 def _sequence(index: mi.UInt32, key: int, k: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """The k-th of places in [0, 1)^2 that fill it evenly, shifted from cell to cell."""
+    """Return the k-th of places in [0, 1)^2 that fill it evenly, shifted from cell to cell."""
     shift = mi.sample_tea_32(index, mi.UInt32(_KEYS[key]))
     u, v = (
         mi.Float((s + k * mi.UInt32(round(a * 2**32))) >> 8) * (2.0**-24) for s, a in zip(shift, _ALPHA, strict=True)
