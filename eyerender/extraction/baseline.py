@@ -64,7 +64,7 @@ def contour_pupil(
 
 
 def _likely(contour: NDArray[Any], shape: tuple[int, ...], low: float, high: float) -> bool:
-    """Whether a contour has the size and the shape of a pupil and does not touch the frame."""
+    """Return whether a contour has the size and the shape of a pupil and does not touch the frame."""
     x, y, w, h = cv2.boundingRect(contour)
     cut = x == 0 or y == 0 or x + w == shape[1] or y + h == shape[0]
     area = cv2.contourArea(contour)

@@ -55,5 +55,5 @@ def _cross(out: Bytes, centre: Floats, size: float, colour: tuple[int, int, int]
 
 
 def _fixed(points: Floats) -> NDArray[np.int32]:
-    """Points in OpenCV's fixed-point coordinates."""
+    """Compute points in OpenCV's fixed-point coordinates."""
     return np.rint(np.clip(points, -1e4, 1e5) * (1 << _SHIFT)).astype(np.int32)

@@ -52,7 +52,7 @@ def extract_eyes(
 
 
 def _moved(found: Extraction, x0: int, shape: tuple[int, int]) -> Extraction:
-    """A result of a part of the image that begins at column x0, in the whole image."""
+    """Return a result of a part of the image that begins at column x0, in the whole image."""
     shift = np.array([float(x0), 0.0])
     glints, rejected = (
         tuple(replace(one, xy_px=one.xy_px + shift) for one in several) for several in (found.glints, found.rejected)

@@ -111,7 +111,7 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
 
 
 def _better(pixels: PupilResult, edges: PupilResult) -> bool:
-    """Whether the pupil by the pixels is as certain as that by the edges.
+    """Return whether the pupil by the pixels is as certain as that by the edges.
 
     Where a lid cuts the outline, it must also be closer to the truth by the covariances: the lid's shadow reaches the
     pixels beside the edges.
@@ -123,14 +123,14 @@ def _better(pixels: PupilResult, edges: PupilResult) -> bool:
 
 
 def _deviation(pupil: PupilResult) -> float:
-    """Standard deviation of a pupil's boundary, px; infinite if it is missing."""
+    """Compute the standard deviation of a pupil's boundary, px; infinite if it is missing."""
     if pupil.ellipse is None or pupil.covariance is None:
         return math.inf
     return boundary_deviation(pupil.ellipse, pupil.covariance)
 
 
 def _iris_level(prepared: Prepared, found: PupilCandidate, model: EdgeModel) -> float:
-    """Level just outside the seen parts of the boundary, in the image as it is."""
+    """Compute the level just outside the seen parts of the boundary, in the image as it is."""
     away = 1.5 * model.sigma_px + 1.0
     levels = levels_beside(model.ellipse.numbers(), away, prepared.linear, (0, 0), NO_PATCH)
     return median(levels[found.sectors])
@@ -187,7 +187,7 @@ def _boundary_fit(
 
 
 def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> Bools | None:
-    """Spots (n,) whose window reaches the boundary, or None."""
+    """Compute spots (n,) whose window reaches the boundary, or None."""
     apart = np.abs(signed_distance(model.ellipse, spots.xy_px))
     on_boundary = fit.converged & (apart < window_radius(spots.width_px) + 3.0 * model.sigma_px)
     return np.asarray(on_boundary) if on_boundary.any() else None
@@ -211,7 +211,7 @@ def _fitted_again(
 
 
 def _agrees(fit: PixelFit, found: PupilCandidate) -> bool:
-    """Whether the refined boundary agrees with the edges everywhere, not on average only.
+    """Return whether the refined boundary agrees with the edges everywhere, not on average only.
 
     Noise and texture leave a tenth of the points farther from it than 1.6 standard deviations, light that the model
     mistakes for iris (a ring of glints) an arc of them much farther.
@@ -239,7 +239,7 @@ def _fit_spots(prepared: Prepared, found: PupilCandidate, spots: Spots) -> tuple
 
 
 def _background(work: Prepared, model: EdgeModel) -> Callable[[Floats, Floats], Floats]:
-    """Level without spots at pixels (x, y), up to a constant, which the spots' fit contains."""
+    """Compute the level without spots at pixels (x, y), up to a constant, which the spots' fit contains."""
     return (lambda x, y: -model.level(x, y)) if work.inverted else model.level
 
 

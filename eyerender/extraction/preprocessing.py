@@ -46,7 +46,7 @@ class Prepared:
     scale: int = 1
 
     def reduced(self, scale: int) -> Prepared:
-        """The image at 1 / scale of the size, with the noise that it has there."""
+        """Return the image at 1 / scale of the size, with the noise that it has there."""
         if scale == 1:
             return self
         height, width = (scale * (side // scale) for side in self.linear.shape)

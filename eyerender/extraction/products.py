@@ -44,7 +44,7 @@ def solve(matrix: Floats, right: Floats) -> None:
 
 @inlined
 def largest_size(values: Floats) -> float:
-    """Largest absolute value of (n,) values; 0 for none, NaN if one is NaN."""
+    """Compute the largest absolute value of (n,) values; 0 for none, NaN if one is NaN."""
     out = 0.0
     for i in range(values.size):
         size = abs(values[i])

@@ -13,18 +13,18 @@ from ..jit import compiled, inlined
 
 
 def median(values: NDArray[Any]) -> float:
-    """Median of (n,) values: the mean of the middle two where n is even, NaN for none."""
+    """Compute the median of (n,) values: the mean of the middle two where n is even, NaN for none."""
     return quantile(values, 0.5)
 
 
 def quantile(values: NDArray[Any], share: float) -> float:
-    """Value below which `share` of (n,) values of any type lie, by linear interpolation; NaN for none."""
+    """Compute the value below which `share` of (n,) values of any type lie, by linear interpolation; NaN for none."""
     return quantile_of(np.asarray(values, dtype=np.float64), share)
 
 
 @compiled("f8[::1], f8")
 def quantile_of(values: Floats, share: float) -> float:
-    """Value below which `share` of (n,) values lie, by linear interpolation; NaN for none."""
+    """Compute the value below which `share` of (n,) values lie, by linear interpolation; NaN for none."""
     if values.size == 0:
         return math.nan
     at = share * (values.size - 1)

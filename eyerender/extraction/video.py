@@ -60,7 +60,7 @@ class Frame:
 
 
 def is_video(path: str | Path) -> bool:
-    """Whether a name is that of a video."""
+    """Return whether a name is that of a video."""
     return Path(path).suffix.lower() in SUFFIXES
 
 

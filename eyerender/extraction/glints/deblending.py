@@ -71,7 +71,7 @@ def give_edges(fitted: FittedSpots, blur_px: float, widest_px: float, limits: Li
 
 
 def _unexplained(fit: SpotFit, noise_dn: float, most: float) -> Bools:
-    """Spots (n,) whose residual is too large for a single glint, but at most `most` of their height."""
+    """Compute spots (n,) whose residual is too large for a single glint, but at most `most` of their height."""
     least = np.maximum(UNEXPLAINED * noise_dn, UNLIKE_BELL * fit.amplitude_dn)
     most_dn = most * np.minimum(fit.amplitude_dn, DN)
     return np.asarray(fit.converged & (fit.residual_dn > least) & (fit.residual_dn < most_dn))

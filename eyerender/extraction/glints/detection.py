@@ -110,14 +110,14 @@ def detect_spots(
 
 @inlined
 def _level(image: Image, x: float, y: float) -> float:
-    """Level of the pixel nearest to a point."""
+    """Compute the level of the pixel nearest to a point."""
     column = int(np.rint(min(max(x, 0.0), image.shape[1] - 1.0)))
     return image[int(np.rint(min(max(y, 0.0), image.shape[0] - 1.0))), column]
 
 
 @inlined
 def _is_free(xy: Floats, disc: Floats, outer: float, k: int, x: float, y: float) -> bool:
-    """Whether a point on the ring of spot k lies in the disc of no other spot."""
+    """Return whether a point on the ring of spot k lies in the disc of no other spot."""
     for m in range(disc.size):
         apart2 = (xy[m, 0] - xy[k, 0]) ** 2 + (xy[m, 1] - xy[k, 1]) ** 2
         if 0.0 < apart2 < (outer + disc[m]) ** 2 and (x - xy[m, 0]) ** 2 + (y - xy[m, 1]) ** 2 <= disc[m] ** 2:
@@ -162,7 +162,7 @@ def optics_sigma(blur_px: float) -> float:
 
 
 def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
-    """Whether the level falls by at least a third of the height in 9 of 12 directions, 2.5 sigma from the peak.
+    """Return whether the level falls by at least a third of the height in 9 of 12 directions, 2.5 sigma from the peak.
 
     This rejects strips of sclera and the corners between lid and iris. A glint beside another one or on an edge passes.
     """
@@ -176,7 +176,7 @@ def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
 
 @compiled("f4[:,::1], f8[:,::1], i8, f8")
 def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> Indices:
-    """Indices of the maxima xy (n, 2) that are spots of their own, in the given order.
+    """Compute indices of the maxima xy (n, 2) that are spots of their own, in the given order.
 
     Two maxima count as one spot unless the level between them falls by `dip` below the lower one, or they are farther
     apart than `size`. The flat tops of clipped spots have several maxima, and so have wide spots with noise.
@@ -209,14 +209,14 @@ def _no_spots() -> Spots:
 
 
 def _opening(half: Image, size: int) -> Image:
-    """Level around spots: a square morphological opening of `size` px. Half resolution is enough for it."""
+    """Compute level around spots: a square morphological opening of `size` px. Half resolution is enough for it."""
     side = 2 * (size // 4) + 1
     return as_image(cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)))
 
 
 @inlined
 def _highest(image: Image, y: int, x: int) -> bool:
-    """Whether no neighbour of a pixel is brighter."""
+    """Return whether no neighbour of a pixel is brighter."""
     for j in range(max(y - 1, 0), min(y + 2, image.shape[0])):
         for i in range(max(x - 1, 0), min(x + 2, image.shape[1])):
             if image[j, i] > image[y, x]:

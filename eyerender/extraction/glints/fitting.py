@@ -123,7 +123,7 @@ def no_fit() -> FittedSpots:
 
 
 def _distance(start: Floats) -> Floats:
-    """Distances (n, n) between spots; infinite on the diagonal."""
+    """Compute distances (n, n) between spots; infinite on the diagonal."""
     gap = start[:, None] - start
     out: Floats = np.sqrt((gap * gap).sum(axis=-1))
     np.fill_diagonal(out, np.inf)
@@ -164,7 +164,7 @@ def _start(pixels: SpotPixels, start: Floats, width: Floats, height: Floats, tou
 
 
 def _ring_level(pixels: SpotPixels, rest: Floats) -> Floats:
-    """Mean level (n,) along the edges of the windows."""
+    """Compute the mean level (n,) along the edges of the windows."""
     ring = pixels.dx * pixels.dx + pixels.dy * pixels.dy > ((pixels.radius - 1.0) ** 2)[pixels.spot]
     return pixels.total(rest * ring) / np.maximum(pixels.total(ring), 1.0)
 

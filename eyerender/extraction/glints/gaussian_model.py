@@ -77,7 +77,7 @@ class Descent:
 
 @compiled("f8[:,::1], f8[:,::1]")
 def lost(theta: Floats, start: Floats) -> Bools:
-    """Whether spots (n,) have grown or moved more than a glint can."""
+    """Return whether spots (n,) have grown or moved more than a glint can."""
     out = np.empty(theta.shape[0], dtype=np.bool_)
     for s in range(out.size):
         wide = max(theta[s, 3], theta[s, 4]) > math.log(LOST_PX)
@@ -87,7 +87,7 @@ def lost(theta: Floats, start: Floats) -> Bools:
 
 @compiled("f8[:,::1], f8[:,:,::1], f8[::1], f8")
 def promising(theta: Floats, gram: Floats, used: Floats, noise: float) -> Bools:
-    """Whether the fit roughly explains spots (n,) (see ROUGH and ROUGH_SHARE)."""
+    """Return whether the fit roughly explains spots (n,) (see ROUGH and ROUGH_SHARE)."""
     out, k = np.empty(theta.shape[0], dtype=np.bool_), theta.shape[1]
     for s in range(out.size):
         misfit = noise * math.sqrt(gram[s, k, k] / max(used[s], 1.0))
@@ -96,7 +96,7 @@ def promising(theta: Floats, gram: Floats, used: Floats, noise: float) -> Bools:
 
 
 def slopes(pixels: SpotPixels, theta: Floats, rest: Floats, blur_px: float | None = None) -> Floats:
-    """Derivatives (K + 1, P) of the model at every pixel and, in the last row, the residual.
+    """Compute derivatives (K + 1, P) of the model at every pixel and, in the last row, the residual.
 
     Args:
         pixels: P pixels of n spots.
@@ -147,7 +147,7 @@ def _add_edge(begin: int, end: int, plane: Floats, theta: Floats, blur_px: float
 
 
 def prior(limits: Limits, edge: bool) -> Floats:
-    """Normal matrix (K, K) of the priors, all with mean 0.
+    """Compute the normal matrix (K, K) of the priors, all with mean 0.
 
     They favour a nearly round spot, a background that is flat to within its slope, and an edge of at most full scale
     within reach.
@@ -164,7 +164,7 @@ def prior(limits: Limits, edge: bool) -> Floats:
 def _gram(
     first: Indices, clip: Bools, rows: Floats, theta: Floats, noise: float, penalty: Floats
 ) -> tuple[Floats, Floats]:
-    """Products of the `slopes`, summed over each spot's pixels, with the priors, in units of the noise.
+    """Compute products of the `slopes`, summed over each spot's pixels, with the priors, in units of the noise.
 
     Returns:
         (n, K + 1, K + 1) products, and (n,) number of pixels that count. A clipped pixel does not count where the model
@@ -223,7 +223,7 @@ def _finish(step: Floats, trial: Floats, theta: Floats) -> None:
 
 @inlined
 def _progress(theta: Floats, middle: Floats, gram: Floats, cost: Floats) -> tuple[Floats, Bools]:
-    """How far each spot (n,) moved since the middle of the steps, and whether its squared misfit halved."""
+    """Say how far each spot (n,) moved since the middle of the steps, and whether its squared misfit halved."""
     n, k = theta.shape
     moved, falling = np.empty(n), np.empty(n, np.bool_)
     for s in range(n):

@@ -30,7 +30,7 @@ class Assignment:
 
     Attributes:
         light: (m,) index of every glint's light, -1 for none.
-        reasons: why a glint has no light; None for the others.
+        reasons: why a glint has no light; None where it has one.
         residual_px: (m,) distance to the place expected after shift and scale; 0 where there is no light.
         shift_px: (2,) shift of the layout that fitted.
         scale: scale of the layout that fitted.
@@ -44,7 +44,7 @@ class Assignment:
 
 
 def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLike, lights_mm: ArrayLike) -> Floats:
-    """Points (l, 3) of a sphere that mirror the lights to the camera: the normal bisects the two directions.
+    """Compute points (l, 3) of a sphere that mirror the lights to the camera: the normal bisects the two directions.
 
     The fixed-point iteration n <- (unit to camera + unit to light) / |...| from the point centre + radius n contracts
     by about radius / distance.
@@ -295,7 +295,7 @@ def _refitted(
     scale: float,
     span: tuple[float, float],
 ) -> tuple[Floats, float]:
-    """Least-squares shift and scale of a match."""
+    """Compute the least-squares shift and scale of a match."""
     placed = match >= 0
     if not placed.any():
         return shift, scale
@@ -325,7 +325,7 @@ def _merit(
 
 
 def _contradicts(first: tuple[int, ...], second: tuple[int, ...]) -> bool:
-    """Whether two matches name different lights for a glint, or different glints for a light."""
+    """Return whether two matches name different lights for a glint, or different glints for a light."""
     if any(a != b for a, b in zip(first, second, strict=True) if a >= 0 and b >= 0):
         return True
     where = {light: i for i, light in enumerate(second) if light >= 0}

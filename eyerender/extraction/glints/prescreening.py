@@ -32,7 +32,7 @@ def gaussian_like(
     clip_dn: float,
     which: Bools | None = None,
 ) -> Bools:
-    """Whether the pixels around each spot form a bell (m,). Skin, lashes and the gaps between lashes do not.
+    """Return whether the pixels around each spot form a bell (m,). Skin, lashes and the gaps between lashes do not.
 
     The level within 2.2 sigma + 1 px of the peak is fitted by linear least squares. Pixels nearer to another spot are
     left out. The model is
@@ -57,7 +57,7 @@ def gaussian_like(
 
 @inlined
 def _owns(xy: Floats, k: int, reach: float, dx: float, dy: float) -> bool:
-    """Whether a pixel beside spot k is nearer to it than to any other."""
+    """Return whether a pixel beside spot k is nearer to it than to any other."""
     for m in range(xy.shape[0]):
         gx, gy = xy[m, 0] - xy[k, 0], xy[m, 1] - xy[k, 1]
         apart2 = gx * gx + gy * gy
@@ -86,7 +86,7 @@ def _patch(linear: Image, xy: Floats, k: int, reach: float, clip_dn: float, out:
 
 @inlined
 def _elongation(pixels: Floats, tall: float) -> float:
-    """Ratio of the standard deviations along and across a patch (n, 3) of offsets and levels.
+    """Compute the ratio of the standard deviations along and across a patch (n, 3) of offsets and levels.
 
     Only the part above a third of the height counts.
     """
@@ -105,7 +105,7 @@ def _elongation(pixels: Floats, tall: float) -> float:
 
 @inlined
 def _is_bell(pixels: Floats, sigma: float, tall: float, noise_dn: float) -> bool:
-    """Whether the levels of a patch (n, 3) of offsets and levels form a bell."""
+    """Return whether the levels of a patch (n, 3) of offsets and levels form a bell."""
     n, mean = pixels.shape[0], 0.0
     terms, gram = np.empty((8, n)), np.zeros((8, 8))
     for i in range(n):

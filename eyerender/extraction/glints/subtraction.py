@@ -22,7 +22,7 @@ SPARE_PX = 36.0  # the band of the pixel model and the centres of spots reach so
 
 
 def well_fitted(prepared: Prepared, fit: SpotFit) -> Bools:
-    """Whether spots (n,) have a fit good enough to subtract their light."""
+    """Return whether spots (n,) have a fit good enough to subtract their light."""
     return np.asarray(fit.converged & (fit.residual_dn < WELL_FITTED * prepared.noise_dn))
 
 
@@ -33,7 +33,7 @@ def part_about(linear: Image, ellipse: Ellipse) -> Part:
 
 
 def affected_pixels(prepared: Prepared, part: Part, spots: Spots, which: Bools | None = None) -> Bools:
-    """Mask (h, w) of a part's pixels affected by spots (`which` of them, or all), clutter or saturation.
+    """Compute the mask (h, w) of a part's pixels affected by spots (`which` of them, or all), clutter or saturation.
 
     The extent of a spot follows from its detected height and width.
     """
@@ -45,7 +45,7 @@ def affected_pixels(prepared: Prepared, part: Part, spots: Spots, which: Bools |
 
 
 def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools:
-    """Mask (h, w) of the clipped pixels and those nearer to a place (n, 2) than its radius (n,)."""
+    """Compute the mask (h, w) of the clipped pixels and those nearer to a place (n, 2) than its radius (n,)."""
     mask = linear >= clip_dn
     for (x, y), far in zip(xy.tolist(), radius.tolist(), strict=True):
         rows, columns = _window(x, y, far, mask.shape)
@@ -105,12 +105,12 @@ def _subtracted(linear: Image, spots: Floats, radius: Floats, limit: float) -> t
 
 
 def _reach(sigma: Floats, peak: Floats, noise_dn: float) -> Floats:
-    """Distance (n,) from the peak at which a Gaussian spot falls to FAINT standard deviations of the noise."""
+    """Find the distance (n,) from the peak at which a Gaussian spot falls to FAINT standard deviations of the noise."""
     return np.asarray(sigma * np.sqrt(2.0 * np.log(np.maximum(peak / (FAINT * noise_dn), math.e))))
 
 
 def _window(x: float, y: float, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of an image within `radius` of a point, along each axis."""
+    """List rows and columns of an image within `radius` of a point, along each axis."""
     columns = slice(max(0, math.floor(x - radius)), min(shape[1], math.ceil(x + radius) + 1))
     rows = slice(max(0, math.floor(y - radius)), min(shape[0], math.ceil(y + radius) + 1))
     return slice(rows.start, max(rows.stop, rows.start)), slice(columns.start, max(columns.stop, columns.start))

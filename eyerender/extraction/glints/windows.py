@@ -24,7 +24,7 @@ LARGEST_PX = 20  # radius of a window at most
 
 
 def window_radius(width: Floats) -> Floats:
-    """Radius, px, of the pixels to which a spot of that sigma is fitted."""
+    """Compute the radius, px, of the pixels to which a spot of that sigma is fitted."""
     return 2.7 * width + 1.2
 
 
@@ -82,11 +82,11 @@ class SpotPixels:
         return [values[..., begin:end] for begin, end in pairwise(ends)]
 
     def rows(self, spots: Indices) -> Indices:
-        """Indices of the pixels of given spots, in the order of the spots."""
+        """Compute indices of the pixels of given spots, in the order of the spots."""
         return _ranges(self.first[spots], self.first[spots + 1] - self.first[spots])
 
     def taken(self, spots: Indices) -> SpotPixels:
-        """Windows of the chosen spots."""
+        """Compute windows of the chosen spots."""
         if spots.size == self.radius.size and bool((spots == np.arange(spots.size)).all()):
             return self
         count = self.first[spots + 1] - self.first[spots]
@@ -107,11 +107,11 @@ class SpotPixels:
         )
 
     def total(self, values: NDArray[np.generic]) -> Floats:
-        """Sum (n,) of a value (P,) over each spot's pixels."""
+        """Compute the sum (n,) of a value (P,) over each spot's pixels."""
         return np.asarray(np.bincount(self.spot, weights=values, minlength=self.radius.size), dtype=np.float64)
 
     def most(self, values: Floats) -> Floats:
-        """Largest value (n,) of a value (P,) among each spot's pixels, at least 0."""
+        """Compute the largest value (n,) of a value (P,) among each spot's pixels, at least 0."""
         out = np.zeros(self.radius.size)
         some = self.first[:-1] < self.first[1:]
         if values.size:
@@ -120,14 +120,14 @@ class SpotPixels:
 
 
 def _starts(count: Indices) -> Indices:
-    """Cumulative sum 0, count[0], count[0] + count[1], ..., with the total at the end."""
+    """Compute the cumulative sum 0, count[0], count[0] + count[1], ..., with the total at the end."""
     out = np.zeros(count.size + 1, dtype=np.intp)
     np.cumsum(count, out=out[1:])
     return out
 
 
 def _ranges(first: Indices, count: Indices) -> Indices:
-    """Concatenated ranges first[0], first[0] + 1, ... (count[0] of them), first[1], ..."""
+    """Compute the concatenated ranges first[0], first[0] + 1, ... (count[0] of them), first[1], ..."""
     start = _starts(count)
     return np.asarray(np.arange(start[-1]) + np.repeat(first - start[:-1], count), dtype=np.intp)
 
@@ -195,7 +195,7 @@ def _windows(linear: Image, start: Floats, centre: Floats, radius: Floats) -> tu
 
 
 def shining_pairs(pixels: SpotPixels, theta: Floats, pairs: Bools, noise_dn: float) -> Indices:
-    """Pairs (m, 2) of a window and a spot whose light there rises above a small fraction of the noise.
+    """Compute pairs (m, 2) of a window and a spot whose light there rises above a small fraction of the noise.
 
     Args:
         pixels: the pixels of all windows.
@@ -212,7 +212,7 @@ def shining_pairs(pixels: SpotPixels, theta: Floats, pairs: Bools, noise_dn: flo
 
 @inlined
 def profile(low: float, sigma: float) -> tuple[float, float, float]:
-    """Integral of exp(-x^2 / (2 s^2)) over the pixel from `low` to `low` + 1, relative to the centre.
+    """Compute the integral of exp(-x^2 / (2 s^2)) over the pixel from `low` to `low` + 1, relative to the centre.
 
     Returns:
         The derivative by the centre, the value, and the derivative by ln s.
@@ -225,7 +225,7 @@ def profile(low: float, sigma: float) -> tuple[float, float, float]:
 
 @compiled(f"{WINDOWS}, f8[:,::1], i8[:,::1], i8")
 def light_of_others(windows: Windows, theta: Floats, pairs: Indices, count: int) -> Floats:
-    """Light (count,) of other spots in every spot's pixels.
+    """Compute the light (count,) of other spots in every spot's pixels.
 
     Args:
         windows: first, plane, centre and radius of `SpotPixels`.

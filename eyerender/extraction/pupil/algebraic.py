@@ -13,7 +13,7 @@ from ..products import solve
 
 @compiled("f8[:,:,::1]")
 def direct_fits(points: Floats) -> Floats:
-    """Direct ellipses (m, 5) through points (m, k, 2): centre, semi-axes and angle; NaN where there is none.
+    """Compute direct ellipses (m, 5) through points (m, k, 2): centre, semi-axes and angle; NaN where there is none.
 
     Source: Halir and Flusser (1998), for points that an affine map has made round.
     """
@@ -63,7 +63,7 @@ def _direct_fit(points: Floats, out: Floats) -> None:
 
 @inlined
 def _conic_moments(points: Floats, rounding: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Moments of p = u^2 + v^2 - 2, q = u^2 - v^2 and r = 2 u v of the round points (u, v).
+    """Compute moments of p = u^2 + v^2 - 2, q = u^2 - v^2 and r = 2 u v of the round points (u, v).
 
     Args:
         points: (k, 2).
@@ -91,7 +91,7 @@ def _conic_moments(points: Floats, rounding: tuple[float, ...]) -> tuple[tuple[f
 
 @inlined
 def _elliptic_direction(quadratic: tuple[float, ...]) -> tuple[float, float, float]:
-    """Unit vector w of the least w^T S w / w^T C w with C = diag(1, -1, -1), whose conic is an ellipse.
+    """Compute the unit vector w of the least w^T S w / w^T C w with C = diag(1, -1, -1), whose conic is an ellipse.
 
     The eigenvalue is the largest root of a cubic; two Rayleigh quotients polish it. `quadratic` holds S as 11, 12, 13,
     22, 23, 33.
@@ -147,7 +147,7 @@ def taubin_fit(points: Floats, out: Floats) -> bool:
 
 @inlined
 def _least_direction(scatter: Floats, gradient: Floats) -> Floats:
-    """The v (5,) of the least v^T S v / v^T G v, by inverse iteration; its largest element is 1 or -1."""
+    """Return the v (5,) of the least v^T S v / v^T G v, by inverse iteration; its largest element is 1 or -1."""
     ridge = 0.0
     for j in range(5):
         ridge += 1e-15 * scatter[j, j]
@@ -173,7 +173,7 @@ def _least_direction(scatter: Floats, gradient: Floats) -> Floats:
 
 @inlined
 def _unit(points: Floats) -> tuple[float, float, float]:
-    """Mean of points (n, 2) and their largest offset: what makes them small numbers about 0."""
+    """Compute the mean of points (n, 2) and their largest offset: what makes them small numbers about 0."""
     n, x, y, scale = points.shape[0], 0.0, 0.0, 0.0
     for i in range(n):
         x, y = x + points[i, 0] / n, y + points[i, 1] / n
@@ -205,7 +205,7 @@ def _scatter(points: Floats, mean_x: float, mean_y: float, scale: float) -> tupl
 
 @inlined
 def _axes(g11: float, g12: float, g22: float) -> tuple[float, float, float]:
-    """Semi-axes and angle of the ellipse with this shape matrix; NaN where there is none."""
+    """Compute semi-axes and angle of the ellipse with this shape matrix; NaN where there is none."""
     mean, half = 0.5 * (g11 + g22), 0.5 * (g11 - g22)
     major = mean + math.sqrt(half * half + g12 * g12)
     minor = (g11 * g22 - g12 * g12) / major

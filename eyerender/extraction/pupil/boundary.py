@@ -49,7 +49,7 @@ class PupilCandidate:
         return self.inside(self.boundary.ellipse, self.model.sigma_px)
 
     def inside(self, ellipse: Ellipse, blur_px: float) -> Interior:
-        """Statistics of the pixels inside an ellipse about the blob."""
+        """Compute statistics of the pixels inside an ellipse about the blob."""
         return inspect_interior(self.inpainted, ellipse, blur_px, self.image.noise_dn)
 
     @cached_property

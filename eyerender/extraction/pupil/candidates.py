@@ -98,7 +98,7 @@ def _reduced(linear: Image, factor: int, removal: int) -> Image:
 
 
 def _levels(small: Image, count: int) -> Floats:
-    """Thresholds: `count` at even levels, and a third as many at even areas.
+    """Compute thresholds: `count` at even levels, and a third as many at even areas.
 
     Some of them separate the pupil even if its step is faint or the image has a small dark backdrop.
     """
@@ -228,7 +228,7 @@ def _score(levels: Floats, filled: float, noise: float) -> float:
 
 @inlined
 def _different(blobs: Floats, levels: Floats, score: Floats, noise: float) -> Indices:
-    """Indices (k,) of different blobs that stand out, at most MOST_BLOBS, by score."""
+    """Compute indices (k,) of different blobs that stand out, at most MOST_BLOBS, by score."""
     kept, count, order = np.empty(MOST_BLOBS, dtype=np.int64), 0, _descending(score)
     for place in range(order.size):
         i = order[place]
@@ -243,7 +243,7 @@ def _different(blobs: Floats, levels: Floats, score: Floats, noise: float) -> In
 
 @inlined
 def _descending(values: Floats) -> Indices:
-    """Indices (n,) of values from the largest down; equal ones in their order."""
+    """Compute indices (n,) of values from the largest down; equal ones in their order."""
     out = np.empty(values.size, dtype=np.int64)
     for i in range(values.size):
         k = i
@@ -256,14 +256,14 @@ def _descending(values: Floats) -> Indices:
 
 @inlined
 def _inside(inner: Floats, outer: Floats) -> bool:
-    """Whether one blob of `_sweep` is well inside another one."""
+    """Return whether one blob of `_sweep` is well inside another one."""
     near = math.hypot(outer[0] - inner[0], outer[1] - inner[1]) < 0.6 * outer[3]
     return near and inner[2] * inner[3] < 0.6 * outer[2] * outer[3]
 
 
 @inlined
 def _core(inner: Floats, outer: Floats, noise: float) -> bool:
-    """Whether the levels (5,) of a blob, as of `_ring_levels`, show it as the dark core of another one."""
+    """Return whether the levels (5,) of a blob, as of `_ring_levels`, show it as the dark core of another one."""
     darker = outer[3] - inner[3] > max(0.1 * outer[1], 2.0 * noise)
     return darker and inner[2] > 0.55 and inner[1] > 0.12 * outer[1]
 
@@ -284,7 +284,7 @@ def _ring_levels(small: Image, blobs: Floats, noise: float) -> Floats:
 
 @inlined
 def _share_above(values: Floats, limit: float) -> float:
-    """Share of values (n,) above a limit."""
+    """Compute the share of values (n,) above a limit."""
     count = 0
     for i in range(values.size):
         count += values[i] > limit
@@ -293,7 +293,7 @@ def _share_above(values: Floats, limit: float) -> float:
 
 @inlined
 def _deviation(values: Floats) -> float:
-    """Standard deviation of values (n,)."""
+    """Compute the standard deviation of values (n,)."""
     total = square = 0.0
     for i in range(values.size):
         total += values[i]
@@ -343,7 +343,7 @@ def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
 
 @compiled("f4[:,::1], UniTuple(f8, 5)")
 def _levels_about(linear: Image, ellipse: tuple[float, ...]) -> tuple[float, float]:
-    """Level inside an ellipse (cx, cy, a, b, angle), and the step from its outer part to a ring outside.
+    """Compute the level inside an ellipse (cx, cy, a, b, angle), and the step from its outer part to a ring outside.
 
     They are medians of the means of 3 x 3 pixels along ellipses.
     """
@@ -354,7 +354,7 @@ def _levels_about(linear: Image, ellipse: tuple[float, ...]) -> tuple[float, flo
 
 @inlined
 def _same(first: Floats, second: Floats) -> bool:
-    """Whether two blobs of `_sweep` are the same object at two thresholds."""
+    """Return whether two blobs of `_sweep` are the same object at two thresholds."""
     near = math.hypot(first[0] - second[0], first[1] - second[1]) < 0.35 * min(first[3], second[3])
     return near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65
 
@@ -375,7 +375,7 @@ class Interior:
 
 
 def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
-    """Statistics of the pixels inside an ellipse, up to where the blur of the boundary begins.
+    """Compute statistics of the pixels inside an ellipse, up to where the blur of the boundary begins.
 
     The interior of a pupil is even. An iris has the pupil in its middle, and other objects have structure. Pixels that
     glints covered do not count. Medians and quartiles are used because of fainter reflections.
@@ -397,7 +397,7 @@ def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noi
 
 @compiled("f4[:,::1], b1[:,::1], UniTuple(f8, 5), f8")
 def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float) -> tuple[float, int, int, float]:
-    """Statistics of the pixels inside an ellipse (cx, cy, a, b, angle), up to the share `end` of its axes.
+    """Compute statistics of the pixels inside an ellipse (cx, cy, a, b, angle), up to the share `end` of its axes.
 
     Returns:
         Median of the ring below `end` minus that of the middle, the pixels of each, and the interquartile range of all.
@@ -436,7 +436,7 @@ def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float
 
 
 def find_inside(prepared: Prepared, inpainted: Inpainted, ellipse: Ellipse, shape: Shape) -> list[Candidate]:
-    """Candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
+    """Compute candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
     a, b = ellipse.semi_axes_px.tolist()
     columns, rows = around(ellipse, a, inpainted.linear.shape)
     crop, _ = inpainted.cut(columns, rows)

@@ -124,7 +124,7 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> Floats:
 
 
 def _sane(a: Any, b: Any, candidate: Candidate, shape: Shape) -> Any:
-    """Whether semi-axes, numbers or arrays, are plausible; those that are NaN are not."""
+    """Return whether semi-axes, numbers or arrays, are plausible; those that are NaN are not."""
     a0, b0 = candidate.ellipse.semi_axes_px.tolist()
     alike = (a < 2.2 * a0) & (b > 0.4 * b0) & (b > shape.aspect * a)
     return alike & (a <= shape.most_px) & (b >= 0.8 * shape.least_px)
@@ -132,7 +132,7 @@ def _sane(a: Any, b: Any, candidate: Candidate, shape: Shape) -> Any:
 
 @compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8")
 def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) -> Floats:
-    """Score (m,) of every ellipse (m, 5).
+    """Compute the score (m,) of every ellipse (m, 5).
 
     The score counts nearby points with an agreeing normal, weighted by closeness, per length.
     """
@@ -294,7 +294,7 @@ def _seen(numbers: Floats, points: Floats) -> Floats:
 
 @compiled("UniTuple(f8, 5), f8[:,::1], f8")
 def far_off(ellipse: tuple[float, ...], points: Floats, sigma_px: float) -> float:
-    """Distance within which nine in ten edge points (n, 2) lie of an ellipse (cx, cy, a, b, angle).
+    """Compute the distance within which nine in ten edge points (n, 2) lie of an ellipse (cx, cy, a, b, angle).
 
     They are moved outward by the curvature shift.
     """

@@ -47,7 +47,7 @@ def distance_slopes(ellipse: Ellipse, place: Place) -> Floats:
 
 
 def sector_excess(plain: Floats, inverse: Floats, sums: Floats) -> float:
-    """Factor by which correlated residuals increase the covariance: trace(plain^-1 S) / 5.
+    """Compute the factor by which correlated residuals increase the covariance: trace(plain^-1 S) / 5.
 
     S is the sum over k sectors of the outer product of `inverse` (5, p) times the sector's summed scores `sums` (p, k).
 
@@ -75,7 +75,7 @@ class EdgeSums:
 
     @staticmethod
     def of(ellipse: Ellipse, points: Floats) -> EdgeSums:
-        """Sum over points (n, 2)."""
+        """Compute the sum over points (n, 2)."""
         return EdgeSums(*_edge_sums(ellipse.numbers(), points[:, 0].copy(), points[:, 1].copy()))
 
 
@@ -88,7 +88,7 @@ def slopes_at(cos: float, sin: float, c: float, s: float, nx: float, ny: float, 
 
 @compiled("UniTuple(f8, 5), f8[::1], f8[::1]")
 def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Indices]:
-    """The sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle) and points (x, y)."""
+    """Return the sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle) and points (x, y)."""
     cos, sin = math.cos(ellipse[4]), math.sin(ellipse[4])
     matrix, scores, slopes = np.zeros((SHAPE, SHAPE)), np.zeros((SHAPE, GROUPS)), np.zeros((SHAPE, GROUPS))
     number, row, place = np.zeros(GROUPS, dtype=np.int64), np.empty(SHAPE), np.empty(8 * BLOCK)
@@ -108,7 +108,7 @@ def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats
 
 
 def edge_covariance(sums: EdgeSums, residual_px: float) -> Floats:
-    """Covariance (5, 5) of the centre and shape matrix of an ellipse fitted to edge points with this residual.
+    """Find the covariance (5, 5) of the centre and shape matrix of an ellipse fitted to edge points with this residual.
 
     Neighbouring edge points share noise (through the filter) and texture. `sector_excess` accounts for that.
     """
@@ -142,9 +142,9 @@ def hidden_part(ellipse: Ellipse, seen: Bools, residual_px: float) -> Floats:
 
 
 def towards_round(ellipse: Ellipse, covariance: Floats) -> tuple[Ellipse, Floats]:
-    """Most likely ellipse, and its covariance, if pupils are as elongated as ELONGATION says.
+    """Compute the most likely ellipse, and its covariance, if pupils are as elongated as ELONGATION says.
 
-    An arc between two lids hardly tells the size across it; a whole outline is not affected. One step of the
+    An arc between two lids hardly determines the size across it; a whole outline is not affected. One step of the
     Kalman filter.
 
     Args:
@@ -174,7 +174,7 @@ def reshaped(ellipse: Ellipse, step: Floats) -> Ellipse:
 
 
 def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
-    """How far an ellipse through edge points follows displacements of parts of the outline.
+    """Say how far an ellipse through edge points follows displacements of parts of the outline.
 
     It is the root mean square, over the outline, of the boundary's standard deviation if groups of three sectors
     that hold points were displaced independently by 1 px. A real boundary is uneven, so the hidden
@@ -185,7 +185,7 @@ def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
 
 
 def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
-    """Root mean square, over the outline, of the boundary's standard deviation along its normal, px."""
+    """Compute the root mean square, over the outline, of the boundary's standard deviation along its normal, px."""
     # Use the off-diagonal term of the shape matrix in place of the angle: d ab = (a - b) d angle.
     scale = np.ones(SHAPE)
     scale[4] = ellipse.semi_axes_px[0] - ellipse.semi_axes_px[1]
@@ -209,12 +209,12 @@ def _along_outline(ellipse: tuple[float, ...], covariance: Floats) -> float:
 
 
 def _inverse(matrix: Floats) -> Floats:
-    """Inverse (5, 5) of the points' matrix, which a ridge keeps regular."""
+    """Compute the inverse (5, 5) of the points' matrix, which a ridge keeps regular."""
     return np.asarray(np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE)), dtype=np.float64)
 
 
 def to_axes(covariance: Floats, ellipse: Ellipse) -> Floats:
-    """Covariance of (cx, cy, a, b, angle) from that of the shape matrix: d angle = d ab / (a - b)."""
+    """Compute the covariance of (cx, cy, a, b, angle) from that of the shape matrix: d angle = d ab / (a - b)."""
     a, b = ellipse.semi_axes_px.tolist()
     # The standard deviation of the angle is at most that of a uniform orientation, pi / sqrt(12).
     floor = math.sqrt(covariance[4, 4] * 12.0) / math.pi

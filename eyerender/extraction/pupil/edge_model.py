@@ -62,7 +62,7 @@ class EdgeModel:
     displaced: Floats | None = None
 
     def numbers(self) -> Floats:
-        """The parameters (11 + 1 + 2 K,) without the displacements.
+        """Return the parameters (11 + 1 + 2 K,) without the displacements.
 
         They are the centre, the semi-axes and the angle, sigma, inner level, slope, kurtosis, lean (two) and `outer`.
         """
@@ -91,7 +91,7 @@ class EdgeModel:
         return float(self.outer[0]) - self.inner_dn
 
     def level(self, x: Floats, y: Floats) -> Floats:
-        """Expected grey level at pixels (x, y) of any shape."""
+        """Compute the expected grey level at pixels (x, y) of any shape."""
         displaced = _EXACT if self.displaced is None else self.displaced
         return _levels(self.numbers(), displaced, x.ravel(), y.ravel()).reshape(x.shape)
 
@@ -150,7 +150,7 @@ def outer_levels(place: Floats, count: int, outer: Floats, basis: Floats, out: F
 
 @compiled("f8[::1], f8[::1], f8[::1], f8[::1]")
 def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
-    """Levels (n,) of the model of these numbers; `displaced` is empty for an exact ellipse."""
+    """Compute levels (n,) of the model of these numbers; `displaced` is empty for an exact ellipse."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
     inner_dn, slope, lean_x, lean_y = numbers[6], numbers[7], numbers[9], numbers[10]
     place, edge, basis = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(2 * BLOCK)
@@ -173,7 +173,7 @@ def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
 
 
 def longest_gap(held: Bools) -> float:
-    """Share of the outline in the longest run of sectors that are not held; 1 if none is."""
+    """Compute the share of the outline in the longest run of sectors that are not held; 1 if none is."""
     at = np.flatnonzero(held)
     if at.size == 0:
         return 1.0

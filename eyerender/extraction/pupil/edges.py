@@ -19,8 +19,9 @@ from .glare import Inpainted, around
 # Levels at an edge of the pupil, in steps above the pupil's: the highest one behind it, and the highest one close
 # ahead. Texture and shading of an iris stay below. Skin and sclera are brighter by two steps and more.
 DARK, BRIGHT = 0.5, 1.5
-# By how much the level may still rise, in steps, half as far again: it goes on rising in the shadow of a lid and at its
-# margin. Of nine properties of edge points, this one tells best which lie beside the outline (rendered eyes in lids).
+# Largest further rise of the level, in steps, over half of the distance again: it keeps rising in the shadow of a lid
+# and at its margin. Of nine properties of edge points, this one best separates those beside the outline (rendered eyes
+# in lids).
 RISE = 0.2
 # By how much an edge inside a mirrored window rises, in steps. Behind the window's light there is the whole step, while
 # texture and shadows have less. (0.5 adds edges in the irises of recorded frames.)
@@ -51,7 +52,7 @@ class EdgePoints:
     filter_px: float
 
     def arcs(self) -> Indices:
-        """Label (n,) of the connected piece that each point lies on."""
+        """Compute the label (n,) of the connected piece that each point lies on."""
         row, column = (one - one.min() for one in self.ridge)
         mask = np.zeros((row.max() + 1, column.max() + 1), np.uint8)
         mask[row, column] = 1
@@ -185,7 +186,7 @@ def _vertex(gx: Image, gy: Image, magnitude: Image, y: int, x: int, point: Float
 
 @inlined
 def _beside(gx: Image, gy: Image, magnitude: Image, y: int, x: int) -> tuple[float, float]:
-    """Gradient's magnitude at the pixels before and after one, along the gradient's larger component."""
+    """Compute the gradient's magnitude at the pixels before and after one, along the gradient's larger component."""
     if abs(gx[y, x]) >= abs(gy[y, x]):
         return magnitude[y, x - 1], magnitude[y, x + 1]
     return magnitude[y - 1, x], magnitude[y + 1, x]
@@ -193,14 +194,14 @@ def _beside(gx: Image, gy: Image, magnitude: Image, y: int, x: int) -> tuple[flo
 
 @inlined
 def nearest(image: Image, x: float, y: float) -> float:
-    """Level of the pixel nearest to a point; outside the frame its border is repeated."""
+    """Compute the level of the pixel nearest to a point; outside the frame its border is repeated."""
     column = min(max(int(np.rint(x)), 0), image.shape[1] - 1)
     return image[min(max(int(np.rint(y)), 0), image.shape[0] - 1), column]
 
 
 @compiled("f4[:,::1], f8[:,::1], f8[:,::1], f8, UniTuple(f8, 6)")
 def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, limits: tuple[float, ...]) -> Bools:
-    """Whether there is pupil behind points and iris ahead of them.
+    """Return whether there is pupil behind points and iris ahead of them.
 
     The limits are the pupil's level and, above it, the dark one, an iris' level, the rise at an edge inside a mirrored
     window, the bright one, and the rise farther ahead. The level `depth` px behind is dark. Or it is darker than an
@@ -223,12 +224,12 @@ def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, l
 
 
 def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:
-    """Width of the derivative filter: 1 px for a clear edge, up to 2.5 px (and b / 6) for a noisy one."""
+    """Compute the width of the derivative filter: 1 px for a clear edge, up to 2.5 px (and b / 6) for a noisy one."""
     return min(max(9.0 * noise_dn / max(step_dn, 1e-6), 1.0), max(1.0, min(2.5, b / 6.0)))
 
 
 def edge_noise_px(step_dn: float, *, noise_dn: float, sigma_filter: float, sigma_total: float) -> float:
-    """Standard deviation of one edge point along its normal, px.
+    """Compute the standard deviation of one edge point along its normal, px.
 
     sigma_x = n'' / |g''|. The noise's second derivative along the normal after filtering is noise sqrt(3 / (16 pi)) /
     s_f^3. The curvature of the gradient's ridge is step / (sqrt(2 pi) s_t^3). s_f is the width of the filter, s_t that
@@ -240,7 +241,7 @@ def edge_noise_px(step_dn: float, *, noise_dn: float, sigma_filter: float, sigma
 
 
 def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
-    """Derivatives of a Gaussian, normalised so that a ramp of 1 DN per px gives 1."""
+    """Compute derivatives of a Gaussian, normalised so that a ramp of 1 DN per px gives 1."""
     smooth, slope = _filters(sigma)
     return (
         as_image(cv2.sepFilter2D(crop, cv2.CV_32F, slope, smooth, borderType=cv2.BORDER_REPLICATE)),
@@ -250,7 +251,7 @@ def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
 
 @lru_cache(maxsize=64)
 def _filters(sigma: float) -> tuple[Floats, Floats]:
-    """Weights of a Gaussian, and of its derivative."""
+    """Compute weights of a Gaussian, and of its derivative."""
     t = np.arange(-math.ceil(4.0 * sigma), math.ceil(4.0 * sigma) + 1, dtype=np.float64)
     smooth = np.exp(-0.5 * (t / sigma) ** 2)
     smooth /= smooth.sum()

@@ -65,7 +65,7 @@ class Inpainted:
         return crop, hidden
 
     def enlarged(self, linear: Image, scale: int) -> Inpainted:
-        """The same at `scale` times the size, of the image `linear` of that size."""
+        """Return the same at `scale` times the size, of the image `linear` of that size."""
         if self.patch is None or self.mask is None:
             return Inpainted(linear)
         size = (scale * self.patch.shape[1], scale * self.patch.shape[0])
@@ -80,7 +80,7 @@ class Inpainted:
 def _beside(
     ellipse: tuple[float, ...], k: int, away: float, linear: Image, corner: tuple[int, int], patch: Image
 ) -> float:
-    """Level at the pixel `away` outside an ellipse, in the middle of sector k."""
+    """Compute the level at the pixel `away` outside an ellipse, in the middle of sector k."""
     cx, cy, a, b, angle = ellipse
     cos, sin, t = math.cos(angle), math.sin(angle), 2.0 * math.pi * ((k + 0.5) / SECTORS - 0.5) - angle
     c, s = math.cos(t), math.sin(t)
@@ -111,7 +111,7 @@ def levels_beside(
 
 
 def around(ellipse: Ellipse, reach: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Columns and rows of an image (h, w) up to `reach` px from an ellipse's centre."""
+    """Return columns and rows of an image (h, w) up to `reach` px from an ellipse's centre."""
     (cx, cy), (height, width) = ellipse.centre_px.tolist(), shape
     x0, x1 = max(0, math.floor(cx - reach)), min(width, math.ceil(cx + reach) + 1)
     y0, y1 = max(0, math.floor(cy - reach)), min(height, math.ceil(cy + reach) + 1)

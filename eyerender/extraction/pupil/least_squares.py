@@ -126,7 +126,7 @@ class Prior:
         return Prior(weights, uneven_px, displacement)
 
     def of_all(self, size: int) -> Floats:
-        """Weight (size,) of every parameter except the displacements."""
+        """Compute the weight (size,) of every parameter except the displacements."""
         out = np.zeros(size)
         out[7], out[8], out[9:11], out[FIXED:] = self.weights
         return out
@@ -156,7 +156,7 @@ class Sums:
 
     @staticmethod
     def of(pixels: Pixels, model: EdgeModel, displaced: Floats) -> Sums:
-        """Sum with sectors that lie `displaced` (k,) px inside the ellipse."""
+        """Compute the sum with sectors that lie `displaced` (k,) px inside the ellipse."""
         return Sums(*_pixel_sums(pixels.x, pixels.y, pixels.level, pixels.index, model.numbers(), displaced))
 
 

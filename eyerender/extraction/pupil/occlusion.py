@@ -68,7 +68,7 @@ def visible_part(
 
 @compiled("f8[::1], f8[::1], f8[::1]")
 def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
-    """Sector of each pixel (n,), and its distance, curvature, inner level and step (4, n)."""
+    """Compute the sector of each pixel (n,), and its distance, curvature, inner level and step (4, n)."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
     bins, out = np.empty(x.size, dtype=np.int64), np.empty((4, x.size))
     place, basis, outer = np.empty(8 * BLOCK), np.empty(2 * BLOCK), np.empty(BLOCK)
@@ -135,7 +135,7 @@ def _displacements(
 
 @inlined
 def _uneven2(seen: Bools, whole: Floats, weight: Floats, by_noise: Floats) -> float:
-    """Variance of the displacements of the sectors that are seen and told by their pixels, beyond noise."""
+    """Compute the variance, beyond noise, of the displacements of visible sectors whose pixels show them."""
     least, n = 0.1 * largest_size(weight), 0
     size, noise = np.empty(SECTORS), np.empty(SECTORS)
     for k in range(SECTORS):

@@ -84,7 +84,7 @@ def _along(
     Returns:
         Sectors without points that are dark on both sides; other points outside and inside the ellipse; sectors with
         points whose outside is shaded, and whose inside is not dark; those without points that have an edge on a bright
-        inside. What is dark there is told by the median step of the sectors with points.
+        inside. The median step of the sectors with points decides what is dark there.
     """
     pupil, dark = levels
     inside = levels_beside(ellipse, -away[0], linear, corner, patch)

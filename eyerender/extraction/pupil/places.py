@@ -39,7 +39,7 @@ class Place:
 
     @staticmethod
     def middles(ellipse: Ellipse, count: int = SECTORS) -> Place:
-        """Places on the ellipse, in the middle of each of `count` sectors."""
+        """Compute places on the ellipse, in the middle of each of `count` sectors."""
         (a, b), angle = ellipse.semi_axes_px.tolist(), ellipse.angle_rad
         u = 2.0 * np.pi * ((np.arange(count) + 0.5) / count - 0.5)
         cos_t, sin_t = np.cos(u - angle), np.sin(u - angle)
@@ -101,7 +101,7 @@ def sector_at(c: float, s: float) -> int:
 
 @compiled("UniTuple(f8, 5), f8[::1], f8[::1]")
 def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats) -> Indices:
-    """Sector (n,) of each point (x, y) near an ellipse (cx, cy, a, b, angle)."""
+    """Compute the sector (n,) of each point (x, y) near an ellipse (cx, cy, a, b, angle)."""
     out, place = np.empty(x.size, dtype=np.int64), np.empty(8 * BLOCK)
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
@@ -112,7 +112,7 @@ def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats) -> Indices:
 
 
 def holding(ellipse: tuple[float, ...], points: Floats) -> Bools:
-    """Whether each sector (SECTORS,) of an ellipse (cx, cy, a, b, angle) holds one of the points (n, 2)."""
+    """Return whether each sector (SECTORS,) of an ellipse (cx, cy, a, b, angle) holds one of the points (n, 2)."""
     out = np.zeros(SECTORS, dtype=bool)
     out[sectors_at(ellipse, points[:, 0].copy(), points[:, 1].copy())] = True
     return out

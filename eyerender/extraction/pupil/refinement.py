@@ -185,7 +185,7 @@ def _fitted(
 
 
 def _rough(model: EdgeModel, uneven_px: float) -> bool:
-    """Whether a boundary is as uneven as those of real pupils in textured irises are."""
+    """Return whether a boundary is as uneven as those of real pupils in textured irises are."""
     return uneven_px > ROUGH * math.sqrt(float(model.ellipse.semi_axes_px.prod()))
 
 
@@ -240,7 +240,7 @@ def _padded(outer: Floats, order: int) -> Floats:
 
 
 def _best_order(pixels: Pixels, found: Solution, prior: Prior) -> int:
-    """Fourier order of the outer level by BIC, from one linear step with the largest order's columns."""
+    """Compute the Fourier order of the outer level by BIC, from one linear step with the largest order's columns."""
     full = replace(found.model, outer=_padded(found.model.outer, ORDERS[-1]))
     normal = Normal.of(Sums.of(pixels, full, found.displaced), found.displaced, prior)
     matrix, vector, total = normal.matrix, normal.vector, normal.cost - float(normal.along**2 @ normal.inverse)
@@ -303,7 +303,7 @@ def _report(ended: _Ended, noise_dn: float, scatter_px: float) -> PixelFit:
 
 
 def _through(start: Ellipse, displaced: Floats) -> tuple[Ellipse, Floats]:
-    """Ellipse that fits an uneven boundary best, as a direct fit to the traced boundary would.
+    """Compute the ellipse that fits an uneven boundary best, as a direct fit to the traced boundary would.
 
     Also returns the derivatives (5, SECTORS) of its centre and shape by the sectors' displacements from `start`.
     """

@@ -46,7 +46,7 @@ FEATURES = (
 
 
 def features(ellipse: Ellipse, goodness: Goodness) -> Floats:
-    """Features (22,) on which the confidence depends, in the order of FEATURES."""
+    """Compute features (22,) on which the confidence depends, in the order of FEATURES."""
     g = goodness
     b = float(ellipse.semi_axes_px[1])
     return np.array(
@@ -78,7 +78,7 @@ def features(ellipse: Ellipse, goodness: Goodness) -> Floats:
 
 
 def design(rows: Floats, low: Floats, high: Floats) -> Floats:
-    """Design matrix (n, 1 + 3 x 22): 1, every feature scaled to 0..1 within its limits, and its two excesses.
+    """Find the design matrix (n, 1 + 3 x 22): 1, every feature scaled to 0..1 within its limits, and its two excesses.
 
     The excesses are those over 1/3 and over 2/3.
     """
@@ -90,7 +90,7 @@ def design(rows: Floats, low: Floats, high: Floats) -> Floats:
 
 
 def confidence(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "refined"]) -> float:
-    """Probability that IoU > 0.9."""
+    """Compute the probability that IoU > 0.9."""
     low, high, weights, bend, _ = _arrays(method)
     row = design(features(ellipse, goodness)[None], low, high)
     logit = float(calibrated(row @ weights, bend)[0])
@@ -103,12 +103,12 @@ def _arrays(method: Literal["fast", "refined"]) -> tuple[Floats, ...]:
 
 
 def calibrated(logit: Floats, bend: Floats) -> Floats:
-    """Calibrated logit c0 + c1 logit + c2 min(logit, 1), which corrects low ones separately."""
+    """Compute the calibrated logit c0 + c1 logit + c2 min(logit, 1), which corrects low ones separately."""
     return np.asarray(bend[0] + bend[1] * logit + bend[2] * np.minimum(logit, 1.0))
 
 
 def covariance_scale(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "refined"]) -> float:
-    """Factor of the covariance: how much farther ellipses like this one lie from the truth than it says."""
+    """Compute the factor of the covariance: how much farther ellipses like this one lie from the truth than it says."""
     low, high, _, _, weights = _arrays(method)
     row = design(features(ellipse, goodness)[None], low, high)
     return math.exp(min(max(float((row @ weights)[0]), SCALES[0]), SCALES[1]))
@@ -126,7 +126,7 @@ class ScoredCandidate:
     confidence: float
 
     def enlarged(self, work: Prepared) -> ScoredCandidate:
-        """The same in the pixels of the whole image; the evidence is that of the reduced one."""
+        """Return the same in the pixels of the whole image; the evidence is that of the reduced one."""
         scale, goodness = self.candidate.image.scale, self.goodness
         pixels = ("residual_px", "blur_px", "boundary_sd_px", "uneven_px")
         lengths = {name: scale * getattr(goodness, name) for name in pixels}
@@ -140,7 +140,7 @@ def score(candidate: PupilCandidate) -> ScoredCandidate:
 
 
 def goodness_of(found: PupilCandidate, fit: PixelFit | None) -> Goodness:
-    """How well a boundary explains the image, from its edges or the pixel model."""
+    """Say how well a boundary explains the image, from its edges or the pixel model."""
     boundary, image = found.boundary, found.image
     about = outline_of(found, boundary.ellipse if fit is None else fit.ellipse)
     if fit is None:

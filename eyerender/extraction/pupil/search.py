@@ -76,7 +76,7 @@ def find_pupil(
 
 
 def _contains(outer: PupilCandidate, inner: PupilCandidate) -> bool:
-    """Whether a boundary lies inside a larger one."""
+    """Return whether a boundary lies inside a larger one."""
     large, small = outer.boundary.ellipse, inner.boundary.ellipse
     apart = float(np.hypot(*(large.centre_px - small.centre_px)))
     return small.area_px2 < large.area_px2 and apart < float(large.semi_axes_px[1])
@@ -124,7 +124,7 @@ def _likeliest(work: Prepared, shape: Shape) -> ScoredCandidate | PupilResult:
 
 
 def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, PupilCandidate | str]]:
-    """Boundaries, or why a candidate has none, and whether they are of a later look.
+    """Compute boundaries, or why a candidate has none, and whether they are of a later look.
 
     1. the best candidate at a quarter of the scale, then those of a less reduced image, and those inside each that has
        a dark core
@@ -150,7 +150,7 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, PupilCandid
 def _bounded(
     work: Prepared, candidates: Sequence[Candidate], shape: Shape, tried: list[Candidate]
 ) -> Iterator[PupilCandidate | str]:
-    """Boundaries about those candidates that were not tried before, and inside those with a darker core."""
+    """Compute boundaries about those candidates that were not tried before, and inside those with a darker core."""
     for candidate in candidates:
         if any(_same(candidate.ellipse, one.ellipse) for one in tried):
             continue
@@ -163,7 +163,7 @@ def _bounded(
 
 
 def _pyramid(work: Prepared, shape: Shape) -> Iterator[tuple[Prepared, Shape]]:
-    """The image at full, half and quarter scale, and the sizes to look for there."""
+    """Return the image at full, half and quarter scale, and the sizes to look for there."""
     for scale in SCALES:
         if min(work.linear.shape) >= LEAST_SIDE * scale:
             least = max(shape.least_px / scale, LEAST_PX)
@@ -185,7 +185,7 @@ def _at_full_scale(work: Prepared, scored: ScoredCandidate, shape: Shape) -> Sco
 
 
 def _large(work: Prepared, shape: Shape) -> list[Candidate]:
-    """The best candidate of at least LARGE_PX, with the levels of the image at full scale."""
+    """Return the best candidate of at least LARGE_PX, with the levels of the image at full scale."""
     if not shape.least_px < LARGE_PX < 0.5 * shape.most_px:
         return []
     found = find_candidates(work, replace(shape, least_px=LARGE_PX), 1, levels=FEW)
@@ -194,7 +194,7 @@ def _large(work: Prepared, shape: Shape) -> list[Candidate]:
 
 
 def _near(work: Prepared, shape: Shape, prior: Ellipse) -> Iterator[PupilCandidate | str]:
-    """Boundaries where the pupil was before, then those of dark blobs of its size around there."""
+    """Compute boundaries where the pupil was before, then those of dark blobs of its size around there."""
     candidate = candidate_at(work, prior)
     if candidate is not None:
         yield find_boundary(work, candidate, shape)
@@ -212,7 +212,7 @@ def _near(work: Prepared, shape: Shape, prior: Ellipse) -> Iterator[PupilCandida
 
 
 def _same(first: Ellipse, second: Ellipse) -> bool:
-    """Whether two ellipses overlap by SAME; most pairs differ too much in size or place for a closer look."""
+    """Return whether two ellipses overlap by SAME; most pairs differ too much in size or place for a closer look."""
     ratio = first.area_px2 / second.area_px2
     apart = float(np.abs(first.centre_px - second.centre_px).max())
     near = apart < (1.0 - SAME) * math.pi * float(first.semi_axes_px[0])
@@ -220,13 +220,13 @@ def _same(first: Ellipse, second: Ellipse) -> bool:
 
 
 def _best(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Candidates that are not much worse than the best of them."""
+    """Compute candidates that are not much worse than the best of them."""
     least = LIKELY * max((one.score for one in candidates), default=0.0)
     return [one for one in candidates if one.score >= least]
 
 
 def _rounder(candidates: Sequence[Candidate], shape: Shape) -> Iterator[Candidate]:
-    """Circles as wide as each flat blob, about its middle and to either side of it.
+    """Compute circles as wide as each flat blob, about its middle and to either side of it.
 
     Half a disc of radius r has the second moments of an ellipse of semi-axes r and 0.53 r, 0.42 r from the middle of
     the disc: 0.9 of the difference. A disc that two lids cut alike has its middle in the middle of the blob.
