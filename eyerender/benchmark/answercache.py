@@ -88,13 +88,13 @@ class AnswerCache:
 
 
 def image_key(image: LabelledImage) -> str:
-    """SHA-256 of all that an extractor is told: the file's bytes, the bit depth and the hints."""
+    """Compute the SHA-256 of everything that an extractor receives: the file's bytes, the bit depth and the hints."""
     told = json.dumps([image.bit_depth, image.hints], sort_keys=True)
     return hashlib.sha256(read_bytes(image.path) + told.encode()).hexdigest()
 
 
 def check_reference(extractor: ExtractorCommand, timeout_s: float) -> list[Path] | None:
-    """Load a `module:callable` in a process of its own, before any image is read.
+    """Load a `module:callable` in a separate process, before any image is read.
 
     Returns:
         The files of the extractor's code. None where its process failed in another way than by a wrong reference; the
@@ -128,7 +128,7 @@ def _file_of(word: str) -> Path | None:
 
 
 def _identity(extractor: ExtractorCommand, sources: Iterable[Path]) -> str:
-    """SHA-256 of an extractor's command, of the files of its code, and of the libraries here."""
+    """Return the SHA-256 of an extractor's command, of the files of its code, and of the libraries here."""
     digest = hashlib.sha256(json.dumps([extractor.argv, sys.version, versions()], sort_keys=True).encode())
     for path in sources:
         digest.update(str(path).encode())

@@ -86,7 +86,7 @@ def ask_extractors(
 
 
 class _Asker:
-    """Questions to one extractor, from several threads."""
+    """Asks one extractor about images, from several threads."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class _Asker:
         return Run(self._extractor, greeting, tuple(named))
 
     def _answer(self, row: int, process: ExtractorProcess | None) -> tuple[_Answer, ExtractorProcess | None]:
-        """Answer about one image, stored or new, and the process that may be asked next."""
+        """Return the answer about one image, stored or new, and the process that may be asked next."""
         stored = None if self._options.fresh else self._cache.get(self._keys[row])
         if stored is not None:
             with suppress(InputError):  # another version may have stored it

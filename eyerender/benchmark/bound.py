@@ -36,7 +36,7 @@ class Edge:
     sigma_px: float
 
     def centre_sigma_px(self, pupil: Ellipse) -> float:
-        """Standard deviation sigma_c per axis, px."""
+        """Return the standard deviation sigma_c per axis, px."""
         radius = math.sqrt(float(pupil.semi_axes_px.prod()))
         return self.noise_dn / abs(self.step_dn) * math.sqrt(2.0 * self.sigma_px / (math.sqrt(math.pi) * radius))
 
@@ -54,7 +54,7 @@ def edge_of(
     known: Mapping[str, float],
     shows: Bools | None = None,
 ) -> Edge | None:
-    """Edge as the folder states it (`known`), else measured along the true outline where it is visible.
+    """Return the edge as the folder states it (`known`), else measured along the true outline where it is visible.
 
     Args:
         image: (h, w) as stored.

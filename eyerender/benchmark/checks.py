@@ -122,7 +122,7 @@ def compare_with(old: dict[str, Any], new: dict[str, Any], source: str) -> list[
 
 
 def problems_of(data: dict[str, Any], gated: bool) -> list[str]:
-    """Reasons for exit code 1, one line each; with `gated`, any error of an extractor is one."""
+    """List reasons for exit code 1, one line each; with `gated`, any error of an extractor is one."""
     out = []
     for entry in data["extractors"]:
         errors = entry["summary"]["errors"]

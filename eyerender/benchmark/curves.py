@@ -19,7 +19,7 @@ _ANSWERED = ("right", "wrong", "false")
 
 
 def curves_of(scores: Sequence[Score]) -> dict[str, Any]:
-    """Curves over the images that show a pupil.
+    """Return curves over the images that show a pupil.
 
     Returns:
         `iou`: share of images with at least this overlap; `centre_px` and `centre_radii`: share with at most this error

@@ -30,7 +30,7 @@ _IRIS_RATIO = (1.4, 8.0)
 
 
 def kind_of(found: Ellipse, image: LabelledImage, grey: NDArray[Any], mask: Bytes | None) -> FailureKind:
-    """Kind of a wrong ellipse: the first of `KINDS` that applies.
+    """Return the kind of a wrong ellipse: the first of `KINDS` that applies.
 
     Args:
         found: the ellipse.

@@ -60,7 +60,7 @@ class LabelledImage:
         hints: what an extractor may know.
         known: what the folder itself states of noise (DN), blur (px) and step (DN).
         factors: possible causes of an error, by name.
-        subject: whose eye it is; "" where unknown, and then the image counts as a subject of its own.
+        subject: the person; "" where unknown, and then each image counts as a separate subject.
         iris: outline of the iris, None where unknown.
         lids_px: (n, 2) margins of the lids, as far as they are known.
         mask_path: file of the classes of the pixels, None where they are unknown.
@@ -168,7 +168,7 @@ def _without_rig(
     polarity: str = "auto",
     known: Mapping[str, float] | None = None,
 ) -> LabelledImage:
-    """An image, with `stored` bit depth and shape, of which no camera or lights are known."""
+    """Return an image, with `stored` bit depth and shape, of which no camera or lights are known."""
     bit_depth, (height, width) = stored
     size, outline = (width, height), np.zeros((0, 2)) if pupil is None else pupil.points(120)
     hints = {"polarity": polarity, "gamma": 1.0, "radius_px": None, "rig": None}
@@ -254,7 +254,7 @@ def _ellipse_factors(pupil: Ellipse | None, visible: float | None) -> dict[str, 
 def _hints(
     entry: ImageEntry, truth: Observations, row: int, scene_rig: RigGeometry | None, eye_error_mm: float
 ) -> dict[str, Any]:
-    """Information that an extractor may have, but never the truth.
+    """Return the information that an extractor may have, but never the truth.
 
     It is the rig, a rough place of the eye, and thus a range of sizes. The place has a normal error of its own for each
     image, which follows from the image's name.
@@ -306,7 +306,7 @@ def _camera_and_lights(
 
 
 def _rig_of(folder: ImageFolder) -> RigGeometry | None:
-    """Rig of the scene from which the folder was rendered; None for a dataset, whose images have their own."""
+    """Find the rig of the scene from which the folder was rendered; None for a dataset, whose images have their own."""
     spec = folder.dataset.get("spec")
     if not isinstance(spec, dict) or folder.dataset.get("kind") == "dataset":
         return None

@@ -69,7 +69,7 @@ class FolderHints(Spec):
         return cls.from_mapping(data, source=str(path))
 
     def to_request(self) -> dict[str, Any]:
-        """The hints of a request; the gamma is 1 where it is unknown."""
+        """Return the hints of a request; the gamma is 1 where it is unknown."""
         rig = None if self.rig is None else self.rig.model_dump(mode="json")
         radius = None if self.radius_px is None else list(self.radius_px)
         return {"polarity": self.polarity, "gamma": self.gamma or 1.0, "radius_px": radius, "rig": rig}

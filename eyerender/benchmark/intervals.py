@@ -15,7 +15,7 @@ _SEED = 20_001
 
 
 def wilson(part: float, whole: float, quantile: float | None = None) -> tuple[float, float] | None:
-    """Wilson's score interval of a share.
+    """Return Wilson's score interval of a share.
 
         (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n),   p = part / whole, n = whole
 
@@ -43,7 +43,7 @@ def wilson(part: float, whole: float, quantile: float | None = None) -> tuple[fl
 def subject_interval(
     parts: Sequence[float] | Floats, wholes: Sequence[float] | Floats, subjects: Sequence[str]
 ) -> tuple[float, float] | None:
-    """Interval of a share whose trials come from subjects, by resampling the subjects.
+    """Return the interval of a share whose trials come from subjects, by resampling the subjects.
 
     The bootstrap over subjects gives the variance of the share, and thereby the effective number of trials, which is
     n p (1 - p) / (n variance) but not above n. Wilson's interval with that number and Student's quantile for the number

@@ -15,7 +15,7 @@ from .summary import sizes
 
 
 def is_success(score: Score) -> bool:
-    """Whether the pupil is right, or none is reported where none is."""
+    """Return whether the pupil is right, or none is reported where none is."""
     return score.outcome in ("right", "absent")
 
 
@@ -46,7 +46,7 @@ def pairs_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def common_errors(runs: Sequence[Run]) -> dict[str, Any]:
-    """Errors on the pupils that every extractor finds, of those that find any."""
+    """Return errors on the pupils that every extractor finds, of those that find any."""
     some = [run for run in runs if any(s.outcome == "right" for s in run.scores)]
     rows = [k for k in range(len(some[0].scores)) if all(r.scores[k].outcome == "right" for r in some)] if some else []
     return {

@@ -29,7 +29,7 @@ class Failed(Exception):
 class _Tail:
     """The end of a pipe's output.
 
-    A thread of its own reads the pipe, so that the writer never waits. Only the end is kept, so that a process may
+    A separate thread reads the pipe, so that the writer never waits. Only the end is kept, so that a process may
     print without limit.
     """
 
@@ -44,7 +44,7 @@ class _Tail:
             self._kept = (self._kept + chunk)[-_TAIL_BYTES:]
 
     def read(self) -> bytes:
-        """Last bytes so far; all of the last ones where the writer has ended."""
+        """Return last bytes so far; all of the last ones where the writer has ended."""
         self._thread.join(timeout=0.5)
         return self._kept
 
@@ -185,7 +185,7 @@ class ExtractorProcess:
         return line.decode("utf-8", "replace")
 
     def _died(self) -> Failed:
-        """Reason why it ended: its exit status and the last line it wrote to stderr."""
+        """Return the reason why it ended: its exit status and the last line it wrote to stderr."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=0.5)
         code = self._process.poll()

@@ -95,7 +95,7 @@ class Request:
     hints: Mapping[str, Any]
 
     def to_line(self) -> str:
-        """Line that is sent."""
+        """Return the line that is sent."""
         data = {"schema": SCHEMA, "id": self.id, "image": self.image, "bit_depth": self.bit_depth}
         return json.dumps({**data, "hints": dict(self.hints)}, allow_nan=False) + "\n"
 
@@ -198,7 +198,7 @@ def _glints(entries: Any, conventions: Conventions) -> tuple[tuple[tuple[float, 
 
 
 def _words(value: Any) -> str:
-    """Text of an extractor as one line that may be shown."""
+    """Make the text of an extractor as one line that may be shown."""
     return one_line(" ".join(str(value).split()), 200)
 
 

@@ -36,7 +36,7 @@ class ExtractorCommand:
 
 
 def names() -> tuple[str, ...]:
-    """Names in the entry-point group `eyerender.extractors`, sorted."""
+    """List names in the entry-point group `eyerender.extractors`, sorted."""
     return tuple(sorted(_installed()))
 
 
@@ -68,7 +68,7 @@ def resolve(given: str) -> ExtractorCommand:
 
 
 def defaults() -> tuple[list[ExtractorCommand], dict[str, str]]:
-    """Every installed extractor that can be run here, and the reasons why the others cannot."""
+    """List the installed extractors that can run here, and the reasons why the remaining ones cannot."""
     ready, absent = [], {}
     for name, entry in sorted(_installed().items(), key=lambda item: item[0]):
         try:

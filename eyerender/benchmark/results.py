@@ -30,7 +30,7 @@ TIMES_SCHEMA = "eyerender/bench-times/1"
 def entry_of(
     run: Run, images: Sequence[LabelledImage], sigmas: Sequence[float | None], factors: Sequence[dict[str, float]]
 ) -> dict[str, Any]:
-    """Results of one extractor."""
+    """Return results of one extractor."""
     greeting = run.greeting
     return {
         "name": run.extractor.name,
@@ -50,7 +50,7 @@ def entry_of(
 
 
 def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors: dict[str, float]) -> dict[str, Any]:
-    """One line of results.csv: the answer of an extractor about an image."""
+    """Return one line of results.csv: the answer of an extractor about an image."""
     s = run.scores[k]
     dx, dy = s.offset_px or (None, None)
     da, db = s.axes_px or (None, None)
@@ -82,7 +82,7 @@ def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors:
 
 
 def times_of(runs: Sequence[Run], images: Sequence[LabelledImage]) -> dict[str, Any]:
-    """Content of times.json: the machine, and the times of every extractor in all and per image, in ms."""
+    """Make the content of times.json: the machine, and the times of every extractor in all and per image, in ms."""
     return {
         "schema": TIMES_SCHEMA,
         "machine": {"system": platform.platform(), "processor": _processor(), "threads": 1},
@@ -101,14 +101,14 @@ def times_of(runs: Sequence[Run], images: Sequence[LabelledImage]) -> dict[str, 
 
 
 def digest_of(image: LabelledImage, key: str) -> str:
-    """Digest of an image, its hints and its truth, by which benches recognise the same task."""
+    """Return the digest of an image, its hints and its truth, by which benches recognise the same task."""
     pupil = None if image.pupil is None else image.pupil.numbers()
     truth = [key, pupil, image.visible, [[g.light, *g.xy_px] for g in image.glints]]
     return hashlib.sha256(json.dumps(truth).encode()).hexdigest()[:16]
 
 
 def gammas_of(images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
-    """Encoding gammas that the extractors were told, where they come from, and the number of images of each."""
+    """List the encoding gammas given to the extractors, their origins, and the number of images of each."""
     counts = Counter((float(image.hints["gamma"]), image.gamma_from) for image in images)
     return [{"gamma": gamma, "from": source, "images": n} for (gamma, source), n in sorted(counts.items())]
 

@@ -99,7 +99,7 @@ def bench_extractors(
 
 
 def _chosen(extractors: Sequence[str | ExtractorCommand] | None) -> tuple[list[ExtractorCommand], dict[str, str]]:
-    """The extractors to run, and why installed ones cannot be run if none were given."""
+    """Return the extractors to run, and why installed ones cannot be run if none were given."""
     absent: dict[str, str] = {}
     if extractors is None:
         chosen, absent = defaults()
@@ -117,7 +117,7 @@ def _chosen(extractors: Sequence[str | ExtractorCommand] | None) -> tuple[list[E
 def _results(
     folder: Path, runs: Sequence[Run], images: Sequence[LabelledImage], keys: Sequence[str]
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Content of results.json without its checks, and rows of results.csv."""
+    """Make the content of results.json without its checks, and rows of results.csv."""
     edges = [_edge(image) for image in images]
     sigmas = [
         e.centre_sigma_px(i.pupil) if e and i.pupil and is_bounded(i.visible, i.known) else None
@@ -164,7 +164,7 @@ def _classified(run: Run, images: Sequence[LabelledImage]) -> Run:
 
 
 def _thumbnails(run: Run, images: Sequence[LabelledImage]) -> list[Thumbnail]:
-    """Pictures of the first images of every kind of failure, the most frequent kinds first."""
+    """Return pictures of the first images of every kind of failure, the most frequent kinds first."""
     kinds: dict[tuple[str, str], list[int]] = {}
     for k, s in enumerate(run.scores):
         if s.outcome not in ("right", "absent"):
@@ -187,7 +187,7 @@ def _thumbnails(run: Run, images: Sequence[LabelledImage]) -> list[Thumbnail]:
 
 
 def _factors(image: LabelledImage, edge: Edge | None) -> dict[str, float]:
-    """Possible causes of an error; noise and blur as the folder states them, else as measured."""
+    """Return possible causes of an error; noise and blur as the folder states them, else as measured."""
     out = dict(image.factors)
     if image.known:
         out |= {"noise_dn": image.known["noise_dn"], "blur_px": image.known["blur_px"]}
@@ -210,7 +210,7 @@ def _edge_summary(edges: Sequence[Edge | None], images: Sequence[LabelledImage])
 
 
 def _is_bench(output: Path) -> bool:
-    """Whether a folder holds a bench's files and nothing else."""
+    """Return whether a folder holds a bench's files and nothing else."""
     try:
         found = {p.name for p in output.iterdir()}
     except OSError:

@@ -53,7 +53,7 @@ opencv_contour.reports = ("pupil",)  # type: ignore[attr-defined]
 
 
 def pupil_labs_python() -> Path | None:
-    """Interpreter of the environment with `pupil-detectors`, if there is one.
+    """Return the interpreter of the environment with `pupil-detectors`, if there is one.
 
     EYERENDER_PUPIL_DETECTORS names it; else it is where scripts/setup_pupil_detectors.sh puts it.
     """
@@ -118,7 +118,7 @@ def _own(settings: ExtractionSettings, image: NDArray[Any], request: Mapping[str
 
 
 def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None]:
-    """Light of each glint, where the rig is known."""
+    """Return the light of each glint, where the rig is known."""
     if rig is None or not found.glints or found.pupil.ellipse is None:
         return [None] * len(found.glints)
     camera = PinholeCamera.of(rig["K"], rig["R"], rig["t_mm"], (1, 1), rig["distortion"])

@@ -116,7 +116,7 @@ def efficiency(scores: Sequence[Score], sigmas_px: Sequence[float | None]) -> di
 
 
 def failures(scores: Sequence[Score], images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
-    """Every reason for a wrong, missing or unusable answer, with its count and first image."""
+    """Return every reason for a wrong, missing or unusable answer, with its count and first image."""
     seen: dict[tuple[Outcome, str], dict[str, Any]] = {}
     members: dict[tuple[Outcome, str], list[Score]] = {}
     for s, image in zip(scores, images, strict=True):
@@ -142,7 +142,7 @@ def failure_kind(score: Score) -> str:
 
 
 def _joined(reasons: Sequence[str]) -> str:
-    """One text for reasons that differ only by their numbers, with the span of each number."""
+    """Return one text for reasons that differ only by their numbers, with the span of each number."""
     columns = zip(*([m.group() for m in _NUMBER.finditer(reason)] for reason in reasons), strict=True)
     ordered = [sorted(column, key=float) for column in columns]
     spans = iter(c[0] if c[0] == c[-1] else f"{c[0]} to {c[-1]}" for c in ordered)
@@ -190,7 +190,7 @@ def breakdown(
     factors: Sequence[dict[str, float]],
     reports_glints: bool,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Summaries for every bin of every factor that varies, over the images that show a pupil."""
+    """Return summaries for every bin of every factor that varies, over the images that show a pupil."""
     shown = [i for i, s in enumerate(scores) if s.with_pupil]
     out: dict[str, list[dict[str, Any]]] = {}
     for name in FACTORS:
