@@ -43,7 +43,7 @@ class Measured(ArrayValue):
     glint_white: Floats
 
     def take(self, rows: Ints) -> Measured:
-        """Some of the views."""
+        """Return some of the views."""
         return replace(self, **{name: getattr(self, name)[rows] for name in self.__slots__})
 
     @property
@@ -58,7 +58,7 @@ class Measured(ArrayValue):
 
 
 def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Measured:
-    """Features of observations with their covariances, or `noise` where they have none."""
+    """Compute features of observations with their covariances, or `noise` where they have none."""
     camera = np.maximum(observations.index.camera, 0)
     points, white, size = _outlines(observations, noise.outline_px[camera])
     glints, weights = np.zeros((len(camera), lights, 2)), np.zeros((len(camera), lights, 2, 2))
@@ -76,7 +76,7 @@ def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Me
 
 
 def _covariance_of(observations: Observations, light: int) -> Floats:
-    """Covariance (n, 2, 2) of one light's glint; NaN where there is none."""
+    """Compute the covariance (n, 2, 2) of one light's glint; NaN where there is none."""
     glints = observations.glints
     out = np.full((len(observations), 2, 2), np.nan)
     if glints.light.shape[1]:
@@ -87,7 +87,7 @@ def _covariance_of(observations: Observations, light: int) -> Floats:
 
 
 def _whitening(covariance: Floats) -> Floats:
-    """Inverse square roots (n, q, q) of covariances, W^T W = C^-1; directions of no weight are left out."""
+    """Compute inverse square roots (n, q, q) of covariances, W^T W = C^-1; directions of no weight are left out."""
     values, vectors = np.linalg.eigh(covariance)
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.where(values > 0, 1.0 / np.sqrt(values), 0.0)
@@ -95,7 +95,7 @@ def _whitening(covariance: Floats) -> Floats:
 
 
 def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Floats, Ints]:
-    """Points of the outlines, the whitening of their distances, and how many of these are independent."""
+    """Compute points of the outlines, the whitening of their distances, and how many of these are independent."""
     pupil = observations.pupil
     given = pupil.points_px[:, :: max(1, -(-pupil.points_px.shape[1] // MOST_POINTS))]
     traced = np.sum(np.isfinite(given).all(axis=2), axis=1) >= 6
@@ -189,7 +189,7 @@ def residuals(seen: Measured, model: Images | Slopes) -> Residuals:
 
 
 def outline_distances(model_px: Floats, slopes: Floats | None, observed_px: Floats) -> tuple[Floats, Floats | None]:
-    """Signed distances (n, k) of observed points from modelled outlines along their normals, and the derivatives.
+    """Find signed distances (n, k) of observed points from modelled outlines along their normals, and the derivatives.
 
     The outline through the modelled points is their trigonometric interpolation p(f). The foot of a point o satisfies
     (p(f) - o) . p'(f) = 0 (Newton's steps from the nearest point), and its distance is n . (o - p).

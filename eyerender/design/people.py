@@ -143,7 +143,7 @@ def people_of(survey: Survey, first: int, count: int) -> tuple[list[Someone], li
 
 
 def place_of(survey: Survey, scene: Scene, person: Person) -> Floats:
-    """Apex (3,) of a person's unrotated eye in the world.
+    """Compute the apex (3,) of a person's unrotated eye in the world.
 
     It is the scene's, moved by half the difference in the distance of the pupils and by a draw of slippage.
     """
@@ -183,7 +183,7 @@ def _nobody(refused: list[int]) -> Figures:
 
 
 def _of_group(survey: Survey, rig: RigGeometry, noise: FeatureNoise, people: list[Someone]) -> Figures:
-    """Figures of a few people at once, camera by camera."""
+    """Compute figures of a few people at once, camera by camera."""
     case = _case(survey, rig, people)
     i, m = len(case.theta), len(rig.lights)
     matrices, outline = np.zeros((i, COUNT, COUNT)), np.zeros(i)
@@ -211,7 +211,7 @@ def _of_group(survey: Survey, rig: RigGeometry, noise: FeatureNoise, people: lis
 
 
 def _case(survey: Survey, rig: RigGeometry, people: list[Someone]) -> Case:
-    """All directions of some people, each an instant; the camera is set later."""
+    """Return all directions of some people, each an instant; the camera is set later."""
     eyes = stacked_eyes([one.eye for one in people])
     cells = GRID * GRID
     person = np.repeat(np.arange(len(people)), cells)
@@ -225,7 +225,7 @@ def _case(survey: Survey, rig: RigGeometry, people: list[Someone]) -> Case:
 
 
 def _openings(survey: Survey, people: list[Someone]) -> Floats:
-    """Inner margins of the lids around the eye in the world, (i, columns, 3).
+    """Compute inner margins of the lids around the eye in the world, (i, columns, 3).
 
     They follow the elevation above all, so they are computed at three azimuths and interpolated between these.
     """
@@ -248,7 +248,7 @@ def _openings(survey: Survey, people: list[Someone]) -> Floats:
 
 
 def _globe(eye: EyeModel, turn: Floats, shift: Floats) -> Globe:
-    """Globe of an eye in a pose."""
+    """Compute the globe of an eye in a pose."""
     return Globe(
         cornea=eye.front[0],
         limbus_radius_mm=float(eye.limbus_radius_mm),
@@ -261,7 +261,7 @@ def _globe(eye: EyeModel, turn: Floats, shift: Floats) -> Globe:
 
 
 def visible(slopes: Slopes, camera: PinholeCamera, openings: Floats | None) -> tuple[Slopes, Ints]:
-    """Features that the lids leave visible, and how many glints (n, 3) are missing for which of `LOST`."""
+    """Compute features that the lids leave visible, and how many glints (n, 3) are missing for which of `LOST`."""
     traced = np.isfinite(slopes.images.glints_px).all(axis=2)
     inside = np.where(traced, slopes.glint_ok, False)
     hidden_glints = np.zeros_like(inside)
@@ -275,7 +275,7 @@ def visible(slopes: Slopes, camera: PinholeCamera, openings: Floats | None) -> t
 
 
 def inside_polygon(polygon_px: Floats, points_px: Floats) -> Bools:
-    """Whether points (n, k, 2) lie inside closed polygons (n, c, 2), by the parity of crossings to the right."""
+    """Return whether points (n, k, 2) lie inside closed polygons (n, c, 2), by the parity of crossings to the right."""
     x0, y0 = polygon_px[:, None, :, 0], polygon_px[:, None, :, 1]
     x1, y1 = np.roll(x0, -1, axis=2), np.roll(y0, -1, axis=2)
     x, y = points_px[..., 0:1], points_px[..., 1:2]
@@ -286,7 +286,7 @@ def inside_polygon(polygon_px: Floats, points_px: Floats) -> Bools:
 
 
 def bounds(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns) -> tuple[Floats, Floats]:
-    """Standard deviation (i,) of the line of sight in degrees, after each person's calibration, equation (7).
+    """Find the standard deviation (i,) of the line of sight in degrees, after each person's calibration, equation (7).
 
     The second one is that of a person who is known exactly.
     """
@@ -304,7 +304,7 @@ def bounds(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns
 
 
 def _learned(case: Case, matrices: Floats, noise: FeatureNoise, parts: tuple[Floats, Indices, Indices]) -> Floats:
-    """Information (p, q, q) on each person after the calibration and with the prior, equation (7)."""
+    """Compute the information (p, q, q) on each person after the calibration and with the prior, equation (7)."""
     prior, local, person = parts
     chosen = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
     rows = (GRID * GRID * np.arange(len(matrices) // GRID**2)[:, None] + chosen).ravel()

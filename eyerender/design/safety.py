@@ -134,7 +134,7 @@ def eye_exposure(
 def _of_lamp(
     lamp: Lamp, eye_mm: Floats, box_mm: Floats, wavelength_nm: float, path: str
 ) -> tuple[float, float, float, float]:
-    """Distance, irradiance, weighted radiance and its limit for one LED at the nearest place of the box."""
+    """Compute the distance, irradiance, weighted radiance and its limit for one LED at the nearest place of the box."""
     place = eye_mm + np.clip(lamp.position_mm - eye_mm, -box_mm, box_mm)
     gap = place - lamp.position_mm
     distance = float(np.linalg.norm(gap))
