@@ -133,7 +133,7 @@ def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
 
 
 def shards_of(dataset: Mapping[str, Any]) -> Sequence[int] | None:
-    """Shards that the spec in a dataset.json asks for; None where it does not say."""
+    """Return shards that the spec in a dataset.json asks for; None where it does not say."""
     spec = dataset.get("spec")
     if isinstance(spec, dict) and spec.get("choice") == "spread":
         with suppress(InputError):
@@ -146,7 +146,7 @@ def shards_of(dataset: Mapping[str, Any]) -> Sequence[int] | None:
 
 
 def _lines(folder: Path, shards: Iterable[int], take: Callable[[dict[str, Any]], None]) -> Iterator[bytes]:
-    """Lines of metadata.jsonl; `take` receives each, parsed."""
+    """List lines of metadata.jsonl; `take` receives each, parsed."""
 
     def lines() -> Iterator[str]:
         for shard in shards:

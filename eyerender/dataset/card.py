@@ -37,7 +37,7 @@ _MORE = {
 
 
 def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
-    """Text of README.md."""
+    """Make the text of README.md."""
     spec = plan.spec
     splits = sorted(statistics["images_by_split"])
     shown = {name: number for name, number in run_versions().items() if name not in ("python", "results")}

@@ -61,7 +61,7 @@ class ShardActor:
         return {"ok": True, **summary, "backend": {**self._maker.backend, "cpu": cpu_family()}}
 
     def pid(self) -> int:
-        """Process id of the actor."""
+        """Return the process id of the actor."""
         return os.getpid()
 
 
@@ -162,7 +162,7 @@ def end_session(session: int, patience_s: float = 3.0) -> None:
 
 
 def _members(session: int) -> Iterator[int]:
-    """Living processes of a session except this one."""
+    """List living processes of a session except this one."""
     for place in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it has ended
             # After the name, which may contain anything, follow state, parent, group and session.
@@ -180,7 +180,7 @@ class _Held:
 
 @dataclass
 class _Driver:
-    """Talks to Ray, in a process of its own."""
+    """Talks to Ray, in a separate process."""
 
     job: Job
     workers: int | None
@@ -255,7 +255,7 @@ class _Driver:
         return lost
 
     def _limit(self) -> float:
-        """Largest time for a whole shard, s; `timeout_s` is for one sample."""
+        """Return the largest time for a whole shard, s; `timeout_s` is for one sample."""
         return self.timeout_s * max(1, int(self.job.plan["spec"].get("shard_size", 64)) // 8)
 
     @staticmethod

@@ -33,7 +33,7 @@ def type_first(lines: Callable[[], Iterable[str]], take: Callable[[dict[str, Any
 
 
 def _filled(node: Any, path: str) -> Iterator[str]:
-    """Paths of everything that is neither null nor an empty list."""
+    """List paths of everything that is neither null nor an empty list."""
     if isinstance(node, dict):
         for key, value in node.items():
             yield from _filled(value, f"{path}.{key}")

@@ -1,4 +1,4 @@
-"""The record of a shard, done.json: what it holds, the checksums of its files, and what made them."""
+"""The record of a shard, done.json: its samples, the checksums of its files, and the versions that made them."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ def _are(value: object, fits: Callable[[Any], bool]) -> bool:
 
 
 def samples_of(done: Mapping[str, Any]) -> tuple[list[int], list[int] | None]:
-    """Which samples a shard holds: first and end, and the samples where some between are left out."""
+    """Say which samples a shard holds: first and end, and the samples where some between are left out."""
     return list(done["samples"]), done.get("chosen")
 
 
 def described(samples: Sequence[int]) -> tuple[list[int], list[int] | None]:
-    """Samples of a shard as `samples_of` tells them."""
+    """Describe the samples of a shard for `samples_of`."""
     whole = isinstance(samples, range)
     return [samples[0], samples[-1] + 1], None if whole else list(samples)
 
 
 def is_sums(value: object) -> bool:
-    """Whether a value from a file maps names to sizes and SHA-256, as `compare_sums` requires."""
+    """Return whether a value from a file maps names to sizes and SHA-256, as `compare_sums` requires."""
     return isinstance(value, Mapping) and all(
         isinstance(entry, Mapping) and _is_count(entry.get("bytes")) and isinstance(entry.get("sha256"), str)
         for entry in value.values()
@@ -104,25 +104,25 @@ def compare_sums(folder: Path, sums: Mapping[str, Mapping[str, Any]], *, quick: 
 
 
 def checksum(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sum_of(path: Path) -> dict[str, Any]:
-    """Size and SHA-256 of a file."""
+    """Return the size and SHA-256 of a file."""
     return {"bytes": path.stat().st_size, "sha256": checksum(path)}
 
 
 def run_versions() -> dict[str, str]:
-    """Versions that affect a dataset's bytes."""
+    """List versions that affect a dataset's bytes."""
     found = versions()
     del found["opencv-python-headless"]  # nothing here uses it
     return {**found, "pillow": package_version("pillow")}
 
 
 def cpu_family() -> str:
-    """Name of the processor, or its architecture."""
+    """Return the name of the processor, or its architecture."""
     from ..backends.probe import cpu_name
 
     return cpu_name()

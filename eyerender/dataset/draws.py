@@ -124,7 +124,7 @@ class MultivariateNormalDraw(_Draw):
         return self
 
     def at(self, numbers: Sequence[float]) -> list[float]:
-        """Value at one number in (0, 1) for each dimension."""
+        """Return the value at one number in (0, 1) for each dimension."""
         factor = np.linalg.cholesky(np.array(self.covariance))
         return [float(v) for v in np.array(self.mean) + factor @ ndtri(np.array(numbers))]
 
@@ -136,7 +136,7 @@ class MixtureDraw(_Draw):
     components: Annotated[tuple[Any, ...], Field(min_length=1)]
 
     def as_choice(self) -> ChoiceDraw:
-        """The choice of the components.
+        """Return the choice of the components.
 
         Raises:
             InputError: a component is no draw, or has no weight.
@@ -195,7 +195,7 @@ class GridDraw(_Draw):
         return len(self.values) if self.values is not None else self.steps or 1
 
     def point(self, k: int) -> Any:
-        """Value number k."""
+        """Return value number k."""
         if self.values is not None:
             return self.values[k]
         if self.low is None or self.high is None or self.steps is None or self.steps == 1:
@@ -235,7 +235,7 @@ KINDS = (*_KINDS, "mixture", "table")
 
 
 def is_draw(node: object) -> bool:
-    """Whether a node of a template is a distribution."""
+    """Return whether a node of a template is a distribution."""
     return isinstance(node, dict) and MARK in node
 
 
@@ -264,7 +264,7 @@ def unit_number(seed: int, path: str, unit: str, number: int, attempt: int) -> f
 
 
 def random_value(draw: Draw, u: float) -> Any:
-    """Value of a random draw at u; for a choice the index of the value."""
+    """Return the value of a random draw at u; for a choice the index of the value."""
     if isinstance(draw, UniformDraw | SobolDraw):
         return draw.low + (draw.high - draw.low) * u
     if isinstance(draw, LogUniformDraw):

@@ -34,7 +34,7 @@ def estimate(
     warn: Warn | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """Time and disk that `generate` would need: seconds = (samples t + subjects t_subject) / workers.
+    """Return the time and disk that `generate` would need: seconds = (samples t + subjects t_subject) / workers.
 
     The rate is the last one of this spec on this machine, for any seed and number of samples.
 

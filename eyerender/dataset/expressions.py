@@ -41,12 +41,12 @@ _UNARY: dict[type[ast.unaryop], Callable[[float], float]] = {ast.USub: operator.
 
 
 def is_reference(node: object) -> bool:
-    """Whether a node of a template refers to variables."""
+    """Return whether a node of a template refers to variables."""
     return isinstance(node, dict) and REFERENCE in node
 
 
 def names_of(text: str) -> set[str]:
-    """Names of the variables in an expression.
+    """List names of the variables in an expression.
 
     Raises:
         InputError: it is not an expression of this kind.
@@ -57,7 +57,7 @@ def names_of(text: str) -> set[str]:
 
 
 def evaluate(text: str, variables: Mapping[str, Any]) -> Any:
-    """Value of an expression: a number, or what a variable holds where the expression is its name alone.
+    """Return the value of an expression: a number, or what a variable holds where the expression is its name alone.
 
     Raises:
         InputError: the value is not a finite number or a list of such, or cannot be computed.

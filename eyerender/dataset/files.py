@@ -52,7 +52,7 @@ def _names(scene: Mapping[str, Any], base: Path) -> Iterator[str]:
 
 
 def _texts(node: Any, *keys: str) -> Iterator[str]:
-    """Every text that may be at a place of a template, or in a list there."""
+    """Return every text that may be at a place of a template, or in a list there."""
     for value in possible(node):
         if keys and isinstance(value, Mapping):
             yield from _texts(value.get(keys[0]), *keys[1:])
@@ -67,7 +67,7 @@ def _texts(node: Any, *keys: str) -> Iterator[str]:
 
 
 def sum_of_file(path: Path) -> str:
-    """SHA-256 of a file, cached while the file seems unchanged.
+    """Return the SHA-256 of a file, cached while the file seems unchanged.
 
     Raises:
         InputError: the file cannot be read.

@@ -19,7 +19,7 @@ EXTENDS = "extends"
 
 
 def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -> dict[str, Any]:
-    """The mapping of a spec merged into the one that it extends; mappings are merged, anything else is replaced.
+    """Return the mapping of a spec merged into the one that it extends; mappings are merged, anything else is replaced.
 
     Args:
         data: the mapping.
@@ -93,7 +93,7 @@ def _choice(node: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def aliased_draws(data: Any) -> Iterator[tuple[str, str]]:
-    """Pairs of places of a file's content in which one draw stands by a YAML alias: each is drawn on its own."""
+    """List pairs of places of a file's content in which one draw stands by a YAML alias: each is drawn on its own."""
     seen: dict[int, str] = {}
 
     def places(node: Any, path: str) -> Iterator[tuple[str, Any]]:

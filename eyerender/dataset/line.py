@@ -13,7 +13,7 @@ from .realise import Realised
 
 
 def image_name(sample: int, frame: int, frames: int, side: str) -> str:
-    """Name of an image without ending; `frame` counts within the sample, which has `frames` of them."""
+    """Return the name of an image without ending; `frame` counts within the sample, which has `frames` of them."""
     return f"{sample:08d}-{f'{frame:03d}-' if frames > 1 else ''}{side}"
 
 
@@ -25,7 +25,7 @@ def image_line(
     labels: dict[str, Any],
     record_version: int = RECORD,
 ) -> tuple[str, dict[str, Any]]:
-    """Name and line of observation `row` of a sample; `frames` is the number of frames of each sample."""
+    """Return the name and line of observation `row` of a sample; `frames` is the number of frames of each sample."""
     sample, scene, observations = found.sample, found.scene, found.observations
     assert sample is not None
     assert scene is not None

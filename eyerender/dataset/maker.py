@@ -101,7 +101,7 @@ class Maker:
         return self._beside.submit(lambda: MadeSample(found.index, tuple(self._images(found, begun)), found.rejections))
 
     def _exposed(self, found: Realised) -> Realised:
-        """The sample with the exposure of its subject; that of the scene where the subject's pictures are dark."""
+        """Find the sample with the exposure of its subject; that of the scene where the subject's pictures are dark."""
         level = self.plan.spec.auto_exposure
         if level is None or found.sample is None:
             return found

@@ -59,7 +59,7 @@ class PlanOptions:
     size: str | None = None
 
     def apply(self, spec: DatasetSpec) -> DatasetSpec:
-        """Spec with these changes.
+        """Return the spec with these changes.
 
         Raises:
             InputError: they cannot be read, or do not fit.

@@ -164,7 +164,7 @@ class PartialShard:
         self.images += 1
 
     def _new_lines(self) -> BinaryIO:
-        """Open a new file of lines, which takes the place of the old one when it is published."""
+        """Open a new file of lines, which replaces the old one when it is published."""
         path = self.stage / _SHARD / f"{LINES}.new"
         path.unlink(missing_ok=True)
         return open(path, "xb")
@@ -212,7 +212,7 @@ class PartialShard:
                     path.unlink()
 
     def _intact_lines(self, done: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], bytes]]:
-        """Lines of a checkpoint, whose files are compared with their checksums.
+        """List lines of a checkpoint, whose files are compared with their checksums.
 
         Raises:
             InputError: something differs.
@@ -234,7 +234,7 @@ class PartialShard:
 
 
 def checkpoints(folder: Path) -> dict[int, int]:
-    """Number of finished images of each partial shard of a run."""
+    """Return the number of finished images of each partial shard of a run."""
     found: dict[int, int] = {}
     for shard, stage in stages(folder):
         with suppress(InputError):
@@ -243,7 +243,7 @@ def checkpoints(folder: Path) -> dict[int, int]:
 
 
 def stages(folder: Path) -> Iterator[tuple[int, Path]]:
-    """Shards at work in a folder, with their temporary folders."""
+    """Return shards at work in a folder, with their temporary folders."""
     for stage in sorted(folder.glob(f"{STAGE}*-*")):
         number = stage.name.removeprefix(STAGE).split("-")[0]
         if number.isdigit() and stage.is_dir() and not stage.is_symlink():
@@ -251,7 +251,7 @@ def stages(folder: Path) -> Iterator[tuple[int, Path]]:
 
 
 def reopen(folder: Path, shard: int, kinds: Sequence[str]) -> None:
-    """Turn a finished shard into a partial one, from which `PartialShard` goes on with more or fewer samples.
+    """Turn a finished shard into a partial one, which `PartialShard` can continue with more or fewer samples.
 
     After a kill between the moves, `take_back` does the rest.
 
@@ -285,7 +285,7 @@ def take_back(folder: Path, shards: Iterable[int]) -> None:
 
 
 def remove_stages(folder: Path, shards: Iterable[int], finished: set[int]) -> None:
-    """Remove what ended workers left of some shards, except what later ones can go on with."""
+    """Remove what ended workers left of some shards, except what later workers can continue."""
     own = set(shards)
     for shard, stage in stages(folder):
         if shard in own and (shard in finished or not (stage / DONE).is_file()):
@@ -307,6 +307,6 @@ def _claimed(folder: Path, shard: int, stage: Path) -> dict[str, Any] | None:
 
 
 def _comparable(value: Any) -> Any:
-    """Value of done.json without what affects no byte."""
+    """Return the value of done.json without what affects no byte."""
     ignored = ("threads", "python")
     return {k: v for k, v in value.items() if k not in ignored} if isinstance(value, Mapping) else value

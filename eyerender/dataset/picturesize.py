@@ -38,7 +38,7 @@ def scaled(scene: Mapping[str, Any], size_px: tuple[int, int]) -> dict[str, Any]
 
 
 def _cameras(node: Any) -> list[Mapping[str, Any]]:
-    """Every camera of a template."""
+    """Return every camera of a template."""
     if isinstance(node, Mapping):
         if "resolution_px" in node:
             return [node]

@@ -192,7 +192,7 @@ class Plan:
 
     @cached_property
     def _variables(self) -> dict[str, Unit]:
-        """For what each variable is drawn; a plain value is the same for every sample."""
+        """Say for what each variable is drawn; a plain value is the same for every sample."""
         draws = self.variable_template.draws
         names = self.spec.variables or {}
         return {
@@ -233,7 +233,7 @@ class Plan:
         )
 
     def warnings(self) -> list[InputWarning]:
-        """Probable mistakes in the scenes of some samples, spread over the dataset; each is reported once."""
+        """Return probable mistakes in the scenes of some samples, spread over the dataset; each is reported once."""
         found: dict[tuple[str, str], InputWarning] = {}
         for first, again in self.aliases:
             reason = f"is an alias of {first}, but drawn on its own; use 'variables' for one value in both places"
@@ -320,12 +320,12 @@ class Plan:
         return next((name for name, share in zip(names, self._shares, strict=True) if u < share), names[-1])
 
     def subject_of(self, sample: int) -> tuple[int, int]:
-        """Subject of a sample, and the sample's place in the subject's sequence."""
+        """Return the subject of a sample, and the sample's place in the subject's sequence."""
         subject = self.spec.selection.subject_of(sample)
         return subject, sample - self.first_of(subject)
 
     def first_of(self, subject: int) -> int:
-        """First sample of a subject."""
+        """Return the first sample of a subject."""
         return self.spec.selection.first_of(subject)
 
     def draw(self, sample: int, attempt: int = 0) -> Sample:
@@ -372,7 +372,7 @@ class Plan:
         return {}
 
     def identity(self, subject: int) -> tuple[int, tuple[str, ...]]:
-        """First attempt in which a subject's eye can be made, and the reasons why earlier ones failed."""
+        """Return the first attempt in which a subject's eye can be made, and the reasons why earlier ones failed."""
         if subject not in self._identities:
             if len(self._identities) >= 1024:
                 self._identities.clear()
@@ -428,7 +428,7 @@ class Plan:
 
 
 def plan_digest(mapping: Mapping[str, Any]) -> str:
-    """SHA-256 of a plan's mapping, whatever number of its samples is made."""
+    """Return the SHA-256 of a plan's mapping, whatever number of its samples is made."""
     spec = dict(mapping["spec"])
     spec["planned"] = spec.get("planned") or spec["count"]
     del spec["count"]
@@ -437,13 +437,13 @@ def plan_digest(mapping: Mapping[str, Any]) -> str:
 
 
 def mapping_digest(mapping: Mapping[str, Any]) -> str:
-    """SHA-256 of a mapping's canonical JSON."""
+    """Return the SHA-256 of a mapping's canonical JSON."""
     text = json.dumps(mapping, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _eye_names(spec: DatasetSpec, source: str) -> list[str]:
-    """Names of the eye models that a spec may use; none where it draws people."""
+    """List names of the eye models that a spec may use; none where it draws people."""
     part = spec.scene.get("eye", {})
     if is_draw(part):
         raise InputError("draw single values of the eye, not the whole eye", source=source, path="scene.eye")
@@ -461,12 +461,12 @@ def _eye_names(spec: DatasetSpec, source: str) -> list[str]:
 
 
 def _is_at(path: str, name: str) -> bool:
-    """Whether the path of a draw is at or below a variable."""
+    """Return whether the path of a draw is at or below a variable."""
     return re.match(rf"variables\.{name}(?![A-Za-z0-9_])", path) is not None
 
 
 def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
-    """Parts of a spec with another eye model in place of its own."""
+    """Replace the eye model in parts of a spec."""
     part = spec.scene.get("eye", {})
     if spec.population is not None:
         raise InputError("the spec draws people with eyes of their own; take 'population' out of it", source="--eye")
@@ -481,7 +481,7 @@ def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
 
 @lru_cache(maxsize=64)
 def _eye(text: str) -> EyeSpec:
-    """Eye file from its JSON; the frames of a subject share it and its computed values."""
+    """Return the eye file from its JSON; the frames of a subject share it and its computed values."""
     return EyeSpec.from_mapping(json.loads(text))
 
 

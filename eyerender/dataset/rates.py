@@ -46,12 +46,12 @@ class Rate(Spec):
 
 
 def now() -> str:
-    """Current time in the format of a rate."""
+    """Return the current time in the format of a rate."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
 def keep_rate(plan: Plan, rate: Rate) -> None:
-    """Store a rate, unless the one that is stored tells more: of the same backend, with more than twice the samples.
+    """Store a rate, unless a stored one of the same backend is from more than twice as many samples.
 
     It is dropped where the cache cannot be written.
     """
@@ -64,7 +64,7 @@ def keep_rate(plan: Plan, rate: Rate) -> None:
 
 
 def last_rate(plan: Plan, backend: str = "auto") -> Rate | None:
-    """Rate that was last measured on this machine with a backend; None where none is known."""
+    """Return the rate that was last measured on this machine with a backend; None where none is known."""
     path = _path(plan)
     if path is None:
         return None
@@ -76,7 +76,7 @@ def last_rate(plan: Plan, backend: str = "auto") -> Rate | None:
 
 
 def _path(plan: Plan) -> Path | None:
-    """Path of the rate of a plan on this machine; it does not depend on the seed and the number of samples."""
+    """Find the path of the rate of a plan on this machine; it does not depend on the seed and the number of samples."""
     folder = cache_folder()
     if folder is None:
         return None

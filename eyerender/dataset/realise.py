@@ -49,14 +49,14 @@ class Realised:
         return None if self.frames is None else self.frames.scene
 
     def exposed(self, exposure_ms: float) -> Realised:
-        """The sample with another exposure time."""
+        """Return the sample with another exposure time."""
         assert self.sample is not None
         tree = self.sample.scene
         sample = replace(self.sample, scene={**tree, "sensor": {**tree.get("sensor", {}), "exposure_ms": exposure_ms}})
         return replace(self, sample=sample, frames=sample.build().frames())
 
     def warnings(self) -> list[InputWarning]:
-        """Probable mistakes in the scene (see `Scene.warnings`)."""
+        """Return probable mistakes in the scene (see `Scene.warnings`)."""
         return [] if self.scene is None else [warning.at(self.source) for warning in self.scene.warnings()]
 
     def to_mapping(self) -> dict[str, Any]:
@@ -165,7 +165,7 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
 
 
 def frames_of(plan: Plan) -> int:
-    """Number of frames of each sample, from sample 0.
+    """Return the number of frames of each sample, from sample 0.
 
     Raises:
         InputError: sample 0 cannot be made at all.
@@ -184,7 +184,7 @@ def frames_of(plan: Plan) -> int:
 
 
 def windows_of(scene: Scene, observations: Observations) -> list[Window]:
-    """Rendered window of each observation."""
+    """Return the rendered window of each observation."""
     index, windows = observations.index, scene.windows()
     return [windows[int(index.camera[r]), int(index.head[r]), int(index.eye[r])] for r in range(len(observations))]
 

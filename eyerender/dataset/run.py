@@ -64,7 +64,7 @@ def generate(
         options: workers, engine, backend and the like.
         eye: replaces the eye model of the spec: a name of the catalogue or an eye file.
         seed: replaces the seed of the spec.
-        count: makes so many samples of the spec's plan, spread over its subjects, or continues the plan with new
+        count: number of samples of the spec's plan, spread over its subjects; beyond the plan it continues with new
             subjects. In a folder that holds another number of them, those that are wanted are kept.
         part: (k, n) makes only every n-th shard, starting with the k-th; for array jobs that write to one folder.
         progress: called with (images done, images in all, note).
@@ -140,12 +140,12 @@ def _generate(
 
 
 def usable_cpus() -> int:
-    """Number of processors that this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_count(options: RunOptions, shards: int) -> tuple[int, int]:
-    """Numbers of workers and of threads of each: by default one worker per processor while memory suffices."""
+    """List numbers of workers and of threads of each: by default one worker per processor while memory suffices."""
     cpus = options.threads or usable_cpus()
     workers = options.workers
     if workers is None:

@@ -115,7 +115,7 @@ def commit(folder: Path, staged: Staged) -> None:
 
 
 def is_finished(folder: Path, shard: int) -> bool:
-    """Whether a shard has a done.json."""
+    """Return whether a shard has a done.json."""
     return (folder / SHARDS / shard_name(shard) / DONE).is_file()
 
 

@@ -46,7 +46,7 @@ class LabelsSpec(Spec):
 
     @property
     def pictures(self) -> tuple[str, ...]:
-        """Kinds of images that every sample has; each kind has a folder of its own."""
+        """Kinds of images that every sample has; each kind has a separate folder."""
         more = {"amodal_masks": self.amodal_masks, "noiseless": self.noiseless, "highlights": self.highlights}
         return ("images", "masks", *(kind for kind, wanted in more.items() if wanted))
 
@@ -134,7 +134,7 @@ class DatasetSpec(FileSpec):
 
     @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """The mapping of a file in this folder, with the spec that it extends and the rows of its tables."""
+        """Return the mapping of a file in this folder, with the spec that it extends and the rows of its tables."""
         found: dict[str, Any] = with_tables(extended(data, find_dataset, folder), folder)
         return found
 
@@ -161,7 +161,7 @@ class DatasetSpec(FileSpec):
         return self.subjects or self.planned_count
 
     def first(self, count: int) -> Self:
-        """Spec of `count` samples of the same plan, spread over its subjects, or of its continuation."""
+        """Return the spec of `count` samples of the same plan, spread over its subjects, or of its continuation."""
         planned = self.planned_count
         changes = {"count": count, "planned": None if count == planned else planned}
         return self.replaced("--count", {**changes, "choice": "spread" if count % planned else None})
@@ -177,7 +177,7 @@ class DatasetSpec(FileSpec):
         return self.selection.shards
 
     def shard_samples(self, shard: int) -> Sequence[int]:
-        """Samples of a shard."""
+        """Return samples of a shard."""
         return self.selection.shard_samples(shard)
 
 

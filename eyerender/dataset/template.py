@@ -99,7 +99,7 @@ class Template:
     def values(
         self, turn: Turn, variables: Mapping[str, Any] = MappingProxyType({})
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Tree of plain values of one sample, and every draw's value (None where it was not used)."""
+        """Return the tree of plain values of one sample, and every draw's value (None where it was not used)."""
         drawn: dict[str, Any] = dict.fromkeys(self.draws)
         tree = self._resolve(self.tree, "", turn, drawn)
         return _with_variables(tree, variables) if variables else tree, drawn
@@ -117,7 +117,7 @@ class Template:
         return node
 
     def _value(self, placed: PlacedDraw, path: str, turn: Turn) -> tuple[Any, int]:
-        """Value of a draw, and its index among the draw's values (0 where it has none to choose from)."""
+        """Return the value of a draw, and its index among the draw's values (0 where it has none to choose from)."""
         draw, unit = placed.draw, placed.unit
         number = turn.sample if unit == "sample" else turn.subject
         attempt = turn.attempt if unit == "sample" else turn.subject_attempt
@@ -142,7 +142,7 @@ class Template:
         return value, 0
 
     def _grid_index(self, path: str, unit: Unit, number: int) -> int:
-        """Index in one grid of the full product, of which the last grid (by name) varies fastest."""
+        """Return the index in one grid of the full product, of which the last grid (by name) varies fastest."""
         grids = [(p, d.draw) for p, d in self.draws.items() if isinstance(d.draw, GridDraw) and d.unit == unit]
         for name, grid in reversed(grids):
             size = grid.size
@@ -162,7 +162,7 @@ def _with_variables(node: Any, variables: Mapping[str, Any]) -> Any:
 
 
 def possible(node: Any) -> list[Any]:
-    """Every value that a node of a template can take; none for numbers that are drawn at random."""
+    """Return every value that a node of a template can take; none for numbers that are drawn at random."""
     if not is_draw(node):
         return [node]
     values = [node.get("value")] if node.get("draw") == "fixed" else node.get("values") or []
@@ -188,7 +188,7 @@ def _label(draw: Draw, value: Any, k: int) -> Any:
 
 @lru_cache(maxsize=16)
 def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
-    """Points block * 256 .. + 255 of a scrambled Sobol sequence in (0, 1), (256, dimensions)."""
+    """Return the points block * 256 .. + 255 of a scrambled Sobol sequence in (0, 1), (256, dimensions)."""
     from scipy.stats import qmc  # which takes half a second
 
     generator = np.random.default_rng([seed, 1 if unit == "subject" else 0])
@@ -290,7 +290,7 @@ def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
 
 
 def _values_of(draw: Draw) -> tuple[Any, ...]:
-    """Values that a draw lists, which may contain draws again."""
+    """Return values that a draw lists, which may contain draws again."""
     if isinstance(draw, FixedDraw):
         return (draw.value,)
     if isinstance(draw, ChoiceDraw | SequenceDraw | GridDraw):

@@ -1,4 +1,4 @@
-"""A worker process, which makes the shards that it is told to make and sends a message after each sample."""
+"""A worker process, which makes the requested shards and sends a message after each sample."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FAILURES: dict[str, type[EyerenderError]] = {"backend": BackendError, "input": I
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """What every worker of a run is told.
+    """Settings of every worker of a run.
 
     This is the plan and the folder of its files, the frames per sample, the folder to write, and the backend with its
     threads. Folders are absolute because a worker may start in any working directory.
@@ -113,7 +113,7 @@ class _Ending:
 
 
 def failure(error: Exception, folder: Path) -> tuple[str, str]:
-    """Kind and reason of an error while a shard is made: one of `FAILURES`, or `error` for a defect."""
+    """Return the kind and reason of an error while a shard is made: one of `FAILURES`, or `error` for a defect."""
     if isinstance(error, OSError):
         return "disk", f"{folder}: cannot be written ({error.strerror or error})"
     if isinstance(error, EyerenderError):

@@ -53,7 +53,7 @@ def write(items: Items, out: Path) -> None:
 
 
 def _gaze(line: dict[str, Any]) -> dict[str, Any]:
-    """Keys of an image: unit vectors in the camera's frame, their angles, and the diameters of the pupil."""
+    """List keys of an image: unit vectors in the camera's frame, their angles, and the diameters of the pupil."""
     space = line["labels"]["space"]["camera"]
     return {**{name: space[name] for name in DIRECTIONS}, **gaze_of(line), **pupil_of(line)}
 
@@ -103,7 +103,7 @@ def _append(file: IO[str], count: int, value: dict[str, Any]) -> int:
 
 
 def run_lengths(inside: Bools) -> list[int]:
-    """COCO's uncompressed run lengths: down the columns, starting with zeros."""
+    """Return COCO's uncompressed run lengths: down the columns, starting with zeros."""
     flat = inside.ravel(order="F")
     edges = np.flatnonzero(np.diff(flat)) + 1
     runs = np.diff(np.concatenate([[0], edges, [flat.size]])).tolist()

@@ -23,7 +23,7 @@ _MAT_TEXT = b"MATLAB 5.0 MAT-file".ljust(116)
 
 
 class _Archive(io.FileIO):
-    """A file for HDF5, which can neither go on nor close after a failed write: the error waits for `check`."""
+    """A file for HDF5, which can neither continue nor close after a failed write; `check` raises the error."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "w+")
@@ -116,6 +116,6 @@ def _write_key(folder: Path, file: Any, dataset: str, split: str) -> None:
 
 
 def fit_of(item: Item, part: str) -> Floats:
-    """Amodal outline as x, y, a, b, angle, or -1 five times."""
+    """Return the amodal outline as x, y, a, b, angle, or -1 five times."""
     ellipse = item.ellipse(part)
     return np.full(5, -1.0) if ellipse is None else np.array(ellipse.numbers())

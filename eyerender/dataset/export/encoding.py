@@ -41,7 +41,7 @@ class Encoding:
     gain_from: str
 
     def apply(self, image: NDArray[Any], bit_depth: int, gamma: float = 1.0) -> NDArray[Any]:
-        """Codes, (h, w) uint8 or uint16, of an image's counts, (h, w) unsigned integers of `bit_depth`.
+        """Return codes, (h, w) uint8 or uint16, of an image's counts, (h, w) unsigned integers of `bit_depth`.
 
         The counts are the linear share of full scale^(1 / gamma).
         """
@@ -49,7 +49,7 @@ class Encoding:
         return np.asarray(table[np.minimum(image.astype(np.intp), len(table) - 1)])
 
     def keeps(self, bit_depth: int, gamma: float = 1.0) -> bool:
-        """Whether the codes are the counts themselves."""
+        """Return whether the codes are the counts themselves."""
         return self.curve == "linear" and self.gain == 1 and self.bits == bit_depth and gamma == 1
 
     def to_mapping(self) -> dict[str, Any]:
@@ -76,7 +76,7 @@ RAW = Encoding(16, "linear", 1.0, "none")
 
 
 def measured_gain(images: Iterable[tuple[NDArray[Any], int, float]]) -> float:
-    """Gain that brings the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
+    """Return the gain that brings the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
 
     Args:
         images: counts (h, w), their bit depths and their gammas.
@@ -108,7 +108,7 @@ def check(bits: int, curve: str | None, gain: float | None) -> None:
 
 @lru_cache(maxsize=4)
 def _table(bits: int, curve: Curve, gain: float, full: int, source_gamma: float) -> NDArray[Any]:
-    """Code of each count."""
+    """Return the code of each count."""
     value = np.minimum(1.0, gain * (np.arange(full + 1) / full) ** source_gamma)
     if curve == "gamma":
         value = value ** (1 / GAMMA)

@@ -29,13 +29,13 @@ distortion, the position of the eye and the roll of the head are not removed.
 
 
 def yaw_pitch_deg(direction: Sequence[float]) -> tuple[float, float]:
-    """Yaw and pitch of a unit vector in the camera's frame."""
+    """Return the yaw and pitch of a unit vector in the camera's frame."""
     x, y, z = direction
     return float(np.degrees(np.arctan2(-x, -z))), float(np.degrees(np.arcsin(np.clip(-y, -1.0, 1.0))))
 
 
 def gaze_of(line: dict[str, Any]) -> dict[str, float]:
-    """Yaw and pitch of both directions, by column."""
+    """Return the yaw and pitch of both directions, by column."""
     space = line["labels"]["space"]["camera"]
     return {
         f"{name}_{angle}_deg": value
@@ -45,6 +45,6 @@ def gaze_of(line: dict[str, Any]) -> dict[str, float]:
 
 
 def pupil_of(line: dict[str, Any]) -> dict[str, float | None]:
-    """Diameters of the pupil, by column; None in datasets of versions before 4."""
+    """Return diameters of the pupil, by column; None in datasets of versions before 4."""
     pupil = line["labels"]["pupil"]
     return {f"pupil_{name}": pupil.get(name) for name in ("entrance_diameter_mm", "stop_diameter_mm")}

@@ -81,7 +81,7 @@ class Item:
         return png_bytes(self.encoding.apply(counts, self.bit_depth, self.entry.gamma))
 
     def exported_line(self) -> dict[str, Any]:
-        """Line of metadata for the exported image."""
+        """Return the line of metadata for the exported image."""
         e = self.encoding
         own = {"bit_depth": e.bits, "encoding": e.curve, "gamma": e.to_mapping()["gamma"], "gain": e.gain}
         return {**self.line, **own, "source_bit_depth": self.bit_depth}
@@ -110,7 +110,7 @@ class Item:
         return out
 
     def ellipse(self, part: str, kind: str = "amodal") -> Ellipse | None:
-        """Ellipse of the pupil or the iris; None where there is none."""
+        """Return the ellipse of the pupil or the iris; None where there is none."""
         found = self.line["labels"][part][kind]
         if found["centre_px"] is None or min(found["semi_axes_px"]) <= 0:
             return None
@@ -119,7 +119,7 @@ class Item:
         return Ellipse(np.array([x - x0, y - y0]), np.array(found["semi_axes_px"]), found["angle_rad"])
 
     def visible(self, part: str) -> bool:
-        """Whether any of the pupil or the iris is visible."""
+        """Return whether any of the pupil or the iris is visible."""
         return bool(self.line["labels"][part]["visible"]["pixels"] > 0)
 
     def glints(self) -> list[tuple[int, float, float, bool]]:
@@ -132,7 +132,7 @@ class Item:
         ]
 
     def pixel_of(self, point_mm: Any) -> Floats:
-        """Pixel of a point of the camera's frame (no lens distortion)."""
+        """Return the pixel of a point of the camera's frame (no lens distortion)."""
         K = np.array(self.line["labels"]["camera"]["K"])
         x = K @ np.asarray(point_mm, dtype=float)
         return np.asarray(x[:2] / x[2] - self.entry.window[:2])

@@ -87,7 +87,7 @@ def _picture(item: Item, name: str) -> dict[str, Any] | None:
 
 
 def _type(name: str) -> str:
-    """Type of a column of labels, as `datasets` calls it."""
+    """Return the type of a column of labels, as `datasets` calls it."""
     if name in _TEXTS:
         return "string"
     if name in _WHOLE:

@@ -36,7 +36,7 @@ def write(items: Items, out: Path) -> None:
 
 
 def row_of(item: Item, lights: int) -> dict[str, Any]:
-    """Flat labels of an image."""
+    """Return flat labels of an image."""
     line = item.exported_line()
     record, labels = line["records"][0], line["labels"]
     x0, y0 = item.entry.window[:2]

@@ -110,7 +110,7 @@ class _Video:
 
 
 def rows_of(item: Item) -> dict[str, list[float]]:
-    """Annotations of a frame, without its number."""
+    """Return annotations of a frame, without its number."""
     space = item.line["labels"]["space"]["camera"]
     globe = np.array(space["globe_centre_mm"])
     K = np.array(item.line["labels"]["camera"]["K"])

@@ -33,7 +33,7 @@ class Tally:
         self.saturated += float(np.mean(image >= full))
 
     def to_mapping(self) -> dict[str, Any]:
-        """Means over all images; empty where there were none."""
+        """Return means over all images; empty where there were none."""
         if not self.images:
             return {}
         return {
@@ -79,7 +79,7 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
 
 
 def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats | None) -> Iterator[str]:
-    """Masks of visible parts and, if there is one, of whole parts."""
+    """Return masks of visible parts and, if there is one, of whole parts."""
     w, h = entry.window[2:]
     for name, picture in (("mask", mask), ("amodal mask", whole)):
         if picture is None:
@@ -94,7 +94,7 @@ def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats 
 
 
 def _iris(mask: Mask) -> Bools:
-    """Pixels of iris and pupil."""
+    """Return pixels of iris and pupil."""
     return np.asarray((mask == IRIS) | (mask == PUPIL))
 
 
@@ -158,7 +158,7 @@ def _compare(name: str, shown: Bools, not_shown: Bools, outline: Outline, window
 
 
 def pupil_outline(line: dict[str, Any]) -> Outline | None:
-    """Apparent outline of the pupil in a line's record; None where it is missing or incomplete."""
+    """Return the apparent outline of the pupil in a line's record; None where it is missing or incomplete."""
     if len(line["records"]) != 1:
         return None
     pupil = line["records"][0]["pupil"]
@@ -171,7 +171,7 @@ def pupil_outline(line: dict[str, Any]) -> Outline | None:
 
 
 def iris_outline(line: dict[str, Any], limbus_px: Floats | None) -> Outline | None:
-    """Apparent limbus, recomputed or the ellipse of the labels; None where there is none."""
+    """Return the apparent limbus, recomputed or the ellipse of the labels; None where there is none."""
     if limbus_px is not None:
         return Outline(limbus_px, EXACT_PX)
     own = line.get("labels", {}).get("iris")
@@ -186,7 +186,7 @@ def _ellipse(values: dict[str, Any], tolerance_px: float) -> Outline:
 
 
 def _share(labels: dict[str, Any], name: str) -> float | None:
-    """Visible fraction of a part in the labels of a dataset or of a rendered folder."""
+    """Return the visible fraction of a part in the labels of a dataset or of a rendered folder."""
     own = labels.get(name)
     value = own["visible_fraction"] if isinstance(own, dict) else labels.get(f"{name}_visible_fraction")
     return None if value is None else float(value)

@@ -50,7 +50,7 @@ class _Shape:
         return cls(frozenset(node), tuple(objects), tuple(lists))
 
     def fits(self, node: Any) -> bool:
-        """Whether a value is an object of this shape."""
+        """Return whether a value is an object of this shape."""
         return (
             isinstance(node, dict)
             and node.keys() == self.keys
@@ -113,7 +113,7 @@ class Lines:
             problems.add(f"{METADATA} line {k + 1}: subject {self._subjects[k]} is in two splits")
 
     def _moved(self) -> Ints:
-        """Lines whose subject was in another split before."""
+        """List lines whose subject was in another split before."""
         order = np.argsort(self._subjects, kind="stable")
         subject, split = self._subjects[order], self._splits[order]
         first = np.concatenate([[True], subject[1:] != subject[:-1]])
@@ -172,7 +172,7 @@ def _agree(line: dict[str, Any]) -> Iterator[str]:
 
 
 def _other_keys(line: dict[str, Any], first: dict[str, Any]) -> Iterator[str]:
-    """Keys that only one of two lines has; below a null any keys are allowed."""
+    """List keys that only one of two lines has; below a null any keys are allowed."""
     keys: set[str] = set()
     known: set[str] = set()
     nulls: set[str] = set()

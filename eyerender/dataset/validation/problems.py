@@ -63,7 +63,7 @@ def _differences_of_keys(expected: dict[str, Any], found: dict[str, Any], tolera
 
 
 def _same_angle(expected: dict[str, Any], found: dict[str, Any], tolerance: float) -> bool:
-    """Whether two ellipses with the same axes are equal within the tolerance, given their angles."""
+    """Return whether two ellipses with the same axes are equal within the tolerance, given their angles."""
     axes, a, b = expected.get("semi_axes_px"), expected.get("angle_rad"), found.get("angle_rad")
     if axes is None or not (isinstance(a, float) and isinstance(b, int | float)):
         return False

@@ -94,7 +94,7 @@ def compare_lines(folder: Path, problems: Problems) -> None:
 
 
 def _values(files: Sequence[Path], numbers: Ints) -> NDArray[np.void]:
-    """Some lines of a few files: their numbers, and hashes of their images' names and of their values."""
+    """Return some lines of a few files: their numbers, and hashes of their images' names and of their values."""
 
     def rows() -> Iterator[tuple[int, int, int]]:
         for number, line in _objects(files, numbers):
@@ -106,7 +106,7 @@ def _values(files: Sequence[Path], numbers: Ints) -> NDArray[np.void]:
 
 
 def _objects(files: Sequence[Path], numbers: Ints) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Lines with given numbers, in order, that are objects; other checks report what is not an object."""
+    """List lines with given numbers, in order, that are objects; other checks report what is not an object."""
     if not len(numbers):
         return
     wanted = iter(numbers.tolist())
@@ -123,7 +123,7 @@ def _objects(files: Sequence[Path], numbers: Ints) -> Iterator[tuple[int, dict[s
 
 
 def _lines(files: Sequence[Path]) -> Iterator[tuple[int, bytes]]:
-    """Lines of several files, numbered from 0; a file that cannot be read has none."""
+    """List lines of several files, numbered from 0; a file that cannot be read has none."""
     number = 0
     for path in files:
         with suppress(InputError, OSError), opened(path, limit=MAX_BYTES, follow=False) as file:
@@ -133,7 +133,7 @@ def _lines(files: Sequence[Path]) -> Iterator[tuple[int, bytes]]:
 
 
 def _plain(node: Any) -> Any:
-    """JSON value with whole numbers in floating-point form where that is exact."""
+    """Return the JSON value with whole numbers in floating-point form where that is exact."""
     if isinstance(node, dict):
         return {key: _plain(value) for key, value in node.items()}
     if isinstance(node, list):
@@ -143,5 +143,5 @@ def _plain(node: Any) -> Any:
 
 
 def hashed(data: bytes) -> int:
-    """Hash of 64 bits."""
+    """Return the hash of 64 bits."""
     return int.from_bytes(hashlib.blake2b(data, digest_size=8).digest(), "big")

@@ -86,7 +86,7 @@ class DatasetTruth:
         return None
 
     def whose(self, line: dict[str, Any]) -> dict[str, Any]:
-        """Subject, split and file names that a line must have; raises one of `WRONG`, `InputError`."""
+        """Return the subject, split and file names that a line must have; raises one of `WRONG`, `InputError`."""
         sample, record = line["sample"], line["records"][0]
         subject, sequence = self.plan.subject_of(sample)
         name = image_name(sample, record["frame"] - sample * self.frames, self.frames, record["eye"])
@@ -157,7 +157,7 @@ class SceneTruth:
         return cls(frames, trace(frames))
 
     def whose(self, line: dict[str, Any]) -> dict[str, Any]:
-        """File names that a line must have; raises one of `WRONG`."""
+        """List file names that a line must have; raises one of `WRONG`."""
         name = f"{line['records'][0]['frame']:06d}_{line['records'][0]['eye']}"
         return {"file_name": f"images/{name}.png", "mask_file_name": f"masks/{name}.png"}
 
@@ -219,7 +219,7 @@ def _differences(expected: dict[str, Any], line: dict[str, Any]) -> list[str]:
 
 
 def _summed(texts: Iterator[str]) -> list[str]:
-    """First of several differences, and the number of the others."""
+    """Return the first of several differences, and the number of further ones."""
     found = list(texts)
     if len(found) > _SHOWN:
         found = [*found[:_SHOWN], f"{len(found) - _SHOWN} more values differ"]
