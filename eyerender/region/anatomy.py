@@ -188,7 +188,7 @@ class Region(Spec):
         return self
 
     def of_side(self, side: str) -> Self:
-        """The region of the right or left eye: their brows may differ in height."""
+        """Return the region of the right or left eye: their brows may differ in height."""
         if self.brow.asymmetry_mm == 0:
             return self
         half = 0.5 * self.brow.asymmetry_mm * (1 if side == "left" else -1)

@@ -54,7 +54,7 @@ def brow(spec: Region) -> Hairs:
 
 
 def brow_band(spec: Region, s: Floats) -> tuple[Floats, Floats, Floats]:
-    """Coordinates y, lower z and upper z of the band at s."""
+    """Compute the coordinates y, lower z and upper z of the band at s."""
     b = spec.brow
     y = 21.0 - 46.0 * s
     arch = b.arch_mm * np.sin(np.pi * np.clip(s / 1.25, 0, 1)) ** 1.5

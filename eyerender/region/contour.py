@@ -57,7 +57,7 @@ class Contour(ArrayValue):
     openness: float
 
     def every(self, step: int) -> Contour:
-        """Every `step`-th column, from the first."""
+        """Return every `step`-th column, from the first."""
         arrays = ("angle", "along", "upper", "point", "normal", "away", "along_lid")
         return replace(self, **{name: getattr(self, name)[::step] for name in arrays})
 
@@ -70,12 +70,12 @@ def step(x: NDArray[Any] | float, low: float, high: float) -> NDArray[Any]:
 
 
 def unit(v: Floats) -> Floats:
-    """Unit vectors (..., 3)."""
+    """Compute unit vectors (..., 3)."""
     return np.asarray(v / np.maximum(lengths(v)[..., None], 1e-12))
 
 
 def canthi(spec: Region) -> tuple[Floats, Floats]:
-    """Middle (y, z) of the chord between the canthi, and half the chord from there to the medial one."""
+    """Compute the middle (y, z) of the chord between the canthi, and half the chord from there to the medial one."""
     f = spec.fissure
     tilt = np.radians(f.tilt_deg)
     half = f.width_mm / 2 * np.array([np.cos(tilt), -np.sin(tilt)])
@@ -84,7 +84,7 @@ def canthi(spec: Region) -> tuple[Floats, Floats]:
 
 
 def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
-    """Contour of the fissure for a posed globe."""
+    """Compute the contour of the fissure for a posed globe."""
     angle, a, upper, on_globe, flat = _columns(columns)
     yz, openness = _outline(spec, globe, a, upper)
     centre = globe.rest + on_globe * (globe.centre - globe.rest)
@@ -111,7 +111,7 @@ def _columns(count: int) -> tuple[Floats, ...]:
 
 
 def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floats, float]:
-    """Inner edge (y, z) as seen from the front (n, 2), and the openness."""
+    """Compute the inner edge (y, z) as seen from the front (n, 2), and the openness."""
     f, lids = spec.fissure, spec.lids
     middle, half = canthi(spec)
     chord = middle + a[:, None] * half
@@ -157,7 +157,7 @@ def _shape(a: Floats, peak: float, power: float) -> Floats:
 
 
 def _support(globe: Globe, centre: Floats, yz: Floats) -> tuple[Floats, Floats]:
-    """Points over (y, z) of the sphere or its softened tangent continuation, and their normals."""
+    """Compute points over (y, z) of the sphere or its softened tangent continuation, and their normals."""
     d = yz - centre[..., 1:]
     rho = np.maximum(np.hypot(d[..., 0], d[..., 1]), 1e-9)
     e = d / rho[..., None]

@@ -41,7 +41,7 @@ _DEPTH = np.array([
 
 
 def face_depth(face: Face, y_mm: Floats, z_mm: Floats) -> Floats:
-    """Depth x (mm) of the face over points (y, z) of the region's frame."""
+    """Compute the depth x (mm) of the face over points (y, z) of the region's frame."""
     off = MIDDLE_MM - y_mm
     # The face is mirrored, and rounded where the halves meet. More than a centimetre away the rounding has no effect.
     folded = MIDDLE_MM - (np.sqrt(off * off + 5.5**2) - 5.5 * np.exp(-((off / 9.0) ** 2)))

@@ -81,7 +81,7 @@ class Globe(ArrayValue):
         return float(np.arcsin(np.clip(self.M[2, 0], -1, 1)))
 
     def radial(self, direction: Floats) -> Floats:
-        """Radius r (n,) mm along unit directions (n, 3) from the centre."""
+        """Compute the radius r (n,) mm along unit directions (n, 3) from the centre."""
         direction = np.asarray(direction)
         r = np.full(direction.shape[:-1], self.radius_mm)
         if self.cornea is not None:
@@ -90,7 +90,7 @@ class Globe(ArrayValue):
         return r
 
     def _height(self, direction: Floats) -> Floats:
-        """Height (n,) mm of the cornea above the sphere along unit directions (n, 3) within its table."""
+        """Compute the height (n,) mm of the cornea above the sphere along unit directions (n, 3) within its table."""
         posed = _posed(self)
         x, y, z = (direction @ posed.axes).T
         row = np.arccos(np.minimum(x, 1.0)) * ((_POLAR - 1) / _WIDEST)
@@ -104,7 +104,7 @@ class Globe(ArrayValue):
         return np.asarray((1 - column) * before + column * after)
 
     def clearance(self, points: Floats) -> Floats:
-        """Distance (n,) mm of points (n, 3) from the globe along the line from its centre; negative inside."""
+        """Find the distance (n,) mm of points (n, 3) from the globe along the line from its centre; negative inside."""
         away = points - self.centre
         distance = np.maximum(lengths(away), 1e-9)
         return np.asarray(distance - self.radial(away / distance[..., None]))

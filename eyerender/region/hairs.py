@@ -59,7 +59,7 @@ class Hairs(ArrayValue):
 
 @lru_cache(maxsize=8)
 def tube_faces(count: int, points: int, sides: tuple[int, ...] = (0, 2), pointed: bool = False) -> Ints:
-    """Triangles (m, 3) of `count` tubes of `points` rings.
+    """Compute triangles (m, 3) of `count` tubes of `points` rings.
 
     The sides of a tube follow its corners, so the side 1 is opposite to the first corner. Tubes that are `pointed` end
     in the first corner of their last ring.

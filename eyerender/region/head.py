@@ -85,7 +85,7 @@ def load_head(spec: Head) -> HeadMesh:
 
 
 def file_states(spec: Head) -> tuple[tuple[int, int], ...]:
-    """Time of change and size of each file of a spec with absolute paths.
+    """Compute the time of change and size of each file of a spec with absolute paths.
 
     Raises:
         InputError: a file is missing.
@@ -99,7 +99,7 @@ def file_states(spec: Head) -> tuple[tuple[int, int], ...]:
 
 
 def _all_objects(spec: Head) -> dict[str, list[trimesh.Trimesh]]:
-    """Meshes of all files by their names.
+    """Compute meshes of all files by their names.
 
     Raises:
         InputError: a checksum is wrong.
@@ -218,7 +218,7 @@ def _rows(texture_rows: int) -> int:
 
 
 def _map_uv(head: HeadMesh, texture: int) -> Floats:
-    """Places in the map; `texture` is the number of the texture's rows, 0 without one."""
+    """Compute places in the map; `texture` is the number of the texture's rows, 0 without one."""
     h = texture or _PLAIN
     rows = _rows(h)
     part = np.searchsorted(head.vertex_ends, np.arange(len(head.vertices)), side="right")
@@ -230,13 +230,13 @@ def _map_uv(head: HeadMesh, texture: int) -> Floats:
 
 
 def texture_rows(spec: Head) -> int:
-    """Number of rows of the texture in the map, 0 without one."""
+    """Compute the number of rows of the texture in the map, 0 without one."""
     return 0 if spec.texture is None else len(_picture(Path(spec.texture), Path(spec.texture).stat().st_mtime_ns))
 
 
 @lru_cache(maxsize=2)
 def _picture(path: Path, changed_ns: int) -> Floats:
-    """Red channel of an image, linear, 0 to 1, at most 2048 rows and columns."""
+    """Compute the red channel of an image, linear, 0 to 1, at most 2048 rows and columns."""
     del changed_ns
     try:
         with opened(path) as stream, Image.open(stream, formats=_PICTURES) as file:
@@ -256,7 +256,7 @@ def _picture(path: Path, changed_ns: int) -> Floats:
 
 
 def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
-    """Named objects of a file: an OBJ's objects, or its groups where it has none; a PLY under its stem."""
+    """Return named objects of a file: an OBJ's objects, or its groups where it has none; a PLY under its stem."""
     import trimesh  # which takes a quarter of a second, and few processes need it
 
     source, kind = str(path), path.suffix.lower()
@@ -319,7 +319,7 @@ def _axes(spec: Head, source: str) -> Floats:
 
 
 def _smooth(vertices: Floats, faces: Ints) -> Floats:
-    """Unit normals of the vertices, equal for vertices at one place, so that seams of a texture do not show."""
+    """Compute unit normals of the vertices, equal for vertices at one place, so that seams of a texture do not show."""
     import trimesh
 
     _, first, same = np.unique(np.round(vertices, 6), axis=0, return_index=True, return_inverse=True)

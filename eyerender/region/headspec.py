@@ -99,7 +99,7 @@ class Head(Spec):
 
 
 def is_manifest(name: str) -> bool:
-    """Whether a file name is that of a manifest, not of a mesh."""
+    """Return whether a file name is that of a manifest, not of a mesh."""
     return name.lower().endswith(".json")
 
 

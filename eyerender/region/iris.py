@@ -86,7 +86,7 @@ def _noise(
 
 
 def iris_maps(iris: DrawnPattern) -> Singles:
-    """Relative albedo and height (mm) of an iris, (2, RADIAL, ANGULAR).
+    """Compute the relative albedo and height (mm) of an iris, (2, RADIAL, ANGULAR).
 
     Rows run from the pupil's margin (0) to the root (1), columns once around. The mean albedo over the iris' area is 1;
     heights are above the plane of the iris, 0 at margin and root.
@@ -136,7 +136,7 @@ def iris_maps(iris: DrawnPattern) -> Singles:
 
 
 def _fibres(rng: np.random.Generator, warp: Singles, ciliary: Singles, strength: float) -> tuple[Singles, Singles]:
-    """Relative albedo and height (mm) of the radial fibres."""
+    """Compute the relative albedo and height (mm) of the radial fibres."""
     shape = (RADIAL, ANGULAR)
 
     def bent(field: Singles, share: float) -> Singles:
@@ -163,7 +163,7 @@ def _fibres(rng: np.random.Generator, warp: Singles, ciliary: Singles, strength:
 
 
 def _furrows(rng: np.random.Generator, s: NDArray[Any], turn: NDArray[Any]) -> Singles:
-    """Depth 0 to 1 of the contraction furrows: arcs in the outer half, each over a part of the circle."""
+    """Compute the depth 0 to 1 of the contraction furrows: arcs in the outer half, each over a part of the circle."""
     out = np.zeros(np.broadcast_shapes(s.shape, turn.shape), np.float32)
     count = int(rng.integers(2, 6))
     for place in np.linspace(rng.uniform(0.5, 0.64), rng.uniform(0.82, 0.93), count) + rng.uniform(-0.03, 0.03, count):
@@ -179,7 +179,7 @@ def _furrows(rng: np.random.Generator, s: NDArray[Any], turn: NDArray[Any]) -> S
 def _crypts(
     rng: np.random.Generator, strength: float, *, s: NDArray[Any], off: NDArray[Any], turn: NDArray[Any], warp: Singles
 ) -> tuple[Singles, Singles]:
-    """Fuchs' crypts, lens-shaped gaps in the front layer, as depth 0 to 1, and the trabeculae between them.
+    """Compute Fuchs' crypts, lens-shaped gaps in the front layer, as depth 0 to 1, and the trabeculae between them.
 
     They form a lattice along the collarette that is deep in some sectors and closed in others, with a few single crypts
     towards the root.

@@ -83,7 +83,7 @@ def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
     spread = np.radians(spec.spread_deg)
 
     def both(common: float, own: float) -> Floats:
-        """Deviations that a tuft shares, and deviations of its members."""
+        """Compute deviations that a tuft shares, and deviations of its members."""
         return common * _shared(rng.normal(0, 1, count), tuft) + own * rng.normal(0, 1, count)
 
     # A few lashes cross all others.
@@ -104,19 +104,19 @@ def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
 
 
 def _tufts(rng: np.random.Generator, count: int) -> Ints:
-    """Number of the tuft of each lash; a tuft has one to six."""
+    """Compute the number of the tuft of each lash; a tuft has one to six."""
     sizes = rng.choice([1, 2, 3, 4, 5, 6], max(count, 1), p=[0.24, 0.2, 0.2, 0.17, 0.12, 0.07])
     return np.repeat(np.arange(len(sizes)), sizes)[:count].astype(np.int64)
 
 
 def _shared(values: Floats, tuft: Ints) -> Floats:
-    """One value for all lashes of a tuft: that of the first."""
+    """Return one value for all lashes of a tuft: that of the first."""
     first = np.searchsorted(tuft, tuft)
     return np.asarray(values[first])
 
 
 def _means(values: Floats, tuft: Ints) -> Floats:
-    """Mean over the tuft of each lash."""
+    """Compute the mean over the tuft of each lash."""
     total, number = np.bincount(tuft, values, 1), np.bincount(tuft, minlength=1)
     return np.asarray((total / np.maximum(number, 1))[tuft])
 
@@ -162,7 +162,7 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
 
 
 def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
-    """Whether the first pieces of curves (n, k, 3) cross the sheet near their roots (n,), on either lid.
+    """Return whether the first pieces of curves (n, k, 3) cross the sheet near their roots (n,), on either lid.
 
     The test is that of Moeller and Trumbore.
     """
@@ -190,7 +190,7 @@ def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
 
 
 def _at(angle: Floats, values: Floats) -> Floats:
-    """Values (columns, k) at column angles, interpolated linearly."""
+    """Return values (columns, k) at column angles, interpolated linearly."""
     n = len(values)
     place = angle / (2 * np.pi) * n
     i = np.floor(place).astype(int)
@@ -217,7 +217,7 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     out, k = points.copy(), points.shape[1]
 
     def lift(at: Floats, within: float, least: Floats) -> tuple[Floats, Floats]:
-        """Moves of points (..., 3) to the height `least`, and their distances from the skin."""
+        """Compute moves of points (..., 3) to the height `least`, and their distances from the skin."""
         distance, nearest = tree.query(at, eps=_NEARLY, distance_upper_bound=within)
         normal = normals[nearest]
         return normal * np.maximum(least + heights[nearest] - dots(at, normal), 0)[..., None], distance
@@ -252,7 +252,7 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
         search = np.ones((len(active), at.shape[1]), dtype=bool)
         if not len(active):
             break
-    # A lash that was deformed too much for want of room is reduced to its root.
+    # Lashes that cannot be bent out of the skin are collapsed to their root.
     way = np.diff(out, axis=1)
     pieces, rest = (lengths(v) for v in (way, np.diff(straight, axis=1)))
     spoilt = ((pieces / np.maximum(rest, 1e-9)).max(axis=1) > 1.7) | (left > _CAUGHT_MM)

@@ -98,7 +98,7 @@ def sheet(spec: Region, globe: Globe) -> Sheet:
 
 
 def halved(grid: Floats) -> Floats:
-    """Grid (rows, 2 n, 3) with a column halfway between each two of a closed one (rows, n, 3)."""
+    """Compute the grid (rows, 2 n, 3) with a column halfway between each two of a closed one (rows, n, 3)."""
     rows, columns, _ = grid.shape
     out = np.empty((rows, 2 * columns, 3))
     out[:, ::2] = grid
@@ -108,7 +108,7 @@ def halved(grid: Floats) -> Floats:
 
 
 def grid_normals(vertices: Floats) -> Floats:
-    """Unit normals of a grid (rows, columns, 3) that is closed along its columns."""
+    """Compute unit normals of a grid (rows, columns, 3) that is closed along its columns."""
     across, out = np.empty_like(vertices), np.empty_like(vertices)
     across[:, 1:-1] = vertices[:, 2:] - vertices[:, :-2]
     across[:, 0], across[:, -1] = vertices[:, 1] - vertices[:, -1], vertices[:, 0] - vertices[:, -2]
@@ -122,7 +122,7 @@ def grid_normals(vertices: Floats) -> Floats:
 
 
 def margin_width(spec: Region, c: Contour) -> Floats:
-    """Thickness of the margin (columns,); the lower one is thinner (Zhu et al. 2022).
+    """Compute the thickness of the margin (columns,); the lower one is thinner (Zhu et al. 2022).
 
     It decreases towards the canthi. The margins of closed lids are equally thick, so that neither overhangs the other's
     lashes.
@@ -134,7 +134,7 @@ def margin_width(spec: Region, c: Contour) -> Floats:
 
 
 def _across() -> tuple[Floats, Floats]:
-    """Places of the margin's rows, from its inner edge (0) to the outer one (1), and their rounding (mm)."""
+    """Compute places of the margin's rows, from its inner edge (0) to the outer one (1), and their rounding (mm)."""
     turn = np.cos(np.pi * np.linspace(0, 1, MARGIN)[:, None, None])
     u = 0.5 - 0.5 * turn * (0.6 + 0.4 * turn**2)
     return u, EDGE_MM * (2 * u - 1) ** 4
@@ -157,7 +157,7 @@ def _margin(spec: Region, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
 
 
 def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
-    """Rows from below the globe's surface to the inner edge (exclusive)."""
+    """List rows from below the globe's surface to the inner edge (exclusive)."""
     away = c.point - globe.centre
     distance = lengths(away)
     on_globe = step(distance - globe.radial(unit(away)), 0.6, 0.05)
@@ -194,7 +194,7 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
 
 
 def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Floats:
-    """Coordinate z (columns,) on a line across the corner of the fissure, evenly between the lids' crossings.
+    """Find the coordinate z (columns,) on a line across the corner of the fissure, evenly between the lids' crossings.
 
     Near the canthus, where the contour's own z crowd, the distances h from the canthus grow as the square root of
     theirs.
@@ -211,7 +211,7 @@ def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Flo
 
 
 def _skin(spec: Region, globe: Globe, c: Contour, lash_line: Floats) -> Floats:
-    """Rows from the lash line (exclusive) outwards, in the columns of a contour."""
+    """List rows from the lash line (exclusive) outwards, in the columns of a contour."""
     crease = _crease(spec, c)
     v, y, z = _spokes(c, crease, lash_line)
     # Lids move their own skin, and move that of the brow and the cheek less the farther away it is.
@@ -235,7 +235,7 @@ def _skin(spec: Region, globe: Globe, c: Contour, lash_line: Floats) -> Floats:
 
 
 def _spokes(c: Contour, crease: Floats, lash_line: Floats) -> tuple[Floats, Floats, Floats]:
-    """Distance from the lash line, y and z (rows, columns) of places on straight lines out to the border."""
+    """Find the distance from the lash line, y and z (rows, columns) of places on straight lines out to the border."""
     y0, z0 = lash_line[:, 1], lash_line[:, 2]
     border_y, border_z = _border(c)
     dy, dz = border_y - y0, border_z - z0
@@ -247,7 +247,7 @@ def _spokes(c: Contour, crease: Floats, lash_line: Floats) -> tuple[Floats, Floa
 
 @lru_cache(maxsize=8)
 def _at_rest(spec: Region, columns: int) -> tuple[Floats, Floats]:
-    """Coordinates y and z (rows, columns) of the skin with the eye open and straight ahead."""
+    """Compute the coordinates y and z (rows, columns) of the skin with the eye open and straight ahead."""
     globe = Globe.sphere()
     c = contour(spec, globe, columns)
     _, lash_line = _margin(spec, globe, c)
@@ -256,7 +256,7 @@ def _at_rest(spec: Region, columns: int) -> tuple[Floats, Floats]:
 
 
 def _border(c: Contour) -> tuple[Floats, Floats]:
-    """Outer end (y, z) of the sheet: a rounded rectangle."""
+    """Compute the outer end (y, z) of the sheet: a rounded rectangle."""
     cos, sin = np.cos(c.angle), np.sin(c.angle)
     power = 0.72
     return (
@@ -276,7 +276,7 @@ def _crease(spec: Region, c: Contour) -> Floats:
 
 
 def _distances(crease: Floats, length: Floats) -> Floats:
-    """Distances v (LID + FACE, columns) from the lash line: dense at the lash line and about the crease."""
+    """Compute the distances v (LID + FACE, columns) from the lash line: dense at the lash line and about the crease."""
     turn = np.cos(np.pi * _LID_ROWS)
     lid = (0.5 - 0.5 * turn * (0.55 + 0.45 * turn**2))[:, None] * crease
     k = np.arange(1, FACE + 1) / FACE
@@ -286,7 +286,7 @@ def _distances(crease: Floats, length: Floats) -> Floats:
 
 
 def _fold(spec: Region, c: Contour, v: Floats, crease: Floats, strength: Floats) -> tuple[Floats, Floats]:
-    """Depth that the fold adds, and its overhang over the crease (both rows x columns, mm)."""
+    """Compute the depth that the fold adds, and its overhang over the crease (both rows x columns, mm)."""
     lids = spec.lids
     open_ = min(max(c.openness, 0.0), 1.15)
     height = lids.fold_mm * (0.4 + 0.6 * open_) * strength
@@ -321,7 +321,7 @@ def _epicanthus(spec: Region, c: Contour, v: Floats, x: Floats, y: Floats, z: Fl
 
 
 def _fullness(spec: Region, c: Contour, y: Floats, z: Floats) -> Floats:
-    """Filling (mm) of the hollow above the lid as the lid comes down and brings its skin and fat along."""
+    """Compute the filling (mm) of the hollow above the lid as the lid comes down and brings its skin and fat along."""
     shut = 1 - min(c.openness, 1.0)
     return np.asarray(spec.lids.fill_mm * shut * np.exp(-(((z - 10.5) / 6.0) ** 2) - np.square((y - 1.0) / 18.0) ** 2))
 
@@ -349,7 +349,7 @@ def skin_depth(spec: Region, globe: Globe, y: Floats, z: Floats) -> Floats:
 
 
 def _canthal_hollow(spec: Region, y: Floats, z: Floats) -> Floats:
-    """Depth by which the canthal tendons hold back the skin about either canthus, mm."""
+    """Compute the depth by which the canthal tendons hold back the skin about either canthus, mm."""
     middle, half = canthi(spec)
     out = np.zeros_like(y)
     for end, depth, wide in ((middle - half, 2.2, 4.2), (middle + half, 1.4, 3.5)):
@@ -358,7 +358,7 @@ def _canthal_hollow(spec: Region, y: Floats, z: Floats) -> Floats:
 
 
 def _bulge(globe: Globe, y: Floats, z: Floats, outer: float) -> Floats:
-    """Lift of a lid by the cornea below it: a soft hill about the optic axis."""
+    """Compute the lift of a lid by the cornea below it: a soft hill about the optic axis."""
     axis, centre = globe.axis, globe.centre
     apex = centre + outer * axis
     d2 = (y - apex[1]) ** 2 + (z - apex[2]) ** 2

@@ -14,7 +14,7 @@ from ..geometry.surfaces import Surface
 
 
 def upwards(front: Surface) -> Floats:
-    """Direction (2,) in the y, z plane of the front cornea's own frame that is up in the eye frame."""
+    """Compute the direction (2,) in the y, z plane of the front cornea's own frame that is up in the eye frame."""
     up = np.asarray(front.rotation)[2, 1:]
     return np.asarray(up / np.hypot(*up))
 

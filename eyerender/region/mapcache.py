@@ -56,7 +56,7 @@ def without_cache() -> Iterator[None]:
 
 
 def kept(make: Callable[[_Argument], NDArray[Any]], argument: _Argument) -> NDArray[Any]:
-    """Read-only array that `make(argument)` gives, float16 or float32; from disk where it is known.
+    """Compute the read-only array that `make(argument)` gives, float16 or float32; from disk where it is known.
 
     Args:
         make: a function of the module's top level that depends on its argument alone.
@@ -75,7 +75,7 @@ def kept(make: Callable[[_Argument], NDArray[Any]], argument: _Argument) -> NDAr
 
 
 def folder() -> Path | None:
-    """Folder of the maps; None where none are kept."""
+    """Return the folder of the maps; None where none are kept."""
     place = cache_folder()
     return place / "maps" if place is not None and _limit_bytes() > 0 else None
 
@@ -99,7 +99,7 @@ def _place(name: str, argument: int | Region | DrawnPattern) -> Path | None:
 
 @lru_cache(maxsize=1)
 def _code() -> list[str]:
-    """What makes the maps: the package's version, a digest of this folder's sources, NumPy and SciPy."""
+    """Say what makes the maps: the package's version, a digest of this folder's sources, NumPy and SciPy."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())

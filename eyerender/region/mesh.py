@@ -122,19 +122,19 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
 
 
 def _closed(grid: Floats) -> Floats:
-    """Grid with its first column repeated at the end, where the map's u is 1."""
+    """Compute the grid with its first column repeated at the end, where the map's u is 1."""
     return np.concatenate([grid, grid[:, :1]], axis=1)
 
 
 def _joined(fine: Floats, coarse: Floats, lash_tubes: Floats, hair_tubes: Floats, film: Floats) -> Floats:
-    """All vertices (n, 3), or their normals; `sheet_vertices` numbers those of the sheet."""
+    """Return all vertices (n, 3), or their normals; `sheet_vertices` numbers those of the sheet."""
     parts = (_closed(fine), _closed(coarse), lash_tubes, hair_tubes, film)
     return np.concatenate([p.reshape(-1, 3) for p in parts])
 
 
 @lru_cache(maxsize=16)
 def _brow(spec: Region) -> tuple[Hairs, Floats, Floats]:
-    """Brow, its tubes and their normals; it does not blink."""
+    """Compute the brow, its tubes and their normals; it does not blink."""
     hairs = brow(spec)
     tubes, normals = hairs.tubes(np.array([1.0, 0.0, 0.0]))
     return hairs, sealed(tubes), sealed(normals)
@@ -173,7 +173,7 @@ def _layout(upper_count: int, lash_count: int, brow_count: int, mirrored: bool) 
 
 
 def _tear_faces() -> Ints:
-    """Triangles (m, 3) of the menisci, where they have any height."""
+    """Compute triangles (m, 3) of the menisci, where they have any height."""
     n = COLUMNS + 1
     high = on_globe(2 * np.pi * np.arange(n) / COLUMNS) > 0
     i, j = np.meshgrid(np.arange(TEAR_ROWS - 1), np.flatnonzero(high[:-1] | high[1:]), indexing="ij")
@@ -184,7 +184,7 @@ def _tear_faces() -> Ints:
 
 @lru_cache(maxsize=1)
 def sheet_faces() -> Ints:
-    """Triangles (m, 3) of the sheet, from row to row.
+    """Compute triangles (m, 3) of the sheet, from row to row.
 
     From the row `FINE` on, cells are two columns wide. That row itself has a vertex in every column for the cells
     before it. Every second one lies on an edge of the cells after it, which is divided there, so that no gap opens.
@@ -209,14 +209,14 @@ def sheet_vertices(row: Ints | int, column: Ints | int) -> Ints:
 
 @lru_cache(maxsize=1)
 def sheet_ends() -> Bools:
-    """Whether each triangle of the sheet of skin is in its first or last row, which no other row continues."""
+    """Return whether each triangle of the sheet of skin is in its first or last row, which no other row continues."""
     within = (sheet_vertices(1, 0) <= sheet_faces()) & (sheet_faces() < sheet_vertices(ROWS - 1, 0))
     return frozen(~within.all(axis=1), np.bool_)
 
 
 @lru_cache(maxsize=1)
 def sheet_neighbours() -> Ints:
-    """Numbers (2, ROWS, COLUMNS) of the vertices at each place of the sheet's grid, or before and after it."""
+    """List numbers (2, ROWS, COLUMNS) of the vertices at each place of the sheet's grid, or before and after it."""
     i, j = np.meshgrid(np.arange(ROWS), np.arange(COLUMNS), indexing="ij")
     odd = np.where(i > FINE, j % 2, 0)
     return frozen(np.stack([sheet_vertices(i, j - odd), sheet_vertices(i, j + odd)]), np.int64)
@@ -234,7 +234,7 @@ def _grid_uv(u: Floats, v: Floats) -> Floats:
 
 
 def _lash_uv(upper_count: int, count: int) -> Floats:
-    """Coordinates of lashes, upper ones first: u runs from root to tip in the half of the band of its lid."""
+    """Compute coordinates of lashes, upper ones first: u runs from root to tip in the half of the band of its lid."""
     along = LASH_U[0] + LASH_U[1] * np.arange(SEGMENTS + 1) / SEGMENTS
     lower = np.where(np.arange(count) < upper_count, 0.0, 0.5)
     u = np.repeat((lower[:, None] + along).reshape(-1), 3)

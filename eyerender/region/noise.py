@@ -17,7 +17,7 @@ _BLOCK, _CANDIDATES = 8, 12  # one place in twenty thousand would need more cand
 
 
 def gain(f: Floats, low: float, high: float) -> Floats:
-    """Gain of a band-pass from `low` to `high` at the frequencies f."""
+    """Compute the gain of a band-pass from `low` to `high` at the frequencies f."""
     out = np.exp(-((f / high) ** 2))
     return np.asarray(out * (1 - np.exp(-((f / low) ** 2))) if low > 0 else out)
 
@@ -53,7 +53,7 @@ def band(seed: int, size: int, across: tuple[float, float], up: tuple[float, flo
 
 
 def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Singles:
-    """Height 0 (furrow) to about 1 (plateau) over a periodic square of `cells` cells.
+    """Compute the height 0 (furrow) to about 1 (plateau) over a periodic square of `cells` cells.
 
     The height is the distance to the border between the nearest two seeds. `stretch` > 1 draws cells out across.
     """
@@ -138,7 +138,7 @@ class Places:
 
     @staticmethod
     def _split(turns: Singles, size: int) -> tuple[Any, Singles]:
-        """Whole and fractional part of coordinates in texels, the whole ones from 0 to `size`."""
+        """Compute the whole and fractional part of coordinates in texels, the whole ones from 0 to `size`."""
         turns -= np.floor(turns)
         turns *= np.float32(size)
         whole = turns.astype(np.int32)
@@ -146,7 +146,7 @@ class Places:
         return whole, turns
 
     def sample(self, tile: Padded) -> Singles:
-        """Values of one tile, in the shape of the places."""
+        """Return values of one tile, in the shape of the places."""
         rows = []
         for pairs in (tile.pairs, tile.pairs[self._width :]):
             both = pairs.take(self._at)

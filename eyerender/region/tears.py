@@ -25,13 +25,13 @@ _SLOPE = 0.12  # standard deviation of the slope of the short waves at an uneven
 
 
 def waves(spec: Region, count: int) -> Floats:
-    """Slope of the meniscus along the lids at `count` places once around the fissure."""
+    """Compute the slope of the meniscus along the lids at `count` places once around the fissure."""
     return _SLOPE * spec.tears.unevenness * _noise(spec.seed + 1, count, *_SHORT)
 
 
 @lru_cache(maxsize=16)
 def _noise(seed: int, count: int, low: int, high: int) -> Floats:
-    """Noise (count,) of mean 0 and variance 1 with `low` to `high` waves around the fissure."""
+    """Compute the noise (count,) of mean 0 and variance 1 with `low` to `high` waves around the fissure."""
     rng = np.random.default_rng((0x7EA2, seed))
     turn = rng.uniform(0, 2 * np.pi, high - low)
     angle = 2 * np.pi * np.arange(count)[:, None] / count
@@ -39,12 +39,12 @@ def _noise(seed: int, count: int, low: int, high: int) -> Floats:
 
 
 def on_globe(angle: Floats) -> Floats:
-    """Share of its height that the meniscus has at angles about the fissure; it ends towards the canthi."""
+    """Compute the share of its height that the meniscus has at angles about the fissure; it ends towards the canthi."""
     return np.asarray(step(np.abs(np.sin(angle)), 0.25, 0.6))
 
 
 def meniscus(spec: Region, globe: Globe, sheet: Sheet) -> Floats:
-    """Vertices (ROWS, columns, 3) of the strip, from the globe to the margin."""
+    """Compute vertices (ROWS, columns, 3) of the strip, from the globe to the margin."""
     c = sheet.contour
     height = spec.tears.height_mm * on_globe(c.angle) * np.where(c.upper > 0, 0.66, 1.0) * step(c.openness, 0.02, 0.25)
     low = np.maximum(1 + 0.8 * spec.tears.unevenness * _noise(spec.seed, len(c.angle), *_LONG), 0.15)

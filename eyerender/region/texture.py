@@ -12,7 +12,7 @@ from .noise import band_noise, gain
 
 
 def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) -> Floats:
-    """Isotropic Gaussian noise of unit variance on a periodic square, `low` to `high` cycles."""
+    """Compute the isotropic Gaussian noise of unit variance on a periodic square, `low` to `high` cycles."""
     f = np.hypot((np.fft.fftfreq(size) * size)[:, None], (np.fft.rfftfreq(size) * size)[None, :])
     keep = gain(f, low, high)
     keep[0, 0] = 0
@@ -22,7 +22,7 @@ def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) ->
 
 @lru_cache(maxsize=4)
 def sclera_texture(seed: int, size: int = 768) -> Singles:
-    """Relative albedo (size, size) of the globe's front, azimuthal equidistant to 108 degrees from the pole.
+    """Find the relative albedo (size, size) of the globe's front, azimuthal equidistant to 108 degrees from the pole.
 
     It has slow unevenness and conjunctival vessels, which are faint at 850 nm. The vessels run in from the fornices,
     branch and end before the limbus.
@@ -39,7 +39,7 @@ def sclera_texture(seed: int, size: int = 768) -> Singles:
 
 
 def _vessels(rng: np.random.Generator, size: int) -> Singles:
-    """Loss of light over the vessels of a globe's front, (size, size)."""
+    """Compute the loss of light over the vessels of a globe's front, (size, size)."""
     limbus = 0.29 / 0.6 / 2 * size / np.pi * 1.02  # 29 degrees of polar angle, in pixels of the map
     half, count = size / 2, 70
     start, away = rng.uniform(0, 2 * np.pi, count), size * rng.uniform(0.36, 0.48, count)
@@ -88,7 +88,7 @@ def _vessels(rng: np.random.Generator, size: int) -> Singles:
 
 @lru_cache(maxsize=4)
 def skin_texture(seed: int, size: int = 768) -> Singles:
-    """Relative albedo (size, size) of a periodic tile of skin: slow unevenness, the net of furrows, pores."""
+    """Find the relative albedo (size, size) of a periodic tile of skin: slow unevenness, the net of furrows, pores."""
     rng = np.random.default_rng((0x5817, seed))
     slow = 0.025 * _even_noise(rng, size, 0, 3)
     net = np.abs(_even_noise(rng, size, 45, 70))  # zero crossings: a net of furrows about a millimetre wide
