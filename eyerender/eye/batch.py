@@ -21,11 +21,11 @@ _RECORDS = (LineOfSight, RotationCentres, Sphere, Stop)
 CHUNK_POINTS = 30000
 """Points refracted at once: fewer leave the time to the interpreter, more leave the cache."""
 FEW_EYES = 4
-"""Up to so many different eyes are traced one after the other with plain numbers; more are stacked."""
+"""Largest number of different eyes that are traced one after the other with plain numbers; more are stacked."""
 
 
 def structure_of(eye: EyeModel) -> Structure:
-    """Structure that eyes must share to be stacked: kinds and numbers of surfaces."""
+    """Compute the structure that eyes must share to be stacked: kinds and numbers of surfaces."""
     front, back = (tuple(s.kind for s in surfaces) for surfaces in (eye.front, eye.back))
     return front, back, eye.back_passing, eye.lens_gradient is not None, eye.retina.kind
 
@@ -44,7 +44,7 @@ def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
 
 
 def take_eyes(eye: EyeModel, index: Indices) -> EyeModel:
-    """Eyes of a batch at `index`; a single eye is returned as it is."""
+    """Compute eyes of a batch at `index`; a single eye is returned as it is."""
     if eye.fovea_mm.ndim == 1:
         return eye
     return replace(eye, **{name: _taken(getattr(eye, name), index) for name in _NUMBERS})
@@ -65,7 +65,7 @@ def _stacked(values: tuple[Any, ...]) -> Any:
 
 
 def _taken(value: Any, index: Indices) -> Any:
-    """Parts of a batch of eyes at `index`."""
+    """Return parts of a batch of eyes at `index`."""
     if isinstance(value, np.ndarray):
         return value[index]
     if isinstance(value, tuple):
@@ -76,7 +76,7 @@ def _taken(value: Any, index: Indices) -> Any:
 
 
 def groups(eyes: Sequence[EyeModel], which: Indices) -> list[tuple[tuple[EyeModel, Indices | None], Indices]]:
-    """Rows whose eyes can be traced together: ((eye or stacked eyes, row -> eye of the stack), rows)."""
+    """List rows whose eyes can be traced together: ((eye or stacked eyes, row -> eye of the stack), rows)."""
     kinds: dict[object, list[int]] = {}
     for k in np.unique(which):
         kinds.setdefault(structure_of(eyes[k]), []).append(int(k))
@@ -124,6 +124,6 @@ def slices(count: int, size: int) -> list[slice]:
 
 
 def _with_waves(stop: Stop, waves: int) -> Stop:
-    """The stop with its contour padded by zeros to `waves`."""
+    """Return the stop with its contour padded by zeros to `waves`."""
     missing = waves - stop.contour.shape[-1]
     return replace(stop, contour=np.pad(stop.contour, ((0, 0), (0, missing)))) if missing else stop

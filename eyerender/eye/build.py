@@ -65,7 +65,7 @@ def fitting_stop(spec: EyeParts, pupil_diameter_mm: float | None) -> Stop:
 
 
 def bare_eye(spec: EyeParts, wavelength_nm: float, stop: Stop) -> EyeModel:
-    """The right eye without its landmarks (fovea and chief ray are zeros), which is enough for tracing."""
+    """Return the right eye without its landmarks (fovea and chief ray are zeros), which is enough for tracing."""
     front = tuple(surface_of(s) for s in spec.cornea)
     front_indices = tuple(index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(spec.cornea))
     back: tuple[Surface, ...] = ()
@@ -127,7 +127,7 @@ class _Key:
 
 @lru_cache(maxsize=64)
 def _with_surfaces(spec: _Key, wavelength_nm: float) -> EyeModel:
-    """The right eye with its fovea, which does not depend on the stop; its stop is the file's own."""
+    """Return the right eye with its fovea, which does not depend on the stop; its stop is the file's own."""
     parts = spec.spec
     bare = bare_eye(parts, wavelength_nm, stop_of(parts, parts.stop.diameter_mm))
     if parts.fovea.position_mm is not None:
@@ -140,7 +140,7 @@ def _with_surfaces(spec: _Key, wavelength_nm: float) -> EyeModel:
 
 @lru_cache(maxsize=256)
 def _with_landmarks(spec: _Key, wavelength_nm: float, stop_centre_mm: tuple[float, float, float]) -> EyeModel:
-    """The right eye with all landmarks, of which the chief ray depends on the stop's centre only."""
+    """Return the right eye with all landmarks, of which the chief ray depends on the stop's centre only."""
     eye = replace(_with_surfaces(spec, wavelength_nm), name=spec.spec.name)
     eye = replace(eye, stop=replace(eye.stop, centre_mm=np.array(stop_centre_mm)))
     return replace(eye, chief_ray=chief_ray_in_air(eye, eye.fovea_mm))

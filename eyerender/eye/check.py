@@ -142,7 +142,7 @@ def _stop_depth(centre: Floats, normal: Floats, grid: Floats) -> Floats:
 
 
 def _disc(radius_mm: float, centre: Floats) -> Floats:
-    """Points (y, z) that fill a disc."""
+    """Compute points (y, z) that fill a disc."""
     radius, angle = np.meshgrid(np.linspace(0.0, radius_mm, 25), np.linspace(0.0, 2 * np.pi, 32, endpoint=False))
     return centre + np.column_stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()])
 
@@ -189,7 +189,7 @@ def _shape_problem(placed: PlacedSpec) -> tuple[str, str] | None:
 
 
 def _continued(surface: Measured) -> tuple[str, str] | None:
-    """Problem of a measured surface that its outer biconic does not continue."""
+    """Return the problem of a measured surface that its outer biconic does not continue."""
     away = misfit_mm(surface)
     if away < _MISFIT_MM:
         return None

@@ -25,7 +25,7 @@ _ANY = np.array([8.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 @lru_cache(maxsize=4096)
 def zernike_surface(shape: ZernikeSpec) -> ZernikeSurface:
-    """The surface of Zernike terms at the eye's origin."""
+    """Return the surface of Zernike terms at the eye's origin."""
     coefficients = np.zeros(terms(max(order_of(len(shape.coefficients_mm)), 1)))
     coefficients[: len(shape.coefficients_mm)] = shape.coefficients_mm
     base = np.array([0.0 if shape.base_radius_mm is None else 1.0 / shape.base_radius_mm, shape.base_conic_constant])
@@ -38,7 +38,7 @@ def zernike_surface(shape: ZernikeSpec) -> ZernikeSurface:
 
 @lru_cache(maxsize=256)
 def grid_surface(shape: GridSpec) -> GridSurface:
-    """The bicubic surface of a grid of heights at the eye's origin."""
+    """Return the bicubic surface of a grid of heights at the eye's origin."""
     heights, spacing = np.array(shape.heights_mm).T, np.array(shape.spacing_mm)
     half = 0.5 * (len(heights) - 1) * float(spacing)
     zone = half / WINDOW[1] if shape.zone_radius_mm is None else shape.zone_radius_mm
@@ -72,7 +72,7 @@ def grid_surface(shape: GridSpec) -> GridSurface:
 
 
 def misfit_mm(surface: Measured) -> float:
-    """Root mean square of the deviation from the outer biconic, on a circle in the middle of the window."""
+    """Compute the root mean square of the deviation from the outer biconic, on a circle in the middle of the window."""
     angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
     radius = float(np.mean(surface.window_mm))
     y, z = radius * np.cos(angle), radius * np.sin(angle)

@@ -27,7 +27,7 @@ _SETTLED_MM = 1e-10
 
 
 def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS, distance_mm: float = FAR_MM) -> float:
-    """Diameter of the entrance pupil of a single eye, for the circle of equal area.
+    """Compute the diameter of the entrance pupil of a single eye, for the circle of equal area.
 
     Args:
         eye: the eye.
@@ -42,7 +42,7 @@ def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS, distance_mm: float
 
 @remembered
 def entrance_pupil(eye: EyeModel) -> tuple[Floats, float]:
-    """Centre (3,) mm and lateral magnification of the paraxial image of the stop, seen from air.
+    """Compute the centre (3,) mm and lateral magnification of the paraxial image of the stop, seen from air.
 
     n / s - n' / s' = (n - n') / R at each surface, from the stop outwards; m = n s' / (n' s).
     """
@@ -67,7 +67,7 @@ def stop_for_entrance(
     *,
     points: int = POINTS,
 ) -> float:
-    """Diameter of the stop that has an entrance pupil of `entrance_mm`.
+    """Compute the diameter of the stop that has an entrance pupil of `entrance_mm`.
 
     Args:
         front: refracting surfaces before the stop, outside in.
@@ -111,7 +111,7 @@ def _diameter(
 
 
 def _curvature(surface: Surface) -> float:
-    """Mean curvature at the apex (1/mm), from the sag."""
+    """Compute the mean curvature at the apex (1/mm), from the sag."""
     h = 0.05
     # A measured surface may lean at its apex, so both sides count.
     ends = sum(surface.sag(s * h, 0.0) + surface.sag(0.0, s * h) for s in (1, -1))

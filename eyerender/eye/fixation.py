@@ -53,7 +53,8 @@ class Fixations(ArrayValue):
 
     Attributes:
         poses: poses of the eye.
-        residual_mm: (n,) by how much the line of sight misses (chief ray: the target; entrance window: the fovea).
+        residual_mm: (n,) miss distance of the line of sight (chief ray: from the target; entrance window: from the
+            fovea).
         status: (n,) of `Status`.
         line_of_sight_mm: (n, 3) point of the unturned eye where the line of sight meets the cornea.
         line_of_sight_direction: (n, 3) unit vectors from there to the target, in the eye-fixed frame.
@@ -66,7 +67,7 @@ class Fixations(ArrayValue):
     line_of_sight_direction: Floats
 
     def reason(self, item: int) -> str | None:
-        """Reason why fixation `item` failed; None if it did not."""
+        """Compute the reason why fixation `item` failed; None if it did not."""
         return Status(int(self.status[item])).reason
 
     def __len__(self) -> int:
@@ -216,7 +217,7 @@ def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floa
 
 
 def entrance_window_centre(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Bools]:
-    """Centre of the entrance window seen from viewpoints, and where there is none.
+    """Compute the centre of the entrance window seen from viewpoints, and where there is none.
 
     c = mean(p_i) - t mean(u_i) with exit points p_i and directions u_i, where t makes c come closest to the optic axis.
     Where the mean ray runs along the optic axis, t is not determined. The window is then that of a viewpoint 1e-4 rad
@@ -248,7 +249,7 @@ def _mean_ray(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Floats, Bool
 
 
 def _to_the_axis(point: Floats, way: Floats) -> Floats:
-    """Parameter t (n,) for which point - t way comes closest to the x axis."""
+    """Compute the parameter t (n,) for which point - t way comes closest to the x axis."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.sum(way[:, 1:] * point[:, 1:], axis=-1) / np.sum(way[:, 1:] ** 2, axis=-1))
 
@@ -263,7 +264,7 @@ def _status(target_mm: Floats, *, azimuth: Floats, elevation: Floats, residual: 
 
 
 def _tangents(direction: Xyz) -> tuple[Xyz, Xyz]:
-    """Two unit vectors orthogonal to a direction that points roughly along +x."""
+    """Make two unit vectors orthogonal to a direction that points roughly along +x."""
     x, y, z = direction
     scale = 1.0 / np.sqrt(x * x + y * y)
     e1 = (-y * scale, x * scale, 0.0 * x)

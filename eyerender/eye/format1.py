@@ -69,7 +69,7 @@ def _placed(value: Any, path: str) -> Any:
 
 
 def _apex_from_centre(shape: Any, path: str) -> float | None:
-    """Distance of the apex from the centre along the axis (mm); None where the shape itself is wrong."""
+    """Compute the distance of the apex from the centre along the axis (mm); None where the shape itself is wrong."""
     kind = shape.get("kind") if isinstance(shape, Mapping) else None
     if kind == "ellipsoid":
         semi_axes = _numbers(shape.get("semi_axes_mm"), 3)
@@ -87,7 +87,7 @@ def _apex_from_centre(shape: Any, path: str) -> float | None:
 
 
 def _tilt_deg(rotation: Floats) -> Floats:
-    """Angles (deg) about x, y, z of a rotation (3, 3) as Rz Ry Rx."""
+    """Compute angles (deg) about x, y, z of a rotation (3, 3) as Rz Ry Rx."""
     about_y = np.arctan2(-rotation[2, 0], np.hypot(rotation[2, 1], rotation[2, 2]))
     about_z = np.arctan2(rotation[1, 0], rotation[0, 0])
     # The remaining rotation is the one about x, also where x and z turn about one axis.

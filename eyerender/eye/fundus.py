@@ -83,7 +83,7 @@ class Spread:
 
 
 def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: float, spread: Spread) -> FundusLight:
-    """Light of lamps that the fundus returns to a camera.
+    """Compute the light of lamps that the fundus returns to a camera.
 
     Args:
         eye: the eye.
@@ -150,7 +150,7 @@ def _sums(seen: Floats, lit: Floats, sigma: float, fall: float) -> tuple[Floats,
 
 @remembered
 def retinal_scale_mm(eye: EyeModel) -> float:
-    """Height on the retina per angle (rad) in air about the entrance pupil, mm.
+    """Compute the height on the retina per angle (rad) in air about the entrance pupil, mm.
 
     Without a lens it is D w / u, with D the distance of the stop from the fovea, and u = n w / m by Lagrange's
     invariant. An eye with a lens is nearly in focus; then it is the distance of the nodes from the fovea.
@@ -166,7 +166,7 @@ def _inner_index(eye: EyeModel) -> float:
 
 
 def _retina_area_mm2(eye: EyeModel) -> float:
-    """Area of the inside of the globe, that of the sclera's sphere less its wall of about 1 mm."""
+    """Compute the area of the inside of the globe, that of the sclera's sphere less its wall of about 1 mm."""
     return float(4 * np.pi * (float(eye.sclera.radius_mm) - 1.0) ** 2)
 
 
@@ -184,7 +184,7 @@ def _pupil_nodes(eye: EyeModel) -> tuple[Floats, float]:
 
 
 def _direction(way: Floats, axis: Floats, plane: Floats) -> Floats:
-    """Angle (2,) rad between a unit vector and an axis, along the axes of a plane across it."""
+    """Compute the angle (2,) rad between a unit vector and an axis, along the axes of a plane across it."""
     across = plane @ way
     sine = np.linalg.norm(across)
     return np.asarray(across * (np.arctan2(sine, way @ axis) / sine) if sine > 0 else across)

@@ -30,7 +30,7 @@ _SETTLED_MM = 1e-9
 
 
 def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
-    """The point (3,) where the pupillary axis leaves the cornea, and its outward unit direction (3,).
+    """Return the point (3,) where the pupillary axis leaves the cornea, and its outward unit direction (3,).
 
     Raises:
         InputError: the cornea has no such axis.
@@ -39,7 +39,7 @@ def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
 
 
 def kappa_deg(eye: EyeModel) -> tuple[float, float]:
-    """Angles (horizontal, vertical) of the line of sight from the pupillary axis, nasal and up, in degrees.
+    """Compute angles (horizontal, vertical) of the line of sight from the pupillary axis, nasal and up, in degrees.
 
     Raises:
         InputError: the cornea has no pupillary axis.
@@ -50,7 +50,7 @@ def kappa_deg(eye: EyeModel) -> tuple[float, float]:
 
 
 def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
-    """Where the fovea (3,) must lie for an angle kappa: the retina's point on that line of sight.
+    """Find where the fovea (3,) must lie for an angle kappa: the retina's point on that line of sight.
 
     Args:
         eye: the eye, whose own fovea does not matter.
@@ -88,7 +88,7 @@ def with_kappa(spec: EyeSpec, wanted_deg: tuple[float, float], *, wavelength_nm:
 
 
 def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: float = 1500.0) -> tuple[float, float]:
-    """Angles (horizontal, vertical) of the nodal ray that ends on the fovea, nasal and up, in degrees.
+    """Compute angles (horizontal, vertical) of the nodal ray that ends on the fovea, nasal and up, in degrees.
 
     Args:
         eye: the eye.
@@ -149,7 +149,7 @@ def _through_stop(eye: EyeModel, way: Callable[[Floats], Floats], reason: str) -
 
 
 def angles_of(eye: EyeModel, way: Floats) -> Floats:
-    """Angles (2,) rad of a direction from the optic axis, nasal and up: it is along (1, tan h, tan v)."""
+    """Compute angles (2,) rad of a direction from the optic axis, nasal and up: it is along (1, tan h, tan v)."""
     return np.asarray(np.arctan2([_handed(eye) * way[1], way[2]], way[0]))
 
 

@@ -24,7 +24,7 @@ NODE_DISTANCE_MM = 1500.0
 
 
 def path_to_retina(eye: EyeModel) -> tuple[Crossing, ...]:
-    """All crossings from air to the retina; the last one does not bend the light, which ends there."""
+    """Return all crossings from air to the retina; the last one does not bend the light, which ends there."""
     last = eye.back_indices[-1] if eye.back else eye.front_indices[-1]
     lens = zip(eye.back, eye.back_indices, eye.back_rims_mm, eye.back_passing, _through(eye, 1), strict=True)
     return (
@@ -38,12 +38,12 @@ def path_to_retina(eye: EyeModel) -> tuple[Crossing, ...]:
 
 
 def _through(eye: EyeModel, last: int) -> list[GradientMedium | None]:
-    """Medium before each surface of the lens, on a path that leaves a gradient lens at its surface `last`."""
+    """Find the medium before each surface of the lens, on a path that leaves a gradient lens at its surface `last`."""
     return [eye.lens_gradient if k == last else None for k in range(len(eye.back))]
 
 
 def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Floats, Floats]:
-    """Rays from objects that reach the retina parallel to themselves.
+    """Compute rays from objects that reach the retina parallel to themselves.
 
     Args:
         eye: the eye.
@@ -70,7 +70,7 @@ def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Flo
 
 
 def _parallel_rays(path: Sequence[Crossing], objects_mm: Floats, direction: Floats) -> tuple[Floats, Floats, Floats]:
-    """Newton on the change of direction, with differences over 1e-5 rad: directions, |change|, retina points."""
+    """Run Newton on the change of direction, with differences over 1e-5 rad: directions, |change|, retina points."""
     for _ in range(30):
         first, second = _tangents(direction)
         bundle = np.stack([direction, direction + _STEP * first, direction + _STEP * second])
@@ -91,14 +91,14 @@ def _parallel_rays(path: Sequence[Crossing], objects_mm: Floats, direction: Floa
 
 
 def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
-    """Crossings that one traced ray (leading shape (1,)) really met, without their rims."""
+    """Compute crossings that one traced ray (leading shape (1,)) really met, without their rims."""
     moved = np.linalg.norm(np.diff(traced.points_mm[:, 0], axis=0), axis=-1) > 0.0
     return tuple(replace(c, rim_mm=np.inf, beyond_rim=Status.MISSED) for c, met in zip(path, moved, strict=True) if met)
 
 
 @remembered
 def incident_node(eye: EyeModel) -> Floats:
-    """Incident node (3,): the waist of a ring of nodal rays.
+    """Compute the incident node (3,): the waist of a ring of nodal rays.
 
     The ring has 16 nodal rays from (h, v) = 14.3 deg (sin f, cos f), from objects 1500 mm from the apex. The node is
     the mean of the points of closest approach of all pairs. It lies on the optic axis where the eye is centred about
@@ -125,7 +125,7 @@ def incident_node(eye: EyeModel) -> Floats:
 
 
 def fovea_by_nodal_ray(eye: EyeModel, node_mm: Floats, field_rad: Floats, distance_mm: float) -> Floats:
-    """Fovea (3,): where the nodal ray from the field direction (h nasal, v up) meets the retina.
+    """Compute the fovea (3,): where the nodal ray from the field direction (h nasal, v up) meets the retina.
 
     The object lies in the direction (1, tan h, tan v) from the incident node, `distance_mm` from the corneal apex.
     """
@@ -137,7 +137,7 @@ def fovea_by_nodal_ray(eye: EyeModel, node_mm: Floats, field_rad: Floats, distan
 
 
 def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
-    """Ray that leaves the fovea, passes the stop's centre and goes out into the air.
+    """Compute the ray that leaves the fovea, passes the stop's centre and goes out into the air.
 
     It is fixed in the eye, so fixation by chief ray only has to turn the eye until it meets the target.
 
@@ -181,7 +181,7 @@ def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
 
 
 def field_direction(field_rad: Floats) -> Floats:
-    """Unit vectors along (1, tan h, tan v); field angles (..., 2) -> (..., 3)."""
+    """Compute unit vectors along (1, tan h, tan v); field angles (..., 2) -> (..., 3)."""
     field = np.asarray(field_rad, dtype=np.float64)
     return normalize(np.stack([np.ones(field.shape[:-1]), np.tan(field[..., 0]), np.tan(field[..., 1])], axis=-1))
 

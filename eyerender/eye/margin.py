@@ -72,13 +72,13 @@ class PupilMargin(Spec):
         return self
 
     def outline(self) -> ContourSpec | None:
-        """Outline that is drawn or given; None where that of the eye file is kept."""
+        """Compute the outline that is drawn or given; None where that of the eye file is kept."""
         if self.seed is None:
             return self.contour
         return drawn_contour(self.seed, NONCIRCULARITY if self.noncircularity is None else self.noncircularity)
 
     def applied(self, eye: EyeSpec) -> EyeSpec:
-        """Eye file with this margin in its stop."""
+        """Return the eye file with this margin in its stop."""
         changes: dict[str, object] = {"shift_mm_per_mm": self.shift_mm_per_mm}
         outline = self.outline()
         if outline is not None:

@@ -113,7 +113,7 @@ def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
 
 
 def cornea_patches(eye: EyeModel, rings: int, sectors: int) -> tuple[Patch, ...]:
-    """Patches of the cornea's refracting surfaces, from outside: the front, and the back if there is one."""
+    """Compute patches of the cornea's refracting surfaces, from outside: the front, and the back if there is one."""
     limbus = np.full(sectors, float(eye.limbus_radius_mm))
     indices = [1.0, *(float(n) for n in eye.front_indices)]
     patches = [_cap("cornea_front", eye.front[0], limbus, rings, indices[0], indices[1])]
@@ -126,7 +126,7 @@ def cornea_patches(eye: EyeModel, rings: int, sectors: int) -> tuple[Patch, ...]
 
 def _cap(name: str, surface: Surface, rho: Floats, rings: int, exterior: float, interior: float,
          inward: bool = False) -> Patch:  # fmt: skip
-    """Part of a surface within radius rho (sectors,) of its axis; faces towards +x, or -x if `inward`."""
+    """Compute the part of a surface within radius rho (sectors,) of its axis; faces towards +x, or -x if `inward`."""
     sectors = len(rho)
     angle = 2 * np.pi * np.arange(sectors) / sectors
     share = np.arange(1, rings + 1) / rings
@@ -147,7 +147,7 @@ def _fan(sectors: int) -> Ints:
 
 
 def _strips(first: int, rings: int, sectors: int) -> Ints:
-    """Quads between consecutive rings of `sectors` vertices; the innermost ring starts at vertex `first`."""
+    """Compute quads between consecutive rings of `sectors` vertices; the innermost ring starts at vertex `first`."""
     i, j = np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij")
     a, k = first + i * sectors, (j + 1) % sectors
     upper = np.stack([a + j, a + sectors + j, a + sectors + k], axis=-1)
@@ -156,7 +156,7 @@ def _strips(first: int, rings: int, sectors: int) -> Ints:
 
 
 def _rim(patch: Patch, sectors: int) -> Floats:
-    """Last ring of a patch."""
+    """Compute the last ring of a patch."""
     return patch.vertices[-sectors:]
 
 
@@ -169,7 +169,7 @@ def _trimesh(vertices: Floats, faces: Ints, normals: Floats | None = None) -> An
 def _band(
     name: str, inner: Floats, outer: Floats, exterior: float | None = None, interior: float | None = None
 ) -> Patch:
-    """Strip between two rings, oriented like a cap that continues from `inner` to `outer`."""
+    """Compute the strip between two rings, oriented like a cap that continues from `inner` to `outer`."""
     sectors = len(inner)
     vertices = np.concatenate([inner, outer])
     faces = _strips(0, 2, sectors)
@@ -190,7 +190,7 @@ def chamber_rim(surface: Surface, centre: Floats, normal: Floats, limbus_mm: flo
 
 
 def _lenses(eye: EyeModel, outside: float, rings: int, sectors: int, angle: Floats) -> list[tuple[Patch, Patch, Patch]]:
-    """Front, equator and back of the lens and of every shell inside it; all face out of the lens."""
+    """Compute the front, equator and back of the lens and of every shell inside it; all face out of the lens."""
     found = []
     count = len(eye.back) // 2
     before = [outside, *(float(n) for n in eye.back_indices)]
@@ -209,7 +209,7 @@ def _lenses(eye: EyeModel, outside: float, rings: int, sectors: int, angle: Floa
 
 
 def _meeting(front: Surface, back: Surface, rim: float, angle: Floats) -> float:
-    """Largest radius, at most `rim`, at which the front is at least a hundredth of a mm before the back."""
+    """Compute the largest radius, at most `rim`, at which the front is at least a hundredth of a mm before the back."""
     low, high = 0.0, rim
     for _ in range(50):
         middle = 0.5 * (low + high) if high != rim or low > 0 else rim
@@ -228,7 +228,7 @@ def _meeting(front: Surface, back: Surface, rim: float, angle: Floats) -> float:
 
 
 def _retinal_wall(eye: EyeModel, depth: float, rings: int, sectors: int, angle: Floats) -> tuple[Patch, Floats]:
-    """Sphere 1 mm inside the sclera from the plane x = depth to its back pole, and its first ring."""
+    """Compute the sphere 1 mm inside the sclera from the plane x = depth to its back pole, and its first ring."""
     centre, radius = np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm) - _WALL_MM
     start = np.arccos(np.clip((depth - centre[0]) / radius, -1, 1))
     polar = start + (np.pi - start) * np.arange(rings) / rings
@@ -237,7 +237,7 @@ def _retinal_wall(eye: EyeModel, depth: float, rings: int, sectors: int, angle: 
 
 
 def _sclera(eye: EyeModel, rim: Floats, rings: int) -> Patch:
-    """Sphere of the sclera from the cornea's rim to its back pole; its first ring is that rim."""
+    """Compute the sphere of the sclera from the cornea's rim to its back pole; its first ring is that rim."""
     centre, radius = np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm)
     r = rim - centre
     start = np.arctan2(np.hypot(r[:, 1], r[:, 2]), r[:, 0])
@@ -249,7 +249,7 @@ def _sclera(eye: EyeModel, rim: Floats, rings: int) -> Patch:
 
 
 def _polar(name: str, centre: Floats, radius: float, polar: Floats, angle: Floats) -> Patch:
-    """Part of a sphere by rings of polar angle (rings, sectors) from +x, closed at its back pole."""
+    """Compute the part of a sphere by rings of polar angle (rings, sectors) from +x, closed at its back pole."""
     rings, sectors = polar.shape
     n = np.stack(
         [np.cos(polar), np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle)], axis=-1
@@ -262,7 +262,7 @@ def _polar(name: str, centre: Floats, radius: float, polar: Floats, angle: Float
 
 
 def _iris(eye: EyeModel, sectors: int) -> Patch:
-    """Annulus in the stop's plane from the pupil's margin to the root, facing the cornea."""
+    """Compute the annulus in the stop's plane from the pupil's margin to the root, facing the cornea."""
     inner = eye.stop.boundary(sectors)
     if float(eye.stop.handed) < 0:
         inner = np.roll(inner[::-1], 1, axis=0)

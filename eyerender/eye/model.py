@@ -48,7 +48,7 @@ class Stop(ArrayValue):
         return np.asarray(self.rotation[..., :, 0])
 
     def relative_radius(self, angle_rad: npt.ArrayLike) -> Floats:
-        """Relative radius r at the parameter f of the ellipse.
+        """Compute the relative radius r at the parameter f of the ellipse.
 
         f is counted from the first semi-axis of the right eye's stop towards up; it is mirrored for a left eye.
 
@@ -64,7 +64,7 @@ class Stop(ArrayValue):
         return out
 
     def boundary(self, count: int) -> Floats:
-        """Points of the margin, evenly spaced in the ellipse's parameter, (..., count, 3).
+        """Compute points of the margin, evenly spaced in the ellipse's parameter, (..., count, 3).
 
         The first lies on the first semi-axis (nasal where it is not turned), and the next follow towards up. Those of a
         left eye are the mirror images of the right eye's.
@@ -79,7 +79,7 @@ class Stop(ArrayValue):
         return np.asarray(c + first[..., None] * r[..., :, 1] + second[..., None] * r[..., :, 2])
 
     def contains(self, points_mm: npt.ArrayLike) -> Bools:
-        """Whether points (..., 3) of the plane lie inside the margin; (n, ..., 3) for a batch of stops."""
+        """Return whether points (..., 3) of the plane lie inside the margin; (n, ..., 3) for a batch of stops."""
         point = components(points_mm)
         ndim = point[0].ndim
         _, y, z = turn_back(self.rotation, shift(point, self.centre_mm, -1.0))
@@ -90,13 +90,13 @@ class Stop(ArrayValue):
         return np.asarray(first * first + second * second <= limit * limit)
 
     def height_mm(self, point: Xyz) -> Floats:
-        """Height of points above the stop's plane, towards the cornea."""
+        """Compute the height of points above the stop's plane, towards the cornea."""
         ndim = point[0].ndim
         gap = shift(point, self.centre_mm, -1.0)
         return np.asarray(sum(gap[i] * fit(self.rotation[..., i, 0], ndim) for i in range(3)))
 
     def lets_through(self, course_mm: npt.ArrayLike) -> Bools:
-        """Whether rays pass inside the margin wherever they cross the stop's plane.
+        """Return whether rays pass inside the margin wherever they cross the stop's plane.
 
         Args:
             course_mm: (k, ..., 3) points of the rays in order, inside the eye; (k, n, ..., 3) for a batch of n stops.

@@ -76,7 +76,7 @@ class QuadricSpec(Spec):
 class ZernikeSpec(Spec):
     """Zernike terms on a conic: x = conic(y, z) - sum_j c_j Z_j(y / r, z / r), shifted to x = 0 at the position.
 
-    The terms are orthonormal on the disc of radius r and stand in the standard order of OSA/ANSI: j = (n (n + 2) + m) /
+    The terms are orthonormal on the disc of radius r, in the standard order of OSA/ANSI: j = (n (n + 2) + m) /
     2, the angle counted from +y (nasal) towards +z (up). Coefficients are depths, positive into the eye. Beyond the
     measured zone a biconic continues the surface, see `zone_radius_mm`.
     """
@@ -216,7 +216,7 @@ class GradientLensSpec(Spec):
     (n_core - n_edge) p^2. The centre is at `centre_mm`, or on the line between the two apexes at `centre_fraction` of
     it, counted from the front. Rays are traced through the gradient itself, or through the given number of `shells` in
     each half: shell k is where n has changed by k / shells from edge to core, and the medium inside it has the index
-    half a step farther. `layers` in place of `shells` gives each shell a size and an index of its own, from outside in.
+    half a step farther. `layers` instead of `shells` gives the size and the index of each shell, from outside in.
     """
 
     kind: Literal["gradient"] = Field(description="the kind of lens")

@@ -53,13 +53,13 @@ class Poses(ArrayValue):
 
 
 def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Floats:
-    """Torsion tau = -asin(sin az sin el / (1 + cos az cos el))."""
+    """Compute the torsion tau = -asin(sin az sin el / (1 + cos az cos el))."""
     azimuth, elevation = np.asarray(azimuth_rad), np.asarray(elevation_rad)
     return np.asarray(-np.arcsin(np.sin(azimuth) * np.sin(elevation) / (1.0 + np.cos(azimuth) * np.cos(elevation))))
 
 
 def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
-    """Rigid motion of the eye: x_turned = M x + t in the eye frame.
+    """Compute the rigid motion of the eye: x_turned = M x + t in the eye frame.
 
     The world's point is x_turned + the eye's position + the head's position.
 
@@ -77,7 +77,7 @@ def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
 
 
 def centres_of(eye: EyeModel) -> Floats:
-    """Centres of azimuth, elevation and torsion, (1, 9), or (n, 9) for a batch."""
+    """Compute centres of azimuth, elevation and torsion, (1, 9), or (n, 9) for a batch."""
     r = eye.rotation
     centres = np.concatenate([r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm], axis=-1)
     return np.array(np.atleast_2d(centres))
@@ -115,5 +115,5 @@ def into_eye(turning: Turning, eye: EyeModel, point: Xyz) -> Xyz:
 
 
 def split(vector: Floats) -> Xyz:
-    """Components of vectors (..., 3), as views."""
+    """Compute components of vectors (..., 3), as views."""
     return vector[..., 0], vector[..., 1], vector[..., 2]

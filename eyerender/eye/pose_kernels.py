@@ -16,7 +16,7 @@ _STEPS = 20
 
 @compiled("f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1]")
 def move_all(angles: Floats, centres: Floats, turn: Floats, shift: Floats) -> None:
-    """Rigid motions Rz(a) about c_a, Ry(-e) about c_e, Rx(t) about c_t, the last one first.
+    """Compute the rigid motions Rz(a) about c_a, Ry(-e) about c_e, Rx(t) about c_t, the last one first.
 
     Args:
         angles: (n, 3) a, e and t, rad.
@@ -41,7 +41,7 @@ def move_all(angles: Floats, centres: Floats, turn: Floats, shift: Floats) -> No
 
 @inlined
 def seen(c, target, azimuth, elevation):  # type: ignore[no-untyped-def]
-    """The target in the frame of the turned eye, with its derivatives by azimuth and elevation.
+    """Return the target in the frame of the turned eye, with its derivatives by azimuth and elevation.
 
     Listing's torsion is included. `c` are the centres of azimuth, elevation and torsion.
     """
@@ -70,7 +70,7 @@ def seen(c, target, azimuth, elevation):  # type: ignore[no-untyped-def]
 
 @inlined
 def dot(a, b):  # type: ignore[no-untyped-def]
-    """Scalar product a.b."""
+    """Compute the scalar product a.b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

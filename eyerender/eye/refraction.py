@@ -22,12 +22,12 @@ _SLOPE = 1e-4
 
 
 def at_cornea_d(spectacles_d: float, vertex_mm: float = VERTEX_MM) -> float:
-    """Refraction at the cornea of eyes that need spectacles of a power: F / (1 - d F)."""
+    """Compute the refraction at the cornea of eyes that need spectacles of a power: F / (1 - d F)."""
     return spectacles_d / (1.0 - vertex_mm * spectacles_d / 1000.0)
 
 
 def refraction_d(eye: EyeModel, *, vertex_mm: float = VERTEX_MM) -> tuple[float, float, float]:
-    """Spectacle refraction (D) about the optic axis as a power vector: sphere equivalent M, J0, J45.
+    """Compute the spectacle refraction (D) about the optic axis as a power vector: sphere equivalent M, J0, J45.
 
     The refraction in the meridian f, from nasal towards up, is M + J0 cos 2f + J45 sin 2f (Thibos, Wheeler and Horner
     1997, Optom. Vis. Sci. 74, 367-375). Derivatives are central differences over 0.002 mm and 0.0001 rad.

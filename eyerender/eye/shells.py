@@ -94,5 +94,5 @@ def shelled(eye: EyeModel, count: int = SHELLS) -> EyeModel:
 
 
 def passing_shells(count: int) -> tuple[bool, ...]:
-    """Whether a ray may miss each surface of a lens of shells: true for all but the outermost."""
+    """Return whether a ray may miss each surface of a lens of shells: true for all but the outermost."""
     return tuple(k not in (0, count - 1) for k in range(count))

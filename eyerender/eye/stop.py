@@ -30,5 +30,5 @@ def stop_of(spec: EyeParts, diameter_mm: float) -> Stop:
 
 
 def stop_reach_mm(stop: Stop) -> float:
-    """Largest distance of the margin from the stop's centre, within 0.1 %."""
+    """Compute the largest distance of the margin from the stop's centre, within 0.1 %."""
     return float(np.max(np.linalg.norm(stop.boundary(360) - stop.centre_mm, axis=-1)))

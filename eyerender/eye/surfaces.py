@@ -84,7 +84,7 @@ def medium_of(spec: MediumSpec) -> Medium:
 
 
 def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
-    """Index at a wavelength.
+    """Compute the index at a wavelength.
 
     Raises:
         InputError: the index is below 1.
@@ -110,7 +110,7 @@ def sclera_of(spec: EyeParts, cornea: Surface) -> Sphere:
 
 
 def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]:
-    """Geometry of a gradient lens: (front, back, centre (3,)).
+    """Compute the geometry of a gradient lens: (front, back, centre (3,)).
 
     Raises:
         InputError: the surfaces cannot be those of a gradient lens.
@@ -156,7 +156,7 @@ def gradient_lens(
 
 
 def _equator_radius(front: Surface, back: Surface) -> float:
-    """Distance from the axis (mm) where the outer front and back surfaces meet; infinite if they do not."""
+    """Compute the distance from the axis (mm) where the outer front and back surfaces meet; infinite if they do not."""
     thickness = float(np.linalg.norm(front.origin_mm - back.origin_mm))
 
     def gap(r: float) -> float:

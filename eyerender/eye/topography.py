@@ -85,7 +85,7 @@ def read_topography(spec: TopographySpec, folder: str | Path = ".") -> GridSpec:
 
 
 def topography_files(path: str | Path) -> tuple[str, ...]:
-    """Paths of the measured points that an eye file names, relative to its folder.
+    """Compute paths of the measured points that an eye file names, relative to its folder.
 
     Raises:
         InputError: the eye file cannot be read.
@@ -143,7 +143,7 @@ def _fitted(node: Mapping[str, Any], path: str, folder: Path) -> dict[str, Any]:
 
 
 def _rows(path: Path) -> list[list[str]]:
-    """Cells of a table, row by row."""
+    """Return cells of a table, row by row."""
     text = read_text(path, limit=MAX_FILE_BYTES).lstrip("\ufeff")
     delimiter = max(",;\t", key=text.split("\n", 1)[0].count)
     rows: list[list[str]] = []
@@ -161,7 +161,7 @@ def _rows(path: Path) -> list[list[str]]:
 
 
 def _columns(rows: list[list[str]], spec: TopographySpec, source: str) -> Floats:
-    """Three columns of a table as points (n, 3); rows with an empty cell are left out."""
+    """Return three columns of a table as points (n, 3); rows with an empty cell are left out."""
     wanted = (0, 1, 2) if spec.columns is None else spec.columns
     header = rows[0] if any(isinstance(name, str) for name in wanted) else None
     places = []
@@ -183,7 +183,7 @@ def _columns(rows: list[list[str]], spec: TopographySpec, source: str) -> Floats
 
 
 def _matrix(rows: list[list[str]], source: str) -> Floats:
-    """A table of z with x in its first row and y in its first column as points (n, 3)."""
+    """Return a table of z with x in its first row and y in its first column as points (n, 3)."""
     across = [_number(cell, source, 1) for cell in rows[0][1:]]
     out = []
     for number, row in enumerate(rows[1:], start=2):
@@ -209,7 +209,7 @@ def _number(cell: str, source: str, row: int) -> float:
 
 
 def _mesh(path: Path) -> Floats:
-    """Vertices of a PLY file, (n, 3)."""
+    """Compute vertices of a PLY file, (n, 3)."""
     import trimesh  # which takes a quarter of a second
 
     data = plain_ply(read_bytes(path, limit=MAX_FILE_BYTES), source=str(path))
@@ -224,7 +224,7 @@ def _mesh(path: Path) -> Floats:
 
 
 def _reach(y: Floats, z: Floats) -> float:
-    """Largest radius up to which there are points in every direction (sectors of ten degrees)."""
+    """Compute the largest radius up to which there are points in every direction (sectors of ten degrees)."""
     radius, angle = np.hypot(y, z), np.arctan2(z, y)
     sector = np.floor((angle + np.pi) / (2.0 * np.pi) * _SECTORS).astype(int) % _SECTORS
     farthest = np.zeros(_SECTORS)

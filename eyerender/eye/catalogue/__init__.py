@@ -19,13 +19,13 @@ _PACKAGE = FOLDER.parents[1]
 
 
 def catalogue_names() -> tuple[str, ...]:
-    """Names of the catalogue, sorted, including those from other packages."""
+    """List names of the catalogue, sorted, including those from other packages."""
     return tuple(sorted(catalogue_files()))
 
 
 @cache
 def catalogue_files() -> Mapping[str, Path]:
-    """Eye file of each name."""
+    """Return the eye file of each name."""
     return {path.stem: path for path in (*_PACKAGE.glob("*/eyes/*.yaml"), *FOLDER.glob("*.yaml"))}
 
 
