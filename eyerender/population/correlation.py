@@ -12,7 +12,7 @@ SMALLEST = 1e-6
 
 
 def nearest_correlation(matrix: Floats, *, smallest: float = SMALLEST, steps: int = 2000) -> Floats:
-    """Nearest matrix (Frobenius norm) with a unit diagonal and no eigenvalue below `smallest`.
+    """Compute the nearest matrix (Frobenius norm) with a unit diagonal and no eigenvalue below `smallest`.
 
     Projections on the two convex sets alternate, with Dykstra's correction for the cone (Higham 2002, "Computing the
     nearest correlation matrix", IMA J. Numer. Anal. 22, 329-343, algorithm 3.3).
@@ -42,7 +42,7 @@ def nearest_correlation(matrix: Floats, *, smallest: float = SMALLEST, steps: in
 
 
 def completed(matrix: Floats, pairs: list[tuple[int, int]], *, sweeps: int = 500) -> Floats:
-    """Correlation matrix with the given correlations of `pairs` and the largest determinant.
+    """Compute the correlation matrix with the given correlations of `pairs` and the largest determinant.
 
     All other pairs are independent given the rest: their entries of the inverse are 0 (Dempster 1972, "Covariance
     selection", Biometrics 28, 157-175). The pairs are fitted in turn; where no matrix has them all, the last sweep's is

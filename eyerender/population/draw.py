@@ -124,7 +124,7 @@ class Conditions:
 
 
 def latent_numbers(model: Model, conditions: Conditions, seed: int, first: int, count: int) -> Floats:
-    """Latent numbers (count, width) of subjects `first` and following that meet the conditions.
+    """List latent numbers (count, width) of subjects `first` and following that meet the conditions.
 
     Raises:
         InputError: hardly anybody meets them.
@@ -155,7 +155,7 @@ def uniform_numbers(seed: int, stream: int, first: int, count: int, width: int) 
 
 
 def _conditioned(model: Model, conditions: Conditions, z: Floats, u: Floats) -> tuple[Floats, Bools]:
-    """Latent numbers with the exact conditions, and whether each subject is accepted."""
+    """List latent numbers with the exact conditions, and whether each subject is accepted."""
     good = np.ones(len(z), dtype=bool)
     for column, (low, high, follow) in conditions.cut.items():
         z = z + (truncated(z[:, column], low, high) - z[:, column])[:, None] * follow
@@ -173,7 +173,7 @@ def _conditioned(model: Model, conditions: Conditions, z: Floats, u: Floats) -> 
 
 
 def _times(rows: Floats, matrix: Floats) -> Floats:
-    """Matrix product whose sums run in one order, whatever the number of rows."""
+    """Compute the matrix product whose sums run in one order, whatever the number of rows."""
     return np.asarray(np.einsum("ij,jk->ik", rows, np.ascontiguousarray(matrix)))
 
 
@@ -186,7 +186,7 @@ def _range(name: str, wanted: tuple[float, float] | float) -> tuple[float, float
 
 
 def _ends(name: str, found: Distribution, wanted: Condition) -> tuple[float, float]:
-    """Ends of the latent number of a quantity with a marginal."""
+    """Compute ends of the latent number of a quantity with a marginal."""
     assert not isinstance(found, Regression)
     if isinstance(found, Share):
         number = float(found.latent(np.array(wanted))) if isinstance(wanted, int | float) else np.nan

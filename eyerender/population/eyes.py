@@ -39,12 +39,12 @@ _DESIGN_NM = 850.0
 
 
 def amplitude_d(table: Table, age_years: float) -> float:
-    """Largest accommodation at an age."""
+    """Compute the largest accommodation at an age."""
     return max(table.constant("amplitude_d") + table.constant("amplitude_d_per_year") * age_years, 0.0)
 
 
 def thickening_mm(age_years: float, accommodation_d: float) -> float:
-    """By how much the lens is thicker when it is accommodated."""
+    """Compute the increase of the lens' thickness by accommodation."""
     return (LENS_MM_PER_D + LENS_MM_PER_D_YEAR * age_years) * accommodation_d
 
 
@@ -58,7 +58,7 @@ def eye_file(
     entrance_mm: float,
     seed: int,
 ) -> EyeSpec:
-    """Eye file of a drawn eye.
+    """Return the eye file of a drawn eye.
 
     Args:
         name: name of the eye.
@@ -187,7 +187,7 @@ def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, acco
 
 
 def _cornea(eye: Mapping[str, float]) -> list[dict[str, Any]]:
-    """Front and back of the cornea."""
+    """Compute the front and back of the cornea."""
     return [
         {
             "name": "anterior cornea",
@@ -209,7 +209,7 @@ def _cornea(eye: Mapping[str, float]) -> list[dict[str, Any]]:
 
 
 def _lens(eye: Mapping[str, float], table: Table, age: float, accommodation: float) -> list[dict[str, Any]]:
-    """Front and back of the lens."""
+    """Compute the front and back of the lens."""
     thicker = thickening_mm(age, accommodation)
     front_radius = 1.0 / (1.0 / eye["lens_front_radius_mm"] + FRONT_PER_D * accommodation)
     back_radius = 1.0 / (1.0 / eye["lens_back_radius_mm"] + BACK_PER_D * accommodation)
@@ -263,7 +263,7 @@ def _fovea_of(relaxed: str, kappa_deg: tuple[float, float], wavelength_nm: float
 
 
 def _toric(flat_mm: float, steep_mm: float, axis_deg: float, asphericity: float) -> dict[str, Any]:
-    """Biconic whose meridian `axis_deg`, from nasal towards up, has the larger radius."""
+    """Compute the biconic whose meridian `axis_deg`, from nasal towards up, has the larger radius."""
     # A turn about x of +t carries nasal (+y) towards up (+z).
     return {
         "shape": {"kind": "biconic", "radii_mm": [flat_mm, steep_mm], "conic_constants": [asphericity, asphericity]},
@@ -272,7 +272,7 @@ def _toric(flat_mm: float, steep_mm: float, axis_deg: float, asphericity: float)
 
 
 def _stop_gap(eye: Mapping[str, float]) -> float:
-    """Distance of the stop before the lens' apex, so that its centre is before a tilted lens at every size."""
+    """Find the distance of the stop before the lens' apex, so that its centre is before a tilted lens at every size."""
     away = np.hypot(eye["pupil_nasal_mm"] - eye["lens_nasal_mm"], eye["pupil_up_mm"] - eye["lens_up_mm"])
     tilt = np.radians(np.hypot(eye["lens_tilt_y_deg"], eye["lens_tilt_z_deg"]))
     return float(_IRIS_GAP_MM + (away + _SHIFTED_MM) * np.tan(tilt))

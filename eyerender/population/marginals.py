@@ -26,11 +26,11 @@ class Fixed(Spec):
     value: Number = Field(description="the value")
 
     def at(self, z: Floats) -> Floats:
-        """Values of standard normal numbers."""
+        """Map standard normal numbers to values."""
         return np.full(np.shape(z), self.value)
 
     def latent(self, x: Floats) -> Floats:
-        """Standard normal numbers of values."""
+        """List standard normal numbers of values."""
         return np.zeros(np.shape(x))
 
     @property
@@ -61,14 +61,14 @@ class Normal(Spec):
         return low, high
 
     def at(self, z: Floats) -> Floats:
-        """Values of standard normal numbers."""
+        """Map standard normal numbers to values."""
         low, high = self._ends
         if low == -np.inf and high == np.inf:
             return np.asarray(self.mean + self.sd * z)
         return np.asarray(self.mean + self.sd * truncated(z, low, high))
 
     def latent(self, x: Floats) -> Floats:
-        """Standard normal numbers of values."""
+        """List standard normal numbers of values."""
         low, high = self._ends
         t = (np.asarray(x) - self.mean) / self.sd
         if low == -np.inf and high == np.inf:
@@ -96,11 +96,11 @@ class Lognormal(Spec):
     sigma: Positive = Field(description="standard deviation of the natural logarithm")
 
     def at(self, z: Floats) -> Floats:
-        """Values of standard normal numbers."""
+        """Map standard normal numbers to values."""
         return np.asarray(self.median * np.exp(self.sigma * z))
 
     def latent(self, x: Floats) -> Floats:
-        """Standard normal numbers of values."""
+        """List standard normal numbers of values."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.log(np.asarray(x) / self.median) / self.sigma)
 
@@ -125,11 +125,11 @@ class Uniform(Spec):
         return self
 
     def at(self, z: Floats) -> Floats:
-        """Values of standard normal numbers."""
+        """Map standard normal numbers to values."""
         return np.asarray(self.low + (self.high - self.low) * ndtr(z))
 
     def latent(self, x: Floats) -> Floats:
-        """Standard normal numbers of values."""
+        """List standard normal numbers of values."""
         share = (np.asarray(x) - self.low) / (self.high - self.low)
         return np.asarray(ndtri(np.where((share >= 0) & (share <= 1), share, np.nan)))
 
@@ -146,11 +146,11 @@ class Share(Spec):
     share: float = Field(ge=0, le=1, description="share of the people with the value 1")
 
     def at(self, z: Floats) -> Floats:
-        """Values of standard normal numbers."""
+        """Map standard normal numbers to values."""
         return np.asarray(ndtr(z) > 1.0 - self.share, dtype=np.float64)
 
     def latent(self, x: Floats) -> Floats:
-        """Median of the latent numbers that give a value."""
+        """Compute the median of the latent numbers that give a value."""
         x = np.asarray(x)
         middle = np.where(x > 0.5, 1.0 - self.share / 2, (1.0 - self.share) / 2)
         possible = ((x == 1) & (self.share > 0)) | ((x == 0) & (self.share < 1))
@@ -182,7 +182,7 @@ class Mixture(Spec):
         return weight / weight.sum(), mean, sd
 
     def latent(self, x: Floats) -> Floats:
-        """Standard normal numbers of values."""
+        """List standard normal numbers of values."""
         weight, mean, sd = self._parts
         t = (np.asarray(x, dtype=np.float64)[..., None] - mean) / sd
         # The smaller tail is used, so that the far upper tail keeps its digits.
@@ -202,7 +202,7 @@ class Mixture(Spec):
         return z[rising], x[rising]
 
     def at(self, z: Floats) -> Floats:
-        """Values of standard normal numbers."""
+        """Map standard normal numbers to values."""
         zs, xs = self._table
         z = np.clip(z, zs[0], zs[-1])
         x = np.interp(z, zs, xs)
@@ -228,7 +228,7 @@ Marginal = Annotated[Fixed | Normal | Lognormal | Uniform | Share | Mixture, ByK
 
 
 def truncated(z: Floats, low: float, high: float) -> Floats:
-    """Standard normal numbers truncated to [low, high]: Phi^-1(Phi(low) + Phi(z) (Phi(high) - Phi(low)))."""
+    """Find the standard normal numbers truncated to [low, high]: Phi^-1(Phi(low) + Phi(z) (Phi(high) - Phi(low)))."""
     if low > 0:
         return -truncated(-z, -high, -low)
     log_low, log_high = float(log_ndtr(low)), float(log_ndtr(high))

@@ -115,7 +115,7 @@ class Model:
         return np.asarray(np.linalg.cholesky(self.reference.latent))
 
     def places(self, name: str) -> tuple[int, ...]:
-        """Columns of a quantity's latent numbers: one, or right and left.
+        """Return columns of a quantity's latent numbers: one, or right and left.
 
         Raises:
             InputError: there is no such quantity.
@@ -128,7 +128,7 @@ class Model:
         raise InputError(f"no such quantity; there are {', '.join(self.distributions)}", path=name)
 
     def value(self, name: str, latent: Floats, known: Mapping[str, Floats] | None = None) -> Floats:
-        """Values of a quantity, (n,) or (n, 2) for right and left, of latent numbers (n, width).
+        """Return values of a quantity, (n,) or (n, 2) for right and left, of latent numbers (n, width).
 
         `known` holds values of the predictors, where they were computed before.
         """
@@ -139,7 +139,7 @@ class Model:
         return found.at(z)
 
     def mean(self, name: str, latent: Floats, known: Mapping[str, Floats] | None = None) -> Floats:
-        """Mean (n,) or (n, 2) of a regression, of the predictors of latent numbers (n, width).
+        """Compute the mean (n,) or (n, 2) of a regression, of the predictors of latent numbers (n, width).
 
         A regression of a subject's quantity on the refraction uses the mean of both eyes.
         """
@@ -157,12 +157,12 @@ class Model:
         return np.broadcast_to(mean, shape)
 
     def values(self, latent: Floats) -> dict[str, Floats]:
-        """Values of every quantity, (n,) or (n, 2), of latent numbers (n, width)."""
+        """Return values of every quantity, (n,) or (n, 2), of latent numbers (n, width)."""
         roots = {root: self.value(root, latent) for root in ROOTS}
         return {name: roots[name] if name in roots else self.value(name, latent, roots) for name in self.distributions}
 
     def required(self, name: str, value: float, latent: Floats) -> Floats:
-        """Latent numbers (n,) or (n, 2) that give a quantity one value."""
+        """List latent numbers (n,) or (n, 2) that give a quantity one value."""
         found, places = self.distributions[name], self.places(name)
         shape = (len(latent),) if len(places) == 1 else (len(latent), 2)
         if isinstance(found, Regression):
@@ -170,7 +170,7 @@ class Model:
         return np.broadcast_to(found.latent(np.array(value)), shape)
 
     def expected(self, name: str) -> tuple[float, float]:
-        """Mean and standard deviation of a quantity, exactly."""
+        """Compute the mean and standard deviation of a quantity, exactly."""
         found = self.distributions[name]
         if not isinstance(found, Regression):
             return found.moments
@@ -178,7 +178,7 @@ class Model:
         return _mean(found, self.distributions), float(np.sqrt(variance))
 
     def expected_correlation(self, first: str, second: str) -> float:
-        """Correlation of two quantities of one eye: regressions exactly, others by their latent number."""
+        """Compute the correlation of two quantities of one eye: regressions exactly, others by their latent number."""
         a, b = self.distributions[first], self.distributions[second]
         i, j = self.places(first)[0], self.places(second)[0]
         latent = float(self.reference.latent[i, j])
@@ -191,7 +191,7 @@ class Model:
 
 @cache
 def default_reference() -> Reference:
-    """Reference population of the package's table, solved once."""
+    """Compute the reference population of the package's table, solved once."""
     return Reference.of(default_table())
 
 
@@ -221,7 +221,7 @@ def _resolved(name: str, quantity: Quantity, table: Table, about: Mapping[str, f
 
 
 def _latent(pair: Pair, table: Table, found: Mapping[str, Distribution]) -> float:
-    """Correlation of the latent numbers of a pair."""
+    """Compute the correlation of the latent numbers of a pair."""
     a, b = (found[name] for name in pair.pair)
     if pair.of == "residuals" or not (isinstance(a, Regression) and isinstance(b, Regression)):
         return pair.r
@@ -232,13 +232,13 @@ def _latent(pair: Pair, table: Table, found: Mapping[str, Distribution]) -> floa
 
 
 def _explained(a: Regression, b: Regression, roots: Mapping[str, Distribution], table: Table) -> float:
-    """Covariance of the means of two regressions in one eye."""
+    """Compute the covariance of the means of two regressions in one eye."""
     pairs = [(p, q) for p in sorted(a.slopes) for q in sorted(b.slopes)]
     return sum(a.slopes[p] * b.slopes[q] * _covariance(p, q, roots, table) for p, q in pairs)
 
 
 def _covariance(first: str, second: str, roots: Mapping[str, Distribution], table: Table) -> float:
-    """Covariance of two predictors."""
+    """Compute the covariance of two predictors."""
     if first == second:
         return _moments(roots[first])[1] ** 2
     if {first, second} != {"age_years", "refraction_d"} or not table.age_r:
@@ -249,7 +249,7 @@ def _covariance(first: str, second: str, roots: Mapping[str, Distribution], tabl
 
 
 def _hermite(found: Distribution) -> Floats:
-    """E[F(z) He_k(z)] for k >= 1 of the map F of a marginal."""
+    """Compute the E[F(z) He_k(z)] for k >= 1 of the map F of a marginal."""
     assert not isinstance(found, Regression)
     z, weight = hermegauss(_NODES)
     return np.asarray((weight / weight.sum() * found.at(z)) @ hermevander(z, _ORDERS - 1)[:, 1:])

@@ -34,7 +34,7 @@ SOLVED = tuple(field.name for field in fields(Optics))
 
 
 class PopulationSpec(Spec):
-    """People: one of the table's populations, with other distributions, and with conditions on anything."""
+    """A population: one of the table's presets, with changed distributions and conditions."""
 
     preset: str = Field(default="adults", description="adults, emmetropic_adults, myopes, children or elderly")
     replace: dict[str, Distribution] = Field(
@@ -74,7 +74,7 @@ class PopulationSpec(Spec):
         return Model(reference, {**reference.distributions, **preset.replace, **self.replace})
 
     def numbers(self, n: int, seed: int = 0, *, first: int = 0) -> dict[str, Floats]:
-        """Numbers of subjects `first` to `first + n - 1`, name -> (n,) or (n, 2) for right and left.
+        """List numbers of subjects `first` to `first + n - 1`, name -> (n,) or (n, 2) for right and left.
 
         A subject's numbers depend on (this population, seed, subject) alone. Besides the quantities of the table they
         are `entrance_pupil_mm`, at the table's luminance, and what follows from the refraction: the cornea's principal
@@ -88,7 +88,7 @@ class PopulationSpec(Spec):
         return _values(self.model, latent_numbers(self.model, Conditions.of(self.model, self.where), seed, first, n))
 
     def person(self, subject: int, seed: int = 0) -> Person:
-        """One subject."""
+        """Return one subject."""
         return Person.of(self.preset, seed, subject, {k: v[0] for k, v in self.numbers(1, seed, first=subject).items()})
 
 
@@ -104,12 +104,12 @@ class Person(Spec):
 
     @classmethod
     def of(cls, preset: str, seed: int, subject: int, numbers: Mapping[str, Any]) -> Self:
-        """Person of numbers that may be NumPy's."""
+        """Compute the person of numbers that may be NumPy's."""
         plain = {name: np.asarray(value).tolist() for name, value in numbers.items()}
         return cls(preset=preset, seed=seed, subject=subject, numbers=plain)
 
     def number(self, name: str, side: Side | None = None) -> float:
-        """A number of the person, or of one eye.
+        """Return a number of the person, or of one eye.
 
         Raises:
             InputError: there is no such number.
@@ -120,7 +120,7 @@ class Person(Spec):
         return value[SIDES.index(side)] if isinstance(value, tuple) and side is not None else float(value)  # type: ignore[arg-type]
 
     def to_json(self) -> str:
-        """The person as text, the same for equal persons."""
+        """Return the person as text, the same for equal persons."""
         return json.dumps(self.to_mapping(), sort_keys=True)
 
     @property
@@ -152,7 +152,7 @@ class Person(Spec):
         return float(np.mean([at_cornea_d(self.number("refraction_d", side)) for side in SIDES]))
 
     def draw_seed(self, purpose: str) -> int:
-        """A seed of 31 bits for something that has no quantity of the table, such as hairs."""
+        """Return a seed of 31 bits for something that has no quantity of the table, such as hairs."""
         text = f"{self.preset}/{self.seed}/{self.subject}/{purpose}"
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") >> 1
 
@@ -162,7 +162,7 @@ class Person(Spec):
         return amplitude_d(default_table(), self.number("age_years"))
 
     def accommodation_d(self, demand_d: float) -> float:
-        """Accommodation to a demand: the demand itself, as far as the age allows."""
+        """Compute the accommodation to a demand: the demand itself, as far as the age allows."""
         return min(max(demand_d, 0.0), self.amplitude_d)
 
     def entrance_pupil_mm(
@@ -173,7 +173,7 @@ class Person(Spec):
         *,
         side: Side | None = None,
     ) -> float:
-        """Diameter of the entrance pupil in a field of a luminance and diameter (deg), looking at a distance.
+        """Find the diameter of the entrance pupil in a field of a luminance and diameter (deg), looking at a distance.
 
         The near response narrows it by the person's miosis per dioptre of the demand that it accommodates to. The
         pupils of both eyes differ by the person's anisocoria; without a `side` it is their mean.
@@ -196,7 +196,7 @@ class Person(Spec):
         field_deg: float | None = None,
         demand_d: float = 0.0,
     ) -> EyeSpec:
-        """Eye file of one eye, written as a right eye as all eye files are.
+        """Return the eye file of one eye, written as a right eye as all eye files are.
 
         Args:
             side: right or left.
@@ -220,7 +220,7 @@ class Person(Spec):
         )
 
     def region(self) -> Region:
-        """Lids, lashes, brow, face and skin; numbers outside the range of a key are moved to its end."""
+        """Compute lids, lashes, brow, face and skin; numbers outside the range of a key are moved to its end."""
         data: dict[str, Any] = {"seed": self.draw_seed("region")}
         for group, kind in Region.model_fields.items():
             fields = getattr(kind.annotation, "model_fields", {})
@@ -230,7 +230,7 @@ class Person(Spec):
         return Region.from_mapping(data)
 
     def look(self) -> Look:
-        """Albedos and textures of the eyes; numbers outside the range of a key are moved to its end."""
+        """Compute albedos and textures of the eyes; numbers outside the range of a key are moved to its end."""
         mine = {key: _within(Look.model_fields[key], value) for key, value in self._under("look.").items()}
         if "limbus_albedo" in mine:
             passed = mine.get("limbus_transmittance", Look.model_fields["limbus_transmittance"].default)
@@ -257,13 +257,13 @@ class PersonChoice(PopulationSpec):
     subject: Annotated[int, Field(ge=0, lt=2**53)] = Field(default=0, description="number of the subject")
 
     def chosen(self) -> Person:
-        """The person."""
+        """Return the person."""
         return self.person(self.subject, self.seed)
 
 
 @lru_cache(maxsize=64)
 def choice_of(text: str) -> PersonChoice:
-    """The choice of a subject from its JSON."""
+    """Return the choice of a subject from its JSON."""
     return PersonChoice.from_mapping(json.loads(text))
 
 
@@ -273,7 +273,7 @@ def _chosen(text: str) -> Person:
 
 
 def chosen_person(data: object) -> Person:
-    """The person of a mapping of `PersonChoice`, drawn once for all frames.
+    """Return the person of a mapping of `PersonChoice`, drawn once for all frames.
 
     Raises:
         InputError: the mapping is no choice, or hardly anybody meets its conditions.
@@ -295,7 +295,7 @@ def far_pupil_mm(table: Table, luminance: float, field: float, age_years: Floats
 
 
 def _values(model: Model, latent: Floats) -> dict[str, Floats]:
-    """Every number of people with latent numbers."""
+    """Return every number of people with latent numbers."""
     values = model.values(latent)
     table = model.reference.table
     values["entrance_pupil_mm"] = far_pupil_mm(
@@ -312,7 +312,7 @@ def _values(model: Model, latent: Floats) -> dict[str, Floats]:
 
 
 def biometry(table: Table, values: Mapping[str, Floats]) -> Biometry:
-    """Lengths and radii of people's eyes, (n, 2) each."""
+    """Compute lengths and radii of people's eyes, (n, 2) each."""
     return Biometry(
         refraction=(values["refraction_d"], values["refraction_j0_d"], values["refraction_j45_d"]),
         corneal_radius_mm=values["corneal_radius_mm"],
@@ -329,7 +329,7 @@ def biometry(table: Table, values: Mapping[str, Floats]) -> Biometry:
 
 
 def _within(field: Any, value: float) -> float | int:
-    """A number moved into the range of a key, whole where the key is."""
+    """Return a number moved into the range of a key, whole where the key is."""
     low = next((m.ge for m in field.metadata if getattr(m, "ge", None) is not None), -np.inf)
     high = next((m.le for m in field.metadata if getattr(m, "le", None) is not None), np.inf)
     moved = min(max(value, low), high)

@@ -13,7 +13,7 @@ OLDEST, YOUNGEST = 83.0, 20.0
 def watson_yellott_mm(
     luminance_cd_m2: FloatLike, field_deg: FloatLike, age_years: FloatLike, *, eyes: int = 2
 ) -> Floats:
-    """Diameter of the entrance pupil by Watson and Yellott's unified formula.
+    """Compute the diameter of the entrance pupil by Watson and Yellott's unified formula.
 
     F = L a e with the luminance L, the field's area a = pi d^2 / 4 (deg^2) and e = 1 for two eyes, 0.1 for one;
 
@@ -38,7 +38,7 @@ def watson_yellott_mm(
 
 
 def ellipticity(stop_diameter_mm: float) -> tuple[float, float]:
-    """Ellipticity 1 - b/a of the stop, and the direction of its long axis (deg): 0 horizontal, 90 vertical.
+    """Compute the ellipticity 1 - b/a of the stop, and the direction of its long axis (deg): 0 horizontal, 90 vertical.
 
     The signed eccentricity of a stop of radius r is 0.0973 (tanh(4.7609 (r - 1.7523)) + 0.1800), positive for a tall
     pupil: small pupils are slightly wide, large ones slightly tall (Wyatt 1995, Vision Res. 35, 2021-2036, with the

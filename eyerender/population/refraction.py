@@ -84,7 +84,7 @@ class Biometry(ArrayValue):
 
 
 def lens_index(lens_c0: Floats, wavelength_nm: float) -> Floats:
-    """Equivalent index of lenses at a wavelength."""
+    """Compute the equivalent index of lenses at a wavelength."""
     return np.asarray(lens_c0 + CauchyMedium(0.0, *LENS).index(wavelength_nm))
 
 
@@ -120,7 +120,7 @@ def solve(eyes: Biometry) -> Optics:
 
 
 def _lens(eyes: Biometry, behind: Floats) -> Floats:
-    """First coefficient of the lens that brings the vergence behind the cornea to a focus on the retina."""
+    """Compute the first coefficient of the lens that brings the vergence behind the cornea to a focus on the retina."""
     _, aqueous, vitreous = _indices(eyes.wavelength_nm)
     at_lens = behind / (1.0 - (eyes.chamber_depth_mm - eyes.corneal_thickness_mm) / aqueous * behind)
     front, back = eyes.lens_radii_mm
@@ -146,19 +146,19 @@ def _lens(eyes: Biometry, behind: Floats) -> Floats:
 
 
 def _indices(wavelength_nm: float) -> tuple[float, float, float]:
-    """Indices of cornea, aqueous and vitreous."""
+    """Compute indices of cornea, aqueous and vitreous."""
     cornea, aqueous, vitreous = (float(CauchyMedium(*c).index(wavelength_nm)) for c in (CORNEA, AQUEOUS, VITREOUS))
     return cornea, aqueous, vitreous
 
 
 def _before(behind: Floats, back: Power, share: Floats) -> Power:
-    """Vergence in front of the cornea's thickness that becomes `behind` after its back surface."""
+    """Compute the vergence in front of the cornea's thickness that becomes `behind` after its back surface."""
     zero = np.zeros_like(behind)
     return _mapped((behind - back[0], zero - back[1], zero - back[2]), lambda v: v / (1.0 + share * v))
 
 
 def _mapped(power: Power, f: Callable[[Floats], Floats]) -> Power:
-    """Function of a power matrix: of its two eigenvalues."""
+    """Compute the function of a power matrix: of its two eigenvalues."""
     m, a, b = power
     r = np.hypot(a, b)
     high, low = f(m + r), f(m - r)

@@ -92,7 +92,7 @@ def _accommodate(data: dict[str, Any], age_years: float, response_d: float) -> f
 
 
 def _curved(shape: dict[str, Any], curvature: float, q: float) -> dict[str, Any]:
-    """Shape with other apex curvatures (1/mm) and conic constants."""
+    """Compute the shape with other apex curvatures (1/mm) and conic constants."""
     if shape["kind"] in ("sphere", "conic"):
         radius = 1.0 / (1.0 / shape["radius_mm"] + curvature)
         return {"kind": "conic", "radius_mm": radius, "conic_constant": shape.get("conic_constant", 0.0) + q}
@@ -117,7 +117,7 @@ def _set_pupil(data: dict[str, Any], entrance_mm: float, wavelength_nm: float) -
 
 
 def _reach_mm(cornea: Surface, depth_x: float) -> float:
-    """Smallest distance from the axis at which a surface lies at a depth x."""
+    """Compute the smallest distance from the axis at which a surface lies at a depth x."""
     angle = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     way = np.stack([np.zeros_like(angle), np.cos(angle), np.sin(angle)], axis=-1)
 

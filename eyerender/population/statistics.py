@@ -16,7 +16,7 @@ from .people import PopulationSpec
 
 CHUNK = 4096
 BINS = 48
-_REACH = 4.0  # histograms reach so many standard deviations on either side of the mean
+_REACH = 4.0  # standard deviations that histograms reach on either side of the mean
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +102,7 @@ class Refusals:
 
 
 def pieces(population: PopulationSpec, n: int, seed: int) -> Iterator[dict[str, Floats]]:
-    """Numbers of n people in pieces, name -> (k,) or (k, 2)."""
+    """List numbers of n people in pieces, name -> (k,) or (k, 2)."""
     for start in range(0, n, CHUNK):
         yield population.numbers(min(CHUNK, n - start), seed, first=start)
 

@@ -182,7 +182,7 @@ class SyntEyes(ArrayValue):
         return self.of_latent(latent, rng.normal(size=3), component, refused)
 
     def of_latent(self, latent: Floats, retina_score: Floats, component: int = 0, refused: int = 0) -> SyntEye:
-        """The eye of a latent vector (18,); `retina_score` (3,) are standard normal numbers of the retina."""
+        """Return the eye of a latent vector (18,); `retina_score` (3,) are standard normal numbers of the retina."""
         terms = self.mean_cornea + 1e-3 * (self.corneas @ latent[6:])
         mean, covariance = self.retina_mean, self.retina_covariance
         slope = covariance[1:, 0] / covariance[0, 0]
@@ -212,7 +212,7 @@ class SyntEyes(ArrayValue):
         alpha_deg: tuple[float, float] = (5.45, 2.5),
         kappa_deg: tuple[float, float] | None = None,
     ) -> EyeSpec:
-        """Eye file of a drawn eye.
+        """Return the eye file of a drawn eye.
 
         Args:
             eye: the drawn eye.
@@ -224,7 +224,7 @@ class SyntEyes(ArrayValue):
             kappa_deg: the line of sight from the pupillary axis in place of alpha, which is then found by tracing.
 
         Raises:
-            InputError: this is no eye.
+            InputError: the numbers do not make a possible eye.
         """
         lens = eye.thickness_mm + eye.chamber_depth_mm
         front, back = (tuple(float(c) for c in row) for row in eye.cornea_mm)
@@ -295,7 +295,7 @@ def _cornea(terms: tuple[float, ...]) -> dict[str, Any]:
 
 
 def _iris_root(eye: SyntEye, limbus_mm: float) -> float:
-    """Radius of the iris' root: just inside the posterior cornea, taken as a sphere of its mean radius."""
+    """Compute the radius of the iris' root: just inside the posterior cornea, taken as a sphere of its mean radius."""
     # The curvature of c_4 Z_4 + c_12 Z_12 at the apex, over the disc's radius.
     back = eye.cornea_mm[1]
     bend = 2.0 * (2.0 * np.sqrt(3.0) * back[4] - 6.0 * np.sqrt(5.0) * back[12]) / CORNEA_RADIUS_MM**2
@@ -305,7 +305,7 @@ def _iris_root(eye: SyntEye, limbus_mm: float) -> float:
 
 
 def _arrays(path: str | Path) -> dict[str, Floats]:
-    """The arrays of the file by name."""
+    """Return the arrays of the file by name."""
     source = str(path)
     data = read_bytes(path, limit=MAX_FILE_BYTES)
     names = (*_SHAPES, _LENS_TERMS)

@@ -144,11 +144,11 @@ class Table(FileSpec):
         return self.quantities["refraction_d"].age_r
 
     def constant(self, name: str) -> float:
-        """Value of a constant."""
+        """Compute the value of a constant."""
         return self.constants[name].value
 
     def median(self, name: str) -> float:
-        """Median of a quantity with a marginal."""
+        """Compute the median of a quantity with a marginal."""
         marginal = self.quantities[name].marginal
         assert marginal is not None
         return float(marginal.at(np.zeros(())))
@@ -156,5 +156,5 @@ class Table(FileSpec):
 
 @cache
 def default_table() -> Table:
-    """The table that comes with the package."""
+    """Return the table that comes with the package."""
     return Table.load(FOLDER / "default.yaml")
