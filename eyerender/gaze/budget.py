@@ -74,11 +74,11 @@ class ErrorBudget:
     """The error of gaze, cause by cause.
 
     Attributes:
-        causes: with the estimator calibrated anew on the features of each step. The first is the estimator's own error.
+        causes: with the estimator calibrated on the features of each step. The first is the estimator's own error.
         transferred: the same causes with the estimator calibrated once, on the features of `calibrated_on`, and tested
             on those of the later steps.
         calibrated_on: step whose features calibrate the estimator for `transferred`; None where there is no later step.
-        total_deg: rms error of the last step, calibrated anew.
+        total_deg: rms error of the last step, calibrated on its own features.
         mean_deg: its mean error.
         transferred_total_deg: rms error of the last step, calibrated on `calibrated_on`; None without later steps.
         transferred_mean_deg: its mean error.
@@ -108,11 +108,11 @@ class ErrorBudget:
         raise InputError(f"has no cause {name!r}", path="causes")
 
     def to_mapping(self) -> dict[str, Any]:
-        """JSON values (schema eyerender/gaze-budget/1)."""
+        """Return JSON values (schema eyerender/gaze-budget/1)."""
         return {"schema": BUDGET_SCHEMA, **asdict(self)}
 
     def __str__(self) -> str:
-        """Two tables, degrees."""
+        """Make two tables, degrees."""
         lines = _table("calibrated anew on each step's features", self.causes, self.total_deg, self.mean_deg)
         if self.transferred and self.transferred_total_deg is not None and self.transferred_mean_deg is not None:
             title = f"calibrated on the features of '{self.calibrated_on}', tested on the images"
@@ -138,8 +138,8 @@ def budget(
             estimator. See `er.budget_steps` for the steps of a scene.
         rig: their rig.
         estimator: a gaze estimator, not calibrated.
-        calibration: fixations to calibrate on, counted from 0; the others are tested. None: each fixation is tested
-            with a calibration on all others.
+        calibration: fixations to calibrate on, counted from 0; the remaining ones are tested. None: each fixation is
+            tested with a calibration on all others.
         transfer_from: step whose features calibrate the estimator for the second reading. None: the last step before
             the first one of images, which is the last whose name is not among `er.gaze.IMAGE_CAUSES`.
         binocular: use the mean of both eyes' estimates of a frame. It hides horizontal errors of eyes that are mirror
@@ -184,7 +184,7 @@ IMAGE_CAUSES = ("extraction", "image formation", "image", "noise")
 
 
 def error_vectors_deg(direction: Floats, wanted: Floats) -> Floats:
-    """Errors (n, 2) of directions (n, 3) from those wanted (n, 3), to the subject's right and up, in degrees.
+    """Compute errors (n, 2) of directions (n, 3) from those wanted (n, 3), to the subject's right and up, in degrees.
 
     The length is the angle between the two; the direction is that of the great circle from `wanted`.
     """
@@ -199,7 +199,7 @@ def error_vectors_deg(direction: Floats, wanted: Floats) -> Floats:
 
 
 def mean_interval(values: Floats) -> tuple[float, float, float]:
-    """Mean of values (n,), n >= 2, such as paired differences, and its 95 % interval."""
+    """Compute the mean of values (n,), n >= 2, such as paired differences, and its 95 % interval."""
     n, mean = len(values), float(values.mean())
     half = float(student.ppf(0.975, n - 1) * values.std(ddof=1) / np.sqrt(n))
     return mean, mean - half, mean + half
@@ -234,7 +234,7 @@ class _Task:
     binocular: bool
 
     def fits(self, learnt: Observations) -> list[tuple[Bools, GazeEstimator]]:
-        """Calibrations, each with the rows that it is tested on."""
+        """Compute calibrations, each with the rows that it is tested on."""
         fixation = learnt.index.fixation
         if self.calibration is not None:
             tests = [~np.isin(fixation, self.calibration)]
@@ -243,14 +243,14 @@ class _Task:
         return [(np.asarray(test), self.estimator.fit(learnt.take(~test), self.rig)) for test in tests]
 
     def errors(self, fits: Sequence[tuple[Bools, GazeEstimator]], seen: Observations) -> Floats:
-        """Error vectors (n, 2) of what is `seen`; NaN where there is no estimate."""
+        """Compute error vectors (n, 2) of what is `seen`; NaN where there is no estimate."""
         out = np.full((len(seen), 2), np.nan)
         for test, fitted in fits:
             out[test] = self._predicted(fitted, seen.take(test))
         return self._of_frames(seen, out) if self.binocular else out
 
     def tested(self, seen: Observations) -> Bools:
-        """Whether each row (or frame) is tested."""
+        """Return whether each row (or frame) is tested."""
         rows = ~np.isin(seen.index.fixation, [] if self.calibration is None else self.calibration)
         if self.binocular:
             _, first = np.unique(seen.index.frame, return_index=True)
@@ -258,7 +258,7 @@ class _Task:
         return np.asarray(rows)
 
     def eyes(self, seen: Observations) -> Ints:
-        """Eye of each row, or `_BOTH` of each frame."""
+        """Compute the eye of each row, or `_BOTH` of each frame."""
         if self.binocular:
             return np.full(len(np.unique(seen.index.frame)), _BOTH)
         return np.asarray(seen.index.eye)
@@ -274,7 +274,7 @@ class _Task:
 
     @staticmethod
     def _of_frames(seen: Observations, errors: Floats) -> Floats:
-        """Mean of both eyes' error vectors of each frame, as of points on a screen."""
+        """Compute the mean of both eyes' error vectors of each frame, as of points on a screen."""
         points = GazePoints.of(np.concatenate([errors, np.where(np.isnan(errors[:, :1]), np.nan, 0.0)], axis=1))
         return np.asarray(binocular_average(seen, points)[1].point_mm[:, :2])
 

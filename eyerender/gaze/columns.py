@@ -35,7 +35,7 @@ class EyeColumns(Spec):
 
 
 class CsvColumns(FileSpec, EyeColumns):
-    """The names of a table's columns, where they differ from those that are found by themselves; and their units."""
+    """The names of a table's columns that are not recognised automatically, and their units."""
 
     time: ColumnName | None = Field(
         default=None, description="rows with the same time are one frame, if there is no `frame`"
@@ -103,7 +103,7 @@ _SIDES = re.compile(r"^(right|left|r|l)_(.*)$|^(.*)_(right|left|r|l)$")
 
 
 def completed(given: CsvColumns, header: list[str], told: str, problems: Problems) -> CsvColumns:
-    """The columns as given, completed by those that are found by their names.
+    """Return the columns as given, completed by those that are found by their names.
 
     Raises:
         InputError: a given column does not exist, or two could be meant.
@@ -127,7 +127,7 @@ def completed(given: CsvColumns, header: list[str], told: str, problems: Problem
 
 
 def _names_in(data: Mapping[str, Any]) -> set[str | None]:
-    """Names of columns in a mapping of columns."""
+    """List names of columns in a mapping of columns."""
     keys = {*EyeColumns.model_fields, "time", "frame", "fixation", "camera", "eye", "light", "target"}
     out: set[str | None] = set()
     for key, value in data.items():
@@ -150,7 +150,7 @@ class _Names:
         self.columns.setdefault(_UNIT.sub("", bare), []).append(column)
 
     def all_of(self, *bare: str) -> list[str] | None:
-        """Columns of names that belong together; None where one is missing."""
+        """Return columns of names that belong together; None where one is missing."""
         if not all(name in self.columns for name in bare):
             return None
         for name in bare:
@@ -160,16 +160,16 @@ class _Names:
         return [self.columns[name][0] for name in bare]
 
     def first(self, choices: Iterable[tuple[str, ...]]) -> list[str] | None:
-        """Columns of the first choice that is there."""
+        """Return columns of the first choice that is there."""
         return next((found for choice in choices if (found := self.all_of(*choice))), None)
 
     def one(self, choices: Iterable[str]) -> str | None:
-        """The column of the first name that is there."""
+        """Return the column of the first name that is there."""
         found = self.first((name,) for name in choices)
         return found[0] if found else None
 
     def glints(self) -> list[list[str] | None] | None:
-        """Columns of the glint of each light; without a light 0, the numbers in the names begin with 1."""
+        """Return columns of the glint of each light; without a light 0, the numbers in the names begin with 1."""
         named = {(int(m[1]), m[2]): name for name in self.columns if (m := _GLINT.fullmatch(name))}
         if not named:
             single = self.first((f"{glint}_x", f"{glint}_y") for glint in ("glint", "cr"))
@@ -180,7 +180,7 @@ class _Names:
         return [self.all_of(x, y) if x and y else None for x, y in pairs]
 
     def eye(self) -> dict[str, Any]:
-        """The keys of `EyeColumns` that are found."""
+        """Return the keys of `EyeColumns` that are found."""
         axes = self.first(_AXES)
         found = {
             "pupil": self.first((f"{name}_x", f"{name}_y") for name in _CENTRES),
@@ -195,7 +195,7 @@ class _Names:
 
 
 def _found(header: list[str], problems: Problems) -> dict[str, Any]:
-    """The columns whose names say what they are."""
+    """Return the columns whose names say what they are."""
     whole, sides = _Names(problems), {side: _Names(problems) for side in EYES}
     for column in header:
         bare = re.sub(r"[^a-z0-9]+", "_", column.lower()).strip("_")

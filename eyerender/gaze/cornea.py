@@ -44,7 +44,7 @@ class CorneaCentres(ArrayValue):
 
 
 def from_all_glints(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats) -> CorneaCentres:
-    """Method A: the k that minimise sum_{i<j} |c_i(k_i) - c_j(k_j)|^2; the centre is the mean of the c_i.
+    """Compute the method A: the k that minimise sum_{i<j} |c_i(k_i) - c_j(k_j)|^2; the centre is the mean of the c_i.
 
     Damped Gauss-Newton on the m distances of every row at once, from the best of a coarse search. The cost is that of
     the deviations from the mean, which is the same up to the factor m:
@@ -115,7 +115,7 @@ def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple
 
 
 def from_plane(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats) -> CorneaCentres:
-    """Method B: c = O + k_c b, with k_c from the mirror condition of the first glint.
+    """Compute the method B: c = O + k_c b, with k_c from the mirror condition of the first glint.
 
     In the plane of camera, light and glint, with e the unit vector normal to b: (c(k) - O) . e = k u.e - R n(k).e = 0.
     Newton's method solves it for the distance k of the mirror point.
@@ -157,7 +157,7 @@ def from_plane(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm
 def optic_axis(
     origin_mm: Floats, *, pupil: Floats, centre_mm: Floats, radius_mm: Floats, distance_mm: Floats, index: Floats
 ) -> tuple[Floats, Bools, Bools]:
-    """The optic axis w (..., 3): from the cornea's centre through the pupil centre.
+    """Return the optic axis w (..., 3): from the cornea's centre through the pupil centre.
 
     r = near intersection of the pupil ray with sphere(c, R), refracted (1 -> n) into t; p = r + k_p t on sphere(c, K);
     w = unit(p - c)                                                               (Guestrin & Eizenman 2006, section II)
@@ -191,7 +191,7 @@ def _radii(radius_mm: Floats, shape: tuple[int, ...]) -> Floats:
 
 
 def _near_intersection(origin: Floats, *, ray: Floats, centre: Floats, radius: Floats) -> tuple[Floats, Bools]:
-    """Where unit rays first meet spheres, and whether they do; the nearest point of the ray where they do not."""
+    """Find where unit rays first meet spheres, and whether they do; the nearest point of the ray where they do not."""
     m = origin - centre
     b = (m * ray).sum(axis=-1, keepdims=True)
     square = b * b - (m * m).sum(axis=-1, keepdims=True) + radius * radius
@@ -201,7 +201,7 @@ def _near_intersection(origin: Floats, *, ray: Floats, centre: Floats, radius: F
 def _mirror_centres(
     origin: Floats, *, glints: Floats, light_mm: Floats, radius: Floats, k: Floats
 ) -> tuple[Floats, Floats]:
-    """Centres c_i(k_i) and their derivatives dc_i/dk_i, both (..., m, 3)."""
+    """Compute the centres c_i(k_i) and their derivatives dc_i/dk_i, both (..., m, 3)."""
     q = origin + k[..., None] * glints
     to_light = light_mm - q
     far = np.sqrt((to_light * to_light).sum(axis=-1, keepdims=True))
@@ -216,7 +216,7 @@ def _mirror_centres(
 
 
 def _coarse(origin: Floats, *, glints: Floats, light_mm: Floats, radius: Floats) -> Floats:
-    """Starting distances (..., m): all equal, with the value of a coarse grid whose centres disagree least."""
+    """Compute starting distances (..., m): all equal, with the value of a coarse grid whose centres disagree least."""
     m = glints.shape[-2]
     k = _START.reshape(-1, *([1] * radius.ndim)) * radius
     c, _ = _mirror_centres(

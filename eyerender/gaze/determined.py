@@ -29,12 +29,12 @@ class UndeterminedWarning(UserWarning):
 
 
 def monomials(v: Floats, terms: Terms) -> Floats:
-    """Design matrix (n, m) of vectors (n, 2): x^i y^j for each of the m terms (i, j)."""
+    """Compute the design matrix (n, m) of vectors (n, 2): x^i y^j for each of the m terms (i, j)."""
     return np.stack([v[:, 0] ** i * v[:, 1] ** j for i, j in terms], axis=1)
 
 
 def seen_shares(vectors: Floats, terms: Terms) -> Floats:
-    """Shares (m,) of the size of the functions of m terms that are seen at vectors (n, 2), in falling order."""
+    """Compute the visible shares (m,) of functions of m terms at vectors (n, 2), in falling order."""
     low, high = vectors.min(axis=0), vectors.max(axis=0)
     shares = np.zeros(len(terms))
     if not (high > low).all():
@@ -50,12 +50,12 @@ def seen_shares(vectors: Floats, terms: Terms) -> Floats:
 
 
 def is_determined(vectors: Floats, terms: Iterable[Terms]) -> bool:
-    """Whether vectors (n, 2) of a calibration determine polynomials of these terms."""
+    """Return whether vectors (n, 2) of a calibration determine polynomials of these terms."""
     return all(seen_shares(vectors, part)[-1] >= LEAST_SHARE for part in terms)
 
 
 def shortfall(vectors: Floats, terms: Iterable[Terms], what: str) -> str | None:
-    """Why features (n, 2) of a calibration do not determine the polynomials of `what`; None where they do."""
+    """Say why features (n, 2) of a calibration do not determine the polynomials of `what`; None where they do."""
     for part in terms:
         shares = seen_shares(vectors, part)
         if shares[-1] < LEAST_SHARE:

@@ -107,7 +107,7 @@ class DirectionRegression:
         return self.predict_rays(observations, rig).on_screen(screen)
 
     def features(self, observations: Observations, rig: RigLike) -> tuple[Floats, Objects]:
-        """Features (n, 2) px, and the reasons why there are none (n,), None where there are."""
+        """Compute features (n, 2) px, and the reasons why there are none (n,), None where there are."""
         built = rig.build()
         _, unknown = camera_of(observations, built)
         lights = () if self.feature == "pupil" else chosen_lights(built, self.lights, 1)

@@ -75,7 +75,7 @@ class GazeRays(ArrayValue):
         )
 
     def on_screen(self, screen: ScreenPlane, name: str = "the gaze ray") -> GazePoints:
-        """Points where the rays meet the screen's plane; `name` says in reasons what the rays are."""
+        """Compute points where the rays meet the screen's plane; `name` says in reasons what the rays are."""
         points, hits = screen.intersect(self.origin_mm, self.direction)
         reason = self.reason.copy()
         reason[(reason == None) & ~hits] = f"{name} does not meet the screen"  # noqa: E711
@@ -120,7 +120,7 @@ class StoredEstimator(GazeEstimator, Protocol):
     """
 
     def to_mapping(self) -> dict[str, Any]:
-        """Calibration as JSON values: mappings, lists, texts, finite numbers, booleans and None."""
+        """Return the calibration as JSON values: mappings, lists, texts, finite numbers, booleans and None."""
         ...
 
     @classmethod
@@ -130,7 +130,7 @@ class StoredEstimator(GazeEstimator, Protocol):
 
 
 def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Observations, GazePoints]:
-    """Mean of both eyes' gaze points of each frame, and the frames' first observations.
+    """Compute the mean of both eyes' gaze points of each frame, and the frames' first observations.
 
     A frame in which either eye is missing has no binocular estimate: the mean of one eye would be biased towards it.
     """

@@ -106,7 +106,7 @@ class GuestrinEizenman:
         return self.visual_axes(observations, rig.build())
 
     def visual_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
-        """Visual axes from the centre of corneal curvature, in the direction of gaze."""
+        """Compute visual axes from the centre of corneal curvature, in the direction of gaze."""
         optic = self.optic_axes(observations, rig)
         direction = np.full((len(observations), 3), np.nan)
         for eye, calibration in self.calibrations.items():
@@ -117,7 +117,7 @@ class GuestrinEizenman:
         return GazeRays.of(optic.origin_mm, direction, optic.reason)
 
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
-        """Optic axes from the centre of corneal curvature through the pupil centre."""
+        """Compute optic axes from the centre of corneal curvature through the pupil centre."""
         if not self.calibrations:
             raise InputError("the estimator is not calibrated; call fit first")
         rays = feature_rays(observations, rig, self.lights, least=2)
@@ -149,7 +149,7 @@ class GuestrinEizenman:
         return find(rays.origin_mm[rows], glints=rays.glints[rows], light_mm=rays.light_mm, radius_mm=radius)
 
     def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
-        """Visual axes (..., 3) of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""
+        """Compute visual axes (..., 3) of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""
         theta = np.arctan2(w[..., 1], w[..., 0]) + alpha
         phi = np.arcsin(np.clip(w[..., 2], -1.0, 1.0)) + beta
         return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
@@ -203,7 +203,7 @@ class _Goals:
 
     @classmethod
     def of(cls, observations: Observations, screen: ScreenPlane | None) -> _Goals:
-        """Targets on the screen, or on planes of their own."""
+        """Return targets on the screen, or on planes of their own."""
         index, targets = observations.index, observations.index.target_mm
         if screen is not None:
             axes = np.stack([screen.right, screen.up, screen.normal], axis=-1)
@@ -243,7 +243,7 @@ class _Goals:
         )
 
     def local(self, vectors: Floats) -> Floats:
-        """Vectors (P, n, 3) in the planes' axes."""
+        """Compute vectors (P, n, 3) in the planes' axes."""
         return vectors @ self.axes if self.axes.ndim == 2 else np.einsum("pni,nij->pnj", vectors, self.axes)
 
 
@@ -271,7 +271,7 @@ class _Model:
         self._series = np.linalg.solve(chebvander(nodes, _DEGREE), centres)
 
     def misses(self, parameters: Floats) -> Floats:
-        """Misses (P, n, 3) mm, along the planes' right, up and normal, at P sets of parameters (P, 5)."""
+        """Compute misses (P, n, 3) mm, along the planes' right, up and normal, at P sets of parameters (P, 5)."""
         shape = (len(parameters), len(self.origin))
         x = (np.sqrt(parameters[:, 0]) - self.middle) / self.half
         centre = (chebvander(x, _DEGREE) @ self._series).reshape(*shape, 3)
@@ -296,7 +296,7 @@ class _Model:
 
 
 def _why(found: CorneaCentres, meets: Bools, inside: Bools) -> Objects:
-    """Reason why an observation has no optic axis; None where it has one."""
+    """Compute the reason why an observation has no optic axis; None where it has one."""
     out = np.full(len(meets), None, dtype=object)
     out[~inside] = "the refracted pupil ray misses the sphere that holds the pupil"
     out[~meets] = "the pupil ray misses the cornea"

@@ -87,7 +87,7 @@ class Homography:
         return GazePoints.of(screen.world(on_screen), reason)
 
     def normalised(self, observations: Observations, rig: RigGeometry) -> tuple[Floats, Objects]:
-        """Pupil centre in the unit square of the glints (n, 2), and the reason why there is none (n,)."""
+        """Compute the pupil centre in the unit square of the glints (n, 2), and the reason why there is none (n,)."""
         chosen_lights(rig, self.lights, 4)
         glints, reason = glints_of(observations, self.lights)
         H, ok = homography(glints, np.broadcast_to(SQUARE, glints.shape))
@@ -142,7 +142,7 @@ def transformed(H: Floats, points: ArrayLike) -> tuple[Floats, Bools]:
 
 
 def _conditioning(points: Floats) -> Floats:
-    """Similarity (..., 3, 3) that brings points (..., k, 2) to zero mean and mean distance sqrt(2)."""
+    """Compute the similarity (..., 3, 3) that brings points (..., k, 2) to zero mean and mean distance sqrt(2)."""
     mean = points.mean(axis=-2)
     size = np.linalg.norm(points - mean[..., None, :], axis=-1).mean(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -155,7 +155,7 @@ def _conditioning(points: Floats) -> Floats:
 
 
 def _spread(points: Floats) -> Floats:
-    """Relative measure of how well k >= 4 points (..., k, 2) are in general position; 0 if they are not.
+    """Compute the relative measure of how well k >= 4 points (..., k, 2) are in general position; 0 if they are not.
 
     With four points it is the smallest triangle's area over the square of their extent. With more it is the smaller
     extent over the larger one.

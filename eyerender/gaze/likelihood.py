@@ -87,7 +87,7 @@ class MaximumLikelihood:
         return self.slippage_mm if self.slippage_mm > 0 else "known"
 
     def _fits(self, observations: Observations, rig: RigLike, unknowns: object, *, targets: bool) -> dict[int, EyeFit]:
-        """Fits by eye; of known persons where the estimator has them and no targets are used."""
+        """Compute fits by eye; of known persons where the estimator has them and no targets are used."""
         from ..design.fit import Options, fit_one
         from ..design.noise import FeatureNoise
         from ..design.unknowns import Unknowns

@@ -37,7 +37,7 @@ class OwnEstimator:
             return cls(reference, kind())
 
     def to_mapping(self) -> dict[str, Any]:
-        """Name of the class, as in calibration files."""
+        """Return the name of the class, as in calibration files."""
         return {"reference": self.reference}
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
@@ -72,7 +72,7 @@ class OwnEstimator:
             raise InputError(reason, source=self.reference)
 
     def state(self) -> dict[str, Any]:
-        """Calibration as JSON values.
+        """Return the calibration as JSON values.
 
         Raises:
             InputError: it cannot be stored.

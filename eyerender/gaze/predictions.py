@@ -120,7 +120,7 @@ def _ray_predictions(estimator: RayEstimator, observations: Observations, rig: R
 def _screen_errors(
     observations: Observations, point_mm: Floats, screen: ScreenPlane | None, screen_px: tuple[float, float] | None
 ) -> dict[str, Floats]:
-    """Distances (n,) on the screen's plane between gaze points (n, 3) and targets, by unit; NaN where unknown."""
+    """Find distances (n,) on the screen's plane between gaze points (n, 3) and targets, by unit; NaN where unknown."""
     unknown = np.full(len(observations), np.nan)
     if screen is None:
         return {"mm": unknown, "px": unknown}
@@ -133,7 +133,7 @@ def _screen_errors(
 
 
 def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGeometry) -> tuple[Floats, Objects]:
-    """Place of each eye (n, 3) mm in the world, NaN where it is unknown, and where it is from (n,)."""
+    """Compute the place of each eye (n, 3) mm in the world, NaN where it is unknown, and where it is from (n,)."""
     index = observations.index
     place = np.array(index.eye_position_mm + index.head_mm)
     source = np.array([GIVEN if np.isfinite(one).all() else None for one in place], dtype=object)
@@ -154,7 +154,7 @@ def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGe
 
 
 def _corneal_centres(observations: Observations, rig: RigGeometry) -> Floats:
-    """Centres of corneal curvature (n, 3) from the glints and an average radius; NaN where there are none."""
+    """Compute centres of corneal curvature (n, 3) from the glints and an average radius; NaN where there are none."""
     centre = np.full((len(observations), 3), np.nan)
     if len(rig.lights) < 2:
         return centre
@@ -179,7 +179,7 @@ def _middles(observations: Observations, place: Floats, frames: Observations) ->
 
 
 def _by_eye(observations: Observations, ok: Bools, errors: dict[str, Floats], source: Objects) -> list[dict[str, Any]]:
-    """Summary of each eye."""
+    """Compute the summary of each eye."""
     out = []
     for eye in np.unique(observations.index.eye):
         rows = observations.index.eye == eye
@@ -189,7 +189,7 @@ def _by_eye(observations: Observations, ok: Bools, errors: dict[str, Floats], so
 
 
 def _summary(ok: Bools, errors: dict[str, Floats], source: Objects) -> dict[str, Any]:
-    """Mean, median and 95th percentile of errors, and the share of samples without an estimate."""
+    """Compute the mean, median and 95th percentile of errors, and the share of samples without an estimate."""
     units = ("mm", "px", "deg")
     found = {unit: values[np.isfinite(values)] for unit, values in errors.items()}
     return {
@@ -214,7 +214,7 @@ def _errors_of(errors: dict[str, Floats], i: int) -> dict[str, float | None]:
 
 
 def _identity(observations: Observations, i: int) -> dict[str, Any]:
-    """Keys that say which observation row `i` is."""
+    """List keys that say which observation row `i` is."""
     index = observations.index
     return {
         "frame": int(index.frame[i]),

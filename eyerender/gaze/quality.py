@@ -27,7 +27,7 @@ class Quality(ArrayValue):
 
 
 def quality(samples_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> Quality:
-    """Quality of repeated estimates.
+    """Compute the quality of repeated estimates.
 
     Args:
         samples_mm: (s, n, 3) s >= 2 samples of n fixations, in time order.

@@ -72,7 +72,7 @@ def feature_rays(
 
 
 def glints_of(observations: Observations, lights: tuple[int, ...]) -> tuple[Floats, Objects]:
-    """Glints (n, m, 2) px of the lights in their order, and why an observation lacks pupil or glint (n,)."""
+    """Compute glints (n, m, 2) px of the lights in their order, and why an observation lacks pupil or glint (n,)."""
     reason = np.full(len(observations), None, dtype=object)
     reason[~observations.pupil.ok] = "no pupil"
     places = np.full((len(observations), len(lights), 2), np.nan)
@@ -113,7 +113,7 @@ OFF_PLANE_MM = 1.0
 
 
 def screen_of(rig: RigGeometry, instead: str = "") -> ScreenPlane:
-    """Screen of the rig; `instead` says what works without one.
+    """Compute the screen of the rig; `instead` says what works without one.
 
     Raises:
         InputError: there is none.
@@ -124,7 +124,7 @@ def screen_of(rig: RigGeometry, instead: str = "") -> ScreenPlane:
 
 
 def targets_on_screen(observations: Observations, screen: ScreenPlane) -> Floats:
-    """Screen points (n, 2) mm of the targets of observations; NaN without a target.
+    """Compute screen points (n, 2) mm of the targets of observations; NaN without a target.
 
     A target off the plane is projected along the line from the eye, because that is where the eye looks through it.
 
@@ -148,18 +148,18 @@ def targets_on_screen(observations: Observations, screen: ScreenPlane) -> Floats
 
 
 def target_directions(observations: Observations) -> Floats:
-    """Unit directions (n, 3) from each eye's place to its target; NaN where one is unknown."""
+    """Compute unit directions (n, 3) from each eye's place to its target; NaN where one is unknown."""
     index = observations.index
     return unit(index.target_mm - index.eye_position_mm - index.head_mm)
 
 
 def unit(v: Floats) -> Floats:
-    """Unit vectors v / |v| along the last axis; NaN for a zero vector."""
+    """Compute the unit vectors v / |v| along the last axis; NaN for a zero vector."""
     length = np.sqrt((v * v).sum(axis=-1, keepdims=True))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(v / np.where(length > 0, length, np.nan))
 
 
 def nasal_sign(eye: Ints) -> Floats:
-    """Sign of the nasal direction along y: +1 for a right eye and eyes of unknown side, -1 for a left eye."""
+    """Find the sign of the nasal direction along y: +1 for a right eye and eyes of unknown side, -1 for a left eye."""
     return np.where(np.asarray(eye) == 1, -1.0, 1.0)

@@ -95,7 +95,7 @@ class Recalibration:
         return GazeRays.of(rays.origin_mm, unit(points.point_mm - rays.origin_mm), points.reason)
 
     def _on_angles(self, observations: Observations, rays: GazeRays) -> GazeRays:
-        """Rays whose angles are corrected, if the correction acts on angles."""
+        """Compute rays whose angles are corrected, if the correction acts on angles."""
         if self.kind == "none":
             return rays
         if not self.coefficients:
@@ -112,7 +112,7 @@ class Recalibration:
 
 
 def angles_of(direction: Floats) -> Floats:
-    """Azimuth and elevation (..., 2) rad of directions (..., 3)."""
+    """Compute the azimuth and elevation (..., 2) rad of directions (..., 3)."""
     size = np.sqrt((direction * direction).sum(axis=-1))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.stack(
@@ -121,12 +121,12 @@ def angles_of(direction: Floats) -> Floats:
 
 
 def direction_of(angles: Floats) -> Floats:
-    """Unit directions (..., 3) of azimuth and elevation (..., 2) rad."""
+    """Compute unit directions (..., 3) of azimuth and elevation (..., 2) rad."""
     theta, phi = angles[..., 0], angles[..., 1]
     return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
 
 
 def monomials(v: Floats) -> Floats:
-    """Monomials (1, a, b, ab, a^2, b^2) of (..., 2)."""
+    """Compute monomials (1, a, b, ab, a^2, b^2) of (..., 2)."""
     a, b = v[..., 0], v[..., 1]
     return np.stack([np.ones_like(a), a, b, a * b, a * a, b * b], axis=-1)

@@ -77,7 +77,7 @@ def load_observations(
 
 
 class RigFile(FileSpec, Rig):
-    """A rig in a file of its own: `format: 1` and the keys of `rig` in a scene."""
+    """A rig in a separate file: `format: 1` and the keys of `rig` in a scene."""
 
 
 def load_rig(path: str | Path) -> RigGeometry:
@@ -92,7 +92,7 @@ def load_rig(path: str | Path) -> RigGeometry:
 
 
 def _read(text: str, source: str) -> tuple[list[Any], Any]:
-    """Records and rig (None: there is none) of the text of a file."""
+    """Read records and rig (None: there is none) from the text of a file."""
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
     # With one record a line, the first line is a whole object and not the last line.
     if len(lines) > 1 and lines[0][1].rstrip().endswith("}"):

@@ -191,7 +191,7 @@ def _instead(vectors: Floats) -> str:
 
 
 def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: bool = True) -> tuple[Floats, Objects]:
-    """Pupil-glint vectors (n, 2), and the reasons why there are none (n,), None where there are.
+    """Compute pupil-glint vectors (n, 2), and the reasons why there are none (n,), None where there are.
 
     Normalised vectors need both eyes of a frame: the distance of their pupils is the unit. Otherwise the unit is
     pixels.
@@ -215,7 +215,7 @@ def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: 
 
 
 def _partners(frame: Ints, eye: Ints) -> Ints:
-    """Row of the other eye of the same frame, -1 where there is none."""
+    """Return the row of the other eye of the same frame, -1 where there is none."""
     # This is one number for each (frame, eye), next to that of its partner. Eyes of unknown side have no partner.
     key = 2 * frame + eye
     order = np.argsort(key, kind="stable")

@@ -26,7 +26,7 @@ Misses = Callable[[Floats], Floats]
 
 
 class FreeParameters:
-    """The k parameters that a search varies within their bounds; the others keep their start.
+    """The k parameters that a search varies within their bounds; the remaining ones keep their start.
 
     Attributes:
         first: (5,) the start.
@@ -50,7 +50,7 @@ class FreeParameters:
             raise InputError("the start of the calibration lies outside the bounds")
 
     def full(self, x: Floats) -> Floats:
-        """All five parameters (m, 5) for free ones (m, k)."""
+        """Return all five parameters (m, 5) for free ones (m, k)."""
         self.evaluations += 1
         out = np.repeat(self.first[None], len(x), axis=0)
         out[:, self.free] = x

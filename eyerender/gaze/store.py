@@ -70,7 +70,7 @@ class EstimatorSpec(Spec):
 
     @classmethod
     def of(cls, estimator: GazeEstimator) -> EstimatorSpec:
-        """Name and options of one of the package's estimators, calibrated or not.
+        """Return the name and options of one of the package's estimators, calibrated or not.
 
         Raises:
             InputError: it is not an estimator of the package, or has options that a file cannot store.
@@ -148,7 +148,7 @@ def choose_estimator(given: str, *, source: str = "--estimator", **options: Any)
 
 
 def _described(estimator: GazeEstimator) -> dict[str, Any]:
-    """Name and options of an estimator, as in files."""
+    """Return the name and options of an estimator, as in files."""
     return estimator.to_mapping() if isinstance(estimator, OwnEstimator) else EstimatorSpec.of(estimator).to_mapping()
 
 
@@ -207,7 +207,7 @@ def fit_estimator(
 
 
 def _mean_and_max(gaze: list[dict[str, Any]], unit: str) -> dict[str, Any]:
-    """Mean and largest error of the entries of `predictions`."""
+    """Compute the mean and largest error of the entries of `predictions`."""
     errors = [one[f"error_{unit}"] for one in gaze if one.get(f"error_{unit}") is not None]
     return {
         f"mean_{unit}": float(np.mean(errors)) if errors else None,
@@ -373,7 +373,7 @@ def _checked(estimator: BuiltIn, state: object) -> Spec:
 
 
 def _state(estimator: BuiltIn) -> dict[str, Any]:
-    """Calibrated values by eye."""
+    """Return calibrated values by eye."""
     found: dict[int, Any]
     if isinstance(estimator, Regression | DirectionRegression):
         found = {

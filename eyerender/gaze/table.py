@@ -130,7 +130,7 @@ class _Table:
         self.problems.add(reason, f"line {self.lines[row]}.{column}")
 
     def numbers(self, column: str | None) -> Floats:
-        """A column as numbers (n,), NaN where a cell is empty or there is no column."""
+        """Return a column as numbers (n,), NaN where a cell is empty or there is no column."""
         out = np.full(len(self), np.nan)
         for k, cell in enumerate(self.cells[column] if column else ()):
             word = cell.strip()
@@ -147,7 +147,7 @@ class _Table:
         return out
 
     def several(self, columns: tuple[str, ...] | None, count: int) -> Floats:
-        """Columns that belong together as (n, count): all of them are given in a row, or none."""
+        """Return columns that belong together as (n, count): all of them are given in a row, or none."""
         if columns is None:
             return np.full((len(self), count), np.nan)
         known = len(self.problems)
@@ -160,7 +160,7 @@ class _Table:
         return out
 
     def counts(self, column: str | None, unknown: int, limit: int = 2**31 - 1) -> Ints:
-        """A column of whole numbers (n,), `unknown` where a cell is empty or there is no column."""
+        """Return a column of whole numbers (n,), `unknown` where a cell is empty or there is no column."""
         found = self.numbers(column)
         empty = np.isnan(found)
         bad = ~empty & ~((found >= 0) & (found <= limit) & (found == np.floor(found)))
@@ -169,7 +169,7 @@ class _Table:
         return np.where(empty | bad, unknown, np.where(bad, 0, found)).astype(np.int64)
 
     def eyes(self, column: str | None, words: Mapping[str, str]) -> Ints:
-        """A column of eyes: 0 right, 1 left, -1 where a cell is empty or there is no column."""
+        """Return a column of eyes: 0 right, 1 left, -1 where a cell is empty or there is no column."""
         out = np.full(len(self), -1, np.int64)
         meanings = {**_EYE_WORDS, **{word.strip().lower(): side for word, side in words.items()}}
         for k, cell in enumerate(self.cells[column] if column else ()):
@@ -246,7 +246,7 @@ def _observations(table: _Table, columns: CsvColumns, screen: ScreenPlane | None
 
 
 def _parts(table: _Table, columns: CsvColumns) -> list[tuple[EyeColumns, Ints]]:
-    """The columns of each eye, and the eye of each row."""
+    """Return the columns of each eye, and the eye of each row."""
     sides = [(getattr(columns, side), k) for k, side in enumerate(EYES) if getattr(columns, side) is not None]
     parts = [(part, np.full(len(table), k, np.int64)) for part, k in sides]
     if parts and columns.light is not None:
@@ -263,7 +263,7 @@ def _parts(table: _Table, columns: CsvColumns) -> list[tuple[EyeColumns, Ints]]:
 
 
 def _frames(table: _Table, columns: CsvColumns, eye: Ints) -> Ints:
-    """Frame of each row."""
+    """Compute the frame of each row."""
     named = columns.frame or columns.time
     for k, cell in enumerate(table.cells[named] if named else ()):
         if cell.strip().lower() in _MISSING:
@@ -309,7 +309,7 @@ def _features(table: _Table, part: EyeColumns, columns: CsvColumns, width: int) 
 
 
 def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> Floats:
-    """Target of each row (n, 3) mm in the world, NaN where there is none."""
+    """Compute the target of each row (n, 3) mm in the world, NaN where there is none."""
     names = columns.target
     if names is None:
         return np.full((len(table), 3), np.nan)
@@ -342,7 +342,7 @@ def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> 
 def _listed_glints(
     table: _Table, column: str, glints: Floats, light: Ints, which: Ints, count: int
 ) -> tuple[Floats, Ints]:
-    """Glints (count, lights, 2) and their lights of rows that hold one glint each."""
+    """Compute glints (count, lights, 2) and their lights of rows that hold one glint each."""
     here = np.isfinite(glints[:, 0]).all(axis=1) if glints.shape[1] else np.zeros(len(light), bool)
     for k in np.flatnonzero(here & (light < 0)).tolist():
         table.refuse(k, column, "is empty, but the row holds a glint")
@@ -359,7 +359,7 @@ def _listed_glints(
 
 
 def _merged(table: _Table, key: str, values: Floats, which: Ints, count: int) -> Floats:
-    """Values of rows that are one observation: those of the first row that has them; the others must agree."""
+    """Return values of rows that are one observation: those of the first row that has them; later rows must agree."""
     out = np.full((count, *values.shape[1:]), np.nan)
     there = np.nonzero(np.isfinite(values))
     backwards = tuple(axis[::-1] for axis in there)  # the first one is written last
@@ -389,7 +389,7 @@ def _places(position: Floats, frame: Ints, eye: Ints, columns: CsvColumns) -> tu
 
 
 def _reasons(found: Bools) -> Objects:
-    """Why features are missing; None where they were found."""
+    """Say why features are missing; None where they were found."""
     reason = np.full(found.shape, None, dtype=object)
     reason[~found] = Status.NOT_FOUND.reason
     return reason

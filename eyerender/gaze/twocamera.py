@@ -70,7 +70,7 @@ class ShihWuLiu:
         return correction.apply_to_rays(observations, self.optic_axes(observations, rig), rig)
 
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
-        """Optic axes from the centre of corneal curvature, one row per observation."""
+        """Compute optic axes from the centre of corneal curvature, one row per observation."""
         if len(set(self.cameras)) != 2 or not all(0 <= k < len(rig.cameras) for k in self.cameras):
             raise InputError(f"this estimator needs two cameras, but the rig has {len(rig.cameras)}")
         rays = feature_rays(observations, rig, self.lights, least=2)
@@ -93,7 +93,7 @@ class ShihWuLiu:
         return GazeRays.of(centre, axis, reason)
 
     def _pairs(self, observations: Observations) -> tuple[Ints, Ints]:
-        """Rows of the first and of the second camera that show the same fixation of the same eye."""
+        """List rows of the first and of the second camera that show the same fixation of the same eye."""
         index = observations.index
         key = np.stack([index.head, index.fixation, index.eye], axis=1)
         known = index.fixation >= 0
@@ -107,7 +107,7 @@ class ShihWuLiu:
 
 
 def _closest(o1: Floats, *, b1: Floats, o2: Floats, b2: Floats) -> tuple[Floats, Bools]:
-    """Middle of the closest approach of two lines (n, 3), and whether they are not parallel (n,)."""
+    """Compute the middle of the closest approach of two lines (n, 3), and whether they are not parallel (n,)."""
     w = o2 - o1
     cosine = (b1 * b2).sum(axis=-1)
     cross = np.cross(b1, b2)
@@ -120,7 +120,7 @@ def _closest(o1: Floats, *, b1: Floats, o2: Floats, b2: Floats) -> tuple[Floats,
 
 
 def _normal_to_both(rays: FeatureRays, first: Ints, second: Ints, c: Floats) -> tuple[Floats, Bools]:
-    """Optic axis (n, 3), towards the cameras, and whether it is defined (n,)."""
+    """Compute the optic axis (n, 3), towards the cameras, and whether it is defined (n,)."""
     one, two = (unit(np.cross(c - rays.origin_mm[rows], rays.pupil[rows])) for rows in (first, second))
     cross = np.cross(one, two)
     d = unit(cross)

@@ -50,7 +50,7 @@ class GazeErrors(ArrayValue):
 
 
 def leave_one_target_out(estimator: GazeEstimator, observations: Observations, rig: RigLike) -> GazeErrors:
-    """Estimate each target by a calibration on all the others.
+    """Estimate each target by a calibration on all other targets.
 
     A residual at the calibration targets themselves would flatter every estimator with many terms.
 
@@ -82,7 +82,7 @@ def leave_one_target_out(estimator: GazeEstimator, observations: Observations, r
 
 
 def gaze_errors(observations: Observations, gaze: GazePoints) -> GazeErrors:
-    """Binocular errors of gaze points (n) of observations (n): the mean of both eyes against the target."""
+    """Compute binocular errors of gaze points (n) of observations (n): the mean of both eyes against the target."""
     frames, both = binocular_average(observations, gaze)
     index = frames.index
     error = angular_error_deg(both.point_mm, index.target_mm, index.head_mm)
