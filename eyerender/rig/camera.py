@@ -156,7 +156,7 @@ class Camera(Spec):
         return cls.from_mapping({"resolution_px": size, "calibration": calibration, **fields}).resolved()
 
     def resolved(self, base: Path | None = None) -> Self:
-        """The camera with the numbers of its calibration file, which is relative to `base` or the current folder.
+        """Find the camera with the numbers of its calibration file, which is relative to `base` or the current folder.
 
         Raises:
             InputError: the file cannot be read, or does not fit the camera.
@@ -190,7 +190,7 @@ class Camera(Spec):
         focal_length_px: float | None = None,
         **fields: Any,
     ) -> Self:
-        """A camera at a place, turned to a point.
+        """Return a camera at a place, turned to a point.
 
         Args:
             point_mm: (3,) world point on the optical axis.
@@ -310,7 +310,7 @@ class PinholeCamera(ArrayValue):
         )
 
     def seen_in(self, mirror: Mirror) -> PinholeCamera:
-        """Virtual camera behind a mirror, which takes the pictures that this camera takes through it.
+        """Compute the virtual camera behind a mirror, which takes the pictures that this camera takes through it.
 
         Raises:
             InputError: the camera lies in the plane.
@@ -365,19 +365,19 @@ class PinholeCamera(ArrayValue):
         return self.pixels_of(cam[..., 0] / z, cam[..., 1] / z), front
 
     def pixels_of(self, x: Floats, y: Floats) -> Floats:
-        """Pixels (..., 2) of undistorted normalised coordinates x = X/Z, y = Y/Z."""
+        """Compute pixels (..., 2) of undistorted normalised coordinates x = X/Z, y = Y/Z."""
         x = self.across * x
         if np.any(self.distortion):
             x, y = distort(x, y, self.distortion)
         return np.stack([self.K[0, 0] * x + self.K[0, 2], self.K[1, 1] * y + self.K[1, 2]], axis=-1)
 
     def scale_at(self, point_mm: ArrayLike) -> float:
-        """Pixels per mm across the line of sight at a world point (3,): focal length over distance."""
+        """Compute pixels per mm across the line of sight at a world point (3,): focal length over distance."""
         distance = float(np.linalg.norm(np.asarray(point_mm, dtype=float) - self.nodal_point_mm))
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1])) / distance
 
     def rays(self, pixels: ArrayLike) -> Floats:
-        """Unit directions (..., 3) in the world along which the camera sees the pixels (..., 2)."""
+        """Compute unit directions (..., 3) in the world along which the camera sees the pixels (..., 2)."""
         p = np.asarray(pixels, dtype=float)
         x = (p[..., 0] - self.K[0, 2]) / self.K[0, 0]
         y = (p[..., 1] - self.K[1, 2]) / self.K[1, 1]
@@ -387,7 +387,7 @@ class PinholeCamera(ArrayValue):
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
     def ideal(self, pixels: ArrayLike) -> Floats:
-        """Pixels (..., 2) with the lens distortion removed."""
+        """Compute pixels (..., 2) with the lens distortion removed."""
         p = np.asarray(pixels, dtype=float)
         if not np.any(self.distortion):
             return p
@@ -396,16 +396,16 @@ class PinholeCamera(ArrayValue):
         return np.stack([fx * x + cx, fy * y + cy], axis=-1)
 
     def is_imaged(self, x: Floats, y: Floats) -> Bools:
-        """Whether the distortion has not folded back the picture of normalised coordinates x = X/Z, y = Y/Z."""
+        """Return whether the distortion has not folded back the picture of normalised coordinates x = X/Z, y = Y/Z."""
         return np.asarray(is_imaged(self.across * x, y, self.distortion))
 
     def in_image(self, pixels: ArrayLike) -> Bools:
-        """Whether pixels (..., 2) lie on the sensor; the far edges of its outer pixels are at -0.5 and W - 0.5."""
+        """Find whether pixels (..., 2) lie on the sensor; the far edges of its outer pixels are at -0.5 and W - 0.5."""
         return in_window((0, 0, *self.resolution_px), pixels)
 
 
 def in_window(window: Window, pixels: ArrayLike) -> Bools:
-    """Whether pixels (..., 2) lie in a window (x0, y0, width, height), whose outer pixels end half a pixel out."""
+    """Find whether pixels (..., 2) lie in a window (x0, y0, width, height), whose outer pixels end half a pixel out."""
     p = np.asarray(pixels, dtype=float)
     x, y, (x0, y0, w, h) = p[..., 0], p[..., 1], window
     return np.asarray((x >= x0 - 0.5) & (x <= x0 + w - 0.5) & (y >= y0 - 0.5) & (y <= y0 + h - 0.5))
@@ -426,7 +426,7 @@ def distort(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
 
 
 def distortion_jacobian(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any, Any]:
-    """Jacobian of `distort` at undistorted coordinates: dx''/dx, dx''/dy = dy''/dx, dy''/dy.
+    """Compute the jacobian of `distort` at undistorted coordinates: dx''/dx, dx''/dy = dy''/dx, dy''/dy.
 
     Like `newton_step`, it takes arrays of NumPy and of Dr.Jit.
     """
@@ -441,19 +441,19 @@ def distortion_jacobian(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any,
 
 
 def distorted_area(x: Any, y: Any, k: Sequence[Any] | Floats) -> Any:
-    """Area on the sensor per area without distortion: the determinant D of `distortion_jacobian`."""
+    """Compute the area on the sensor per area without distortion: the determinant D of `distortion_jacobian`."""
     a, b, d = distortion_jacobian(x, y, k)
     return a * d - b * b
 
 
 def is_imaged(x: Any, y: Any, k: Sequence[Any] | Floats) -> Any:
-    """Whether the distortion has not folded the picture back: its Jacobian is positive definite."""
+    """Return whether the distortion has not folded the picture back: its Jacobian is positive definite."""
     a, b, d = distortion_jacobian(x, y, k)
     return (a > 0) & (a * d - b * b > 0)
 
 
 def newton_step(x: Any, y: Any, xd: Any, yd: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
-    """Newton's step from undistorted coordinates to those of (xd, yd), to be subtracted."""
+    """Compute Newton's step from undistorted coordinates to those of (xd, yd), to be subtracted."""
     fx, fy = distort(x, y, k)
     ex, ey = fx - xd, fy - yd
     a, b, d = distortion_jacobian(x, y, k)
@@ -475,7 +475,7 @@ def undistort(xd: Floats, yd: Floats, k: Floats, iterations: int = 50) -> tuple[
 
 
 def _turned(pan: float, tilt: float) -> Floats:
-    """Camera axes as columns: tilted up about its right axis, then panned about the world's vertical."""
+    """Compute camera axes as columns: tilted up about its right axis, then panned about the world's vertical."""
     ct, st, cp, sp = np.cos(tilt), np.sin(tilt), np.cos(pan), np.sin(pan)
     about_right = np.array([[1.0, 0, 0], [0, ct, -st], [0, st, ct]])
     # The rest direction is -x, so a pan to the subject's left (+y) is a negative turn about +z.

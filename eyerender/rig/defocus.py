@@ -45,7 +45,7 @@ _LEAST_SHARE = 1e-3  # of a pixel: rounding of coverages leaves less
 
 
 def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: Floats | float) -> Floats:
-    """Diameters (px) of the circles of confusion of points.
+    """Compute diameters (px) of the circles of confusion of points.
 
     Args:
         lens: the lens, which gives the distance in focus.
@@ -57,7 +57,7 @@ def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: Fl
 
 
 def confusion_of(lens: Lens, camera: PinholeCamera, sensor: Sensor, nearness: Floats) -> Floats:
-    """The same of points whose inverse depths (1/mm) are given."""
+    """Return the same of points whose inverse depths (1/mm) are given."""
     if lens.focus_mm is None:
         return np.zeros(np.shape(nearness))
     strength_px_mm = float(camera.K[0, 0]) ** 2 * sensor.pixel_pitch_um * 1e-3 / sensor.f_number
@@ -79,7 +79,7 @@ def checked(diameter_px: float) -> float:
 
 
 def one_blur(diameters_px: Floats, subject_px: float, sigma_px: float) -> bool:
-    """Whether a single kernel, that of the subject, serves all diameters within 3 % of the picture's whole blur.
+    """Return whether a single kernel, that of the subject, serves all diameters within 3 % of the picture's whole blur.
 
     Args:
         diameters_px: of the nearest and farthest things.
@@ -92,7 +92,7 @@ def one_blur(diameters_px: Floats, subject_px: float, sigma_px: float) -> bool:
 
 
 def disc(diameter_px: float) -> Floats:
-    """Kernel of a disc for pictures of pixel means: odd, square, sum 1; a single 1 below a tenth of a pixel.
+    """Find the kernel of a disc for pictures of pixel means: odd, square, sum 1; a single 1 below a tenth of a pixel.
 
     Its Fourier transform is that of the disc, 2 J1(pi c f) / (pi c f), up to the highest frequency of the pixel grid.
     So a disc of a pixel's size blurs as much as it should. A disc that is integrated over the pixels would blur by
@@ -106,13 +106,13 @@ def disc(diameter_px: float) -> Floats:
 
 
 def _margin(diameter_px: float) -> int:
-    """Reach of the kernel of a disc: beyond it, its ripples are below 1 %."""
+    """Compute the reach of the kernel of a disc: beyond it, its ripples are below 1 %."""
     return int(np.ceil(diameter_px / 2)) + _RIPPLES_PX
 
 
 @lru_cache(maxsize=32)
 def _transfer(diameter_px: float, shape: tuple[int, int]) -> Singles:
-    """Fourier transform of a disc at the frequencies of `rfft2`."""
+    """Compute the Fourier transform of a disc at the frequencies of `rfft2`."""
     x = np.pi * diameter_px * np.hypot(fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None, :])
     found = np.divide(2 * special.j1(x), x, out=np.ones_like(x), where=x > 0)
     return np.asarray(found, dtype=np.float32)
@@ -130,7 +130,7 @@ def defocused(picture: Reals, diameter_px: float) -> Reals:
 
 
 def reach_px(diameter_px: float) -> int:
-    """Pixels that must be rendered beyond a window's border for discs of at most this diameter."""
+    """Compute pixels that must be rendered beyond a window's border for discs of at most this diameter."""
     return 0 if diameter_px < _SHARP_PX else _margin(min(diameter_px, _LARGEST_PX))
 
 
@@ -188,7 +188,7 @@ def _spread(layer: Layer, uncovered: Singles | None, reach: int) -> tuple[Single
 
 
 def _nearest_discs(diameters_px: Singles) -> tuple[Ints, Singles, Ints]:
-    """Index of the nearest disc for each pixel, and the discs with their reaches (see `disc_kernels.spread`).
+    """Find the index of the nearest disc for each pixel, and the discs with their reaches (see `disc_kernels.spread`).
 
     Disc k has the diameter 2^(k/128) - 1 pixels: small ones differ by 0.005 pixels, large ones by 0.5 % of their size.
     """
@@ -199,7 +199,7 @@ def _nearest_discs(diameters_px: Singles) -> tuple[Ints, Singles, Ints]:
 
 @lru_cache(maxsize=4)
 def _discs(reach: int) -> tuple[Singles, Ints]:
-    """The discs that reach at most so far, and their reaches."""
+    """Return the discs that reach at most so far, and their reaches."""
     from .disc_kernels import LANES
 
     count = 1 + int(_DISCS * np.log2(1 + 2 * max(reach - _RIPPLES_PX, 0)))
@@ -212,7 +212,7 @@ def _discs(reach: int) -> tuple[Singles, Ints]:
 
 
 def vignette(lens: Lens, camera: PinholeCamera, window: Window) -> Floats | float:
-    """Factor by which vignetting reduces the light at each pixel of a window."""
+    """Compute the factor by which vignetting reduces the light at each pixel of a window."""
     if lens.vignetting == 0:
         return 1.0
     x0, y0, width, height = window

@@ -13,7 +13,7 @@ LANES = 8  # numbers that are added at once; rows of discs are padded with zeros
 
 @compiled()
 def spread(pictures: Singles, index: Ints, discs: Singles, reaches: Ints, sums: Singles) -> None:
-    """Spread every pixel of some pictures over the disc of its own diameter.
+    """Spread every pixel of some pictures over a disc of its diameter.
 
     Args:
         pictures: (m, height, width).

@@ -23,7 +23,7 @@ FEW = 12.0  # below this mean the expansion of a Poisson quantile is too inaccur
 
 
 def radiance_to_irradiance(sensor: Sensor) -> float:
-    """Irradiance (W/m^2) of a pixel per radiance times cos^4(theta) / D (mW/mm^2/sr).
+    """Compute the irradiance (W/m^2) of a pixel per radiance times cos^4(theta) / D (mW/mm^2/sr).
 
     E = pi tau L cos^4(theta) / (4 N^2 D), N the working f-number, D the area per area without lens distortion.
     """
@@ -31,7 +31,7 @@ def radiance_to_irradiance(sensor: Sensor) -> float:
 
 
 def electrons(sensor: Sensor, irradiance: Floats, wavelength_nm: float) -> Floats:
-    """Mean photo-electrons of a pixel: eta E A t lambda / (h c)."""
+    """Compute mean photo-electrons of a pixel: eta E A t lambda / (h c)."""
     energy_j = (sensor.pixel_pitch_um * 1e-6) ** 2 * sensor.exposure_ms * 1e-3
     photon_j = _PLANCK_J_S * _LIGHT_M_S / (wavelength_nm * 1e-9)
     return np.asarray(irradiance * (sensor.quantum_efficiency * energy_j / photon_j))
@@ -40,7 +40,7 @@ def electrons(sensor: Sensor, irradiance: Floats, wavelength_nm: float) -> Float
 def expose(
     sensor: Sensor, irradiance: Reals, wavelength_nm: float, seed: int, corner_px: tuple[int, int] = (0, 0)
 ) -> NDArray[np.uint16]:
-    """Stored codes of an exposure.
+    """Compute stored codes of an exposure.
 
     The noise of a pixel is a pure function of `seed`, its place and its mean. Scenes that differ little therefore have
     the same noise where they agree. A rounding difference in the last digit of an irradiance, as between processors,
@@ -74,7 +74,7 @@ def expose_again(
 ) -> NDArray[np.uint16]:
     """Expose a picture that was stored without noise once more, with noise.
 
-    A code tells the pixel's mean charge. At full scale it does not, so these pixels stay saturated.
+    A code gives the pixel's mean charge, except at full scale; pixels there stay saturated.
 
     Args:
         sensor: the sensor; its `noise` does not matter.
@@ -115,13 +115,13 @@ class _Noise:
         return cls(bits, sensitivity, offset)
 
     def of_rows(self, rows: slice) -> _Noise:
-        """The noise of some rows."""
+        """Return the noise of some rows."""
         fixed = (None if v is None else v[rows] for v in (self.sensitivity, self.offset))
         return _Noise(self.bits[:, rows], *fixed)
 
 
 def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
-    """Codes (h, w), whole numbers, of mean electrons, which are overwritten."""
+    """Compute codes (h, w), whole numbers, of mean electrons, which are overwritten."""
     charge: Reals = mean
     read: Any = 0.0
     if noise is not None:
@@ -148,7 +148,7 @@ def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
 def recorded(
     sensor: Sensor, camera: PinholeCamera, window: Window, irradiance: Reals, wavelength_nm: float, seed: int
 ) -> NDArray[np.uint16]:
-    """Stored codes (h, w) of a window of a camera's sensor, with the sensor's border; see `expose`."""
+    """Compute stored codes (h, w) of a window of a camera's sensor, with the sensor's border; see `expose`."""
     codes = expose(sensor, irradiance, wavelength_nm, seed, window[:2])
     if any(sensor.border_px):
         codes[border(sensor, camera, window)] = round(sensor.border_dn)
@@ -157,7 +157,7 @@ def recorded(
 
 @lru_cache(maxsize=8)
 def normals(sigma: float = 1.0) -> Singles:
-    """Normal numbers (65536,), each the mean over its share of the distribution: 16 bits choose one.
+    """List normal numbers (65536,), each the mean over its share of the distribution: 16 bits choose one.
 
     Their variance is that of `sigma` to 3e-6, and the farthest is 4.35 sigma, which one pixel in 30,000 has.
     """
@@ -168,7 +168,7 @@ def normals(sigma: float = 1.0) -> Singles:
 
 @lru_cache(maxsize=8)
 def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int, ...]) -> Singles:
-    """Standard normal numbers of a sensor's pixels (h, w), each a pure function of seed, `which` and its place.
+    """List standard normal numbers of a sensor's pixels (h, w), each a pure function of seed, `which` and its place.
 
     The bits below are those of SplitMix64 (Steele, Lea, Flood 2014), which maps counters to numbers.
     """
@@ -184,7 +184,7 @@ def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int,
 
 
 def bloomed(charge: Reals, full_well: float, share: float, along: str = "columns") -> Reals:
-    """Charge (h, w) of the pixels, at most the full well; what exceeds it spills.
+    """Compute the charge (h, w) of the pixels, at most the full well; what exceeds it spills.
 
     Of the excess, `share` spills, half of it to either side along the columns (or rows), into the nearest pixels that
     have room. What reaches the border is lost, and the rest of the excess is drained.
@@ -242,7 +242,7 @@ def photon_counts(mean: Reals, normal: Reals) -> Reals:
 
 
 def _few_counts(mean: Reals, probability: Reals) -> Reals:
-    """Smallest k whose cumulative probability reaches the given one."""
+    """Compute the smallest k whose cumulative probability reaches the given one."""
     count = np.zeros_like(mean)
     term = np.exp(-mean)
     reached = term.copy()

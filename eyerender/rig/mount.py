@@ -23,7 +23,7 @@ class Mount(Spec):
     about_mm: Vec3 = Field(default=(0, 0, 0), description="the point that the turn leaves where it is")
 
     def _motion(self) -> tuple[Floats, Floats]:
-        """Rotation R and offset d of x' = R x + d."""
+        """Compute the rotation R and offset d of x' = R x + d."""
         rotation = np.eye(3)
         for axis, angle in enumerate(np.radians(np.array(self.rotation_deg, dtype=float))):
             i, j = (axis + 1) % 3, (axis + 2) % 3

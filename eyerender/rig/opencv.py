@@ -113,7 +113,7 @@ def _xml(text: str, source: str) -> dict[str, Any]:
 
 
 def _numbers(text: str | None) -> Any:
-    """Numbers of an element's text: one number, or a list; the text itself if it holds anything else."""
+    """List numbers of an element's text: one number, or a list; the text itself if it holds anything else."""
     words = (text or "").split()
     try:
         found = [float(word) for word in words]
@@ -123,7 +123,7 @@ def _numbers(text: str | None) -> Any:
 
 
 def _array(value: Any, source: str, key: str) -> Floats:
-    """A matrix of OpenCV, or nested lists, as an array of finite numbers."""
+    """Return a matrix of OpenCV, or nested lists, as an array of finite numbers."""
     shape = None
     if isinstance(value, dict):
         shape, value = (value.get("rows"), value.get("cols")), value.get("data")

@@ -21,12 +21,12 @@ _AT_ONCE = 16  # rows or columns of a blurred picture
 
 
 def margin(sigma_px: float) -> int:
-    """Number of pixels that must be rendered beyond a window's border so that the blur inside is right."""
+    """Compute the number of pixels that must be rendered beyond a window's border so that the blur inside is right."""
     return 0 if sigma_px == 0 else int(np.ceil(4 * sigma_px)) + 2
 
 
 def kernel(sigma_px: float) -> Floats:
-    """Discrete Gaussian of variance `sigma_px`^2 over -margin..margin, sum 1."""
+    """Compute the discrete Gaussian of variance `sigma_px`^2 over -margin..margin, sum 1."""
     n = np.arange(-margin(sigma_px), margin(sigma_px) + 1)
     weights = special.ive(np.abs(n), sigma_px**2)
     return np.asarray(weights / weights.sum())
@@ -49,7 +49,7 @@ def blur(image: Reals, sigma_px: float) -> Reals:
 
 @lru_cache(maxsize=8)
 def _band(sigma_px: float, dtype: np.dtype[Any]) -> Reals:
-    """Weights of rows in the blurred rows that lie in their middle."""
+    """Compute weights of rows in the blurred rows that lie in their middle."""
     k = kernel(sigma_px)
     band = np.zeros((_AT_ONCE, _AT_ONCE + len(k) - 1), dtype)
     for row in range(_AT_ONCE):
@@ -58,7 +58,7 @@ def _band(sigma_px: float, dtype: np.dtype[Any]) -> Reals:
 
 
 def _parts(count: int, m: int, band: Reals) -> Iterator[tuple[slice, slice, Reals]]:
-    """A few blurred rows of `count` at a time, the rows of the picture about them, and these rows' weights."""
+    """Return a few blurred rows of `count` at a time, the rows of the picture about them, and these rows' weights."""
     for first in range(0, count, _AT_ONCE):
         end = min(first + _AT_ONCE, count)
         yield slice(first, end), slice(first, end + 2 * m), band[: end - first, : end - first + 2 * m]
@@ -116,7 +116,7 @@ def _spread(
 
 
 def _convolved(a: Floats, b: Floats) -> Floats:
-    """Full convolution of two pictures. SciPy's own takes a second to import."""
+    """Compute the full convolution of two pictures. SciPy's own takes a second to import."""
     shape = tuple(m + n - 1 for m, n in zip(a.shape, b.shape, strict=True))
     size = [fft.next_fast_len(n, real=True) for n in shape]
     both = fft.irfft2(fft.rfft2(a, size) * fft.rfft2(b, size), size)
@@ -124,7 +124,7 @@ def _convolved(a: Floats, b: Floats) -> Floats:
 
 
 def _integrals(first: int, count: int, centres: Floats, sigma: float) -> Floats:
-    """Share (n, count) of each Gaussian that falls into each pixel [k - 1/2, k + 1/2], from the first on."""
+    """Find the share (n, count) of each Gaussian that falls into each pixel [k - 1/2, k + 1/2], from the first on."""
     edges = np.arange(first - 0.5, first + count)[None, :] - centres[:, None]
     cumulative = (edges >= 0).astype(float) if sigma == 0 else special.ndtr(edges / sigma)
     return np.asarray(cumulative[:, 1:] - cumulative[:, :-1])

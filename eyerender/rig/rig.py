@@ -53,7 +53,7 @@ class Rig(Spec):
     def with_light(self, number: int, **changes: Any) -> Self:
         """Change one light of the rig.
 
-        An LED of a ring becomes an LED of its own, and so do the others of that ring, where they are. Places are those
+        Changing an LED of a ring makes all LEDs of that ring single ones, at their places. Places are those
         before the mount moves the rig.
 
         Args:
@@ -104,7 +104,7 @@ class Rig(Spec):
         return self._with_leds(self._single_leds(0), cameras=cameras)
 
     def _single_leds(self, number: int) -> list[dict[str, Any]]:
-        """Fields of all LEDs, those of rings one by one, after a look whether there is light `number`."""
+        """Compute fields of all LEDs, those of rings one by one, after a look whether there is light `number`."""
         if not 0 <= number < self.light_count:
             raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
         geometry, leds = self.model_copy(update={"mount": None}).build(), []
@@ -122,7 +122,7 @@ class Rig(Spec):
         return type(self).from_mapping({**kept, **fields})
 
     def resolved(self, base: Path | None = None) -> Self:
-        """The rig with the numbers of its cameras' calibration files, which are relative to `base`.
+        """Return the rig with the numbers of its cameras' calibration files, which are relative to `base`.
 
         Raises:
             InputError: a file cannot be read, or does not fit its camera.

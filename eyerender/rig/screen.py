@@ -68,7 +68,7 @@ class ScreenPlane(ArrayValue):
         return np.asarray(self.centre_mm + p[..., :1] * self.right + p[..., 1:] * self.up)
 
     def flat(self, world_mm: ArrayLike) -> Floats:
-        """Screen points (..., 2) mm of world points (..., 3), by orthogonal projection; the inverse of `world`."""
+        """Find screen points (..., 2) mm of world points (..., 3), by orthogonal projection; the inverse of `world`."""
         p = np.asarray(world_mm, dtype=float) - self.centre_mm
         return np.stack([p @ self.right, p @ self.up], axis=-1)
 
@@ -80,7 +80,7 @@ class ScreenPlane(ArrayValue):
         return self.world(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
 
     def intersect(self, origin_mm: ArrayLike, direction: ArrayLike) -> tuple[Floats, Bools]:
-        """Where rays meet the screen's plane: screen points (..., 2) mm, and whether the plane is ahead (...)."""
+        """Find where rays meet the screen's plane: screen points (..., 2) mm, and whether the plane is ahead (...)."""
         o, d = np.asarray(origin_mm, dtype=float), np.asarray(direction, dtype=float)
         along = d @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):

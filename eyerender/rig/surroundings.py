@@ -36,7 +36,7 @@ def paint(place: str, seed: int, rows: int = 256) -> Floats:
 
 
 def _outside(way: Floats, rng: np.random.Generator) -> Floats:
-    """Sky with clouds, a row of trees or houses along the horizon, and ground."""
+    """Compute the sky with clouds, a row of trees or houses along the horizon, and ground."""
     rows = way.shape[0]
     elevation = np.degrees(np.arcsin(np.clip(way[..., 2], -1, 1)))
     cover = rng.uniform(0.3, 1.0)
@@ -54,7 +54,7 @@ def _outside(way: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _office(way: Floats, rng: np.random.Generator) -> Floats:
-    """A room with windows on the left or the right, a screen on a desk ahead, and a lamp above."""
+    """Return a room with windows on the left or the right, a screen on a desk ahead, and a lamp above."""
     room = np.array([[-2200.0, 1600.0], [-2600.0, 1900.0], [-1200.0, 1500.0]]) * rng.uniform(0.8, 1.3, (3, 1))
     if rng.uniform() < 0.5:
         way = way * [1.0, -1.0, 1.0]
@@ -86,7 +86,7 @@ def _office(way: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _car(way: Floats, rng: np.random.Generator) -> Floats:
-    """The view of a driver: the outside through windscreen, side windows and rear window, and a dark interior."""
+    """Find the view of a driver: the outside through windscreen, side windows and rear window, and a dark interior."""
     outside = _outside(way, rng) * rng.uniform(0.5, 0.9)  # transmittance of tinted panes
     azimuth = np.degrees(np.arctan2(way[..., 1], way[..., 0]))
     elevation = np.degrees(np.arcsin(np.clip(way[..., 2], -1, 1)))
