@@ -67,7 +67,7 @@ def measure_folder(
 
 
 def _encoding(source: Source) -> tuple[float, str]:
-    """Gamma of a folder's images, and where it is known from."""
+    """Return the gamma of a folder's images, and where it is known from."""
     if source.entries:
         return source.entries[0].gamma, "the folder"
     stated = source.path / EXPORT
@@ -81,7 +81,7 @@ def _encoding(source: Source) -> tuple[float, str]:
 
 
 def _tile(s: Scaled) -> Bytes:
-    """The picture about its eye, with R at 50 px and its 98th percentile at one grey level."""
+    """Return the picture about its eye, with R at 50 px and its 98th percentile at one grey level."""
     width, height = (round(k * RADIUS_PX) for k in _TILE_R)
     x, y = round(s.centre[0]) - width // 2, round(s.centre[1]) - height // 2
     rows, columns = np.arange(height) + y, np.arange(width) + x

@@ -123,14 +123,14 @@ class Scaled:
         )
 
     def is_part(self, *which: int) -> Bools:
-        """Pixels of some parts of the eye; everywhere where the parts are unknown."""
+        """Return pixels of some parts of the eye; everywhere where the parts are unknown."""
         if self.parts is None:
             return np.ones(self.level.shape, dtype=bool)
         return np.isin(self.parts, which)
 
 
 def measure(picture: EyePicture, scaled: Scaled | None = None) -> dict[str, float | None]:
-    """All figures of a picture, in the order of `FIGURES`; `scaled` is its resized form, if it exists already."""
+    """Find all figures of a picture, in the order of `FIGURES`; `scaled` is its resized form, if it exists already."""
     s = scaled or Scaled.of(picture)
     unclipped = s.level <= s.clip
     iris_at, skin_at = _iris(s), _skin(s)
@@ -169,14 +169,14 @@ def _iris(s: Scaled) -> Bools:
 
 
 def _sclera(s: Scaled) -> Bools:
-    """The labelled sclera without its edge, else between 1.12 and 1.35 R, within 15 degrees of the horizontal."""
+    """Find the labelled sclera without its edge, else between 1.12 and 1.35 R, within 15 degrees of the horizontal."""
     if s.parts is not None:
         return np.asarray(ndimage.binary_erosion(s.parts == SCLERA, iterations=2))
     return (s.rings > 1.12) & (s.rings < 1.35) & (s.beside < 15)
 
 
 def _skin(s: Scaled) -> Bools:
-    """A patch below the eye: 1.6 to 2.3 R below the pupil's centre, 2 R wide."""
+    """Return a patch below the eye: 1.6 to 2.3 R below the pupil's centre, 2 R wide."""
     v, u = np.indices(s.level.shape)
     below = (v - s.pupil.centre_px[1]) / RADIUS_PX
     at = (below > 1.6) & (below < 2.3) & (np.abs(u - s.pupil.centre_px[0]) < RADIUS_PX)
@@ -194,7 +194,7 @@ def ratio(over: float | None, under: float | None) -> float | None:
 
 
 def _lashes(s: Scaled) -> float | None:
-    """The band .5 to 1.7 R above the pupil's centre, 2 R wide, without the eye."""
+    """Return the band .5 to 1.7 R above the pupil's centre, 2 R wide, without the eye."""
     v, u = np.indices(s.level.shape)
     above = (s.pupil.centre_px[1] - v) / RADIUS_PX
     at = (above > 0.5) & (above < 1.7) & (np.abs(u - s.pupil.centre_px[0]) < RADIUS_PX) & s.is_part(BACKGROUND)
@@ -205,7 +205,7 @@ def _lashes(s: Scaled) -> float | None:
 
 
 def _rays(s: Scaled, radii: Floats, within_deg: float) -> Floats:
-    """Levels (rays, k) along rays from the iris' centre, `within_deg` of the horizontal on both sides; radii in R.
+    """Find levels (rays, k) along rays from the iris' centre, `within_deg` of the horizontal on both sides; radii in R.
 
     NaN where the picture ends and, of a labelled picture, where lids and lashes hide the eye.
     """
@@ -252,7 +252,7 @@ def _limbus_edge(s: Scaled) -> float | None:
 
 
 def edge_width(rays: Floats, radii: Floats) -> float | None:
-    """Width of a rising edge from 10 to 90 %, in units of `radii`, from the median of profiles (rays, k).
+    """Return the width of a rising edge from 10 to 90 %, in units of `radii`, from the median of profiles (rays, k).
 
     Each profile is moved so that its own 50 % crossing, the one nearest to 1, lies at 1. The levels of 0 and 100 % are
     the medians of the inner and the outer quarter. None where fewer than five profiles have an edge.
@@ -274,7 +274,7 @@ def edge_width(rays: Floats, radii: Floats) -> float | None:
 
 
 def _crossing(profile: Floats, radii: Floats, share: float, quarter: int) -> float | None:
-    """Place where a profile rises through a share of its step: of several, the nearest to 1."""
+    """Return the place where a profile rises through a share of its step: of several, the nearest to 1."""
     low, high = median(profile[:quarter]), median(profile[-quarter:])
     if not high > low:
         return None
@@ -304,7 +304,7 @@ def texture(level: Singles, at: Bools) -> list[float | None]:
 
 
 def _bright_points(s: Scaled) -> float | None:
-    """Components larger than .0008 R^2 that exceed a median of 21 px by .35 of the 99th percentile, per R^2.
+    """Return the components larger than .0008 R^2 that exceed a median of 21 px by .35 of the 99th percentile, per R^2.
 
     They are counted from the cornea (of an unlabelled picture, a circle of radius R) out to 2 R.
     """
@@ -327,7 +327,7 @@ def _fall_off(s: Scaled) -> float | None:
 
 
 def noise(codes: Singles) -> float | None:
-    """Standard deviation of a pixel's noise: .7413 times the median size of the 2 x 2 checkerboard difference.
+    """Find the standard deviation of a pixel's noise: .7413 times the median size of the 2 x 2 checkerboard difference.
 
     The difference a - b - c + d of four neighbours removes planes and has twice the noise of a pixel; the median of its
     size is .6745 of its standard deviation, and 1 / (2 x .6745) is .7413.
@@ -339,7 +339,7 @@ def noise(codes: Singles) -> float | None:
 
 
 def _medians(rays: Floats) -> Floats:
-    """Median of each column, NaN where there is none."""
+    """Return the median of each column, NaN where there is none."""
     known = np.isfinite(rays).any(axis=0)
     out = np.full(rays.shape[1], np.nan)
     out[known] = np.nanmedian(rays[:, known], axis=0)

@@ -82,16 +82,16 @@ class FolderFigures:
     tiles: tuple[Bytes, ...]
 
     def values(self, name: str) -> list[float]:
-        """Values of a figure in all images that have it."""
+        """Return values of a figure in all images that have it."""
         return [row[name] for _, row in self.rows if row[name] is not None]  # type: ignore[misc]
 
     def median(self, name: str) -> float | None:
-        """Median of a figure over the images; None where no image has it."""
+        """Return the median of a figure over the images; None where no image has it."""
         values = self.values(name)
         return float(np.median(values)) if values else None
 
     def to_mapping(self) -> dict[str, Any]:
-        """What the JSON holds of the folder."""
+        """Say what the JSON holds of the folder."""
         return {
             "path": self.path,
             "images": self.images,
@@ -133,7 +133,7 @@ def _spread(count: int, limit: int) -> list[int]:
 
 
 def pictures(source: Source, gamma: float) -> Iterator[EyePicture | Skipped]:
-    """Each image of a source with its landmarks, or the reason why it cannot be measured.
+    """Return each image of a source with its landmarks, or the reason why it cannot be measured.
 
     Args:
         source: the folder.
@@ -163,7 +163,7 @@ def _labelled(entry: ImageEntry, gamma: float) -> EyePicture | Skipped:
 
 
 def _pupil(entry: ImageEntry, mask: Bytes) -> Ellipse | None:
-    """Outline of the pupil by ray optics, if the picture shows some of it."""
+    """Return the outline of the pupil by ray optics, if the picture shows some of it."""
     if np.count_nonzero(mask == PUPIL) < _LEAST_MASK_PX:
         return None
     found = entry.truth().pupil
@@ -193,5 +193,5 @@ def _checked(picture: EyePicture) -> EyePicture | Skipped:
 
 
 def _codes(image: NDArray[Any], bits: int) -> Singles:
-    """Stored codes with full scale 255."""
+    """Return stored codes with full scale 255."""
     return image.astype(np.float32) * np.float32(255 / (2**bits - 1))

@@ -20,7 +20,7 @@ _SIDE = 6  # steps on either side of a radius whose mean levels are compared
 
 
 def iris_extent(level: Singles, pupil: Ellipse) -> tuple[float, float] | None:
-    """Middle and half of the iris' horizontal extent (px), or None where no limbus is found on both sides.
+    """Return the middle and half of the iris' horizontal extent (px), or None where no limbus is found on both sides.
 
     Args:
         level: (h, w) linear levels.

@@ -58,7 +58,7 @@ def _about(f: FolderFigures) -> str:
 
 
 def text(value: float | None) -> str:
-    """A figure with three significant digits."""
+    """Return a figure with three significant digits."""
     return "-" if value is None else f"{value:.3g}"
 
 
@@ -82,7 +82,7 @@ def _cell(f: FolderFigures, name: str) -> str:
 
 
 def _spread(found: Sequence[FolderFigures]) -> list[Figure]:
-    """The middle half of the images of both folders, over the median of the second."""
+    """Return the middle half of the images of both folders, over the median of the second."""
     names = [n for n in FIGURES if all(f.values(n) for f in found) and (found[1].median(n) or 0) > 0]
     if not names:
         return []
