@@ -89,7 +89,7 @@ class Comparison:
         }
 
     def _by_subject(self) -> dict[str, Any] | None:
-        """Mean errors of each subject, with median and 95th percentile over the subjects; None for one subject."""
+        """Average the errors of each subject; add median and 95th percentile over them. None for one subject."""
         if len(self.subjects) < 2:
             return None
         found: dict[str, Any] = {"n": len(self.subjects)}
@@ -236,14 +236,14 @@ def compare(
 
 
 def _with_fixations(observations: Observations) -> Observations:
-    """Observations of drawn targets, in which each target is a fixation; so cameras of one instant share theirs."""
+    """Number drawn targets as fixations, so that the cameras of one instant share a fixation."""
     index = observations.index
     _, fixation = np.unique(index.target_mm, axis=0, return_inverse=True)
     return replace(observations, index=replace(index, fixation=fixation.reshape(-1).astype(np.int64)))
 
 
 def _joined(errors: Sequence[GazeErrors | None]) -> GazeErrors | None:
-    """Errors of several subjects, without those that have none."""
+    """Join the errors of several subjects, without those that have none."""
     known = [one for one in errors if one is not None]
     if len(known) < 2:
         return known[0] if known else None

@@ -679,7 +679,7 @@ class _DrawnEyes:
     demand_d: float
 
     def of(self, side: Side) -> EyeSpec:
-        """Eye file of one side."""
+        """Return the eye file of one side."""
         return _drawn_eye(self, side)
 
 
@@ -699,7 +699,7 @@ def _drawn_eyes(spec: SceneSpec, person: Person, rig: RigGeometry) -> _DrawnEyes
 
 @lru_cache(maxsize=128)
 def _drawn_eye(eyes: _DrawnEyes, side: Side) -> EyeSpec:
-    """Eye of a person, cached because making it takes longer than everything else of a scene."""
+    """Make an eye of a person; cached, because this takes longer than the remaining work on a scene."""
     return Person.from_mapping(json.loads(eyes.person)).eye(
         side, luminance_cd_m2=eyes.luminance_cd_m2, field_deg=eyes.field_deg, demand_d=eyes.demand_d
     )
