@@ -1,10 +1,14 @@
-"""Three simple pupil detectors to compare others with: Otsu's threshold, the Hough transform of circles, a starburst.
+"""
+Three simple pupil detectors
+============================
+
+Otsu's threshold, the Hough transform of circles, and a starburst, to compare other detectors with::
 
     cd examples
     eyerender bench-extractors ../out/images -o ../out/bench --extractor simple_detectors:otsu \
         --extractor simple_detectors:hough --extractor simple_detectors:starburst
 
-They use nothing but the image, and are written from the ideas, not from anybody's code.
+They use only the image. They follow the published ideas, not anybody's code.
 """
 
 from __future__ import annotations
