@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from .realise import frames_of, realise
 from .run import worker_count
 from .spec import DatasetSpec
 
-_SUBJECTS = 3
+_WARM, _MORE = 8, 4  # samples until the kernels of both eyes of a person are recorded, and some more
+_SUBJECTS = 3  # that are measured after these
 
 
 def estimate(
@@ -34,7 +36,7 @@ def estimate(
     warn: Warn | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """Return the time and disk that `generate` would need: seconds = (samples t + subjects t_subject) / workers.
+    """Time and disk that `generate` would need: seconds = t_start + (samples t + subjects t_subject) / workers.
 
     The rate is the last one of this spec on this machine, for any seed and number of samples.
 
@@ -44,7 +46,7 @@ def estimate(
         eye: as for `generate`.
         seed: as for `generate`.
         count: as for `generate`.
-        measure: make two samples of each of a few subjects to measure the rate.
+        measure: make some samples of a few subjects to measure the rate.
         warn: called with warnings about the spec; it may raise.
         changes: as for `generate`.
 
@@ -63,13 +65,16 @@ def estimate(
     processes, each = worker_count(options, shards)
     frames = frames_of(plan)
     if measure:
-        rate: Rate | None = measured_rate(plan, Maker(plan, frames, backend=options.backend, threads=each))
+        began = time.perf_counter()
+        maker = Maker(plan, frames, backend=options.backend, threads=each)
+        rate: Rate | None = measured_rate(plan, maker, loading_s=time.perf_counter() - began)
     else:
         rate = last_rate(plan, options.backend)
     seconds = None
     if rate is not None:
         subjects = plan.spec.selection.subject_count
-        seconds = (samples * rate.seconds + subjects * rate.subject_seconds) / min(processes, shards)
+        work = samples * rate.seconds + subjects * rate.subject_seconds
+        seconds = rate.start_seconds + work / min(processes, shards)
         images = rate.images
     else:
         first = realise(plan, 0, frames).observations
@@ -87,42 +92,56 @@ def estimate(
     }
 
 
-def measured_rate(plan: Plan, maker: Maker) -> Rate:
-    """Measure the rate of one worker from two samples of each of a few subjects, and store it.
+def measured_rate(plan: Plan, maker: Maker, *, loading_s: float = 0.0) -> Rate:
+    """Measure the rate of one worker, and store it.
 
-    A subject's first sample includes the time for its eye and its textures.
+    The first samples of a worker record kernels. What they take beyond the usual time is the worker's start, with the
+    `loading_s` of its maker. Then come the first samples of a few subjects, with the time for eyes and textures. Where
+    a run makes as few samples of a subject, all that they take is their usual time.
     """
-    spec = plan.spec
-    subjects = spec.selection.subject_count
-    starts = [plan.first_of(s) for s in sorted({int(s) for s in np.linspace(0, subjects - 1, _SUBJECTS)})]
-    maker.make(starts[0])  # kernels are compiled once per worker
-    first: list[float] = []
-    again: list[float] = []
-    sizes: list[int] = []
-    images: list[int] = []
-    for start in starts:
-        second = start + 1 if start + 1 < spec.selection.end and plan.subject_of(start + 1)[1] == 1 else None
-        for sample, times in ((start, first), (second, again)):
-            if sample is None:
-                continue
-            began = time.perf_counter()
-            made = maker.make(sample)
-            size = sum(len(png_bytes(picture)) for image in made.images for picture in image.pictures.values())
-            # Metadata is stored in the shards and in the assembled file.
-            size += 2 * sum(len(json.dumps(image.line)) for image in made.images)
-            times.append(time.perf_counter() - began)
-            sizes.append(size)
-            images.append(len(made.images))
-    usual = float(np.median(again or first))
+    samples, subjects = plan.spec.count, plan.spec.selection.subject_count
+    warm = _timed(maker, range(min(_WARM + _MORE, samples)))
+    each = min(_MORE, -(-samples // subjects))
+    chosen = sorted({int(s) for s in np.linspace(1, subjects - 1, _SUBJECTS)}) if subjects > 1 else []
+    groups = [_timed(maker, range(plan.first_of(s), plan.first_of(s) + each)) for s in chosen]
+    usual = float(np.median([one.seconds for group in groups or [warm[-_MORE:]] for one in group[1:] or group]))
+    extra = 0.0
+    if groups:
+        whole = float(np.mean([sum(one.seconds for one in group) for group in groups]))
+        usual = whole / each if each < _MORE else usual
+        extra = max(whole - each * usual, 0.0)
+    made = [one for group in groups or [warm] for one in group]
     rate = Rate(
         how="measured",
         time=now(),
         backend=str(maker.backend["name"]),
-        samples=len(sizes),
+        samples=len(made),
+        start_seconds=loading_s + max(sum(one.seconds for one in warm) - len(warm) * usual, 0.0),
         seconds=usual,
-        subject_seconds=max(float(np.median(first)) - usual, 0.0) if again else 0.0,
-        images=float(np.mean(images)),
-        bytes=float(np.mean(sizes)),
+        subject_seconds=extra,
+        images=float(np.mean([one.images for one in made])),
+        bytes=float(np.mean([one.bytes for one in made])),
     )
     keep_rate(plan, rate)
     return rate
+
+
+@dataclass(frozen=True, slots=True)
+class _Timed:
+    """What a sample took, and what it is on disk."""
+
+    seconds: float
+    images: int
+    bytes: int
+
+
+def _timed(maker: Maker, samples: Iterable[int]) -> list[_Timed]:
+    """Make samples in memory as a worker does, which traces one while it finishes the last."""
+    found, began = [], time.perf_counter()
+    for made in maker.make_all(samples):
+        size = sum(len(png_bytes(picture)) for image in made.images for picture in image.pictures.values())
+        # Metadata is stored in the shards and in the assembled file.
+        size += 2 * sum(len(json.dumps(image.line)) for image in made.images)
+        began, last = time.perf_counter(), began
+        found.append(_Timed(began - last, len(made.images), size))
+    return found

@@ -30,13 +30,16 @@ _Count = Annotated[float, Field(ge=0, le=1e15)]
 class Rate(Spec):
     """Time and size of the samples of a spec."""
 
-    format: Literal["eyerender/rate/1"] = "eyerender/rate/1"
+    format: Literal["eyerender/rate/2"] = "eyerender/rate/2"
     how: Literal["run", "measured"] = Field(
         description="whether a run measured it, or a few samples made for this purpose"
     )
     time: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")]
     backend: Annotated[str, Field(max_length=20)]
     samples: Annotated[int, Field(ge=1, le=10**9)] = Field(description="number of measured samples")
+    start_seconds: _Count = Field(
+        description="additional time of a worker until its kernels are loaded and recorded; 0: included in `seconds`"
+    )
     seconds: Positive = Field(description="time of one worker for a sample")
     subject_seconds: _Count = Field(
         description="additional time for the first sample of a subject; 0: included in `seconds`"

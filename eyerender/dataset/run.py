@@ -176,7 +176,9 @@ class _Run:
     retries: int = 0
     total: int = 0
     samples: int = 0  # sum of `made`
-    timed: int = 0  # samples of the shards that this run has finished
+    loading_s: float = 0.0  # until the first worker could render
+    first_shards: dict[str, tuple[int, float]] = field(default_factory=dict)  # of each worker: samples, seconds
+    timed: int = 0  # samples of the other shards that this run has finished
     worker_seconds: float = 0.0  # and the time that they took
     staged_images: int = 0
     bytes: int = 0
@@ -302,17 +304,22 @@ class _Run:
 
     def _keep_rate(self) -> None:
         """Store the speed of this machine, for an estimate of the next run of this spec."""
-        if self.options.engine != "local" or not self.timed or len(self.backends) != 1:
+        if self.options.engine != "local" or not self.first_shards or len(self.backends) != 1:
             return
+        begun, spent = (sum(column) for column in zip(*self.first_shards.values(), strict=True))
+        # The first shard of a worker includes its start; a short run has no others.
+        usual = self.worker_seconds / self.timed if self.timed else spent / begun
+        samples = self.timed + int(begun)
         rate = Rate(
             how="run",
             time=now(),
             backend=next(iter(self.backends)),
-            samples=self.timed,
-            seconds=self.worker_seconds / self.timed,
+            samples=samples,
+            start_seconds=self.loading_s + max(spent - begun * usual, 0.0) / len(self.first_shards),
+            seconds=usual,
             subject_seconds=0.0,
-            images=self.staged_images / self.timed,
-            bytes=self.bytes / self.timed,
+            images=self.staged_images / samples,
+            bytes=self.bytes / samples,
         )
         keep_rate(self.plan, rate)
 
@@ -320,6 +327,7 @@ class _Run:
 
     def ready(self, backend: dict[str, Any], worker: str) -> None:
         """Record that a worker can render."""
+        self.loading_s = self.loading_s or time.monotonic() - self.start
         self._log("worker", worker=worker, backend=backend)
         self.backends.add(backend["name"])
         self._mixed({"backend": backend, "cpu": cpu_family() if self.options.engine == "local" else None})
@@ -339,8 +347,12 @@ class _Run:
         if not is_finished(self.folder, staged.shard):
             commit(self.folder, staged)
             self.verified.add(staged.shard)
-            self.timed += len(self.plan.spec.shard_samples(staged.shard))
-            self.worker_seconds += staged.seconds
+            samples = len(self.plan.spec.shard_samples(staged.shard))
+            if worker in self.first_shards:
+                self.timed += samples
+                self.worker_seconds += staged.seconds
+            else:
+                self.first_shards[worker] = samples, staged.seconds
             self.staged_images += staged.images
             self.bytes += staged.bytes
         self._count(staged.shard, len(self.plan.spec.shard_samples(staged.shard)))

@@ -102,7 +102,7 @@ def test_a_dry_run_uses_the_last_rate_of_the_spec(spec, tmp_path, monkeypatch, c
     assert found["rate"]["samples"] == 6
     assert found["images"] == 10**9
     assert found["bytes"] == pytest.approx(10**9 * size / 6, rel=1e-9)
-    assert found["seconds"] == pytest.approx(10**9 * found["rate"]["seconds"])
+    assert found["seconds"] == pytest.approx(found["rate"]["start_seconds"] + 10**9 * found["rate"]["seconds"])
     assert (
         f"about {found['seconds'] / 86400:.1f} days, {found['bytes'] / 1e12:.1f} TB (rate of a run with 6 samples"
         in text

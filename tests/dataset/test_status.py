@@ -93,7 +93,7 @@ def test_a_short_run_does_not_replace_the_rate_of_a_long_one(tmp_path, monkeypat
 
     def kept(samples, seconds):
         data = {"how": "run", "time": rates.now(), "backend": "llvm", "samples": samples, "seconds": seconds}
-        keep_rate(made, Rate(**data, subject_seconds=0, images=1, bytes=1))
+        keep_rate(made, Rate(**data, start_seconds=0, subject_seconds=0, images=1, bytes=1))
         return last_rate(made).seconds
 
     assert kept(1, 9.0) == 9.0
