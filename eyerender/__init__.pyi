@@ -17,6 +17,10 @@ from .dataset.run import generate as generate
 from .dataset.sheet import preview as preview
 from .dataset.spec import DatasetSpec as DatasetSpec
 from .dataset.validate import validate as validate
+from .design.choice import SiteInformation as SiteInformation
+from .design.choice import choose_lights as choose_lights
+from .design.choice import noise_of_some as noise_of_some
+from .design.choice import site_information as site_information
 from .design.fit import EyeFit as EyeFit
 from .design.fit import fit_eye as fit_eye
 from .design.information import Information as Information

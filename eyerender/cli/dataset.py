@@ -47,7 +47,7 @@ def generate(
         count: Make COUNT samples of the spec's plan, spread over its subjects. Beyond the plan, new subjects are added.
             A folder that holds more or fewer samples keeps those that are wanted.
     """
-    part = _part(shard)
+    part = part_of(shard)
     if measure and not dry_run:
         raise InputError("needs --dry-run", source="--measure")
     if output is None and not dry_run:
@@ -224,7 +224,12 @@ def export_dataset(
     return 0
 
 
-def _part(text: str | None) -> tuple[int, int]:
+def part_of(text: str | None) -> tuple[int, int]:
+    """K and N of --shard K/N; all of it without the option.
+
+    Raises:
+        InputError: it is not of this form.
+    """
     if text is None:
         return 1, 1
     k, slash, n = text.partition("/")

@@ -54,6 +54,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "status": ("eyerender status data", "eyerender status data --watch"),
         "study": ("eyerender study guestrin2006 -o study --eyes E1,E4",),
         "validate": ("eyerender validate data", "eyerender validate data --quick --json -"),
+        "sweep": (
+            "eyerender sweep sweep.yaml -o layouts",
+            "eyerender sweep sweep.yaml -o layouts --shard 3/16",
+        ),
         "view": ("eyerender view eye E4 -o eye.svg", "eyerender view scene quickstart -o rig.pdf"),
     }
 )

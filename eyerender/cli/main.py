@@ -33,6 +33,7 @@ from . import (  # noqa: F401
     realism,
     rig,
     study,
+    sweep,
 )
 from .app import app, option_name
 from .examples import add_examples

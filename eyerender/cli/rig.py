@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from .app import app
-from .options import Overwrite, Result
+from .options import Backend, Overwrite, Result
 from .output import emit, progress
 from .population import read_population
 
@@ -22,12 +22,15 @@ def rig(
     population: str = "adults",
     people: int = 200,
     sample: int = 5,
+    images: int = 0,
     workers: int | None = None,
     seed: int = 0,
     slippage_mm: float = 1.5,
+    relief_mm: float = 0.0,
     azimuth_deg: float = 20.0,
     elevation_deg: float = 15.0,
     unknowns: Path | None = None,
+    backend: Backend = "auto",
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
@@ -42,10 +45,12 @@ def rig(
         population: adults, emmetropic_adults, myopes, children or elderly, or a YAML file with the keys of
             `population`.
         people: Number of people.
-        sample: Number of people for the errors of estimators.
+        sample: Number of people for the errors of estimators on exact features.
+        images: Number of people for their errors on rendered images, 25 each (a few seconds an image).
         workers: Number of processes (default: one per processor). Results do not depend on it.
         seed: The seed of the people.
         slippage_mm: Standard deviation of people's places about the scene's, along each axis.
+        relief_mm: Standard deviation of the eye relief of a headset, along x, on top of it (3 is a good choice).
         azimuth_deg: Half range of the directions of gaze, horizontally.
         elevation_deg: Half range, vertically.
         unknowns: A YAML file with the keys of `er.Unknowns` (default: priors of a population, 3 mm of slippage).
@@ -58,16 +63,21 @@ def rig(
     size = RigSize(
         people=people,
         sample=sample,
+        images=images,
         workers=workers,
         seed=seed,
         slippage_mm=slippage_mm,
+        relief_mm=relief_mm,
         azimuth_deg=azimuth_deg,
         elevation_deg=elevation_deg,
     )
     given = None if unknowns is None else Unknowns.from_mapping(read_yaml(unknowns), source=str(unknowns))
     everyone = read_population(population, "--population")
     with progress("rig") as steps:
-        found = run_rig(load_scene(scene), everyone, output, size, unknowns=given, overwrite=overwrite, progress=steps)
+        found = run_rig(
+            load_scene(scene), everyone, output, size, unknowns=given, backend=backend, overwrite=overwrite,
+            progress=steps,
+        )  # fmt: skip
     emit(found, f"{_text(found)}\n\nreport: {output / REPORT}", json)
     return 0
 
@@ -87,6 +97,9 @@ def _text(found: dict[str, Any]) -> str:
     for name, one in found["estimators"].items():
         if one["U50E95"] is not None:
             lines.append(f"{name} on exact features: U50E95 {degrees(one['U50E95'])}")
+    for name, one in found["estimators_on_images"].items():
+        if one["U50E95"] is not None:
+            lines.append(f"{name} on rendered images: U50E95 {degrees(one['U50E95'])}")
     if "cornea_share" in safety:
         lines.append(f"cornea: {100 * safety['cornea_share']:.2f} % of the limit ({safety['note']})")
     return "\n".join(lines)

@@ -15,6 +15,7 @@ its core.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,24 +73,33 @@ class FeatureNoise(ArrayValue):
         return cls(outline_px=frozen(outline), glint_px=frozen(glint), fixation_deg=fixation_deg)
 
 
-def sensor_noise(scene: Scene, *, fixation_deg: float = FIXATION_DEG) -> FeatureNoise:
+def sensor_noise(
+    scene: Scene, *, fixation_deg: float = FIXATION_DEG, lights: Sequence[Lamp] | None = None
+) -> FeatureNoise:
     """Noise of the features of a scene: its lamps, its sensor, the albedo of its iris, no rendering.
 
     The levels are those of the first eye at its reference position, looking straight ahead.
+
+    Args:
+        scene: the scene.
+        fixation_deg: noise of fixation.
+        lights: stand in place of the scene's lamps.
     """
     rig, sensor = scene.rig, scene.spec.sensor
+    lights = rig.lights if lights is None else lights
     side = scene.spec.subject.eyes[0]
     eye_mm = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
-    irradiance = sum(corneal_irradiance_mw_mm2(lamp, eye_mm) for lamp in rig.lights)
+    irradiance = sum(corneal_irradiance_mw_mm2(lamp, eye_mm) for lamp in lights)
     radiance = scene.spec.look.iris_albedo / np.pi * irradiance * _CORNEAL_TRANSMITTANCE**2
     blur = float(np.hypot(sensor.psf_sigma_px, 1.0 / np.sqrt(12.0)))
     read = read_noise_e(sensor)
-    outline, glint = np.empty(len(rig.cameras)), np.empty((len(rig.cameras), len(rig.lights)))
+    outline, glint = np.empty(len(rig.cameras)), np.empty((len(rig.cameras), len(lights)))
     for k, camera in enumerate(rig.cameras):
         iris = float(electrons(sensor, radiance_to_irradiance(sensor) * np.asarray(radiance), scene.spec.wavelength_nm))
         dark = PUPIL_SHARE * iris
-        outline[k] = 1.0 / np.sqrt(edge_information(dark, iris, blur, read, sensor.full_well_e))
-        for j, lamp in enumerate(rig.lights):
+        edge = edge_information(dark, iris, blur, read, sensor.full_well_e)
+        outline[k] = 1.0 / np.sqrt(edge) if edge > 0 else np.inf
+        for j, lamp in enumerate(lights):
             energy, size = glint_energy(lamp, camera, eye_mm, sensor, scene.spec.wavelength_nm)
             spread = float(np.hypot(blur, size))
             glint[k, j] = glint_deviation(energy, spread, dark, read, sensor.full_well_e)

@@ -31,6 +31,7 @@ from ..rig.rig import RigGeometry
 from ..scene import Scene
 from ..scene.people import Population
 from ..scene.spec import SceneSpec
+from .choice import SiteInformation, joined, site_matrices, with_priors
 from .information import Case, information_of_views, target_information
 from .noise import FeatureNoise
 from .unknowns import AZIMUTH, COUNT, ELEVATION, LOCAL, PUPIL, Unknowns
@@ -61,6 +62,8 @@ class Survey:
         luminance_cd_m2: luminance of what people see, which sets their pupils.
         unknowns: mapping of what is known beforehand.
         lids: whether lids hide features.
+        relief_mm: standard deviation of the eye relief, the distance along x, on top of the slippage.
+        shift_mm: the same shift of everybody's place, for maps of slippage.
     """
 
     scene: Mapping[str, Any]
@@ -72,6 +75,8 @@ class Survey:
     luminance_cd_m2: float = 20.0
     unknowns: Mapping[str, Any]
     lids: bool = True
+    relief_mm: float = 0.0
+    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def directions_deg(self) -> Floats:
@@ -152,6 +157,8 @@ def place_of(survey: Survey, scene: Scene, person: Person) -> Floats:
     half = (person.ipd_mm - scene.spec.subject.ipd_mm) / 2.0
     rng = np.random.default_rng((survey.seed, person.subject, 0x51))
     shift = survey.slippage_mm * rng.standard_normal(3)
+    shift[0] += survey.relief_mm * rng.standard_normal()
+    shift += survey.shift_mm
     return np.asarray(place + shift + np.array([0.0, half if side == "left" else -half, 0.0]))
 
 
@@ -167,6 +174,28 @@ def figures_of(survey: Survey, noise: FeatureNoise, first: int, count: int) -> F
         for start in range(0, len(same), TOGETHER):
             parts.append(_of_group(survey, scene.rig, noise, same[start : start + TOGETHER]))
     return Figures.joined(parts)
+
+
+def sites_seen(survey: Survey, noise: FeatureNoise, count: int) -> SiteInformation:
+    """What each LED adds for the first people with an eye, in the nine directions of the calibration."""
+    scene = Scene.of(SceneSpec.from_mapping(survey.scene))
+    unknowns, parts = Unknowns.from_mapping(survey.unknowns), []
+    chosen = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
+    for one in people_of(survey, 0, count)[0]:
+        case = _case(survey, scene.rig, [one])
+        instants, theta = case.instants.take(chosen), case.theta[chosen]
+        openings = _openings(survey, [one])[chosen] if survey.lids else None
+        total: tuple[Floats, Floats] | None = None
+        for number, camera in enumerate(scene.rig.cameras):
+            views = replace(instants, camera=np.full(len(chosen), number))
+            slopes, _ = visible(slopes_of(views, theta, POINTS), camera, openings)
+            found = site_matrices(slopes, noise, views.camera)
+            total = found if total is None else (total[0] + found[0], total[1] + found[1])
+        assert total is not None
+        parts.append(with_priors(*total, unknowns))
+    if not parts:
+        raise InputError("nobody's eye can exist", path="population")
+    return joined(parts)
 
 
 def _nobody(refused: list[int]) -> Figures:

@@ -4,8 +4,8 @@ A folder is staged and put in place when it is complete, so a run that is interr
 that looks like a result.
 
 `--overwrite` replaces what this package made and nothing else. A folder is recognised by dataset.json, run.json,
-study.json or results.json with our schema, or by the marker file, which lists what was written. Files that neither have
-a known name nor are in that list belong to somebody else; then nothing is replaced at all.
+study.json, sweep.json or results.json with our schema, or by the marker file, which lists what was written. Files that
+neither have a known name nor are in that list belong to somebody else; then nothing is replaced at all.
 """
 
 from __future__ import annotations
@@ -31,16 +31,18 @@ _SIGNS = {
     DATASET: "eyerender/dataset/",
     RUN: "eyerender/run/",
     "study.json": "eyerender/study/",
+    "sweep.json": "eyerender/sweep/",
     "results.json": "eyerender/bench-extractors/",
 }
 _SIGN_BYTES = 2**30
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp", ".exr", ".hdr")
-_FOLDERS = re.compile(r"(images/)?((images|masks|amodal_masks|noiseless|highlights|shards)(/[0-9]+)?)|images")
+_FOLDERS = re.compile(r"(images/)?((images|masks|amodal_masks|noiseless|highlights|shards)(/[0-9]+)?)|images|layouts")
 _FILES = re.compile(
     r"(images/)?("  # a study's images are a dataset of their own
     r"(dataset|run|croissant)\.json|(metadata|failures|log)\.jsonl|README\.md|report\.html|"
     r"(images|masks|amodal_masks|noiseless|highlights)/([0-9]+/)?[^/]+\.(png|exr)|shards/[0-9]+/(lines\.jsonl|done\.json))"
-    r"|(study|summary|findings|results|times)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
+    r"|(study|summary|findings|results|times|sweep)\.json|(summary|findings|waterfall|results|layouts)\.csv"
+    r"|layouts/[0-9]+\.json|\.eyerender\.json"
 )
 # Names of files that are being written, with their final names.
 _PARTS = re.compile(r"(?P<folder>(?:.*/)?)(?:\.(?P<hidden>[^/]+)\.[0-9a-f]{8}|(?P<plain>[^/]+))\.part")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.applications.rigs import users_of
 from eyerender.cli.main import run
+from eyerender.design.crowd import users_of
 from eyerender.design.information import information
 from eyerender.design.noise import sensor_noise
 from eyerender.design.people import GRID, Survey, figures_of, inside_polygon, people_of

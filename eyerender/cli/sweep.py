@@ -1,0 +1,72 @@
+"""The command sweep: many layouts of a rig, and which of them are worth a look."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from .app import app
+from .dataset import part_of
+from .options import Overwrite, Result
+from .output import emit, progress, say
+
+
+@app.command(name="sweep")
+def sweep(
+    spec: Path,
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    people: int | None = None,
+    workers: int | None = None,
+    shard: str | None = None,
+    overwrite: Overwrite = False,
+    json: Result = None,
+) -> int:
+    """Compare layouts of a rig: places of cameras and LEDs, focal length, resolution, number and intensity of LEDs.
+
+    The folder receives report.html, summary.json and layouts.csv with the layouts that no other one beats in bound,
+    dropout, number of LEDs and light on the cornea. A run that was stopped resumes.
+
+    Args:
+        spec: A YAML file that names a scene and has the key `sweep`.
+        output: The folder to write.
+        people: Number of people (default: the file's).
+        workers: Number of processes (default: one per processor). Results do not depend on it.
+        shard: K/N: evaluate only every N-th layout, starting with the K-th (1 <= K <= N), for array jobs that write to
+            one folder.
+    """
+    from ..applications.sweeps import REPORT, SweepRun, run_sweep
+    from ..applications.sweepspec import SweepSpec
+    from ..errors import InputError
+
+    part = part_of(shard)
+    if overwrite and shard is not None:
+        raise InputError("cannot be combined with --shard, because other jobs may be writing", source="--overwrite")
+    if workers is not None and workers < 1:
+        raise InputError(f"must be >= 1, not {workers}", source="--workers")
+    wanted = SweepSpec.load(spec)
+    if people is not None:
+        wanted = wanted.replaced("--people", {"people": people})
+    how = SweepRun(workers=workers, part=part, overwrite=overwrite)
+    try:
+        scene = wanted.base(spec.parent)
+        with progress("sweep") as steps:
+            found = run_sweep(wanted, scene, output, how, progress=steps, say=say)
+    except InputError as error:
+        raise error.placed(source=str(spec)) from None
+    emit(found, _text(found, output / REPORT), json)
+    return 0
+
+
+def _text(found: dict[str, Any], report: Path) -> str:
+    if not found["complete"]:
+        return f"{found['missing']} of {found['layouts']} layouts are still missing"
+    best = [row for row in found["rows"] if row["pareto"]]
+    lines = [f"{found['layouts']} layouts, {len(best)} of them on the Pareto front"]
+    for row in sorted(best, key=lambda row: row["noise_deg"] or float("inf"))[:8]:
+        noise = "not seen" if row["noise_deg"] is None else f"{row['noise_deg']:.4f} deg"
+        lines.append(f"layout {row['number']}: noise {noise}, dropout {100 * row['dropout']:.1f} %, {row['leds']} LEDs")
+    return "\n".join([*lines, "", f"report: {report}"])

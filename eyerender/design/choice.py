@@ -1,0 +1,138 @@
+"""The best k of n places for LEDs, by greedy exchange on the information that they add.
+
+Glints add up: with the information B_i of outline and priors in frame i and G_ik of the glint of LED k, the LEDs S have
+
+    f(S) = mean over frames of log det (B_i + sum over S of G_ik)                                                  (8)
+
+which is submodular, so adding the best LED again and again loses little, and exchanges of one LED for another lose less
+still (Fedorov's exchange; Nemhauser, Wolsey and Fisher 1978). Two choices differ by the factor exp((f - f') / (2 p)) in
+the geometric mean of the standard deviations of p parameters, whatever their units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..arrays import ArrayValue, Floats, Ints
+from ..errors import InputError
+from ..rig.rig import RigLike
+from ..scene import Frames, Scene
+from .information import case_of, outline_normals
+from .noise import FeatureNoise, sensor_noise
+from .unknowns import COUNT, Unknowns
+from .varied import Slopes, slopes_of
+
+VAGUE = 1e-6
+"""Precision of what is unknown, per rad^2 or mm^2, so that frames without features have a determinant."""
+_POINTS = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SiteInformation(ArrayValue):
+    """What each LED adds to what is known of i frames, on q parameters that are not known beforehand.
+
+    Attributes:
+        base: (i, q, q) information of the outline and of priors.
+        sites: (m, i, q, q) information of each LED's glint, 0 where there is none.
+    """
+
+    base: Floats
+    sites: Floats
+
+    def value(self, chosen: tuple[int, ...]) -> float:
+        """Mean log determinant of the information with these LEDs, equation (8)."""
+        return float(np.linalg.slogdet(self.base + self.sites[list(chosen)].sum(axis=0))[1].mean())
+
+    def worse_by(self, chosen: tuple[int, ...], best: tuple[int, ...]) -> float:
+        """Factor between the geometric-mean standard deviations of two choices, 1 for equally good ones."""
+        return float(np.exp((self.value(best) - self.value(chosen)) / (2.0 * self.base.shape[-1])))
+
+
+def site_information(
+    frames: Frames,
+    rig: RigLike | None = None,
+    *,
+    unknowns: Unknowns | None = None,
+    noise: FeatureNoise | None = None,
+) -> SiteInformation:
+    """Compute what each LED of a rig adds in each frame, see `er.information` for the arguments.
+
+    Each frame stands alone, with the priors of its person; all cameras of an instant count.
+    """
+    case, _ = case_of(frames, rig)
+    scene = frames.scene if rig is None else frames.seen_by(rig).scene
+    noise = sensor_noise(scene) if noise is None else noise
+    views = case.views
+    slopes = slopes_of(views, case.theta[case.instant], _POINTS)
+    base, sites = site_matrices(slopes, noise, views.camera)
+    count = len(case.theta)
+    outlines, glints = np.zeros((count, COUNT, COUNT)), np.zeros((count, len(sites), COUNT, COUNT))
+    np.add.at(outlines, case.instant, base)
+    np.add.at(glints, case.instant, np.moveaxis(sites, 0, 1))
+    unknowns = Unknowns.population() if unknowns is None else unknowns
+    return with_priors(outlines, np.moveaxis(glints, 1, 0), unknowns)
+
+
+def noise_of_some(scene: Scene, count: int) -> FeatureNoise:
+    """Noise while only `count` of a scene's LEDs are on: less light on the iris, the same glints."""
+    dimmer = [
+        replace(light, intensity_mw_sr=light.intensity_mw_sr * count / len(scene.rig.lights))
+        for light in scene.rig.lights
+    ]
+    some = sensor_noise(scene, lights=tuple(dimmer))
+    return replace(some, glint_px=sensor_noise(scene).glint_px)
+
+
+def site_matrices(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
+    """Information of each of n views: (n, 15, 15) of the outline and (m, n, 15, 15) of each LED's glint."""
+    normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
+    size = np.sqrt(length) / noise.outline_px[camera][:, None]
+    across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * size[..., None]
+    weight = np.where(slopes.glint_ok, 1.0 / noise.glint_px[camera], 0.0)
+    glints = np.moveaxis(slopes.glints * weight[..., None, None], 1, 0)
+    return np.swapaxes(across, -1, -2) @ across, np.swapaxes(glints, -1, -2) @ glints
+
+
+def with_priors(base: Floats, sites: Floats, unknowns: Unknowns) -> SiteInformation:
+    """Add the priors once and leave out what is known."""
+    free = np.flatnonzero(unknowns.free())
+    base = base + np.diag(np.maximum(unknowns.precision(), VAGUE))
+    return SiteInformation(base=base[:, free[:, None], free], sites=sites[:, :, free[:, None], free])
+
+
+def joined(parts: list[SiteInformation]) -> SiteInformation:
+    """Join frames of different people."""
+    return SiteInformation(
+        base=np.concatenate([part.base for part in parts]), sites=np.concatenate([part.sites for part in parts], axis=1)
+    )
+
+
+def choose_lights(known: SiteInformation, count: int) -> tuple[int, ...]:
+    """Choose LEDs: add the best one again and again, then exchange one for another while that helps.
+
+    Args:
+        known: what each LED adds.
+        count: number of LEDs to choose.
+
+    Returns:
+        Their numbers, ascending.
+
+    Raises:
+        InputError: there are fewer LEDs than that, or none is asked for.
+    """
+    n = len(known.sites)
+    if not 1 <= count <= n:
+        raise InputError(f"must be 1 to {n}, the number of places, not {count}", path="count")
+    chosen: tuple[int, ...] = ()
+    while len(chosen) < count:
+        chosen = max(((*chosen, k) for k in range(n) if k not in chosen), key=known.value)
+    best = known.value(chosen)
+    while True:
+        swaps = [(*(k for k in chosen if k != out), new) for out in chosen for new in range(n) if new not in chosen]
+        other = max(swaps, key=known.value, default=chosen)
+        value = known.value(other)
+        if value <= best + 1e-12 * abs(best):
+            return tuple(sorted(chosen))
+        chosen, best = other, value

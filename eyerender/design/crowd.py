@@ -1,0 +1,100 @@
+"""Figures of many people on all processors, and the numbers of the industry that sum them up."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
+from itertools import repeat
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..progress import Progress
+from .noise import FeatureNoise
+from .people import Figures, Survey, figures_of
+
+OUTLINE = 0.6
+"""Share of the outline that counts as enough (chosen)."""
+_PIECE = 20
+
+
+def figures_of_people(
+    survey: Survey, noise: FeatureNoise, people: int, *, workers: int | None = None, progress: Progress | None = None
+) -> Figures:
+    """Compute the figures of the first people, in pieces that do not depend on the number of processes.
+
+    Args:
+        survey: what is surveyed.
+        noise: of the features.
+        people: number of people.
+        workers: processes; None: one for each processor.
+        progress: called with (people done, people in all, what).
+    """
+    firsts = range(0, people, _PIECE)
+    counts = [min(_PIECE, people - first) for first in firsts]
+    workers = min(workers or os.cpu_count() or 1, len(firsts))
+    if workers == 1:
+        results: Iterator[Figures] = map(partial(figures_of, survey, noise), firsts, counts)
+        return Figures.joined(list(_told(results, counts, progress)))
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        results = pool.map(figures_of, repeat(survey), repeat(noise), firsts, counts)
+        return Figures.joined(list(_told(results, counts, progress)))
+
+
+SHIFTS_MM = (-3.0, -1.5, 0.0, 1.5, 3.0)
+"""Shifts of a map of slippage along each axis."""
+
+
+def figures_of_shifts(
+    survey: Survey, noise: FeatureNoise, people: int, *, workers: int | None = None
+) -> tuple[Floats, list[Figures]]:
+    """Compute the figures of a few people whose place is shifted: 5 x 5 to the left and up, and 5 in distance.
+
+    Returns:
+        Shifts (30, 3) in mm, those in the plane by rows from top to bottom, and the figures of each.
+    """
+    plane = [(0.0, left, up) for up in SHIFTS_MM[::-1] for left in SHIFTS_MM]
+    shifts = [*plane, *((x, 0.0, 0.0) for x in SHIFTS_MM)]
+    surveys = [replace(survey, slippage_mm=0.0, relief_mm=0.0, shift_mm=shift) for shift in shifts]
+    workers = workers or os.cpu_count() or 1
+    if workers == 1:
+        return np.array(shifts), [figures_of(one, noise, 0, people) for one in surveys]
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        found = list(pool.map(figures_of, surveys, repeat(noise), repeat(0), repeat(people)))
+    return np.array(shifts), found
+
+
+def _told(results: Iterator[Figures], counts: Sequence[int], progress: Progress | None) -> Iterator[Figures]:
+    done = 0
+    for part, count in zip(results, counts, strict=True):
+        done += count
+        if progress is not None:
+            progress(done, sum(counts), "people")
+        yield part
+
+
+def users_of(values: Floats) -> dict[str, float | None]:
+    """Compute the median (U50E95) and 95th-percentile (U95E95) user's 95th-percentile error; values (people, 81)."""
+    if not values.size or np.isnan(values).all():
+        return {"U50E95": None, "U95E95": None}
+    each = np.quantile(np.where(np.isnan(values), np.inf, values), 0.95, axis=1, method="higher")
+    return {f"U{u}E95": finite_or_none(np.quantile(each, u / 100, method="higher")) for u in (50, 95)}
+
+
+def coverage_of(found: Figures) -> dict[str, float]:
+    """Compute the share of people times directions with that number of glints and `OUTLINE` of the outline."""
+    outline = found.outline >= OUTLINE
+    return {
+        "outline": float(outline.mean()),
+        **{f"outline_and_{k}_glints": float((outline & (found.glints >= k)).mean()) for k in (1, 2, 3)},
+    }
+
+
+def finite_or_none(value: Any) -> float | None:
+    """A number for JSON, which has no infinities."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,107 @@
+"""Sweeps of rigs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from eyerender.applications.sweeps import GOALS, SweepRun, pareto, run_sweep
+from eyerender.applications.sweepspec import Places, SweepSpec, layouts_of
+from eyerender.errors import InputError
+
+SWEEP: dict[str, Any] = {
+    "format": 1,
+    "scene": "headset",
+    "people": 2,
+    "sweep": {
+        "cameras": [{"places": {"points_mm": [[40, -38, -15], [42, -25, -12]]}}],
+        "lights": {
+            "places": {"surface_mm": [[28, -45, 12], [28, -18, 12], [28, -18, -12], [28, -45, -12]], "count": [3, 2]},
+            "number": [2, 6],
+            "intensity_mw_sr": [0.2],
+        },
+    },
+}
+
+
+def spec_of(**sweep: object) -> SweepSpec:
+    return SweepSpec.from_mapping({**SWEEP, "sweep": {**SWEEP["sweep"], **sweep}})
+
+
+def test_places_lie_evenly_on_curves_and_surfaces():
+    curve = Places.from_mapping({"curve_mm": [[0, 0, 0], [3, 0, 0], [3, 1, 0]], "count": 5}).places()
+    np.testing.assert_allclose(curve, [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [3, 1, 0]], atol=1e-12)
+    corners = [[0, 0, 0], [2, 0, 0], [2, 3, 0], [0, 3, 0]]
+    grid = Places.from_mapping({"surface_mm": corners, "count": [3, 2]}).places()
+    np.testing.assert_allclose(grid, [[x, y, 0] for y in (0, 3) for x in (0, 1, 2)], atol=1e-12)
+    for wrong in (
+        {"points_mm": [[0, 0, 0]], "count": 1},
+        {"curve_mm": corners},
+        {"surface_mm": corners, "count": 4},
+        {},
+    ):
+        with pytest.raises(InputError):
+            Places.from_mapping(wrong)
+
+
+def test_layouts_are_all_combinations_and_sensors_keep_their_size():
+    spec = spec_of(resolution_scale=[1.0, 0.5])
+    layouts = layouts_of(spec, spec.base(Path()))
+    assert len(layouts) == 2 * 2 * 2
+    half = next(layout for layout in layouts if layout.values["resolution_scale"] == 0.5)
+    whole = layouts[0]
+    small, large = half.scene["rig"]["cameras"][0], whole.scene["rig"]["cameras"][0]
+    assert small["resolution_px"] == [320, 240]
+    # The angle of view stays: focal length over width.
+    assert small["focal_length_px"] / 320 == large["focal_length_px"] / 640
+
+
+def test_a_killed_sweep_in_shards_ends_like_one_run(tmp_path):
+    spec = spec_of(cameras=[])
+    scene = spec.base(Path())
+    whole = run_sweep(spec, scene, tmp_path / "whole", SweepRun(workers=1))
+    assert whole["complete"]
+    parts = tmp_path / "parts"
+    first = run_sweep(spec, scene, parts, SweepRun(workers=1, part=(1, 2)))
+    assert first["missing"] == 1
+    (parts / "layouts" / "000000.json").unlink()  # a kill leaves a layout without its file
+    run_sweep(spec, scene, parts, SweepRun(workers=1, part=(2, 2)))
+    done = run_sweep(spec, scene, parts, SweepRun(workers=1))
+    assert json.loads(json.dumps(done)) == json.loads(json.dumps(whole))
+    assert (parts / "layouts.csv").read_bytes() == (tmp_path / "whole" / "layouts.csv").read_bytes()
+    two = [row for row in done["rows"] if row["values"]["number"] == 2]
+    assert all(row["leds"] == 2 == len(row["lights_mm"]) for row in two)
+    with pytest.raises(InputError, match="holds another sweep"):
+        run_sweep(spec_of(cameras=[], resolution_scale=[0.5]), scene, parts)
+
+
+def test_the_pareto_front_is_what_no_other_row_beats():
+    rng = np.random.default_rng(4)
+    rows = [dict(zip(GOALS, values.tolist(), strict=True)) for values in rng.integers(0, 4, (60, len(GOALS)))]
+    rows[3]["noise_deg"] = None
+    found = pareto(rows)
+
+    def value(row: dict, goal: str) -> float:
+        return float("inf") if row[goal] is None else row[goal]
+
+    for k, row in enumerate(rows):
+        beaten = any(
+            all(value(other, g) <= value(row, g) for g in GOALS) and any(value(other, g) < value(row, g) for g in GOALS)
+            for other in rows
+        )
+        assert found[k] != beaten
+
+
+def test_sweeps_that_cannot_be_are_refused():
+    for sweep, reason in (
+        ({"cameras": [{"camera": 3}]}, "there is no camera 3"),
+        ({"cameras": [{"focal_length_mm": [4.0]}]}, "has no focal_length_mm"),
+        ({"lights": {**SWEEP["sweep"]["lights"], "number": [7]}}, "must be at most 6"),
+    ):
+        spec = spec_of(**sweep)
+        with pytest.raises(InputError, match=reason):
+            layouts_of(spec, spec.base(Path()))
