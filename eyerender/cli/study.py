@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from ..errors import InputError
 from ..study.options import StudyOptions
 from .app import app
 from .options import Result
@@ -20,6 +21,7 @@ def study(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     eyes: str | None = None,
+    people: int | None = None,
     options: Annotated[StudyOptions, Parameter(name="*")] = StudyOptions(),
     json: Result = None,
 ) -> int:
@@ -31,18 +33,44 @@ def study(
 
     Args:
         name: guestrin2006 (model-based gaze), blignaut2014 (interpolation-based gaze), observers (analytic against
-            image-derived features on the head-mounted rig), or conditions (analytic errors over the screen, head
-            positions, pupil sizes and eye parameters).
+            image-derived features on the head-mounted rig), conditions (analytic errors over the screen, head
+            positions, pupil sizes and eye parameters), or rigs (six known layouts over a population: who is lost where,
+            and what each LED buys).
         output: The folder to write.
         eyes: Eye models separated by commas, as catalogue names or eye files (default: E1 to E5).
+        people: rigs: Number of people (default: 100).
     """
     from ..study.literature import MODELS
     from ..study.run import REPORT, run_study
 
+    if name == "rigs":
+        return _rigs(output, people, eyes, options, json)
+    if people is not None:
+        raise InputError("belongs to the study 'rigs'", source="--people")
     names = MODELS if eyes is None else tuple(e.strip() for e in eyes.split(",") if e.strip())
     with progress(f"study {name}") as steps:
         summary = run_study(name, output, options, eyes=names, progress=steps, say=say)
     emit(summary, f"{_table(summary)}\n\nreport: {output / REPORT}", json)
+    return 0
+
+
+def _rigs(output: Path, people: int | None, eyes: str | None, options: StudyOptions, json: str | None) -> int:
+    """Run the study of rigs."""
+    from ..study.rigs import run_rigs
+
+    if people is not None and not 1 <= people <= 100_000:
+        raise InputError(f"must be 1 to 100000, not {people}", source="--people")
+    if eyes is not None:
+        raise InputError("has no meaning for the study 'rigs', whose eyes are those of people", source="--eyes")
+    with progress("study rigs") as steps:
+        found = run_rigs(output, options, people=people, progress=steps)
+    lines = [f"{'layout':<18} {'lost':>7} {'2 glints':>9} {'U95E95 deg':>11}"]
+    for row in found["rows"]:
+        noise = row["frame_to_frame_deg"]["U95E95"]
+        shown = "not seen" if noise is None else f"{noise:.4f}"
+        covered = row["coverage"]["outline_and_2_glints"]
+        lines.append(f"{row['layout']:<18} {100 * row['lost']:>5.1f} % {100 * covered:>7.1f} % {shown:>11}")
+    emit(found, "\n".join([*lines, "", f"report: {output / 'report.html'}"]), json)
     return 0
 
 
