@@ -101,10 +101,9 @@ class FolderDataset(Dataset[Any]):
         self.transform = transform
         self.rows = np.arange(len(self.folder))
         if split is not None:
-            splits = [str(entry.line.get("split")) for entry in self.folder]
-            self.rows = np.flatnonzero(np.array(splits) == split)
+            self.rows, splits = self.folder.rows_of(split)
             if not len(self.rows):
-                found = ", ".join(sorted(set(splits)))
+                found = ", ".join(splits)
                 raise InputError(f"no image is of the split {split!r}; there are {found}", source=str(path))
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""Commands about datasets: generate, sample, preview, validate, export-dataset."""
+"""Commands about datasets: generate, sample, preview, validate, status, merge, export-dataset."""
 
 from __future__ import annotations
 
@@ -146,6 +146,9 @@ def validate(
     *,
     quick: bool = False,
     deep: bool = False,
+    render: int = 0,
+    backend: Backend = "auto",
+    threads: Threads = None,
     json: Result = None,
 ) -> int:
     """Check a folder's files, labels and masks, and print statistics.
@@ -159,11 +162,12 @@ def validate(
             wrong masks.
         deep: Compute every line again. By default, 64 lines are computed again, one at a hashed position in each 64th
             of the file; a folder with at most 64 lines is checked completely.
+        render: Render so many of a dataset's images again, and compare all of their pixels.
     """
     from ..dataset.validate import validate as check
 
     with progress("validating") as steps:
-        report = check(folder, quick=quick, deep=deep, progress=steps)
+        report = check(folder, quick=quick, deep=deep, render=render, backend=backend, threads=threads, progress=steps)
     emit(report, _validate_text(report), json)
     return 0 if report["ok"] else EyerenderError.exit_code
 
@@ -189,13 +193,35 @@ def status(folder: Annotated[Path, Parameter(name="DIR")], /, *, watch: bool = F
     return 0
 
 
+@app.command(name="merge")
+def merge(
+    *folders: Path,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    json: Result = None,
+) -> int:
+    """Join the parts of a dataset that machines without a shared file system made with `generate --shard K/N`.
+
+    Args:
+        folders: The folders of the parts.
+        output: The folder to write, or one that holds some of the shards already.
+    """
+    from ..dataset.merge import merge as join
+
+    with progress("merging") as steps:
+        found = join(folders, output, progress=steps)
+    missing = found["shards_missing"]
+    images = "" if missing else f": {found['statistics']['images']} images"
+    emit(found, f"{output}{images}" + (f": {missing} shards are still missing" if missing else ""), json)
+    return 0
+
+
 @app.command(name="export-dataset")
 def export_dataset(
     folder: Annotated[Path, Parameter(name="DIR")],
     /,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     *,
-    format: Literal["webdataset", "coco", "csv", "parquet", "openeds", "ellseg", "teyed"],
+    format: Literal["webdataset", "imagefolder", "coco", "csv", "parquet", "openeds", "ellseg", "teyed"],
     bits: Literal[8, 16] = 8,
     encoding: Literal["linear", "gamma"] | None = None,
     gain: float | None = None,
@@ -208,7 +234,7 @@ def export_dataset(
         folder: A folder written by generate.
         output: The folder to write.
         format: The layout.
-        bits: Bits per pixel of the images: 8, or 16 for webdataset, coco, csv and parquet.
+        bits: Bits per pixel of the images: 8, or 16 for webdataset, imagefolder, coco, csv and parquet.
         encoding: Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16 bits).
         gain: Exposure gain of all images (default: measured on a sample of the images; 1 for 16-bit linear images).
     """

@@ -37,8 +37,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "generate": (
             "eyerender generate dataset_quick --dry-run --measure",
             "eyerender generate dataset_quick -o data --count 100",
+            "eyerender generate people_openeds -o data --count 1000000 --layout webdataset",
         ),
         "live": ("eyerender live quickstart --browser",),
+        "merge": ("eyerender merge part1 part2 part3 -o data",),
         "population": ("eyerender population adults -o people --faces 0",),
         "preview": ("eyerender preview headset -o sheet.png",),
         "quickstart": ("eyerender quickstart first", "eyerender quickstart -o first --eye E4 --overwrite"),
@@ -53,10 +55,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "setup-llvm": ("eyerender setup-llvm",),
         "status": ("eyerender status data", "eyerender status data --watch"),
         "study": ("eyerender study guestrin2006 -o study --eyes E1,E4",),
-        "validate": ("eyerender validate data", "eyerender validate data --quick --json -"),
-        "sweep": (
-            "eyerender sweep sweep.yaml -o layouts",
-            "eyerender sweep sweep.yaml -o layouts --shard 3/16",
+        "validate": (
+            "eyerender validate data",
+            "eyerender validate data --quick --json -",
+            "eyerender validate data --render 8",
         ),
         "view": ("eyerender view eye E4 -o eye.svg", "eyerender view scene quickstart -o rig.pdf"),
     }

@@ -13,17 +13,24 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import EyerenderError, InputError
 from ..folders.imagefolder import (
     CONVENTIONS,
     DATASET,
     DATASET_SCHEMA,
+    DONE,
     LINES,
     METADATA,
+    PACKED_SCHEMA,
     SHARDS,
     finished,
+    packed_index,
     shard_name,
 )
+from ..folders.packed import INDEX
 from ..storage.files import MAX_FILE_BYTES, read_json, remove_parts, write_json, write_text, written
 from .card import data_card
 from .columns import type_first
@@ -45,8 +52,10 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
         EyerenderError: no sample could be made, or the disk is full or not writable.
         InputError: a shard's lines are not as this version writes them.
     """
-    for name in (FAILURES, METADATA, CROISSANT, CARD, DATASET):
+    for name in (FAILURES, METADATA, INDEX, CROISSANT, CARD, DATASET):
         remove_parts(folder / name)
+    if plan.spec.is_packed:
+        return _assemble_packed(plan, folder)
     statistics = Statistics()
     shards = plan.spec.shards
     with written(folder / FAILURES) as file:
@@ -79,6 +88,40 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
     return found
 
 
+def _assemble_packed(plan: Plan, folder: Path) -> dict[str, Any]:
+    """Merge what each shard says of itself: the index of images, the failures and the statistics. No line is read."""
+    statistics, splits, parts = Statistics(), sorted(plan.spec.splits), []
+    with written(folder / FAILURES) as file:
+        for shard in plan.spec.shards:
+            done = read_done(folder, shard)
+            statistics.take_packed(done)
+            parts.append(packed_index(done, shard, splits, str(folder / SHARDS / shard_name(shard) / DONE)))
+            for rejection in done["rejections"]:
+                file.write((json.dumps(rejection) + "\n").encode())
+    rows = np.concatenate(parts)
+    if not len(rows):
+        raise EyerenderError(f"{folder}: no sample of this spec can be made; see {FAILURES} for the reasons")
+    statistics.take_index(rows, splits)
+    with written(folder / INDEX) as file:
+        np.save(file, rows, allow_pickle=False)
+    found = statistics.to_mapping()
+    write_text(folder / CARD, data_card(plan, found))
+    dataset = {
+        "schema": PACKED_SCHEMA,
+        "kind": "dataset",
+        "digest": plan.digest,
+        **plan.to_mapping(),
+        "splits": splits,
+        "versions": run_versions(),
+        "backends": sorted(statistics.backends),
+        "conventions": CONVENTIONS,
+        "statistics": found,
+        "checksums": {name: sum_of(folder / name) for name in (INDEX, FAILURES)},
+    }
+    write_json(folder / DATASET, dataset)
+    return found
+
+
 def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
     """List what is wrong with the assembled files of a dataset: dataset.json and the files whose checksums it contains.
 
@@ -94,13 +137,14 @@ def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> I
     except InputError as error:
         yield f"{DATASET}: {error.reason}"
         return
-    if dataset.get("schema") != DATASET_SCHEMA or digest not in (None, dataset.get("digest")):
+    packed = dataset.get("schema") == PACKED_SCHEMA
+    if not (packed or dataset.get("schema") == DATASET_SCHEMA) or digest not in (None, dataset.get("digest")):
         yield f"{DATASET}: is of another spec"
         return
     sums = dataset.get("checksums")
-    if sums is None and not quick:
+    if sums is None and not quick and not packed:
         yield from _differs_from_shards(folder)
-    elif sums is not None and not (is_sums(sums) and METADATA in sums):
+    elif (packed or sums is not None) and not (is_sums(sums) and (INDEX if packed else METADATA) in (sums or {})):
         yield f"{DATASET}: checksums: do not have the format of this version"
     else:
         yield from compare_sums(folder, sums or {}, quick=quick)
@@ -135,7 +179,7 @@ def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
 def shards_of(dataset: Mapping[str, Any]) -> Sequence[int] | None:
     """Return shards that the spec in a dataset.json asks for; None where it does not say."""
     spec = dataset.get("spec")
-    if isinstance(spec, dict) and spec.get("choice") == "spread":
+    if isinstance(spec, dict) and (spec.get("choice") == "spread" or spec.get("layout") is not None):
         with suppress(InputError):
             return DatasetSpec.from_mapping(spec).shards
         return None
@@ -182,6 +226,30 @@ class Statistics:
         self.pupil_px: list[float] = []
         self.visible = 0
         self.glints = 0
+
+    def take_packed(self, done: Mapping[str, Any]) -> None:
+        """Count a packed shard's done.json, except for what its rows of the index tell.
+
+        Raises:
+            InputError: it is not in the format of this version.
+        """
+        self.take_shard(dict(done))
+        try:
+            counts = done["counts"]
+            self.visible += int(counts["pupils_visible"])
+            self.glints += int(counts["glints_visible"])
+            self.pupil_px += map(float, counts["pupil_semi_axis_px"])
+        except (KeyError, TypeError, ValueError) as error:
+            name = f"{SHARDS}/{shard_name(done['shard'])}/{DONE}"
+            raise InputError(f"is not in the format of this version ({error})", source=name, path="counts") from None
+
+    def take_index(self, rows: NDArray[Any], splits: Sequence[str]) -> None:
+        """Count the images and subjects of each split in an index."""
+        self.images = len(rows)
+        for k, name in enumerate(splits):
+            own = rows["subject"][rows["split"] == k]
+            if len(own):
+                self.splits[name], self.subjects[name] = len(own), set(np.unique(own).tolist())
 
     def take_shard(self, done: dict[str, Any]) -> None:
         """Count a shard's done.json."""

@@ -8,6 +8,7 @@ from ..folders.imagefolder import CONVENTIONS
 from .done import run_versions
 from .plan import RANKED_SUBJECTS, Plan
 from .reading import IMAGEFOLDER, WHOLE
+from .spec import DatasetSpec
 
 _LABELS = """\
 - `records`: the record of the analytic observer: pose, target, apparent pupil (ellipse and boundary points), glints.
@@ -34,6 +35,21 @@ _MORE = {
     "noiseless": "\n- `noiseless_file_name`: the same rendering exposed without sensor noise.",
     "highlights": "\n- `highlight_mask_file_name`: 1 where wet and oily surfaces mirror a lamp; these are no glints.",
 }
+
+
+_FILES = """\
+`metadata.jsonl` has one line per image, with the same keys in every line. The column `split` names the image's split.
+`datasets.load_dataset("imagefolder", data_dir=..., split="train", filters=[("split", "==", "test")])` reads one split
+of the folder (the loader itself calls all images `train`); without `filters` it reads all images."""
+
+_PACKED = """\
+The pictures are in `shards/*/images.tar`, which `webdataset` and `datasets` read. The lines of metadata are packed in
+`shards/*/lines.jsonl.gz`, with numbers of 9 digits; `eyerender.ImageFolder` and `eyerender.torch.FolderDataset` read
+pictures and labels, and `eyerender export-dataset` converts all of it. A line has these keys:"""
+
+
+def _licence(spec: DatasetSpec) -> str:
+    return "" if spec.licence is None else f"## Licence\n{spec.licence}\n\n"
 
 
 def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
@@ -68,9 +84,7 @@ Values are {CONVENTIONS["values"]}. Of {statistics["samples"]} samples, {statist
 made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jsonl` gives the reasons).
 
 ## Labels
-`metadata.jsonl` has one line per image, with the same keys in every line. The column `split` names the image's split.
-`datasets.load_dataset("imagefolder", data_dir=..., split="train", filters=[("split", "==", "test")])` reads one split
-of the folder (the loader itself calls all images `train`); without `filters` it reads all images.
+{_PACKED if spec.is_packed else _FILES}
 
 {_LABELS.format(mask=CONVENTIONS["mask"], more="".join(_MORE.get(kind, "") for kind in spec.labels.pictures))}
 
@@ -84,7 +98,7 @@ The images are PNG files of `bit_depth` bits, 16 unless the spec says otherwise.
 - Pixels: {CONVENTIONS["pixels"]}.
 - Ellipses: {CONVENTIONS["ellipse"]}.
 
-## What to know before training on it
+{_licence(spec)}## What to know before training on it
 Lids and lashes are those of the scene. The textures of skin, iris and sclera are procedural. Their albedos at 850 nm
 were chosen, not measured. Test a network trained on this dataset on recorded images.
 

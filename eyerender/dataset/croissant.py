@@ -68,6 +68,7 @@ def croissant(plan: Plan, metadata_sha256: str) -> dict[str, Any]:
         "description": spec.description or "Rendered near-infrared images of eyes with exact labels.",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "version": "1.0.0",
+        **({} if spec.licence is None else {"license": spec.licence}),
         "distribution": [
             {
                 "@type": "cr:FileObject",

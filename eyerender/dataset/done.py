@@ -12,7 +12,8 @@ from ..folders.imagefolder import DONE, SHARDS, shard_name, versions
 from ..storage.files import MAX_FILE_BYTES, inside, read_json
 from ..versions import package_version
 
-SHARD_SCHEMA = "eyerender/shard/1"
+SHARD_SCHEMA, PACKED_SHARD_SCHEMA = "eyerender/shard/1", "eyerender/shard/2"
+"""Schemas of done.json of a shard whose pictures are files, and of a packed one."""
 # Kind of image -> key of its file in a line of metadata.
 KINDS = {
     "images": "file_name",
@@ -79,8 +80,8 @@ def read_done(folder: Path, shard: int) -> dict[str, Any]:
 def read_done_file(path: Path) -> dict[str, Any]:
     """Read a done.json or the checkpoint of a partial shard, as `read_done`."""
     data = read_json(path, limit=MAX_FILE_BYTES, follow=False)
-    if data.get("schema") != SHARD_SCHEMA:
-        raise InputError(f"must have the schema {SHARD_SCHEMA!r}", source=str(path))
+    if data.get("schema") not in (SHARD_SCHEMA, PACKED_SHARD_SCHEMA):
+        raise InputError(f"must have the schema {SHARD_SCHEMA!r} or {PACKED_SHARD_SCHEMA!r}", source=str(path))
     for key, fits in _DONE_KEYS.items():
         if not fits(data.get(key)):
             raise InputError("is missing, or not in the format of this version", source=str(path), path=key)

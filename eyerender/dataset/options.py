@@ -24,6 +24,8 @@ class RunOptions:
         threads: Total number of CPU threads (default: all).
         timeout_s: Seconds without a sign of life after which a worker is ended and its shard is retried.
         overwrite: Replace the contents of the folder.
+        repair: Compare finished shards with their checksums first, and make damaged ones again. Shards of pictures in
+            files are always compared.
     """
 
     workers: int | None = None
@@ -33,6 +35,7 @@ class RunOptions:
     threads: int | None = None
     timeout_s: float = 600.0
     overwrite: bool = False
+    repair: bool = False
 
     def __post_init__(self) -> None:
         for name in ("workers", "threads"):
@@ -52,11 +55,14 @@ class PlanOptions:
         splits: Replace the splits, as NAME=SHARE,NAME=SHARE: the shares of the subjects.
         size: Replace the size of the pictures, as WIDTHxHEIGHT in pixels; the cameras are scaled so that they see the
             same.
+        layout: Replace the layout of the folder: each picture a file (files), or each shard one tar that mixes subjects
+            (webdataset).
     """
 
     subjects: int | None = None
     splits: str | None = None
     size: str | None = None
+    layout: Literal["files", "webdataset"] | None = None
 
     def apply(self, spec: DatasetSpec) -> DatasetSpec:
         """Return the spec with these changes.
@@ -72,7 +78,19 @@ class PlanOptions:
             spec = spec.replaced("--splits", {"splits": _splits(self.splits)})
         if self.size is not None:
             spec = spec.replaced("--size", {"scene": scaled(spec.scene, _size(self.size))})
+        if self.layout is not None:
+            spec = spec.replaced("--layout", _of_layout(spec, self.layout))
         return spec
+
+
+def _of_layout(spec: DatasetSpec, layout: str) -> dict[str, Any]:
+    """Values of a spec in another layout; packed shards get their default size where the spec has smaller ones."""
+    if layout == "files":
+        return {"layout": None}
+    from .spec import PACKED_SHARD
+
+    size = min(PACKED_SHARD, -(-spec.planned_count // 16))
+    return {"layout": layout, "shard_size": max(spec.shard_size, size)}
 
 
 def _splits(text: str) -> dict[str, Any]:

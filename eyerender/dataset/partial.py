@@ -27,8 +27,9 @@ from ..errors import InputError
 from ..folders.imagefile import Writer
 from ..folders.imagefolder import DONE, IMAGE_SCHEMA, LINES, SHARDS, STAGE, shard_name
 from ..storage.files import inside, make_folder, opened, parse_json, remove_file, sync_files, sync_folder, write_json
-from .done import KINDS, SHARD_SCHEMA, cpu_family, described, read_done_file, run_versions, sum_of
+from .done import KINDS, PACKED_SHARD_SCHEMA, SHARD_SCHEMA, cpu_family, described, read_done_file, run_versions, sum_of
 from .maker import MadeSample
+from .packing import pack, unpack
 from .plan import Plan
 
 CHECKPOINT_S = 10.0
@@ -62,6 +63,8 @@ class PartialShard:
         self._writer = Writer()
         self.stage = folder / f"{STAGE}{shard_name(shard)}-{uuid.uuid4().hex[:12]}"
         found = _claimed(folder, shard, self.stage)
+        if found is not None and found["schema"] == PACKED_SHARD_SCHEMA:
+            found = _unpacked(self.stage, found)
         for kind in (*plan.spec.labels.pictures, _SHARD):
             make_folder(self.stage / kind)
         self._lines = self._new_lines()
@@ -143,10 +146,14 @@ class PartialShard:
         return done
 
     def finish(self) -> dict[str, Any]:
-        """Order the lines by their samples, and make a last checkpoint; the shard may then be put in place."""
+        """Order the lines by their samples, and make a last checkpoint; the shard may then be put in place.
+
+        A packed shard is then put into its tar. Until that is complete, the checkpoint stays.
+        """
         if self._places != sorted(self._places):
             self._sort_lines()
-        return self.checkpoint()
+        done = self.checkpoint()
+        return pack(self.stage, done, self.plan.spec.seed) if self.plan.spec.is_packed else done
 
     @property
     def seconds(self) -> float:
@@ -263,8 +270,9 @@ def reopen(folder: Path, shard: int, kinds: Sequence[str]) -> None:
     stage.mkdir()
     os.rename(folder / SHARDS / name / DONE, stage / DONE)
     for place, own in ((SHARDS, _SHARD), *((kind, kind) for kind in kinds)):
-        os.rename(folder / place / name, stage / own)
-        sync_folder(folder / place)
+        if (folder / place / name).is_dir():  # packed shards have no folders of pictures
+            os.rename(folder / place / name, stage / own)
+            sync_folder(folder / place)
     sync_folder(stage)
     sync_folder(folder)
 
@@ -304,6 +312,15 @@ def _claimed(folder: Path, shard: int, stage: Path) -> dict[str, Any] | None:
             os.rename(place, stage)
             return done
     return None
+
+
+def _unpacked(stage: Path, done: dict[str, Any]) -> dict[str, Any] | None:
+    """Unpack a packed shard to go on with it; what is damaged is removed."""
+    try:
+        return unpack(stage, done)
+    except (InputError, KeyError, TypeError, ValueError, OSError):
+        shutil.rmtree(stage, ignore_errors=True)
+        return None
 
 
 def _comparable(value: Any) -> Any:

@@ -17,17 +17,18 @@ from ..folders.imagefolder import DATASET, LOG, finished
 from ..folders.outfolder import clear, refuse_non_empty
 from ..plausibility import saturation_warnings
 from ..progress import Progress, Say
-from ..storage.files import make_folder, remove_file
+from ..storage.files import MAX_FILE_BYTES, make_folder, read_json, remove_file
 from ..storage.lock import LOCK, final_lock, run_lock
 from .assemble import assemble, damage
 from .done import cpu_family, described, read_done, samples_of
+from .environment import environment, flags
 from .options import RunOptions
 from .partial import checkpoints, reopen
 from .plan import Plan
 from .pool import NO_SHARD, LocalPool
 from .rates import Rate, keep_rate, now
 from .realise import frames_of
-from .runfile import begin, refuse_another_count, refuse_taken
+from .runfile import begin, refuse_another_count, refuse_taken, settle, was_resized
 from .selection import in_spread_order
 from .shard import Staged, commit, is_finished, remove_leftovers, withdraw_damaged
 from .spec import DatasetSpec
@@ -189,40 +190,34 @@ class _Run:
 
     def make(self, resumed: bool) -> dict[str, Any]:
         """Make this part's missing shards, and assemble the dataset when none is missing."""
-        spec, (k, n) = self.plan.spec, self.part
-        mine = set(spec.shards[k - 1 :: n])
-        done = finished(self.folder)
-        self._withdraw(done & mine)
-        self._reopen(mine | {shard for shard in done - set(spec.shards) if shard % n == k - 1})
-        done = finished(self.folder)
+        mine = self._mine()
+        done = self._sorted_out(mine)
         # The first images of a run come from subjects that are far apart.
         todo = in_spread_order(sorted(mine - done))
+        problem: str | None = DATASET
         if resumed:
             remove_leftovers(self.folder, mine, done)
-            problem = next(damage(self.folder, self.plan.digest), None)
+            problem = next(damage(self.folder, self.plan.digest, quick=not self._verifies), None)
             if problem is not None and ((self.folder / DATASET).exists() or not todo):
                 self.repaired(f"the dataset is assembled again: {problem}")
         if todo:
             remove_file(self.folder / DATASET)  # a folder that has one is complete
-        self.total = sum(len(spec.shard_samples(s)) for s in todo)
+        self.total = sum(len(self.plan.spec.shard_samples(s)) for s in todo)
         if todo:
-            for shard in sorted(done):
+            for shard in sorted(done) if self._verifies else ():
                 with suppress(InputError):  # a damaged shard of another part
                     self._mixed(read_done(self.folder, shard), old=True)
-            self._log("start", shards=len(todo), finished=len(done & mine), engine=self.options.engine)
+            self._log(
+                "start",
+                shards=len(todo),
+                finished=len(done & mine),
+                engine=self.options.engine,
+                options=flags(self.options),
+                source_sha256=environment()["source_sha256"],
+                cpu=cpu_family(),
+            )
             self._render(todo, mine)
-        missing = self._missing()
-        statistics = None
-        if not missing:
-            with final_lock(self.folder, self.say):
-                # These are the shards of other parts; this run has verified or made its own.
-                self._withdraw(set(spec.shards) - self.verified)
-                missing = self._missing()
-                if not missing:
-                    refuse_another_count(self.folder, self.plan)
-                    statistics = assemble(self.plan, self.folder)
-                else:
-                    remove_file(self.folder / DATASET)
+        missing, statistics = self._assembled(not todo and problem is None and not self._verifies)
         summary: dict[str, Any] = {
             "schema": "eyerender/generate/1",
             "path": str(self.folder),
@@ -237,6 +232,54 @@ class _Run:
         if statistics is not None:
             summary |= {"statistics": statistics}
         return summary
+
+    def _mine(self) -> set[int]:
+        """Shards of this part."""
+        k, n = self.part
+        return set(self.plan.spec.shards[k - 1 :: n])
+
+    def _sorted_out(self, mine: set[int]) -> set[int]:
+        """Finished shards, without those of this part that are damaged or hold other samples than are wanted."""
+        spec, (k, n) = self.plan.spec, self.part
+        done = finished(self.folder)
+        if self._verifies:
+            self._withdraw(done & mine)
+        else:
+            self.verified |= done
+        if not spec.is_packed or was_resized(self.folder):
+            self._reopen(mine | {shard for shard in done - set(spec.shards) if shard % n == k - 1})
+        return finished(self.folder)
+
+    def _assembled(self, intact: bool) -> tuple[set[int], dict[str, Any] | None]:
+        """The missing shards, and the statistics of the dataset, which is assembled unless a shard is missing.
+
+        An `intact` dataset is not assembled again.
+        """
+        missing = self._missing()
+        if missing:
+            return missing, None
+        if intact:
+            found: dict[str, Any] = read_json(self.folder / DATASET, limit=MAX_FILE_BYTES)["statistics"]
+            return missing, found
+        with final_lock(self.folder, self.say):
+            if self._verifies:
+                # These are the shards of other parts; this run has verified or made its own.
+                self._withdraw(set(self.plan.spec.shards) - self.verified)
+            if was_resized(self.folder):
+                self._reopen(set(self.plan.spec.shards))
+            missing = self._missing()
+            if missing:
+                remove_file(self.folder / DATASET)
+                return missing, None
+            refuse_another_count(self.folder, self.plan)
+            found = assemble(self.plan, self.folder)
+            settle(self.folder, self.plan)
+            return missing, found
+
+    @property
+    def _verifies(self) -> bool:
+        """Whether finished shards are compared with their checksums: with packed shards on request only."""
+        return self.options.repair or not self.plan.spec.is_packed
 
     def _render(self, todo: list[int], mine: set[int]) -> None:
         """Make missing shards.

@@ -10,17 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..folders.imagefolder import DATASET, LOG, METADATA, RUN, RUN_SCHEMA, SHARDS, STAGE, finished
+from ..folders.imagefolder import DATASET, LOG, METADATA, PACKED_RUN_SCHEMA, RUN, RUN_SCHEMA, SHARDS, STAGE, finished
 from ..folders.outfolder import MARKER, clear
+from ..folders.packed import INDEX
 from ..progress import Say
 from ..storage.files import MAX_FILE_BYTES, PART, read_json, remove_file, remove_parts, write_json
 from ..storage.lock import LOCK
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
 from .done import KINDS, read_done, run_versions
+from .environment import environment
 from .plan import Plan
 
-_OWN = {RUN, LOG, SHARDS, *KINDS, METADATA, FAILURES, CARD, CROISSANT, DATASET}
+_OWN = {RUN, LOG, SHARDS, *KINDS, METADATA, INDEX, FAILURES, CARD, CROISSANT, DATASET}
 _ELSE = "choose another folder or give --overwrite"
 _SHOWN = 4
 
@@ -55,14 +57,14 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
         InputError: it holds something else, or a run of another spec or other versions.
         OSError: the disk is full or not writable.
     """
-    path = folder / RUN
-    mine = {"schema": RUN_SCHEMA, "digest": plan.digest, **plan.to_mapping(), "versions": run_versions()}
+    path, mine = folder / RUN, _content(plan)
     found, reason = _read(path)
     if found is not None:
         _refuse_another(folder, found, mine, plan.files)
         if _count_of(found) != _count_of(mine):
             remove_file(folder / DATASET)  # it is that of another number of samples
-            write_json(path, mine)
+            # Shards that were made for another number of samples are looked for until the dataset is assembled.
+            write_json(path, {**mine, "resized": True})
         return True
     refuse_taken(folder)
     remove_parts(path)
@@ -95,13 +97,33 @@ def refuse_another_count(folder: Path, plan: Plan) -> None:
         raise InputError("another run has changed the number of samples", source=str(folder))
 
 
+def _content(plan: Plan) -> dict[str, Any]:
+    """Content of run.json."""
+    schema = PACKED_RUN_SCHEMA if plan.spec.is_packed else RUN_SCHEMA
+    made_with = {"versions": run_versions(), "environment": environment()}
+    return {"schema": schema, "digest": plan.digest, **plan.to_mapping(), **made_with}
+
+
+def settle(folder: Path, plan: Plan) -> None:
+    """Note that all shards are those of the plan's number of samples; the caller holds the folder's final lock."""
+    if was_resized(folder):
+        write_json(folder / RUN, _content(plan))
+
+
+def was_resized(folder: Path) -> bool:
+    """Whether a run had another number of samples, for which finished shards may have been made."""
+    found, _ = _read(folder / RUN)
+    return found is None or bool(found.get("resized"))
+
+
 def _count_of(run: Mapping[str, Any]) -> tuple[Any, ...]:
     spec = run.get("spec")
     return tuple(spec.get(key) for key in ("count", "planned", "choice")) if isinstance(spec, Mapping) else ()
 
 
 def _of_any_count(run: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Content of run.json without the number of samples that are made of the plan."""
+    """Content of run.json without the number of samples that are made of the plan, and what affects no byte."""
+    run = {key: value for key, value in run.items() if key not in ("resized", "environment")}
     spec = run.get("spec")
     if not isinstance(spec, Mapping):
         return run
@@ -119,7 +141,7 @@ def _read(path: Path) -> tuple[dict[str, Any] | None, str]:
         found = read_json(path, limit=MAX_FILE_BYTES, follow=False)
     except InputError as error:
         return None, error.reason
-    if found.get("schema") != RUN_SCHEMA:
+    if found.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
         raise InputError("does not describe a run of this version", source=str(path))
     return found, ""
 

@@ -17,6 +17,7 @@ from typing import overload
 import numpy as np
 
 from ..arrays import Bools, Ints
+from .interleaving import MIXED, Interleaving
 
 _CHUNK = 2**20
 
@@ -44,13 +45,36 @@ class Joined(Sequence[int]):
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """The `count` samples that are made of a plan of `planned` samples and `subjects` subjects, in shards of a size."""
+    """The `count` samples that are made of a plan of `planned` samples and `subjects` subjects, in shards of a size.
+
+    With a seed to `interleave`, every shard mixes subjects (`Interleaving`); each block of the plan has its own shards.
+    """
 
     count: int
     planned: int
     subjects: int
     shard_size: int
     spread: bool
+    interleave: int | None = None
+
+    @property
+    def _block_shards(self) -> int:
+        """Number of shards of an interleaved block."""
+        return -(-self.planned // self.shard_size)
+
+    @cached_property
+    def _mixed(self) -> Interleaving:
+        run = max(1, self.shard_size // MIXED)
+        assert self.interleave is not None
+        return Interleaving(planned=self.planned, subjects=self.subjects, run=run, seed=self.interleave)
+
+    def shard_of(self, sample: int) -> int:
+        """Shard of a sample."""
+        if self.interleave is None:
+            return sample // self.shard_size
+        block, k = divmod(sample, self.planned)
+        at = int(self._mixed.positions_of(np.array([k]))[0])
+        return block * self._block_shards + at // self.shard_size
 
     def subject_of(self, sample: int) -> int:
         """Subject of a sample."""
@@ -97,6 +121,8 @@ class Selection:
     def shards(self) -> Sequence[int]:
         """Shards that hold a sample, in order."""
         size = self.shard_size
+        if self.interleave is not None:
+            return self._interleaved_shards()
         if not self.spread:
             return range(-(-self.count // size))
         head = self._whole // size
@@ -105,6 +131,12 @@ class Selection:
 
     def shard_samples(self, shard: int) -> Sequence[int]:
         """Samples of a shard, in order; a range where none is left out."""
+        if self.interleave is not None:
+            block, k = divmod(shard, self._block_shards)
+            end = min((k + 1) * self.shard_size, self.planned)
+            mixed = np.sort(self._mixed.samples_at(np.arange(k * self.shard_size, end, dtype=np.int64)))
+            mixed += block * self.planned
+            return list(map(int, mixed[self.are_made(mixed)]))
         samples = range(shard * self.shard_size, min((shard + 1) * self.shard_size, self.end))
         made = self.are_made(np.arange(samples.start, samples.stop, dtype=np.int64))
         if made.all():
@@ -117,6 +149,19 @@ class Selection:
         if not self.spread:
             return range(self.count)
         return Joined(range(self._whole), np.concatenate(list(self._chunks(self._whole))))
+
+    def _interleaved_shards(self) -> Sequence[int]:
+        """Shards of the blocks that are made as a whole, and those of the last one that hold a sample."""
+        blocks, left = divmod(self.count, self.planned)
+        head = range(blocks * self._block_shards)
+        if not left:
+            return head
+        found = [np.zeros(0, dtype=np.int64)]
+        for start in range(0, self.planned, _CHUNK):
+            positions = np.arange(start, min(start + _CHUNK, self.planned), dtype=np.int64)
+            made = self.are_made(self._mixed.samples_at(positions) + blocks * self.planned)
+            found.append(np.unique(positions[made] // self.shard_size))
+        return Joined(head, np.unique(np.concatenate(found)) + len(head))
 
     @property
     def _whole(self) -> int:

@@ -17,8 +17,9 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..folders.imagefolder import DONE, LINES, SHARDS, shard_name
+from ..folders.packed import LINES_GZ
 from ..storage.files import make_folder, remove_file, sync_folder
-from .done import KINDS, compare_sums, read_done
+from .done import KINDS, PACKED_SHARD_SCHEMA, compare_sums, read_done
 from .maker import Maker
 from .partial import PartialShard, remove_stages, take_back
 
@@ -137,8 +138,11 @@ def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool =
     if done["shard"] != shard or digest not in (None, done["digest"]):
         yield f"{SHARDS}/{name}/{DONE}: is of another {'spec' if done['shard'] == shard else 'shard'}"
         return
-    places = tuple(f"{kind}/{name}/" for kind in (*KINDS, SHARDS))
-    if f"{SHARDS}/{name}/{LINES}" not in done["files"] or not all(n.startswith(places) for n in done["files"]):
+    packed = done["schema"] == PACKED_SHARD_SCHEMA
+    places = tuple(f"{kind}/{name}/" for kind in (*(() if packed else KINDS), SHARDS))
+    if f"{SHARDS}/{name}/{LINES_GZ if packed else LINES}" not in done["files"] or not all(
+        n.startswith(places) for n in done["files"]
+    ):
         yield f"{SHARDS}/{name}/{DONE}: files: do not belong to this shard"
         return
     yield from compare_sums(folder, done["files"], quick=quick)

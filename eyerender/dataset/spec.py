@@ -24,6 +24,7 @@ from .selection import Selection
 # Largest number of samples of a run; a Sobol sequence has no more points.
 MAX_COUNT = 10**9
 _LEAST_SHARDS = 16
+PACKED_SHARD = 1000  # samples of a packed shard by default, so that millions of images make some thousand files
 _SPLIT = re.compile(r"[a-z][a-z0-9]*")
 
 
@@ -57,6 +58,9 @@ class DatasetSpec(FileSpec):
     kind: Literal["dataset"] = Field(description="says that the file is a dataset, not a scene")
     name: Annotated[str, Field(min_length=1, max_length=100)] = Field(description="name of the dataset")
     description: str = Field(default="", description="what the dataset is for, in a sentence")
+    licence: Annotated[str, Field(min_length=1, max_length=200)] | None = Field(
+        default=None, description="licence of the pictures and labels, such as CC-BY-4.0; stated beside them"
+    )
     count: Annotated[int, Field(ge=1, le=MAX_COUNT)] = Field(description="number of samples")
     planned: Annotated[int, Field(ge=1, le=MAX_COUNT)] | None = Field(
         default=None,
@@ -69,7 +73,13 @@ class DatasetSpec(FileSpec):
         "first ones of each subject in turn; default: first",
     )
     shard_size: Annotated[int, Field(ge=1, le=100_000)] = Field(
-        default=64, description="samples in a shard; default: 64, fewer in a small plan, so that it has 16 shards"
+        default=64,
+        description="samples in a shard; default: 64 (webdataset: 1000), fewer in a small plan, which has 16 shards",
+    )
+    layout: Literal["files", "webdataset"] | None = Field(
+        default=None,
+        description="files: each picture is a file; webdataset: each shard is one tar that mixes subjects, with its "
+        "metadata packed, for datasets of more than some 100,000 images; default: files",
     )
     subjects: Annotated[int, Field(ge=1, le=MAX_COUNT)] | None = Field(
         default=None, description="number of identities; each has a run of consecutive samples; default: one per sample"
@@ -110,7 +120,8 @@ class DatasetSpec(FileSpec):
     def _divide(self) -> Self:
         """Divide a small plan into enough shards for several workers."""
         if "shard_size" not in self.model_fields_set:
-            object.__setattr__(self, "shard_size", min(self.shard_size, -(-self.planned_count // _LEAST_SHARDS)))
+            size = PACKED_SHARD if self.is_packed else self.shard_size
+            object.__setattr__(self, "shard_size", min(size, -(-self.planned_count // _LEAST_SHARDS)))
         return self
 
     @model_validator(mode="after")
@@ -169,7 +180,14 @@ class DatasetSpec(FileSpec):
     @property
     def selection(self) -> Selection:
         """Which samples are made."""
-        return _selection(self.count, self.planned_count, self.subject_count, self.shard_size, self.choice == "spread")
+        spread = self.choice == "spread" and self.count % self.planned_count > 0
+        sizes = self.count, self.planned_count, self.subject_count, self.shard_size
+        return _selection(*sizes, spread, self.seed if self.is_packed else None)
+
+    @property
+    def is_packed(self) -> bool:
+        """Whether shards are packed."""
+        return self.layout == "webdataset"
 
     @property
     def shards(self) -> Sequence[int]:
@@ -182,13 +200,16 @@ class DatasetSpec(FileSpec):
 
 
 @lru_cache(maxsize=16)
-def _selection(count: int, planned: int, subjects: int, shard_size: int, spread: bool) -> Selection:
+def _selection(
+    count: int, planned: int, subjects: int, shard_size: int, spread: bool, interleave: int | None
+) -> Selection:
     return Selection(
         count=count,
         planned=planned,
         subjects=subjects,
         shard_size=shard_size,
-        spread=spread and count % planned > 0,
+        spread=spread,
+        interleave=interleave,
     )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..folders.imagefolder import DATASET, LOG, RUN, RUN_SCHEMA, finished
+from ..folders.imagefolder import DATASET, LOG, PACKED_RUN_SCHEMA, RUN, RUN_SCHEMA, finished
 from ..storage.files import MAX_FILE_BYTES, opened, parse_json, read_json
 from .partial import checkpoints
 from .selection import Selection
@@ -75,7 +75,7 @@ def status(path: str | Path) -> dict[str, Any]:
     """
     folder = Path(path)
     run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
-    if run.get("schema") != RUN_SCHEMA:
+    if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
         raise InputError("does not describe a run of this version", source=str(folder / RUN))
     selection = _selection(run, str(folder / RUN))
     parts = _parts(folder)
@@ -85,7 +85,9 @@ def status(path: str | Path) -> dict[str, Any]:
     missing = frozenset(shards) - there
     at_work = sum(images for shard, images in kept.items() if shard in missing)
     samples = (
-        sum(len(selection.shard_samples(shard)) for shard in done) if selection.spread else _plain(selection, done)
+        sum(len(selection.shard_samples(shard)) for shard in done)
+        if selection.spread or (selection.interleave is not None and selection.count % selection.planned)
+        else _plain(selection, done)
     )
     is_finished = (folder / DATASET).is_file()
     left = 0 if is_finished else selection.count - samples - at_work
@@ -124,6 +126,7 @@ def _selection(run: dict[str, Any], source: str) -> Selection:
             subjects=int(spec.get("subjects") or planned),
             shard_size=int(spec["shard_size"]),
             spread=spec.get("choice") == "spread" and count % planned > 0,
+            interleave=int(spec["seed"]) if spec.get("layout") == "webdataset" else None,
         )
     except (AssertionError, KeyError, TypeError, ValueError, ZeroDivisionError):
         raise InputError("has no count and shard_size", source=source, path="spec") from None
@@ -131,6 +134,10 @@ def _selection(run: dict[str, Any], source: str) -> Selection:
 
 def _plain(selection: Selection, shards: list[int]) -> int:
     """Number of samples of some shards that hold all of theirs."""
+    if selection.interleave is not None:
+        per_block = -(-selection.planned // selection.shard_size)
+        short = per_block * selection.shard_size - selection.planned
+        return len(shards) * selection.shard_size - short * sum((shard + 1) % per_block == 0 for shard in shards)
     last = (selection.count - 1) // selection.shard_size
     short = selection.shard_size * (last + 1) - selection.count if last in shards[-1:] else 0
     return len(shards) * selection.shard_size - short

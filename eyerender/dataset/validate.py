@@ -13,12 +13,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..backends.choose import BackendChoice
 from ..errors import InputError
 from ..folders.imagefolder import FILE_KEYS, Entries, ImageEntry, ImageFolder
 from ..progress import Progress
 from .validation.images import Tally, check_images
 from .validation.lines import Lines, check_records
 from .validation.problems import WRONG, Problems
+from .validation.rendering import render_again
 from .validation.shards import check_run
 from .validation.truth import Again, DatasetTruth, NoTruth, SceneTruth, truth_of
 
@@ -28,7 +30,14 @@ _BATCH = 256
 
 
 def validate(
-    path: str | Path, *, quick: bool = False, deep: bool = False, progress: Progress | None = None
+    path: str | Path,
+    *,
+    quick: bool = False,
+    deep: bool = False,
+    render: int = 0,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Check a folder and return a report (schema eyerender/validation/1).
 
@@ -36,27 +45,26 @@ def validate(
         path: the folder.
         quick: do not open or hash images; a changed byte and a wrong mask are then not found.
         deep: compute all lines again, not only `SAMPLE` of them (see `sampled`).
+        render: render so many of the images of a dataset again, and compare all of their pixels.
+        backend: what renders them.
+        threads: processor threads for it; None: all.
         progress: called with the amount done, the total, and the kind.
 
     Raises:
+        BackendError: there is nothing to render with.
         InputError: it is not a folder of images.
     """
     path = Path(path)
     folder = ImageFolder.load(path)
     step = progress or (lambda *_: None)
     problems, tally, notes = Problems(), Tally(), [folder.unfinished] if folder.unfinished else []
-    truth: DatasetTruth | SceneTruth | None = None
-    try:
-        truth = truth_of(folder, problems)
-    except NoTruth as reason:
-        notes.append(f"nothing is computed again: {reason}")
+    truth = _truth(folder, problems, notes)
     if folder.dataset.get("kind") == "dataset":
         check_run(folder, quick, problems, step)
     total = len(folder.entries)
     rows = range(total) if deep else sampled(total, str(folder.dataset.get("digest")))
-    if truth is not None and truth.stale is not None:
-        notes.append(f"records and labels are not computed again: {truth.stale}")
     able = truth is not None and truth.stale is None
+    recomputed = len(rows) if able else 0
     chosen = frozenset(rows if able and not deep else ())
     lines = Lines(folder, truth)
     for start, batch in _batches(folder.entries, problems):
@@ -78,19 +86,36 @@ def validate(
                 problems.add(str(error))
             step(k + 1, total, "images")
     lines.finish(problems)
+    if render and able and isinstance(truth, DatasetTruth):
+        images = sampled(total, str(folder.dataset.get("digest")), render)
+        notes += render_again(folder, truth, images, step, problems, backend=backend, threads=threads)
+    elif render:
+        notes.append("no image is rendered again")
     statistics = folder.dataset.get("statistics")
     return {
         "schema": "eyerender/validation/1",
         "path": str(path),
         "ok": not problems.count,
         "images": total,
-        "recomputed": len(rows) if able else 0,
+        "recomputed": recomputed,
         "notes": notes,
         "problem_count": problems.count,
         "problems": problems.shown,
         "problems_left_out": problems.count - len(problems.shown),
         "statistics": {**(statistics if isinstance(statistics, dict) else {}), **tally.to_mapping()},
     }
+
+
+def _truth(folder: ImageFolder, problems: Problems, notes: list[str]) -> DatasetTruth | SceneTruth | None:
+    """What the lines of a folder can be compared with; the reason goes to the notes if they cannot be."""
+    try:
+        found = truth_of(folder, problems)
+    except NoTruth as reason:
+        notes.append(f"nothing is computed again: {reason}")
+        return None
+    if found is not None and found.stale is not None:
+        notes.append(f"records and labels are not computed again: {found.stale}")
+    return found
 
 
 def _check(entry: ImageEntry, truth: DatasetTruth | SceneTruth | None, tally: Tally, *, quick: bool) -> Iterator[str]:
@@ -110,19 +135,19 @@ def _find_files(entry: ImageEntry) -> None:
         InputError: naming the first one that does not.
     """
     for key in FILE_KEYS:
-        entry.file(key)
+        entry.check(key)
 
 
-def sampled(total: int, digest: str) -> list[int]:
-    """Lines that are computed again by default: one at a hashed place in each of `SAMPLE` equal parts of the file.
+def sampled(total: int, digest: str, count: int = SAMPLE) -> list[int]:
+    """Lines that are computed again by default: one at a hashed place in each of `count` equal parts of the file.
 
     They are a pure function of the folder's digest, so two checks of a folder use the same lines.
     """
-    if total <= SAMPLE:
+    if total <= count:
         return list(range(total))
     rows = []
-    for k in range(SAMPLE):
-        start, end = total * k // SAMPLE, total * (k + 1) // SAMPLE
+    for k in range(count):
+        start, end = total * k // count, total * (k + 1) // count
         number = int.from_bytes(hashlib.sha256(f"{digest}/{k}".encode()).digest()[:8], "big")
         rows.append(start + number % (end - start))
     return rows

@@ -11,7 +11,7 @@ import warnings
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,6 +135,12 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
     return image, depth
 
 
+def image_of(data: bytes, source: str) -> tuple[NDArray[Any], int]:
+    """Read the content of an image file, like `read_image`."""
+    image, depth, _ = _image(io.BytesIO(data), len(data), source, colour=False)
+    return image, depth
+
+
 def read_any_image(path: str | Path) -> tuple[NDArray[Any], int, bool]:
     """Read an image like `read_image`, but take the luminance (ITU-R BT.601) where it has real colour.
 
@@ -148,14 +154,17 @@ def read_any_image(path: str | Path) -> tuple[NDArray[Any], int, bool]:
 
 
 def _read(path: str | Path, *, colour: bool) -> tuple[NDArray[Any], int, bool]:
-    source = str(path)
+    with opened(path, limit=MAX_IMAGE_BYTES) as data:
+        return _image(data, os.fstat(data.fileno()).st_size, str(path), colour=colour)
+
+
+def _image(data: BinaryIO, size: int, source: str, *, colour: bool) -> tuple[NDArray[Any], int, bool]:
     try:
-        with opened(path, limit=MAX_IMAGE_BYTES) as data:
-            if os.fstat(data.fileno()).st_size == 0:
-                raise InputError("is empty", source=source)
-            # Where Pillow warns, it either reads the image nevertheless or fails with an error.
-            with warnings.catch_warnings(action="ignore"), Image.open(data, formats=FORMATS) as file:
-                return _decoded(file, source, colour)
+        if size == 0:
+            raise InputError("is empty", source=source)
+        # Where Pillow warns, it either reads the image nevertheless or fails with an error.
+        with warnings.catch_warnings(action="ignore"), Image.open(data, formats=FORMATS) as file:
+            return _decoded(file, source, colour)
     except InputError:
         raise
     except MemoryError:

@@ -2,36 +2,53 @@
 
 from __future__ import annotations
 
+import atexit
+import hashlib
 import json
 import os
 import platform
+import shutil
+import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, TypeGuard, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bytes
+from ..arrays import Bytes, Ints
 from ..errors import InputError, Refuse, UnfinishedRunWarning
 from ..observation import EYES, Observations, concatenate, count_heads
 from ..rig.camera import Window
-from ..storage.files import MAX_FILE_BYTES, inside, is_plain, read_json, shown, write_json
+from ..storage.files import (
+    MAX_FILE_BYTES,
+    inside,
+    is_plain,
+    make_folder,
+    read_bytes,
+    read_json,
+    shown,
+    write_bytes,
+    write_json,
+)
 from ..storage.jsonlines import JsonLines, LineFiles
 from ..versions import package_version
-from .imagefile import read_image
+from .imagefile import MAX_IMAGE_BYTES, image_of
+from .packed import INDEX, INDEX_TYPE, MEMBERS, PackedLines, read_member
 
 IMAGE_SCHEMA, RENDERED_SCHEMA = "eyerender/image/4", "eyerender/image/3"
 """Schemas of a line in a dataset, and in a rendered folder, whose lines hold nothing that version 4 added."""
 # Version 3 has no diameters of the pupil, version 2 no masks of highlights, version 1 neither `gamma` nor the class 4
 # of masks; they are read wherever version 4 is.
 IMAGE_SCHEMAS = (IMAGE_SCHEMA, RENDERED_SCHEMA, "eyerender/image/2", "eyerender/image/1")
-DATASET_SCHEMA = "eyerender/dataset/1"
+DATASET_SCHEMA, PACKED_SCHEMA = "eyerender/dataset/1", "eyerender/dataset/2"
+"""Schemas of dataset.json where each picture is a file, and where shards are packed."""
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
 RUN = "run.json"  # in a folder that `generate` fills, from its start
-RUN_SCHEMA = "eyerender/run/1"
+RUN_SCHEMA, PACKED_RUN_SCHEMA = "eyerender/run/1", "eyerender/run/2"
 LOG = "log.jsonl"
 # Files of a finished shard. LINES is not called metadata.jsonl, because loaders of image folders would read it, too.
 SHARDS, DONE, LINES = "shards", "done.json", "lines.jsonl"
@@ -65,7 +82,7 @@ class ImageEntry:
     """One image of a folder: its files, its window (x0, y0, width, height) and its line of metadata.
 
     `number` counts the lines of the file `listed` from 1; it is 0 where it is unknown. `listed` is metadata.jsonl by
-    default; in an unfinished run it is the file of a shard.
+    default; in an unfinished run and in a packed folder it is the file of a shard.
     """
 
     folder: Path
@@ -107,6 +124,24 @@ class ImageEntry:
             return None
         return inside(self.folder, name, source=str(self.source), path=self._where(key))
 
+    def check(self, key: str) -> None:
+        """Check that the file that one of `FILE_KEYS` names is there; raises as `file`."""
+        self.file(key)
+
+    def data(self, key: str) -> bytes | None:
+        """Content of the file that one of `FILE_KEYS` names, None where the line names none; raises as `file`."""
+        path = self.file(key)
+        return None if path is None else read_bytes(path, limit=MAX_IMAGE_BYTES, follow=False)
+
+    def picture(self, key: str) -> tuple[NDArray[Any], int] | None:
+        """Pixels and bit depth of the file that one of `FILE_KEYS` names, None where the line names none.
+
+        Raises:
+            InputError: as for `file`; the file is not a greyscale image.
+        """
+        data = self.data(key)
+        return None if data is None else image_of(data, str(self.folder / self.line[key]))
+
     @property
     def gamma(self) -> float:
         """The image stores linear intensity^(1 / gamma)."""
@@ -124,7 +159,9 @@ class ImageEntry:
         Raises:
             InputError: as for `file`; the file is not a greyscale image, or its size differs from the window's.
         """
-        return self._picture(self.path)
+        image = self._picture("file_name")
+        assert image is not None
+        return image
 
     def mask(self) -> Bytes | None:
         """Read what each pixel shows, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 a frame.
@@ -147,8 +184,7 @@ class ImageEntry:
 
     def noiseless(self) -> NDArray[Any] | None:
         """Read the counts without the sensor's noise, like `image`; None where the line names no such file."""
-        path = self.file("noiseless_file_name")
-        return None if path is None else self._picture(path)
+        return self._picture("noiseless_file_name")
 
     @property
     def records(self) -> list[dict[str, Any]]:
@@ -170,21 +206,21 @@ class ImageEntry:
             raise InputError("must be a mapping", source=str(self.source), path=self._where("labels"))
         return found
 
-    def _picture(self, path: Path) -> NDArray[Any]:
-        image = read_image(path)[0]
-        width, height = self.window[2:]
+    def _picture(self, key: str) -> NDArray[Any] | None:
+        found = self.picture(key)
+        if found is None:
+            return None
+        image, (width, height) = found[0], self.window[2:]
         if image.shape != (height, width):
             reason = f"is {image.shape[1]} x {image.shape[0]} px, but its window is {width} x {height}"
-            raise InputError(reason, source=str(path))
+            raise InputError(reason, source=str(self.folder / self.line[key]))
         return image
 
     def _parts(self, key: str) -> Bytes | None:
-        path = self.file(key)
-        if path is None:
-            return None
-        mask = self._picture(path)
-        if mask.dtype != np.uint8:
-            raise InputError(f"holds {mask.dtype.name} values; a mask has 8 bits", source=str(path))
+        mask = self._picture(key)
+        if mask is not None and mask.dtype != np.uint8:
+            source = str(self.folder / self.line[key])
+            raise InputError(f"holds {mask.dtype.name} values; a mask has 8 bits", source=source)
         return mask
 
     def truth(self) -> Observations:
@@ -204,6 +240,36 @@ class ImageEntry:
 
 
 @dataclass(frozen=True, slots=True)
+class PackedEntry(ImageEntry):
+    """One image of a packed shard; `members` are the places of its files in the tar, by the keys of their names."""
+
+    members: Mapping[str, Any] = field(default_factory=dict)
+
+    def file(self, key: str) -> Path | None:
+        """Like `ImageEntry.file`: the picture is copied to a temporary file, which goes when this process ends."""
+        data = self.data(key)
+        if data is None:
+            return None
+        name = str(self.line[key])
+        path = Path(_scratch()) / hashlib.sha256(f"{self.folder.resolve()}/{name}".encode()).hexdigest()[:16]
+        make_folder(path)
+        write_bytes(path / PurePosixPath(name).name, data, sync=False)
+        return path / PurePosixPath(name).name
+
+    def check(self, key: str) -> None:
+        """Like `ImageEntry.check`."""
+        self.data(key)
+
+    def data(self, key: str) -> bytes | None:
+        """Like `ImageEntry.data`."""
+        if self.line.get(key) is None:
+            return None
+        shard = self.source.parent.relative_to(self.folder).as_posix()
+        where = self._where(f"{MEMBERS}.{key}")
+        return read_member(self.folder, shard, self.members.get(key), source=str(self.source), path=where)
+
+
+@dataclass(frozen=True, slots=True)
 class Entries(Sequence[ImageEntry]):
     """The images of a folder. Each line of metadata is read and checked when its entry is requested, and not kept.
 
@@ -214,7 +280,7 @@ class Entries(Sequence[ImageEntry]):
     """
 
     folder: Path
-    lines: LineFiles
+    lines: LineFiles | PackedLines
     rows: range
 
     def __len__(self) -> int:
@@ -231,9 +297,16 @@ class Entries(Sequence[ImageEntry]):
         return next(iter(Entries(self.folder, self.lines, range(row, row + 1))))
 
     def __iter__(self) -> Iterator[ImageEntry]:
+        packed = isinstance(self.lines, PackedLines)
         for path, number, line in self.lines.read(self.rows):
             _check_line(line, str(path), f"line {number}")
-            yield ImageEntry(self.folder, line, number, path)
+            if not packed:
+                yield ImageEntry(self.folder, line, number, path)
+                continue
+            members = line.pop(MEMBERS, None)
+            if not isinstance(members, dict):
+                raise InputError("must be a mapping", source=str(path), path=f"line {number}.{MEMBERS}")
+            yield PackedEntry(self.folder, line, number, path, members)
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,6 +337,8 @@ class ImageFolder:
             raise InputError("no such folder", source=str(path))
         if (folder / RUN).is_file() and not (folder / DATASET).is_file():
             return cls._of_run(folder)
+        if (folder / INDEX).exists() and (folder / DATASET).exists():
+            return cls._packed(folder)
         if not (folder / METADATA).exists():
             raise InputError(
                 f"holds no {METADATA}, so it is not a folder of images written by this package", source=str(path)
@@ -282,13 +357,37 @@ class ImageFolder:
         return cls(folder, dataset, entries)
 
     @classmethod
+    def _packed(cls, folder: Path) -> ImageFolder:
+        """Open the folder of a finished run with packed shards."""
+        dataset = read_json(folder / DATASET, limit=MAX_FILE_BYTES, follow=False)
+        if dataset.get("schema") != PACKED_SCHEMA:
+            raise InputError(
+                f"is {shown(dataset.get('schema'))}; this version reads {PACKED_SCHEMA!r}",
+                source=str(folder / DATASET),
+                path="schema",
+            )
+        splits = dataset.get("splits")
+        if not isinstance(splits, list) or not all(isinstance(name, str) for name in splits):
+            raise InputError("must be a list of names", source=str(folder / DATASET), path="splits")
+        lines = PackedLines(folder=folder, splits=tuple(splits), file=folder / INDEX)
+        if not len(lines):
+            raise InputError("holds no images", source=str(folder / INDEX))
+        entries = Entries(folder, lines, range(len(lines)))
+        _ = entries[0]
+        return cls(folder, dataset, entries)
+
+    @classmethod
     def _of_run(cls, folder: Path) -> ImageFolder:
         """Open the folder of an unfinished run, whose finished shards hold the lines."""
         run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
-        if run.get("schema") != RUN_SCHEMA:
+        if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
             raise InputError("does not describe a run of this version", source=str(folder / RUN))
         shards = sorted(finished(folder))
-        entries = _entries(folder, [folder / SHARDS / shard_name(shard) / LINES for shard in shards])
+        if run["schema"] == PACKED_RUN_SCHEMA:
+            lines = packed_lines(folder, shards)
+            entries = Entries(folder, lines, range(len(lines)))
+        else:
+            entries = _entries(folder, [folder / SHARDS / shard_name(shard) / LINES for shard in shards])
         if not len(entries):
             raise InputError(
                 "holds an unfinished run without a finished shard; start generate again on the folder",
@@ -302,7 +401,8 @@ class ImageFolder:
             f"{shown(planned)} samples are planned"
         )
         warnings.warn(f"{folder}: {text}", UnfinishedRunWarning, stacklevel=3)
-        dataset = {**run, "schema": DATASET_SCHEMA, "kind": "dataset", "conventions": CONVENTIONS}
+        schema = DATASET_SCHEMA if run["schema"] == RUN_SCHEMA else PACKED_SCHEMA
+        dataset = {**run, "schema": schema, "kind": "dataset", "conventions": CONVENTIONS}
         return cls(folder, dataset, entries, text)
 
     def __len__(self) -> int:
@@ -310,6 +410,18 @@ class ImageFolder:
 
     def __iter__(self) -> Iterator[ImageEntry]:
         return iter(self.entries)
+
+    def rows_of(self, split: str) -> tuple[Ints, list[str]]:
+        """Rows of the entries of a split, and the names of all splits; the index of packed shards tells both at once.
+
+        Raises:
+            InputError: a line or the index is wrong.
+        """
+        lines = self.entries.lines
+        if isinstance(lines, PackedLines):
+            return lines.of_split(split), list(lines.splits)
+        splits = [str(entry.line.get("split")) for entry in self]
+        return np.flatnonzero(np.array(splits) == split), sorted(set(splits))
 
     def truth(self) -> Observations:
         """Read the records of the analytic observer for every image, in order.
@@ -341,7 +453,50 @@ def finished(folder: Path) -> set[int]:
     place = folder / SHARDS
     if not place.is_dir():
         return set()
-    return {int(p.name) for p in place.iterdir() if p.name.isdigit() and (p / DONE).is_file()}
+    # There may be ten thousands of shards, for which paths as text are three times as fast.
+    return {int(name) for name in os.listdir(place) if name.isdigit() and os.path.isfile(f"{place}/{name}/{DONE}")}
+
+
+def packed_index(done: Mapping[str, Any], shard: int, splits: Sequence[str], source: str) -> NDArray[Any]:
+    """Rows of the index of one packed shard, from the columns in its done.json; `splits` are those of the whole index.
+
+    Raises:
+        InputError: the columns are not in the format of this version.
+    """
+    try:
+        columns, names = done["columns"], done["splits"]
+        out = np.zeros(int(done["images"]), dtype=INDEX_TYPE)
+        for key in ("sample", "subject", "block"):
+            out[key] = columns[key]
+        out["split"] = np.array([splits.index(name) for name in names], dtype=np.uint16)[np.array(columns["split"])]
+        out["shard"], out["row"] = shard, np.arange(len(out))
+        return out
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise InputError(
+            f"is not in the format of this version ({type(error).__name__}: {error})", source=source, path="columns"
+        ) from None
+
+
+def packed_lines(folder: Path, shards: Sequence[int]) -> PackedLines:
+    """Lines of some packed shards, by what their done.json say."""
+    dones = []
+    for shard in shards:
+        dones.append(read_json(folder / SHARDS / shard_name(shard) / DONE, limit=MAX_FILE_BYTES, follow=False))
+    splits = tuple(sorted({str(name) for done in dones for name in done.get("splits") or ()}))
+    parts = [
+        packed_index(done, shard, splits, str(folder / SHARDS / shard_name(shard) / DONE))
+        for shard, done in zip(shards, dones, strict=True)
+    ]
+    rows = np.concatenate(parts) if parts else np.zeros(0, dtype=INDEX_TYPE)
+    return PackedLines(folder=folder, splits=splits, given=rows)
+
+
+@cache
+def _scratch() -> str:
+    """Folder of this process for pictures that are needed as files."""
+    folder = tempfile.mkdtemp(prefix="eyerender-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def _entries(folder: Path, files: list[Path]) -> Entries:

@@ -40,9 +40,9 @@ _FOLDERS = re.compile(r"(images/)?((images|masks|amodal_masks|noiseless|highligh
 _FILES = re.compile(
     r"(images/)?("  # a study's images are a dataset of their own
     r"(dataset|run|croissant)\.json|(metadata|failures|log)\.jsonl|README\.md|report\.html|"
-    r"(images|masks|amodal_masks|noiseless|highlights)/([0-9]+/)?[^/]+\.(png|exr)|shards/[0-9]+/(lines\.jsonl|done\.json))"
-    r"|(study|summary|findings|results|times|sweep)\.json|(summary|findings|waterfall|results|layouts)\.csv"
-    r"|layouts/[0-9]+\.json|\.eyerender\.json"
+    r"(images|masks|amodal_masks|noiseless|highlights)/([0-9]+/)?[^/]+\.(png|exr)|"
+    r"shards/[0-9]+/(lines\.jsonl|lines\.jsonl\.gz|images\.tar|done\.json)|index\.npy)"
+    r"|(study|summary|findings|results|times)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
 )
 # Names of files that are being written, with their final names.
 _PARTS = re.compile(r"(?P<folder>(?:.*/)?)(?:\.(?P<hidden>[^/]+)\.[0-9a-f]{8}|(?P<plain>[^/]+))\.part")

@@ -41,7 +41,7 @@ COMMANDS = {
     "fit-eye": ["records.csv", "--rig", "rig.yaml", "--columns", "columns.yaml"],
     "rig": ["scene.yaml", "--unknowns", "unknowns.yaml"],
     "status": ["folder"],
-    "sweep": ["sweep.yaml"],
+    "merge": ["folder", "other"],
 }
 NO_OUTPUT = {"setup-llvm", "schema", "live"}
 OPTIONS = {"output": "-o", "overlay": "--overlay", "json": "--json"}

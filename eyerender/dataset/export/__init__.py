@@ -20,7 +20,7 @@ from ...progress import Progress
 from ...storage.files import write_json, write_text
 from ..assemble import verify_dataset, verify_finished
 from ..validation.problems import WRONG
-from . import coco, ellseg, openeds, parquet, table, teyed, webdataset
+from . import coco, ellseg, imagefolder, openeds, parquet, table, teyed, webdataset
 from .card import export_card
 from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
 from .item import Item, Items
@@ -32,6 +32,7 @@ SCHEMA = "eyerender/export/2"
 EXPORT, CARD = "export.json", "README.md"
 FORMATS: dict[str, Writer] = {
     "webdataset": webdataset.write,
+    "imagefolder": imagefolder.write,
     "coco": coco.write,
     "csv": table.write,
     "parquet": parquet.write,
@@ -40,7 +41,7 @@ FORMATS: dict[str, Writer] = {
     "teyed": teyed.write,
 }
 # The other layouts have 8 bits by definition.
-_SIXTEEN_BITS = ("webdataset", "coco", "csv", "parquet")
+_SIXTEEN_BITS = ("webdataset", "imagefolder", "coco", "csv", "parquet")
 
 
 def export(
@@ -60,7 +61,7 @@ def export(
         path: the dataset's folder.
         format: one of `FORMATS`.
         out: the folder to write.
-        bits: bits of the images, 8 or 16 (webdataset, coco, csv and parquet).
+        bits: bits of the images, 8 or 16 (webdataset, imagefolder, coco, csv and parquet).
         encoding: `linear` or `gamma`; by default gamma for 8 bits, linear for 16.
         gain: factor for all values; by default it is measured on a sample of the images, but is 1 for 16 bits, linear.
         overwrite: replace what `out` holds.

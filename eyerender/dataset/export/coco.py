@@ -70,7 +70,7 @@ class _Annotations:
         self._image_count = self._mark_count = 0
         head = {
             "info": {"description": items.name, "version": "1", "image": items.encoding.to_mapping()},
-            "licenses": [],
+            "licenses": [] if items.licence is None else [{"id": 1, "name": items.licence}],
             "categories": CATEGORIES,
         }
         self._images.write(json.dumps(head)[:-1] + ', "images": [')

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from ...arrays import Bytes, Floats, Ints
 from ...errors import InputError
-from ...folders.imagefile import png_bytes, read_image
+from ...folders.imagefile import image_of, png_bytes
 from ...folders.imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
 from ...geometry.ellipse import Ellipse, signed_distance
-from ...storage.files import read_bytes
 from .encoding import RAW, Encoding
 
 
@@ -62,22 +61,30 @@ class Item:
         Raises:
             InputError: the file cannot be read.
         """
-        return _integers(self.entry.image(), self.entry.path)
+        return _integers(self.entry.image(), self.entry.folder / self.entry.name)
 
     @property
     def encoded(self) -> NDArray[Any]:
         """Image as the export stores it, (h, w) uint8 or uint16."""
         return self.encoding.apply(self.image, self.bit_depth, self.entry.gamma)
 
-    def encode(self, path: Path) -> bytes:
+    def encode(self, key: str = "file_name") -> bytes | None:
         """Encode one of the sample's images of counts as the PNG file that the export stores.
+
+        Args:
+            key: one of `FILE_KEYS`.
+
+        Returns:
+            The file, None where the line names none.
 
         Raises:
             InputError: the file cannot be read.
         """
-        if self.encoding.keeps(self.bit_depth, self.entry.gamma):
-            return read_bytes(path, follow=False)
-        counts = _integers(read_image(path)[0], path)
+        data = self.entry.data(key)
+        if data is None or self.encoding.keeps(self.bit_depth, self.entry.gamma):
+            return data
+        source = self.entry.folder / self.line[key]
+        counts = _integers(image_of(data, str(source))[0], source)
         return png_bytes(self.encoding.apply(counts, self.bit_depth, self.entry.gamma))
 
     def exported_line(self) -> dict[str, Any]:
@@ -217,6 +224,12 @@ class Items:
     def splits(self) -> list[str]:
         """Names of the splits."""
         return list(self.images_by_split)
+
+    @property
+    def licence(self) -> str | None:
+        """Licence that the dataset states."""
+        found = self.folder.dataset["spec"].get("licence")
+        return None if found is None else str(found)
 
     @property
     def name(self) -> str:

@@ -17,7 +17,6 @@ from typing import Any
 import yaml
 
 from ...errors import InputError
-from ...storage.files import read_bytes
 from .item import Item, Items
 from .table import row_of
 
@@ -79,11 +78,9 @@ def _row(item: Item, items: Items) -> dict[str, Any]:
 
 
 def _picture(item: Item, name: str) -> dict[str, Any] | None:
-    path = item.entry.file(_PICTURES[name])
-    if path is None:
-        return None
-    data = read_bytes(path, follow=False) if "mask" in name else item.encode(path)
-    return {"bytes": data, "path": f"{item.name}.png"}
+    key = _PICTURES[name]
+    data = item.entry.data(key) if "mask" in name else item.encode(key)
+    return None if data is None else {"bytes": data, "path": f"{item.name}.png"}
 
 
 def _type(name: str) -> str:

@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from ...storage.files import read_bytes, write_bytes
+from ...storage.files import write_bytes
 from .gaze import gaze_of, pupil_of
 from .item import Item, Items
 
@@ -24,10 +24,10 @@ def write(items: Items, out: Path) -> None:
     writer = None
     with open(out / "labels.csv", "w", newline="", encoding="utf-8") as file:
         for item in items:
-            write_bytes(out / "images" / f"{item.name}.png", item.encode(item.entry.path), sync=False)
-            if item.entry.mask_path is not None:
-                data = read_bytes(item.entry.mask_path, follow=False)
-                write_bytes(out / "masks" / f"{item.name}.png", data, sync=False)
+            files = {"images": item.encode(), "masks": item.entry.data("mask_file_name")}
+            for kind, data in files.items():
+                if data is not None:
+                    write_bytes(out / kind / f"{item.name}.png", data, sync=False)
             row = row_of(item, items.lights)
             if writer is None:
                 writer = csv.DictWriter(file, list(row))

@@ -11,7 +11,6 @@ import json
 import tarfile
 from pathlib import Path
 
-from ...storage.files import read_bytes
 from .item import Items
 
 SAMPLES = 1000
@@ -30,14 +29,12 @@ def write(items: Items, out: Path) -> None:
                     tars[split].close()
                 tars[split] = _open(out / f"{split}-{k // SAMPLES:06d}.tar")
             counts[split] = k + 1
-            _add(tars[split], f"{item.name}.png", item.encode(item.entry.path))
-            for ending, key in _MASKS.items():
-                path = item.entry.file(key)
-                if path is not None:
-                    _add(tars[split], f"{item.name}.{ending}.png", read_bytes(path, follow=False))
-            noiseless = item.entry.file("noiseless_file_name")
-            if noiseless is not None:
-                _add(tars[split], f"{item.name}.noiseless.png", item.encode(noiseless))
+            files = {".png": item.encode()}
+            files |= {f".{ending}.png": item.entry.data(key) for ending, key in _MASKS.items()}
+            files[".noiseless.png"] = item.encode("noiseless_file_name")
+            for ending, data in files.items():
+                if data is not None:
+                    _add(tars[split], f"{item.name}{ending}", data)
             _add(tars[split], f"{item.name}.json", json.dumps(item.exported_line()).encode())
     finally:
         for tar in tars.values():

@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Bools, Floats
-from ...folders.imagefile import read_image
 from ...folders.imagefolder import FRAME, IRIS, PUPIL, ImageEntry
 from ...imaging.labels import moments_ellipse
 from ...rig.camera import Window
 from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
+from .problems import differences
 
 SKIN, SCLERA = 0, 1
+_VISIBLE = 1e-8  # relative; numbers of packed lines are rounded to 5e-9
 Mask = NDArray[Any]
 
 
@@ -49,7 +50,9 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
         InputError: a file cannot be read.
     """
     line = entry.line
-    image, stored = read_image(entry.path)
+    found = entry.picture("file_name")
+    assert found is not None
+    image, stored = found
     w, h = entry.window[2:]
     if image.shape != (h, w):
         yield f"is {_size(image)} px, but its window is {w} x {h}"
@@ -61,20 +64,15 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
     if float(image.max()) > full:
         yield f"has values above {full:g}"
     tally.take(image, full)
-    quiet_path, mask_path, whole_path, bright_path = (
-        entry.file(f"{kind}_file_name") for kind in ("noiseless", "mask", "amodal_mask", "highlight_mask")
+    quiet, mask, whole, bright = (
+        None if picture is None else picture[0]
+        for picture in (entry.picture(f"{k}_file_name") for k in ("noiseless", "mask", "amodal_mask", "highlight_mask"))
     )
-    if quiet_path is not None:
-        quiet, _ = read_image(quiet_path)
-        if quiet.shape != image.shape or float(quiet.max()) > full:
-            yield "its noiseless image has another shape or values above its range"
-    if bright_path is not None:
-        bright = read_image(bright_path)[0]
-        if bright.shape != image.shape or int(bright.max()) > 1:
-            yield "its mask of highlights has another shape or values above 1"
-    if mask_path is not None:
-        mask = read_image(mask_path)[0]
-        whole = None if whole_path is None else read_image(whole_path)[0]
+    if quiet is not None and (quiet.shape != image.shape or float(quiet.max()) > full):
+        yield "its noiseless image has another shape or values above its range"
+    if bright is not None and (bright.shape != image.shape or int(bright.max()) > 1):
+        yield "its mask of highlights has another shape or values above 1"
+    if mask is not None:
         yield from _masks(entry, mask, whole, limbus_px)
 
 
@@ -108,7 +106,8 @@ def _visible(line: dict[str, Any], mask: Mask, window: Window) -> Iterator[str]:
         own = line.get("labels", {}).get(name)
         if isinstance(own, dict):
             again = moments_ellipse(inside, window)
-            if any(again[key] != own["visible"][key] for key in again):
+            # Packed lines have fewer digits.
+            if next(differences(again, own["visible"], _VISIBLE), None) is not None:
                 yield f"the visible ellipse of its {name} does not match its mask"
 
 

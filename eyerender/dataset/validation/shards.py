@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Ints
 from ...errors import InputError
-from ...folders.imagefolder import LINES, METADATA, SHARDS, ImageFolder, finished, shard_name
+from ...folders.imagefolder import LINES, METADATA, PACKED_SCHEMA, SHARDS, ImageFolder, finished, shard_name
 from ...progress import Progress
 from ...storage.files import opened, parse_json, shown
 from ...storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
@@ -32,7 +32,7 @@ _EXACT_INTEGER = 2**53
 def check_run(images: ImageFolder, quick: bool, problems: Problems, step: Progress) -> None:
     """Check the shards of a dataset, and metadata.jsonl against their lines where the run is finished."""
     check_shards(images, quick, problems, step)
-    if not images.unfinished:
+    if not images.unfinished and images.dataset.get("schema") != PACKED_SCHEMA:
         compare_lines(images.path, problems)
 
 

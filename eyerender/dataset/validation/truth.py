@@ -90,7 +90,7 @@ class DatasetTruth:
         sample, record = line["sample"], line["records"][0]
         subject, sequence = self.plan.subject_of(sample)
         name = image_name(sample, record["frame"] - sample * self.frames, self.frames, record["eye"])
-        shard = shard_name(sample // self.plan.spec.shard_size)
+        shard = shard_name(self.plan.spec.selection.shard_of(sample))
         files = {KINDS[kind]: f"{kind}/{shard}/{name}.png" for kind in self.plan.spec.labels.pictures}
         return {**files, "subject": subject, "sequence_index": sequence, "split": self.plan.split_of(subject)}
 

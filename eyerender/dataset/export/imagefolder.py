@@ -1,0 +1,40 @@
+"""Image folder: images/*.png, masks/*.png and metadata.jsonl, as loaders of image folders read them.
+
+Every line has the same keys, and the lines that are the first to fill a column come first. Datasets of files are such a
+folder already; packed ones become one. `datasets.load_dataset("imagefolder", data_dir="OUT")` reads it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from ...folders.imagefolder import METADATA
+from ...storage.files import write_bytes
+from ..columns import type_first
+from ..done import KINDS
+from .item import Items
+
+
+def write(items: Items, out: Path) -> None:
+    """Write the pictures and metadata.jsonl."""
+    unsorted = out / f"{METADATA}.unsorted"
+    with open(unsorted, "w", encoding="utf-8") as file:
+        for item in items:
+            line = item.exported_line()
+            for kind, key in KINDS.items():
+                data = item.entry.data(key) if "mask" in key else item.encode(key)
+                if data is not None:
+                    line[key] = f"{kind}/{item.name}.png"
+                    (out / kind).mkdir(exist_ok=True)
+                    write_bytes(out / line[key], data, sync=False)
+            file.write(json.dumps(line) + "\n")
+
+    def lines() -> Iterator[str]:
+        with open(unsorted, encoding="utf-8") as file:
+            yield from file
+
+    with open(out / METADATA, "w", encoding="utf-8") as file:
+        file.writelines(type_first(lines, lambda _line: None))
+    unsorted.unlink()

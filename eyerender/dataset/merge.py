@@ -1,0 +1,109 @@
+"""Joining of parts of one run that were made in folders of their own, without a shared file system."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ..errors import EyerenderError, InputError
+from ..folders.imagefolder import DONE, RUN, SHARDS, STAGE, finished, shard_name
+from ..progress import Progress
+from ..storage.files import MAX_FILE_BYTES, make_folder, read_json, sync_folder, sync_tree
+from ..storage.lock import final_lock, run_lock
+from .assemble import assemble
+from .done import KINDS, read_done
+from .plan import Plan
+from .runfile import begin, refuse_taken
+from .shard import Staged, commit, verify
+
+SCHEMA = "eyerender/merge/1"
+
+
+def merge(parts: Sequence[str | Path], out: str | Path, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Put the finished shards of several folders of one run into one, and assemble the dataset if none is missing.
+
+    Files are linked where both folders are on one file system, and copied otherwise. A shard that several folders hold
+    is taken from the first. Merging again adds what is missing.
+
+    Args:
+        parts: folders that `generate --shard K/N` has filled, of the same spec, options and versions.
+        out: the folder to write: a new one, or one of the same run.
+        progress: called with shards done, shards in all, and "shards".
+
+    Returns:
+        A summary: schema eyerender/merge/1.
+
+    Raises:
+        InputError: a folder holds no run, or that of another spec or version; a shard is damaged; `out` is taken.
+        EyerenderError: the disk is full or not writable.
+    """
+    if not parts:
+        raise InputError("give the folders of the parts", source="merge")
+    folder, places = Path(out), [Path(part) for part in parts]
+    runs = [read_json(place / RUN, limit=MAX_FILE_BYTES, follow=False) for place in places]
+    for place, run in zip(places, runs, strict=True):
+        if place.resolve() == folder.resolve():
+            raise InputError("is the folder to write", source=str(place))
+        if {key: run.get(key) for key in _SAME} != {key: runs[0].get(key) for key in _SAME}:
+            raise InputError(f"holds another run than {parts[0]}, or another number of samples", source=str(place))
+    try:
+        plan = Plan.from_mapping(runs[0], places[0])
+    except (KeyError, TypeError) as error:
+        raise InputError(f"holds no plan ({error})", source=str(places[0] / RUN)) from None
+    refuse_taken(folder)
+    step = progress or (lambda *_: None)
+    try:
+        make_folder(folder)
+        with run_lock(folder, (1, 1), lambda _: None), final_lock(folder, lambda _: None):
+            begin(folder, plan, lambda _: None)
+            _take(folder, places, plan, step)
+            missing = set(plan.spec.shards) - finished(folder)
+            statistics = None if missing else assemble(plan, folder)
+    except OSError as error:
+        raise EyerenderError(f"{out}: cannot be written ({error.strerror or error})") from None
+    found = {"schema": SCHEMA, "path": str(folder), "complete": not missing, "shards_missing": len(missing)}
+    return found if statistics is None else {**found, "statistics": statistics}
+
+
+_SAME = ("schema", "digest", "spec", "versions")
+
+
+def _take(folder: Path, places: Sequence[Path], plan: Plan, step: Progress) -> None:
+    """Take every shard that the folder lacks from the first part that holds it."""
+    wanted, there = set(plan.spec.shards), finished(folder)
+    sources = {shard: place for place in reversed(places) for shard in finished(place) & wanted - there}
+    for k, (shard, place) in enumerate(sorted(sources.items())):
+        problem = next(verify(place, shard, plan.digest, quick=True), None)
+        if problem is not None:
+            raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(place))
+        commit(folder, _staged(folder, place, shard))
+        step(k + 1, len(sources), "shards")
+
+
+def _staged(folder: Path, place: Path, shard: int) -> Staged:
+    """Link or copy a shard into a temporary folder, from which `commit` takes it."""
+    name, done = shard_name(shard), read_done(place, shard)
+    stage = folder / f"{STAGE}{name}-{uuid.uuid4().hex[:12]}"
+    for kind, own in ((SHARDS, "shard"), *((kind, kind) for kind in KINDS)):
+        source = place / kind / name
+        if source.is_dir():
+            make_folder(stage / own)
+            for file in source.iterdir():
+                _copied(file, stage / (DONE if file.name == DONE else f"{own}/{file.name}"))
+    sync_tree(stage)
+    sync_folder(folder)
+    return Staged(shard=shard, stage=str(stage), images=done["images"], rejected=0, given_up=0, seconds=0.0, bytes=0)
+
+
+def _copied(source: Path, place: Path) -> None:
+    if source.is_symlink():
+        raise InputError("is a symbolic link", source=str(source))
+    with suppress(OSError):  # other file systems, and those without links
+        os.link(source, place)
+        return
+    shutil.copyfile(source, place)

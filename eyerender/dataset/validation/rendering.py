@@ -1,0 +1,85 @@
+"""Samples rendered again, whose pictures must have the same pixels as those of the folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...backends.choose import BackendChoice
+from ...folders.imagefolder import ImageEntry, ImageFolder
+from ...progress import Progress
+from ...storage.files import shown
+from ..done import KINDS, cpu_family, read_done, run_versions
+from ..maker import Maker
+from .problems import Problems
+from .truth import DatasetTruth
+
+
+def render_again(
+    folder: ImageFolder,
+    truth: DatasetTruth,
+    rows: Sequence[int],
+    step: Progress,
+    problems: Problems,
+    *,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+) -> list[str]:
+    """Render the samples of some rows of a dataset again.
+
+    Differences from pictures that the same versions, backend and kind of processor have made are problems.
+
+    Returns:
+        Notes: the number of images, and differences from other pictures with what differs between the two makers.
+
+    Raises:
+        BackendError: there is nothing to render with.
+        InputError: a file of the plan is missing, or a picture cannot be read.
+    """
+    entries: dict[int, list[ImageEntry]] = {}
+    for row in rows:
+        entry = folder.entries[row]
+        entries.setdefault(int(entry.line["sample"]), []).append(entry)
+    maker = Maker(truth.plan, truth.frames, backend=backend, threads=threads)
+    notes = [f"{len(rows)} images are rendered again"]
+    for k, made in enumerate(maker.make_all(entries)):
+        pictures = {image.name: image.pictures for image in made.images}
+        for entry in entries[made.index]:
+            own = pictures.get(entry.name.split("/")[-1].removesuffix(".png"), {})
+            differences = list(_differences(entry, own))
+            other = other_maker(folder, truth, entry, maker.backend) if differences else ""
+            if other:
+                notes += [f"{text}; {other}" for text in differences]
+            else:
+                problems.extend(differences)
+        step(k + 1, len(entries), "samples rendered again")
+    return notes
+
+
+def _differences(entry: ImageEntry, made: Mapping[str, NDArray[Any]]) -> Iterator[str]:
+    for kind, key in KINDS.items():
+        found = entry.picture(key)
+        if found is None:
+            continue
+        if kind not in made or made[kind].shape != found[0].shape:
+            yield f"{entry.line[key]}: rendered again: there is no such picture"
+            continue
+        gap = np.abs(made[kind].astype(np.int64) - found[0].astype(np.int64))
+        if gap.any():
+            v, u = np.unravel_index(int(gap.argmax()), gap.shape)
+            yield (
+                f"{entry.line[key]}: rendered again: {np.count_nonzero(gap)} pixels differ, by up to {gap.max()} "
+                f"at x = {u}, y = {v}"
+            )
+
+
+def other_maker(folder: ImageFolder, truth: DatasetTruth, entry: ImageEntry, backend: Mapping[str, Any]) -> str:
+    """What differs between what has made an image and this process; empty if nothing that affects its bytes."""
+    done = read_done(folder.path, truth.plan.spec.selection.shard_of(int(entry.line["sample"])))
+    old = {**done["versions"], **{k: v for k, v in done["backend"].items() if k != "threads"}, "cpu": done["cpu"]}
+    new = {**run_versions(), **{k: v for k, v in backend.items() if k != "threads"}, "cpu": cpu_family()}
+    other = [key for key in old if key != "python" and old[key] != new.get(key)]
+    return ", ".join(f"{key} is {shown(new.get(key))}, was {shown(old[key])}" for key in other)

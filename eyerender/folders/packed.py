@@ -1,0 +1,283 @@
+"""Reading of packed shards (docs/formats.md, version 2 of a dataset's folder).
+
+    shards/00003/images.tar       all pictures of the shard
+    shards/00003/lines.jsonl.gz   lines of metadata in gzip members: the tables first, then 32 lines in each member
+    index.npy                     one row per image of the finished dataset
+
+A line is what its image holds beyond the tables: what all lines of the shard share, and those of one eye of a subject.
+Its values stand in a list, whose keys are a shape in the first member.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Ints
+from ..errors import InputError
+from ..storage.files import inside, opened, parse_json
+from ..storage.jsonlines import MAX_LINE_BYTES
+from ..storage.sharing import common, lists, merged, places, rest
+
+TAR, LINES_GZ, INDEX = "images.tar", "lines.jsonl.gz", "index.npy"
+LINES_SCHEMA = "eyerender/lines/2"
+BLOCK = 32  # lines of a gzip member
+DIGITS = 9  # significant digits of numbers outside the scene and the eye
+MEMBERS = "tar_members"  # key of a packed line: key of a file's name -> first byte and size in the tar
+_MAX_TABLE_BYTES = 256 * 2**20
+_TEXTS = ("scene_json", "eye_json")  # JSON as text, whose numbers stay exact
+INDEX_TYPE = np.dtype(
+    [("sample", "<i8"), ("subject", "<i8"), ("split", "<u2"), ("shard", "<u4"), ("row", "<u4"), ("block", "<u8")]
+)
+"""A row of index.npy: the image's sample, subject, split (by its place among `splits` of dataset.json), shard, row in
+the shard, and the first byte of the gzip member that holds its line."""
+
+
+def rounded(node: Any) -> Any:
+    """A JSON value whose numbers have `DIGITS` significant digits; to round twice changes nothing."""
+    if isinstance(node, float):
+        return float(f"{node:.{DIGITS}g}")
+    if isinstance(node, dict):
+        return {key: rounded(value) for key, value in node.items()}
+    return [rounded(value) for value in node] if isinstance(node, list) else node
+
+
+def pack_lines(lines: Sequence[Mapping[str, Any]]) -> tuple[bytes, list[int]]:
+    """File of a shard's lines, and the first byte of the gzip member of each line.
+
+    The same lines, also with other numbers of digits or orders of keys, give the same bytes.
+    """
+    opened_lines = [_opened(line) for line in lines]
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for line in opened_lines:
+        groups.setdefault(_group(line), []).append(line)
+    tables = {group: common(own) for group, own in groups.items()}
+    shared = common(tables.values()) if tables else {}
+    rests = [dict(_leaves(rest(line, tables[_group(line)]), ())) for line in opened_lines]
+    paths = sorted({path for own in rests for path in own})
+    number = {path: k for k, path in enumerate(paths)}
+    keys = [tuple(sorted(number[path] for path in own)) for own in rests]
+    shapes = sorted(set(keys))
+    head = {
+        "schema": LINES_SCHEMA,
+        "shared": shared,
+        "tables": {group: rest(table, shared) for group, table in tables.items()},
+        "paths": paths,
+        "shapes": shapes,
+    }
+    out = io.BytesIO()
+    out.write(_member([_text(head)]))
+    blocks: list[int] = []
+    for first in range(0, len(opened_lines), BLOCK):
+        part = range(first, min(first + BLOCK, len(opened_lines)))
+        blocks += [out.tell()] * len(part)
+        texts = (
+            [_group(opened_lines[k]), shapes.index(keys[k]), *(rests[k][paths[at]] for at in keys[k])] for k in part
+        )
+        out.write(_member(list(map(_text, texts))))
+    return out.getvalue(), blocks
+
+
+def _leaves(node: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Values of a tree of mappings, with the keys that lead to them."""
+    for key, value in node.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, (*path, key))
+        else:
+            yield (*path, key), value
+
+
+def _tree(paths: Sequence[Sequence[str]], values: Sequence[Any]) -> dict[str, Any]:
+    """The tree whose leaves these are."""
+    out: dict[str, Any] = {}
+    for path, value in zip(paths, values, strict=True):
+        node = out
+        for key in path[:-1]:
+            node = node.setdefault(key, {})
+        node[path[-1]] = value
+    return out
+
+
+def _opened(line: Mapping[str, Any]) -> dict[str, Any]:
+    parameters = dict(line["parameters"])
+    texts = {key: parse_json(parameters.pop(key)) for key in _TEXTS}
+    found: dict[str, Any] = places({**rounded({**line, "parameters": parameters}), **texts})
+    return found
+
+
+def _closed(node: dict[str, Any]) -> dict[str, Any]:
+    line: dict[str, Any] = lists(node)
+    for key in _TEXTS:
+        line["parameters"][key] = json.dumps(line.pop(key), sort_keys=True)
+    return line
+
+
+def _group(line: Mapping[str, Any]) -> str:
+    """Whose table a line has: a subject's eyes differ in more than their images do."""
+    return f"{line['subject']} {line['records']['[0]']['eye']}"
+
+
+def _text(value: Any) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+
+
+def _member(texts: Sequence[bytes]) -> bytes:
+    return gzip.compress(b"".join(texts), 9, mtime=0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Head:
+    """What the lines of each group of a shard share, and the paths of the values in each shape of a rest."""
+
+    tables: dict[str, dict[str, Any]]
+    shapes: list[list[list[str]]]
+
+
+@lru_cache(maxsize=128)
+def _head(path: str, state: tuple[int, ...]) -> _Head:
+    del state  # of the file, so that another one in its place is read again
+    (text,) = _inflated(path, 0)
+    head = parse_json(text, source=path)
+    if not isinstance(head, dict) or head.get("schema") != LINES_SCHEMA:
+        raise InputError(f"must begin with {LINES_SCHEMA!r}", source=path)
+    shared, paths = head["shared"], head["paths"]
+    tables = {group: merged(shared, table) for group, table in head["tables"].items()}
+    return _Head(tables, [[paths[k] for k in shape] for shape in head["shapes"]])
+
+
+@lru_cache(maxsize=16)
+def _block(path: str, first: int, state: tuple[int, ...]) -> list[bytes]:
+    del state
+    return _inflated(path, first)
+
+
+def _inflated(path: str, first: int) -> list[bytes]:
+    """Lines of the gzip member that begins at a byte.
+
+    Raises:
+        InputError: there is none, or it is too large.
+    """
+    try:
+        with opened(path, follow=False) as file:
+            file.seek(first)
+            member, parts, size = zlib.decompressobj(wbits=31), [], 0
+            while not member.eof and (chunk := file.read(2**16)):
+                parts.append(member.decompress(chunk, _MAX_TABLE_BYTES + 1 - size))
+                size += len(parts[-1])
+                if size > _MAX_TABLE_BYTES:
+                    raise InputError("holds a member that is too large", source=path)
+    except (zlib.error, OSError, OverflowError) as error:
+        raise InputError(f"cannot be read ({error})", source=path) from None
+    if not member.eof:
+        raise InputError("is truncated", source=path)
+    return b"".join(parts).splitlines()
+
+
+def read_line(path: Path, row: int, block: int) -> dict[str, Any]:
+    """Line of metadata in a row of a shard, whose gzip member begins at byte `block`.
+
+    Raises:
+        InputError: the file or the line is wrong.
+    """
+    name, where = str(path), f"line {row + 1}"
+    try:
+        state = _state(path)
+        texts = _block(name, block, state)
+        text = texts[row % BLOCK]
+        if len(text) > MAX_LINE_BYTES:
+            raise InputError(f"is too long (at most {MAX_LINE_BYTES} bytes are read)", source=name, path=where)
+        group, shape, *values = parse_json(text, source=name, path=where)
+        head = _head(name, state)
+        return _closed(merged(head.tables[group], _tree(head.shapes[shape], values)))
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", source=name) from None
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
+        raise InputError(f"is no packed line ({type(error).__name__}: {error})", source=name, path=where) from None
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    state = path.stat(follow_symlinks=False)
+    return state.st_ino, state.st_size, state.st_mtime_ns
+
+
+def read_member(folder: Path, shard: str, place: object, *, source: str, path: str) -> bytes:
+    """A file of a shard's tar; `place` is its first byte and its size, from a line.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    if not (isinstance(place, list) and len(place) == 2 and all(type(v) is int and v >= 0 for v in place)):
+        raise InputError("must be a place in the tar", source=source, path=path)
+    tar = inside(folder, f"{shard}/{TAR}", source=source, path=path)
+    first, size = place
+    if first + size > os.path.getsize(tar):
+        raise InputError("lies beyond the end of the tar", source=source, path=path)
+    with opened(tar, limit=2**50, follow=False) as file:
+        file.seek(first)
+        return file.read(size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackedLines:
+    """Lines of packed shards, in the order of an index; with the methods of `LineFiles`.
+
+    The index is either a file, which is not kept in memory, or the rows of the finished shards of an unfinished run.
+    """
+
+    folder: Path
+    splits: tuple[str, ...]
+    file: Path | None = None
+    given: NDArray[Any] | None = None
+
+    @cached_property
+    def rows(self) -> NDArray[Any]:
+        """Rows of the index, (n,) of `INDEX_TYPE`.
+
+        Raises:
+            InputError: the file is no such index.
+        """
+        if self.given is not None:
+            return self.given
+        assert self.file is not None
+        path = inside(self.folder, self.file.name)
+        try:
+            rows: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, OSError, EOFError) as error:
+            raise InputError(f"is no index of images ({error})", source=str(path)) from None
+        if rows.dtype != INDEX_TYPE or rows.ndim != 1:
+            raise InputError("is no index of images", source=str(path))
+        return rows
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "rows"}
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def of_split(self, split: str) -> Ints:
+        """Rows of one split."""
+        if split not in self.splits:
+            return np.zeros(0, dtype=np.int64)
+        return np.flatnonzero(self.rows["split"] == self.splits.index(split))
+
+    def read(self, rows: range) -> Iterator[tuple[Path, int, dict[str, Any]]]:
+        """Read some lines: the file, the number in it from 1, and the object.
+
+        Raises:
+            InputError: as `read_line`.
+        """
+        for at in rows:
+            own = self.rows[at]
+            path = self.folder / "shards" / f"{int(own['shard']):05d}" / LINES_GZ
+            yield path, int(own["row"]) + 1, read_line(path, int(own["row"]), int(own["block"]))

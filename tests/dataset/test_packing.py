@@ -1,0 +1,104 @@
+"""Packing without rendering: shards of pictures that nobody rendered are packed, read, resumed, grown and merged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from eyerender.dataset.assemble import assemble, verify_dataset
+from eyerender.dataset.line import image_line
+from eyerender.dataset.maker import MadeImage, MadeSample
+from eyerender.dataset.merge import merge
+from eyerender.dataset.partial import PartialShard, reopen
+from eyerender.dataset.realise import realise
+from eyerender.dataset.runfile import begin
+from eyerender.dataset.shard import Staged, commit
+from eyerender.dataset.status import status
+from eyerender.folders.imagefolder import ImageFolder
+from eyerender.imaging.labels import EyeInWindow, known_labels
+from tests.support.dataset_specs import plan, tree
+
+BACKEND = {"name": "llvm", "device": "none", "threads": 1}
+PACKED = {"layout": "webdataset", "shard_size": 8}
+
+
+def sample_of(made, index):
+    """A sample with its labels, but for those that pixels give, and with random pictures."""
+    found = realise(made, index)
+    view = EyeInWindow.of(found.frames, 0)
+    labels = known_labels(found.scene, found.observations, view)
+    labels["pupil"]["visible"] = {"pixels": 5}
+    labels["glints"] = [{**glint, "visible": True} for glint in labels["glints"]]
+    name, line = image_line(found, 0, 1, view.window, labels)
+    noise = np.random.default_rng(index).integers(0, 4, size=(2, 72, 96))
+    pictures = {"images": noise[0].astype(np.uint16), "masks": noise[1].astype(np.uint8)}
+    return MadeSample(index, (MadeImage(name, pictures, line, False),), ())
+
+
+@pytest.fixture(scope="module")
+def samples():
+    made = plan(**PACKED)
+    return {index: sample_of(made, index) for index in range(24)}
+
+
+def write(folder, made, samples, shards):
+    for shard in shards:
+        with PartialShard(made, BACKEND, folder, shard) as partial:
+            for index in made.spec.shard_samples(shard):
+                if index not in partial.made:
+                    partial.add(samples[index])
+            done = partial.finish()
+        commit(folder, Staged(shard=shard, stage=str(partial.stage), images=done["images"], rejected=0, given_up=0,
+                              seconds=0.0, bytes=0))  # fmt: skip
+
+
+def make(folder, made, samples):
+    folder.mkdir()
+    begin(folder, made, print)
+    write(folder, made, samples, made.spec.shards)
+    assemble(made, folder)
+
+
+def test_shards_are_packed_read_grown_and_merged(samples, tmp_path):
+    made, out = plan(**PACKED), tmp_path / "out"
+    make(out, made, samples)
+    assert list(verify_dataset(out)) == []
+    assert len(list(out.glob("shards/*/*"))) == 9
+    found = {entry.line["sample"]: entry for entry in ImageFolder.load(out)}
+    assert found.keys() == samples.keys()
+    for index, entry in found.items():
+        (image,) = samples[index].images
+        assert np.array_equal(entry.image(), image.pictures["images"])
+        assert np.array_equal(entry.mask(), image.pictures["masks"])
+        assert entry.line["parameters"]["scene_json"] == image.line["parameters"]["scene_json"]
+        assert entry.path.read_bytes() == entry.data("file_name")
+        assert np.allclose(entry.truth().pupil.points_px, image.line["records"][0]["pupil"]["points_px"], rtol=6e-9, atol=0)
+    rows, splits = ImageFolder.load(out).rows_of("validation")
+    assert splits == ["test", "train", "validation"]
+    assert len(rows) == 6
+    assert status(out)["samples_finished"] == 24
+
+    # A shard that is opened again and finished has the same bytes; so has one that first held fewer samples.
+    before = tree(out)
+    reopen(out, 1, made.spec.labels.pictures)
+    write(out, made, samples, [1])
+    assert tree(out) == before
+    few = plan(**PACKED, planned=24, count=7, choice="spread")
+    grown = tmp_path / "grown"
+    make(grown, few, samples)
+    for shard in few.spec.shards:
+        reopen(grown, shard, made.spec.labels.pictures)
+    write(grown, made, samples, made.spec.shards)
+    assert {name: before[name] for name in before if name.startswith("shards")} == {
+        name: value for name, value in tree(grown).items() if name.startswith("shards")
+    }
+
+    # Parts that were made apart are joined.
+    for k in range(2):
+        part = tmp_path / f"part{k}"
+        part.mkdir()
+        begin(part, made, print)
+        write(part, made, samples, made.spec.shards[k::2])
+    assert merge([tmp_path / "part0"], tmp_path / "joined")["shards_missing"] == 1
+    assert merge([tmp_path / "part0", tmp_path / "part1"], tmp_path / "joined")["complete"]
+    assert tree(tmp_path / "joined") == before
