@@ -126,7 +126,7 @@ def _results(
     factors = [_factors(image, edge) for image, edge in zip(images, edges, strict=True)]
     data = {
         "schema": RESULTS_SCHEMA,
-        "folder": folder.name or str(folder),
+        "folder": folder.absolute().name or str(folder),
         "images": len(images),
         "with_pupil": sum(image.pupil is not None for image in images),
         "gamma": gammas_of(images),
