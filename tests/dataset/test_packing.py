@@ -72,7 +72,9 @@ def test_shards_are_packed_read_grown_and_merged(samples, tmp_path):
         assert np.array_equal(entry.mask(), image.pictures["masks"])
         assert entry.line["parameters"]["scene_json"] == image.line["parameters"]["scene_json"]
         assert entry.path.read_bytes() == entry.data("file_name")
-        assert np.allclose(entry.truth().pupil.points_px, image.line["records"][0]["pupil"]["points_px"], rtol=6e-9, atol=0)
+        assert np.allclose(
+            entry.truth().pupil.points_px, image.line["records"][0]["pupil"]["points_px"], rtol=6e-9, atol=0
+        )
     rows, splits = ImageFolder.load(out).rows_of("validation")
     assert splits == ["test", "train", "validation"]
     assert len(rows) == 6
