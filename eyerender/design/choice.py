@@ -65,13 +65,13 @@ def site_information(
     scene = frames.scene if rig is None else frames.seen_by(rig).scene
     noise = sensor_noise(scene) if noise is None else noise
     views = case.views
-    slopes = slopes_of(views, case.theta[case.instant], _POINTS)
+    unknowns = Unknowns.population() if unknowns is None else unknowns
+    slopes = slopes_of(views, case.theta[case.instant], _POINTS, unknowns.free())
     base, sites = site_matrices(slopes, noise, views.camera)
     count = len(case.theta)
     outlines, glints = np.zeros((count, COUNT, COUNT)), np.zeros((count, len(sites), COUNT, COUNT))
     np.add.at(outlines, case.instant, base)
     np.add.at(glints, case.instant, np.moveaxis(sites, 0, 1))
-    unknowns = Unknowns.population() if unknowns is None else unknowns
     return with_priors(outlines, np.moveaxis(glints, 1, 0), unknowns)
 
 

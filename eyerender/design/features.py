@@ -145,8 +145,8 @@ class Residuals:
     Attributes:
         outline: (n, k).
         glints: (n, m, 2).
-        outline_slopes: (n, k, 15); empty where not asked for.
-        glint_slopes: (n, m, 2, 15).
+        outline_slopes: (n, k, 23); empty where not asked for.
+        glint_slopes: (n, m, 2, 23).
         outline_size: (n,) number of independent distances that the model has, too.
         glint_ok: (n, m) glints that are observed and that the model has.
     """
@@ -196,7 +196,7 @@ def outline_distances(model_px: Floats, slopes: Floats | None, observed_px: Floa
 
     Args:
         model_px: (n, j, 2) points, evenly spaced in the parameter.
-        slopes: (n, j, 2, 15) their derivatives, or None.
+        slopes: (n, j, 2, 23) their derivatives, or None.
         observed_px: (n, k, 2).
     """
     count = model_px.shape[1]

@@ -74,9 +74,9 @@ class Problem:
         instants: i views, one for each instant.
         target_mm: (i, 3) known targets; NaN where there is none.
         fixation_rad: noise of fixation per axis.
-        centre: (i, 15) means of the priors.
-        precision: (15,) of the priors.
-        free: (15,) what is fitted.
+        centre: (i, 23) means of the priors.
+        precision: (23,) of the priors.
+        free: (23,) what is fitted.
         robust: the weights.
     """
 
@@ -110,7 +110,7 @@ class EyeFit(ArrayValue):
         eye: right or left.
         rows: (n,) rows of the observations.
         instant: (n,) instant of each row.
-        theta: (i, 15) unknowns of each instant (`design.unknowns`), rad and mm.
+        theta: (i, 23) unknowns of each instant (`design.unknowns`), rad and mm.
         origin_mm: (i, 3) where the line of sight leaves the cornea.
         direction: (i, 3) unit direction of the line of sight.
         known: covariances, and what is not seen.
@@ -201,7 +201,7 @@ def fit_eye(
         noise: of features whose covariance is null; default: 0.1 px for one px of outline, 0.05 px for a glint.
         targets: use the known targets, with the noise of fixation.
         robust: the weights against wrong features.
-        start: (i, 15) unknowns to begin with, for one eye; default: a search.
+        start: (i, 23) unknowns to begin with, for one eye; default: a search.
 
     Raises:
         InputError: there is nothing to fit, or an eye has no position.
@@ -219,7 +219,7 @@ def fit_eye(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How a fit is done, see `fit_eye`; `person` (9,) are numbers of the person that stand in place of the prior's."""
+    """How a fit is done, see `fit_eye`; `person` (17,) are numbers of the person that stand in place of the prior's."""
 
     targets: bool = True
     robust: Robust = "geman-mcclure"
@@ -299,7 +299,7 @@ def problem_of(
 
 
 def start_of(problem: Problem) -> Floats:
-    """Unknowns (i, 15) to begin with: the best of a grid of directions for the pupil's centre and the glints."""
+    """Unknowns (i, 23) to begin with: the best of a grid of directions for the pupil's centre and the glints."""
     seen, n = problem.seen, len(problem.views)
     azimuth, elevation = (a.ravel() for a in np.meshgrid(_START_AZIMUTH, _START_ELEVATION))
     count = len(azimuth)
@@ -393,7 +393,7 @@ def costs_of(problem: Problem, theta: Floats, found: Residuals, weights: Weights
 
 
 def equations_of(problem: Problem, theta: Floats, found: Residuals, weights: Weights) -> tuple[Floats, Floats]:
-    """Information (i, 15, 15) of each instant without priors, and half of the negative gradient (i, 15)."""
+    """Information (i, 23, 23) of each instant without priors, and half of the negative gradient (i, 23)."""
     n = len(problem.views)
     roots = np.sqrt(weights.outline)[:, None], np.sqrt(weights.glints)[..., None]
     slopes = np.concatenate(
@@ -415,16 +415,16 @@ def equations_of(problem: Problem, theta: Floats, found: Residuals, weights: Wei
 
 
 def arrow_step(problem: Problem, matrix: Floats, vector: Floats, theta: Floats, damping: Floats) -> Floats:
-    """Damped Gauss-Newton step (i, 15) of the arrow-shaped normal equations.
+    """Damped Gauss-Newton step (i, 23) of the arrow-shaped normal equations.
 
     With blocks A_i of the frames, B_i to the person and C of the person, the person's step is that of the Schur
     complement C - sum B_i^T A_i^-1 B_i, and A_i x_i = a_i - B_i y gives the frames'.
 
     Args:
         problem: the fit.
-        matrix: (i, 15, 15) information without priors.
-        vector: (i, 15).
-        theta: (i, 15).
+        matrix: (i, 23, 23) information without priors.
+        vector: (i, 23).
+        theta: (i, 23).
         damping: (i,) Levenberg's factors.
     """
     off = (problem.centre - theta) * problem.precision
@@ -451,12 +451,12 @@ def arrow_step(problem: Problem, matrix: Floats, vector: Floats, theta: Floats, 
 
 
 def solve(problem: Problem, theta: Floats, steps: int = _STEPS) -> tuple[Floats, Bools]:
-    """Minimise equation (4) from `theta` (i, 15); returns the unknowns, and which instants settled."""
+    """Minimise equation (4) from `theta` (i, 23); returns the unknowns, and which instants settled."""
     theta, settled = theta.copy(), np.zeros(len(theta), dtype=bool)
     damping = np.full(len(theta), 1e-3)
     for count in range(steps):
         most = max(1.0, _FIRST_SCALE * 0.5**count)
-        found = residuals(problem.seen, slopes_of(problem.views, theta[problem.instant], _POINTS))
+        found = residuals(problem.seen, slopes_of(problem.views, theta[problem.instant], _POINTS, problem.free))
         weights = weights_of(problem, found, most)
         matrix, vector = equations_of(problem, theta, found, weights)
         step = _limited(problem, arrow_step(problem, matrix, vector, theta, damping))
@@ -506,7 +506,7 @@ def unexplained(problem: Problem, theta: Floats) -> Floats:
 
 
 def _limited(problem: Problem, step: Floats) -> Floats:
-    """The steps (i, 15), shortened where a direction would turn by more than `_MOST_RAD`."""
+    """The steps (i, 23), shortened where a direction would turn by more than `_MOST_RAD`."""
     share = np.minimum(1.0, _MOST_RAD / np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-12))
     return np.asarray(step * (share.min() if problem.shared else share[:, None]))
 
@@ -542,7 +542,7 @@ def _result(
 ) -> EyeFit:
     """The fit with its covariances and its eye file."""
     (theta, converged), (spec, unknowns) = state, made
-    found = residuals(problem.seen, slopes_of(problem.views, theta[problem.instant], _POINTS))
+    found = residuals(problem.seen, slopes_of(problem.views, theta[problem.instant], _POINTS, problem.free))
     weights = weights_of(problem, found)
     matrix, _ = equations_of(problem, theta, found, weights)
     first = np.unique(problem.instant, return_index=True)[1]

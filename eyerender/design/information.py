@@ -40,7 +40,7 @@ class Case:
         views: n views.
         instant: (n,) the instant of each view, 0 to i - 1.
         instants: i views, one of each instant, for what does not depend on the camera.
-        theta: (i, 15) the true unknowns.
+        theta: (i, 23) the true unknowns.
         target_mm: (i, 3) what is looked at; NaN where nothing is.
     """
 
@@ -96,7 +96,7 @@ def outline_normals(points_px: Floats, ok: Bools) -> tuple[Floats, Floats]:
 
 
 def information_of_views(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> Floats:
-    """Information (n, 15, 15) of outline and glints in each view, the first two sums of equation (3)."""
+    """Information (n, 23, 23) of outline and glints in each view, the first two sums of equation (3)."""
     normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
     weight = length / noise.outline_px[camera][:, None] ** 2
     across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * np.sqrt(weight)[..., None]
@@ -106,19 +106,19 @@ def information_of_views(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> F
     return np.asarray(np.swapaxes(rows, 1, 2) @ rows)
 
 
-def information_of_instants(case: Case, noise: FeatureNoise, boundary_points: int) -> Floats:
-    """Information (i, 15, 15) of all views of each instant."""
+def information_of_instants(case: Case, noise: FeatureNoise, boundary_points: int, free: Bools | None = None) -> Floats:
+    """Information (i, 23, 23) of all views of each instant."""
     out = np.zeros((len(case.theta), COUNT, COUNT))
     for first in range(0, len(case.views), _ROWS):
         rows = np.arange(first, min(first + _ROWS, len(case.views)))
         views = case.views.take(rows)
-        slopes = slopes_of(views, case.theta[case.instant[rows]], boundary_points)
+        slopes = slopes_of(views, case.theta[case.instant[rows]], boundary_points, free)
         np.add.at(out, case.instant[rows], information_of_views(slopes, noise, views.camera))
     return out
 
 
 def target_information(case: Case, noise: FeatureNoise, rows: Ints) -> Floats:
-    """Information (r, 15, 15) of the known targets of some instants, the third sum of equation (3).
+    """Information (r, 23, 23) of the known targets of some instants, the third sum of equation (3).
 
     An instant without a target looks at a point one metre away on its line of sight.
     """
@@ -141,8 +141,8 @@ class EyeInformation(ArrayValue):
         gaze_covariance_deg2: (i, 2, 2) of the line of sight, to the subject's left and up; inf where it is not seen.
         axis_covariance_deg2: (i, 2, 2) of the optic axis' azimuth and elevation.
         frame_deviation: (i, 6) of what belongs to a frame (`unknowns.FRAME`), rad and mm; 0 known, inf not seen.
-        person_deviation: (9,) of what belongs to the person (`unknowns.PERSON`).
-        person_covariance: (9, 9) of these, rad and mm; inf on the diagonal of what is not seen.
+        person_deviation: (17,) of what belongs to the person (`unknowns.PERSON`).
+        person_covariance: (17, 17) of these, rad and mm; inf on the diagonal of what is not seen.
         matrix: the information on all that is not known.
         names: what its rows are.
         unseen: combinations that the rig does not see, in words.
@@ -220,7 +220,7 @@ def information(
         raise InputError(f"there is no fixation {unknown[0]}", path="calibration")
     scene = frames.scene if rig is None else frames.seen_by(rig).scene
     noise = sensor_noise(scene) if noise is None else noise
-    matrices = information_of_instants(case, noise, boundary_points)
+    matrices = information_of_instants(case, noise, boundary_points, unknowns.free())
     calibrated = np.flatnonzero(np.isin(index.fixation, list(calibration)))
     matrices[calibrated] += target_information(case, noise, calibrated)
     slopes = gaze_slopes(case.instants, case.theta)
@@ -235,10 +235,10 @@ def information(
 
 
 def joint_matrix(matrices: Floats, unknowns: Unknowns) -> tuple[Floats, Bools]:
-    """Information on the unknowns of i instants (6 each) and of their person (9), and which of them are free.
+    """Information on the unknowns of i instants (6 each) and of their person (17), and which of them are free.
 
     Args:
-        matrices: (i, 15, 15) information of each instant, without priors.
+        matrices: (i, 23, 23) information of each instant, without priors.
         unknowns: adds the priors.
     """
     count, own = len(matrices), LOCAL * len(matrices)

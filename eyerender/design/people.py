@@ -218,9 +218,10 @@ def _of_group(survey: Survey, rig: RigGeometry, noise: FeatureNoise, people: lis
     matrices, outline = np.zeros((i, COUNT, COUNT)), np.zeros(i)
     glints, lost = np.zeros((i, m), dtype=bool), np.zeros((i, len(LOST)), dtype=np.int64)
     openings = _openings(survey, people) if survey.lids else None
+    free = Unknowns.from_mapping(survey.unknowns).free()
     for number, camera in enumerate(rig.cameras):
         views = replace(case.instants, camera=np.full(i, number))
-        slopes = slopes_of(views, case.theta, POINTS)
+        slopes = slopes_of(views, case.theta, POINTS, free)
         slopes, why = visible(slopes, camera, openings)
         matrices += information_of_views(slopes, noise, views.camera)
         outline = np.maximum(outline, slopes.outline_ok.mean(axis=1))

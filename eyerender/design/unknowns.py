@@ -1,10 +1,12 @@
 """The unknowns of a rig: what a frame and what a person adds, each known, unknown, or with a prior.
 
-Parameters of one instant are a vector of 15 numbers in radians and millimetres. The first six belong to the frame, the
+Parameters of one instant are a vector of 23 numbers in radians and millimetres. The first six belong to the frame, the
 others to the person:
 
     azimuth, elevation, pupil diameter, slippage (x, y, z),
-    corneal radius, asphericity, pupil depth, kappa (nasal, up), depth of the rotation centre, position (x, y, z)
+    corneal radius, asphericity, pupil depth, kappa (nasal, up), depth of the rotation centre, position (x, y, z),
+    corneal toricity (straight, oblique), pupil centre (nasal, up), pupil ellipticity (straight, oblique),
+    shift of the pupil centre with size (nasal, up)
 
 Azimuth and elevation are those of the optic axis, and the pupil is the anatomical one. All others are differences from
 the eye that the analysis begins with.
@@ -24,11 +26,14 @@ FRAME = ("azimuth", "elevation", "pupil", "slippage_x", "slippage_y", "slippage_
 PERSON = (
     "corneal_radius", "asphericity", "pupil_depth", "kappa_nasal", "kappa_up", "rotation_depth",
     "position_x", "position_y", "position_z",
+    "toricity_straight", "toricity_oblique", "pupil_nasal", "pupil_up",
+    "ellipticity_straight", "ellipticity_oblique", "pupil_shift_nasal", "pupil_shift_up",
 )  # fmt: skip
 NAMES = (*FRAME, *PERSON)
 LOCAL, COUNT = len(FRAME), len(NAMES)
 AZIMUTH, ELEVATION, PUPIL, SLIPPAGE = 0, 1, 2, slice(3, 6)
 RADIUS, ASPHERICITY, DEPTH, KAPPA, ROTATION, POSITION = 6, 7, 8, slice(9, 11), 11, slice(12, 15)
+TORICITY, CENTRE, ELLIPTICITY, SHIFT = slice(15, 17), slice(17, 19), slice(19, 21), slice(21, 23)
 ANGLES = np.array([name in ("azimuth", "elevation", "kappa_nasal", "kappa_up") for name in NAMES])
 
 Knowledge = Literal["known", "unknown"] | Annotated[float, Field(gt=0, le=1e6)]
@@ -53,6 +58,19 @@ class Unknowns(Spec):
     pupil_depth_mm: Knowledge = Field(default="known", description="distance of the pupil behind the corneal apex")
     kappa_deg: Knowledge = Field(default="known", description="direction of the line of sight in the eye, two angles")
     rotation_depth_mm: Knowledge = Field(default="known", description="distance of the centres of rotation behind it")
+    toricity_mm: Knowledge = Field(
+        default="known",
+        description="half the difference of the apex radii of the front of the cornea, as two numbers t cos 2a and "
+        "t sin 2a with the angle a of the flat meridian from nasal towards up",
+    )
+    pupil_centre_mm: Knowledge = Field(default="known", description="place of the pupil's centre, nasal and up")
+    ellipticity: Knowledge = Field(
+        default="known",
+        description="half the difference of the pupil's semi-axes over their mean, as two numbers as for the toricity",
+    )
+    pupil_shift: Knowledge = Field(
+        default="known", description="motion of the pupil's centre per mm of its diameter, nasal and up, mm/mm"
+    )
 
     @classmethod
     def population(cls, **fields: Knowledge) -> Self:
@@ -71,12 +89,28 @@ class Unknowns(Spec):
         }
         return cls.from_mapping({**priors, **fields})
 
+    @classmethod
+    def shaped(cls, **fields: Knowledge) -> Self:
+        """The priors of `population`, and those of the shapes of cornea and pupil: rms of adults about round ones.
+
+        Args:
+            fields: other values of some of them.
+        """
+        shapes: dict[str, Knowledge] = {
+            "toricity_mm": 0.065,
+            "pupil_centre_mm": 0.3,
+            "ellipticity": 0.015,
+            "pupil_shift": 0.07,
+        }
+        return cls.population(**{**shapes, **fields})
+
     def deviations(self) -> Floats:
-        """Standard deviations (15,) in rad and mm: 0 for what is known, inf for what is unknown."""
+        """Standard deviations (23,) in rad and mm: 0 for what is known, inf for what is unknown."""
         groups = (
             (self.gaze_deg, 2), (self.pupil_mm, 1), (self.slippage_mm, 3), (self.corneal_radius_mm, 1),
             (self.asphericity, 1), (self.pupil_depth_mm, 1), (self.kappa_deg, 2), (self.rotation_depth_mm, 1),
-            (self.position_mm, 3),
+            (self.position_mm, 3), (self.toricity_mm, 2), (self.pupil_centre_mm, 2), (self.ellipticity, 2),
+            (self.pupil_shift, 2),
         )  # fmt: skip
         special = {"known": 0.0, "unknown": np.inf}
         values = [special[v] if isinstance(v, str) else float(v) for v, _ in groups]
@@ -84,10 +118,10 @@ class Unknowns(Spec):
         return np.where(ANGLES, np.radians(out), out)
 
     def precision(self) -> Floats:
-        """Prior precision (15,): 1 / deviation^2, 0 for what is unknown and for what is known."""
+        """Prior precision (23,): 1 / deviation^2, 0 for what is unknown and for what is known."""
         deviation = self.deviations()
         return np.where(deviation > 0, 1.0 / np.where(deviation > 0, deviation, 1.0) ** 2, 0.0)
 
     def free(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Which of the 15 numbers are not known, (15,)."""
+        """Which of the 23 numbers are not known, (23,)."""
         return self.deviations() > 0

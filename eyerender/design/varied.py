@@ -1,7 +1,8 @@
 """Features of eyes as functions of the unknowns, and their derivatives, in one batch of traces.
 
-Derivatives are central differences of the analytic observer. Two kinds need no trace of their own: a position of the
-person acts as slippage does, and the depth of the rotation centre moves the turned eye by (M - I) e_x per millimetre.
+Derivatives are central differences of the analytic observer. Three kinds need no trace of their own: a position of the
+person acts as slippage does, the depth of the rotation centre moves the turned eye by (M - I) e_x per millimetre, and
+the pupil's shift with its size acts as its centre does.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from ..analytic.rays import glint_exits, pupil_exits
 from ..arrays import Bools, Floats, Ints, Statuses
 from ..errors import InputError
 from ..eye.batch import CHUNK_POINTS, slices, stack_eyes, structure_of, take_eyes
-from ..eye.model import EyeModel, RotationCentres
+from ..eye.model import EyeModel, RotationCentres, Stop
 from ..eye.pose import Poses, rigid_motion
 from ..geometry.surfaces import Surface
 from ..geometry.surfaces_biconic import Biconic
@@ -27,20 +28,24 @@ from ..status import Status
 from .unknowns import (
     ASPHERICITY,
     AZIMUTH,
+    CENTRE,
     COUNT,
     DEPTH,
     ELEVATION,
+    ELLIPTICITY,
     KAPPA,
     POSITION,
     PUPIL,
     RADIUS,
     ROTATION,
+    SHIFT,
     SLIPPAGE,
+    TORICITY,
 )
 
-STEPS = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3])
-"""Steps of the central differences: angles in rad, lengths in mm, Q."""
-TRACED = np.array([AZIMUTH, ELEVATION, PUPIL, 3, 4, 5, RADIUS, ASPHERICITY, DEPTH])
+TRACED = np.array([AZIMUTH, ELEVATION, PUPIL, 3, 4, 5, RADIUS, ASPHERICITY, DEPTH, 15, 16, 17, 18, 19, 20])
+STEPS = np.where(TRACED < PUPIL, 1e-4, 1e-3)
+"""Steps of the central differences by the traced unknowns: angles in rad, lengths in mm, Q, ellipticity."""
 _RAY_STEP = 1e-5
 
 
@@ -87,12 +92,12 @@ class Images:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Slopes:
-    """Features of n views with their derivatives by the 15 unknowns.
+    """Features of n views with their derivatives by the 23 unknowns.
 
     Attributes:
         images: the features.
-        outline: (n, k, 2, 15) px per rad or mm; 0 where a point does not exist.
-        glints: (n, m, 2, 15).
+        outline: (n, k, 2, 23) px per rad or mm; 0 where a point does not exist.
+        glints: (n, m, 2, 23).
         outline_ok: (n, k) whether a point is on the sensor, and its derivatives exist.
         glint_ok: (n, m).
     """
@@ -152,26 +157,71 @@ def _flattened(surface: Surface, change: Floats) -> Surface:
     return replace(surface, matrix=matrix)
 
 
-def varied_eyes(eye: EyeModel, theta: Floats) -> EyeModel:
-    """Eyes (a batch of n) with the unknowns (n, 15) applied; line of sight, lens and fovea stay.
+def _toric(surface: Surface, change: Floats, handed: Floats) -> Surface:
+    """Make a surface toric: apex radii R + t along the meridian a and R - t across it, `change` = (t cos 2a, t sin 2a).
 
-    The front of the cornea gets the radius R + dR and the surfaces behind it keep their ratio to it.
+    A conic becomes the quadric (1 + Q) x^2 + (1 - t_c / R) y^2 - 2 (t_s / R) y z + (1 + t_c / R) z^2 + 2 R x = 0.
+    """
+    straight, oblique = change[:, 0], handed * change[:, 1]
+    if isinstance(surface, Biconic):
+        mean, own = np.mean(surface.radii_mm, axis=-1), 0.5 * (surface.radii_mm[..., 0] - surface.radii_mm[..., 1])
+        sign = np.where(own < 0, -1.0, 1.0)
+        size = sign * np.hypot(own + straight, oblique)
+        angle = 0.5 * np.arctan2(sign * oblique, sign * (own + straight))
+        turn = np.zeros((len(angle), 3, 3))
+        turn[:, 0, 0], turn[:, 1, 1], turn[:, 2, 2] = 1.0, np.cos(angle), np.cos(angle)
+        turn[:, 1, 2], turn[:, 2, 1] = -np.sin(angle), np.sin(angle)
+        radii = np.stack([mean + size, mean - size], axis=-1)
+        return replace(surface, radii_mm=radii, rotation=surface.rotation @ turn)
+    assert isinstance(surface, Quadric)
+    matrix, radius = np.array(surface.matrix), surface.vector[..., 0]
+    matrix[:, 1, 1] -= straight / radius
+    matrix[:, 2, 2] += straight / radius
+    matrix[:, 1, 2] -= oblique / radius
+    matrix[:, 2, 1] -= oblique / radius
+    return replace(surface, matrix=matrix)
+
+
+def _varied_stop(stop: Stop, theta: Floats) -> Stop:
+    """The stop with its own unknowns; an ellipticity stretches its plane along one axis and shrinks it across."""
+    wanted = theta[:, PUPIL] / (2.0 * np.sqrt(np.prod(stop.semi_axes_mm, axis=-1)))
+    centre = np.array(stop.centre_mm)
+    centre[:, 0] -= theta[:, DEPTH]
+    place = theta[:, CENTRE] + theta[:, SHIFT] * _widening(stop, theta)[:, None]
+    centre[:, 1] += stop.handed * place[:, 0]
+    centre[:, 2] += place[:, 1]
+    straight, oblique = theta[:, ELLIPTICITY.start, None], (stop.handed * theta[:, ELLIPTICITY.start + 1])[:, None]
+    rotation = np.array(stop.rotation)
+    first, second = stop.rotation[:, :, 1], stop.rotation[:, :, 2]
+    rotation[:, :, 1] = (1.0 + straight) * first + oblique * second
+    rotation[:, :, 2] = (1.0 - straight) * second + oblique * first
+    return replace(stop, centre_mm=centre, rotation=rotation, semi_axes_mm=stop.semi_axes_mm * wanted[:, None])
+
+
+def _widening(stop: Stop, theta: Floats) -> Floats:
+    """Diameter (n,) mm of the pupil beyond that of the eye that the analysis begins with."""
+    return np.asarray(theta[:, PUPIL] - 2.0 * np.sqrt(np.prod(stop.semi_axes_mm, axis=-1)))
+
+
+def varied_eyes(eye: EyeModel, theta: Floats) -> EyeModel:
+    """Eyes (a batch of n) with the unknowns (n, 23) applied; line of sight, lens and fovea stay.
+
+    The front of the cornea gets the radius R + dR and the surfaces behind it keep their ratio to it. These keep their
+    toricity, too.
     """
     radius = radius_of(eye.front[0])
     factor = (radius + theta[:, RADIUS]) / radius
     front = tuple(_scaled(surface, factor) for surface in eye.front)
     front = (_flattened(front[0], theta[:, ASPHERICITY]), *front[1:])
-    centre = np.array(eye.stop.centre_mm)
-    centre[:, 0] -= theta[:, DEPTH]
-    axes = eye.stop.semi_axes_mm
-    wanted = theta[:, PUPIL] / (2.0 * np.sqrt(np.prod(axes, axis=-1)))
-    shift = np.zeros_like(centre)
+    if np.any(theta[:, TORICITY]):
+        front = (_toric(front[0], theta[:, TORICITY], eye.stop.handed), *front[1:])
+    shift = np.zeros_like(eye.stop.centre_mm)
     shift[:, 0] = theta[:, ROTATION]
     turns = eye.rotation
     return replace(
         eye,
         front=front,
-        stop=replace(eye.stop, centre_mm=centre, semi_axes_mm=axes * wanted[:, None]),
+        stop=_varied_stop(eye.stop, theta),
         rotation=RotationCentres(
             turns.azimuth_centre_mm - shift, turns.elevation_centre_mm - shift, turns.torsion_centre_mm
         ),
@@ -184,7 +234,7 @@ def diameters_mm(eyes: EyeModel) -> Floats:
 
 
 def images_of(views: Views, theta: Floats, boundary_points: int) -> Images:
-    """Trace the features of views with unknowns (n, 15)."""
+    """Trace the features of views with unknowns (n, 23)."""
     n, m, k = len(views), len(views.rig.lights), boundary_points
     outline, glints = np.full((n, k, 2), np.nan), np.full((n, m, 2), np.nan)
     outline_ok, glint_ok = np.zeros((n, k), dtype=bool), np.zeros((n, m), dtype=bool)
@@ -216,24 +266,35 @@ def _images_of_camera(views: Views, theta: Floats, number: int, k: int) -> tuple
     return outline[:, :-1], outline_ok[:, :-1], *projected(exits, status)
 
 
-def slopes_of(views: Views, theta: Floats, boundary_points: int) -> Slopes:
-    """Features and their derivatives by all 15 unknowns, by central differences in one batch."""
-    n, count = len(views), len(TRACED)
+def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | None = None) -> Slopes:
+    """Features and their derivatives by the unknowns, by central differences in one batch.
+
+    Derivatives by the shapes of cornea and pupil (from `TORICITY` on) that are not `free` (23,) are 0.
+    """
+    moves = np.arange(COUNT) < TORICITY.start
+    if free is not None:
+        moves |= free
+        moves[CENTRE] |= free[SHIFT]
+    use = moves[TRACED]
+    traced_columns, steps = TRACED[use], STEPS[use]
+    n, count = len(views), len(steps)
     shifts = np.zeros((1 + 2 * count, COUNT))
-    shifts[1 : 1 + count, TRACED] = np.diag(STEPS)
-    shifts[1 + count :, TRACED] = -np.diag(STEPS)
+    shifts[1 : 1 + count, traced_columns] = np.diag(steps)
+    shifts[1 + count :, traced_columns] = -np.diag(steps)
+    widening = _widening(take_eyes(views.eyes, views.person).stop, theta)
     every = np.tile(np.arange(n), len(shifts))
     all_theta = (theta[None] + shifts[:, None]).reshape(-1, COUNT)
     traced = images_of(views.take(every), all_theta, boundary_points)
 
     def slopes(points: Floats, ok: Bools) -> tuple[Floats, Bools]:
         points = points.reshape(len(shifts), n, *points.shape[1:])
-        step = STEPS[:, None, None, None]
+        step = steps[:, None, None, None]
         central = (points[1 : 1 + count] - points[1 + count :]) / (2.0 * step)
         out = np.zeros((*points.shape[1:], COUNT))
-        out[..., TRACED] = np.moveaxis(central, 0, -1)
+        out[..., traced_columns] = np.moveaxis(central, 0, -1)
         out[..., POSITION] = out[..., SLIPPAGE]
         out[..., ROTATION] = np.einsum("nkax,nx->nka", out[..., SLIPPAGE], _by_rotation(theta))
+        out[..., SHIFT] = out[..., CENTRE] * widening[:, None, None, None]
         exists: Bools = np.asarray(np.isfinite(out).all(axis=(2, 3)))
         return np.where(exists[..., None, None], out, 0.0), exists & ok[:n]
 
@@ -286,7 +347,7 @@ def tangents(direction: Floats) -> Floats:
 
 
 def gaze_slopes(views: Views, theta: Floats) -> Floats:
-    """Derivatives (n, 2, 15) of the line of sight's direction, left and up (rad), by the unknowns."""
+    """Derivatives (n, 2, 23) of the line of sight's direction, left and up (rad), by the unknowns."""
     across = tangents(lines_of_sight(views, theta)[1])
     columns = [AZIMUTH, ELEVATION, KAPPA.start, KAPPA.start + 1]
     return _differences(theta, columns, lambda t: np.einsum("nci,ni->nc", across, lines_of_sight(views, t)[1]))
@@ -300,13 +361,13 @@ def target_misses(views: Views, theta: Floats, target_mm: Floats) -> Floats:
 
 
 def target_slopes(views: Views, theta: Floats, target_mm: Floats) -> Floats:
-    """Derivatives (n, 2, 15) of `target_misses` by the unknowns."""
-    columns = [c for c in range(COUNT) if c not in (PUPIL, RADIUS, ASPHERICITY, DEPTH)]
+    """Derivatives (n, 2, 23) of `target_misses` by the unknowns."""
+    columns = [c for c in range(TORICITY.start) if c not in (PUPIL, RADIUS, ASPHERICITY, DEPTH)]
     return _differences(theta, columns, lambda t: target_misses(views, t, target_mm))
 
 
 def _differences(theta: Floats, columns: Sequence[int], function: object) -> Floats:
-    """Central differences (n, 2, 15) of a function of the unknowns with values (n, 2)."""
+    """Central differences (n, 2, 23) of a function of the unknowns with values (n, 2)."""
     assert callable(function)
     out = np.zeros((len(theta), 2, COUNT))
     for column in columns:

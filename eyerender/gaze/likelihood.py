@@ -1,9 +1,9 @@
 """Maximum likelihood: gaze by fits of a traced eye model to outlines and glints.
 
-A calibration fits the person (corneal radius and asphericity, pupil depth, kappa, centre of rotation) with the priors
-of a population, together with gaze, pupil and slippage of every frame. Afterwards these three are fitted for each
-frame alone. It is `design.fit` with equation (4) there, and approaches the Cramer-Rao bound of the rig where the model
-holds.
+A calibration fits the person (corneal radius, asphericity and toricity, pupil depth, centre, ellipticity and shift with
+size, kappa, centre of rotation) with the priors of a population, together with gaze, pupil and slippage of every frame.
+Afterwards these three are fitted for each frame alone. It is `design.fit` with equation (4) there, and approaches the
+Cramer-Rao bound of the rig where the model holds.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from .rays import screen_of
 if TYPE_CHECKING:
     from ..design.fit import EyeFit
 
-PERSON_NUMBERS = 9
-OUTLINE_PX, GLINT_PX = 1.0, 0.5
-"""Deviations of features without a covariance (chosen): what real eyes differ from the model, not a sensor's noise."""
+PERSON_NUMBERS = 17
+OUTLINE_PX, GLINT_PX = 0.2, 0.1
+"""Deviations of features without a covariance (chosen): a sensor's noise, and what eyes still differ from the model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class MaximumLikelihood:
     Args:
         eye: name of the eye model that the fits begin with.
         slippage_mm: standard deviation of the eye's position in a frame about the one in the record; 0: it is exact.
-        persons: numbers of the person (9,) by eye (0 right, 1 left), set by `fit`.
+        persons: numbers of the person (17,) by eye (0 right, 1 left), set by `fit`.
     """
 
     eye: str = "E2"
@@ -53,7 +53,7 @@ class MaximumLikelihood:
 
         if not np.isfinite(observations.index.target_mm).all(axis=1).any():
             raise InputError("a calibration needs records with target_mm")
-        unknowns = Unknowns.population(slippage_mm=self._slippage)
+        unknowns = Unknowns.shaped(slippage_mm=self._slippage)
         fits = self._fits(observations, rig, unknowns, targets=True)
         return replace(self, persons={eye: frozen(found.theta[0, LOCAL:]) for eye, found in fits.items()})
 

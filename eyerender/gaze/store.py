@@ -317,7 +317,8 @@ class _CrossRatioState(Spec):
 
 
 class _PersonState(Spec):
-    person: Annotated[tuple[float, ...], Field(min_length=PERSON_NUMBERS, max_length=PERSON_NUMBERS)]
+    # Nine numbers are those without the shapes of cornea and pupil, which are 0 then.
+    person: Annotated[tuple[float, ...], Field(min_length=9, max_length=PERSON_NUMBERS)]
 
 
 _Six = tuple[float, float, float, float, float, float]
@@ -408,7 +409,10 @@ def _restored(estimator: BuiltIn, eyes: dict[int, Any]) -> BuiltIn:
     if isinstance(estimator, CrossRatio):
         return replace(estimator, alphas=arrays("alpha"))
     if isinstance(estimator, MaximumLikelihood):
-        return replace(estimator, persons=arrays("person"))
+        persons = {e: np.zeros(PERSON_NUMBERS) for e in eyes}
+        for e, numbers in arrays("person").items():
+            persons[e][: len(numbers)] = numbers
+        return replace(estimator, persons={e: frozen(numbers) for e, numbers in persons.items()})
     if isinstance(estimator, GuestrinEizenman):
         found = {}
         for e, state in eyes.items():

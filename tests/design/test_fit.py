@@ -16,7 +16,17 @@ from eyerender.design.features import measured, outline_distances, residuals
 from eyerender.design.fit import Options, equations_of, fit_eye, instants_of, problem_of, solve, weights_of
 from eyerender.design.information import case_of, inverse, joint_matrix, outline_normals
 from eyerender.design.noise import FeatureNoise
-from eyerender.design.unknowns import COUNT, LOCAL, NAMES, PUPIL, Unknowns
+from eyerender.design.unknowns import (
+    CENTRE,
+    COUNT,
+    ELLIPTICITY,
+    LOCAL,
+    NAMES,
+    PUPIL,
+    SHIFT,
+    TORICITY,
+    Unknowns,
+)
 from eyerender.design.varied import images_of, lines_of_sight, slopes_of
 from eyerender.gaze.estimate import angular_error_deg
 
@@ -36,7 +46,7 @@ def frames_of(name, eye="E2", most=9):
 def test_exact_features_give_the_gaze_back(rig, eye):
     """From a prior eye with other numbers and a wrong position: gaze to 1e-6 deg, and what is seen of the person."""
     # The pupils of E3 and E4 touch the lens, so that they can only come forward.
-    theta = np.array([0.0] * 6 + [-0.15, -0.05, -0.1] + [0.0] * 6)
+    theta = np.array([0.0] * 6 + [-0.15, -0.05, -0.1] + [0.0] * (COUNT - 9))
     frames = frames_of(rig, eye)
     seen = er.trace(frames)
     prior = changed_file(frames.scene.eye_spec, theta)
@@ -232,6 +242,33 @@ def test_the_eye_file_is_the_eye_that_was_fitted():
     _, way = lines_of_sight(case.instants, theta)
     _, wanted = lines_of_sight(after.instants, after.theta)
     assert angular_error_deg(way, wanted, np.zeros(3)).max() < 1e-6
+
+
+@pytest.mark.parametrize(("model", "side"), [("E2", "right"), ("E4", "left")])
+def test_shapes_of_cornea_and_pupil_have_their_places_in_the_eye_file(model, side):
+    """Toric cornea, decentred elliptic pupil: the built file has the features of the unknowns, and of their slopes."""
+    subject = er.Subject.one_eye(er.Eye(model), side=side)
+    frames = subject.looking([(-8, 5), (10, -6)], er.load_scene("headset").spec.rig)
+    case, _ = case_of(frames)
+    theta = case.theta.copy()
+    theta[:, TORICITY], theta[:, CENTRE], theta[:, SHIFT] = [0.08, -0.05], [0.25, -0.1], [-0.06, 0.02]
+    free = Unknowns.shaped().free()
+    built = er.Scene.compiled(frames.scene.spec, changed_file(frames.scene.eye_spec, theta[0])).frames()
+    after, _ = case_of(built)
+    ours, theirs = slopes_of(case.views, theta, 24, free), images_of(after.views, after.theta, 24)
+    assert ours.images.outline_px == pytest.approx(theirs.outline_px, abs=1e-6)
+    assert ours.images.glints_px == pytest.approx(theirs.glints_px, abs=1e-6, nan_ok=True)
+    # An ellipticity of .015 moves the outline by up to a pixel, and the file has it to first order.
+    theta[:, ELLIPTICITY] = [0.015, -0.01]
+    after, _ = case_of(er.Scene.compiled(frames.scene.spec, changed_file(frames.scene.eye_spec, theta[0])).frames())
+    moved, theirs = images_of(case.views, theta, 24), images_of(after.views, after.theta, 24)
+    distance, _ = outline_distances(moved.outline_px, None, theirs.outline_px)
+    assert np.abs(distance).max() < 0.03
+    # Slopes are those of the features: predicted to first order, they leave the curvature of a small step.
+    step = np.zeros(23)
+    step[ELLIPTICITY] = theta[0, ELLIPTICITY]
+    guess = ours.images.outline_px + ours.outline @ step
+    assert np.abs(guess - moved.outline_px).max() < 0.02
 
 
 def test_a_calibration_finds_kappa():

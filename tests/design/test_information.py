@@ -16,7 +16,7 @@ from eyerender.design.information import (
     outline_normals,
 )
 from eyerender.design.noise import FeatureNoise, edge_information, glint_deviation, sensor_noise
-from eyerender.design.unknowns import COUNT, NAMES, POSITION, ROTATION, Unknowns
+from eyerender.design.unknowns import COUNT, NAMES, POSITION, ROTATION, TORICITY, Unknowns
 from eyerender.design.varied import Images, Slopes, lines_of_sight, slopes_of, target_misses, target_slopes, turned
 from eyerender.eye.build import bare_eye, fitting_stop
 from eyerender.eye.parts import EyeParts
@@ -96,7 +96,7 @@ def test_derivatives_are_those_of_rebuilt_eyes(eye):
     scene = er.Scene.of(er.load_scene("head_mounted").spec, eye=eye)
     case, _ = case_of(scene.frames().take([0, 5]))
     slopes = slopes_of(case.views, case.theta, 12)
-    for column, name in enumerate(NAMES):
+    for column, name in enumerate(NAMES[: TORICITY.start]):
         if name.startswith("kappa"):
             continue
         steps = {h: _central(scene, case.theta, name, h) for h in (1e-3, 2e-3)}
