@@ -13,7 +13,9 @@ from ..errors import InputError
 from ..storage.files import read_json, shown
 from .exact import mcnemar
 
-RESULTS_SCHEMA = "eyerender/bench-extractors/2"
+RESULTS_SCHEMA = "eyerender/bench-extractors/3"
+# Version 2 has no conditions and fewer figures of glints; what --against needs is the same.
+RESULTS_SCHEMAS = (RESULTS_SCHEMA, "eyerender/bench-extractors/2")
 LEVEL = 0.05
 _RESULTS_BYTES = 2**30
 _OPERATORS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
@@ -78,7 +80,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         InputError: it is not such a file.
     """
     data = read_json(path, limit=_RESULTS_BYTES)
-    if data.get("schema") != RESULTS_SCHEMA:
+    if data.get("schema") not in RESULTS_SCHEMAS:
         raise InputError(f"is {shown(data.get('schema'))}; --against reads {RESULTS_SCHEMA!r}", source=str(path))
     if not isinstance(data.get("extractors"), list) or not isinstance(data.get("image_digests"), dict):
         raise InputError("is not complete", source=str(path))

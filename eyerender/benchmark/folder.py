@@ -1,14 +1,14 @@
 """A labelled folder for the bench: images, true features in image coordinates, hints, and factors that vary.
 
-Three kinds are read: what this package renders (docs/formats.md), folders of ideal images, and a person's own images
-with labels (`own`).
+Four kinds are read: what this package renders (docs/formats.md), folders of ideal images, a person's own images with
+labels (`own`), and public layouts (`layouts`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,21 +27,16 @@ from ..scene import Scene
 from ..scene.spec import SceneSpec
 from ..storage.files import inside, read_json
 from ..storage.jsonlines import JsonLines
+from .conditions import of_pixels, of_scene, of_shape, tags
+from .glintlabels import TrueGlint, measured
 from .hints import FolderHints
-from .own import is_own, own_labels
+from .layouts import exported_gamma, layout_of, read_layout
+from .own import Labelled, is_own, own_labels
 
 IDEAL_SCHEMA = "eyerender/ideal-images/1"
 # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens them.
 _RADIUS_MM = (0.6, 5.0)
 EYE_ERROR_MM = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class TrueGlint:
-    """A glint that the image shows: its light and its place in px of the image."""
-
-    light: int
-    xy_px: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +59,8 @@ class LabelledImage:
         iris: outline of the iris, None where unknown.
         lids_px: (n, 2) margins of the lids, as far as they are known.
         mask_path: file of the classes of the pixels, None where they are unknown.
+        hidden_glints_px: places of glints that the image does not show.
+        conditions: hard conditions (`conditions.CONDITIONS`).
         gamma_from: where the gamma of the hints comes from: the folder, an option (`given`), or nowhere (`assumed`).
     """
 
@@ -83,6 +80,8 @@ class LabelledImage:
     iris: Ellipse | None = None
     lids_px: tuple[Floats, ...] = ()
     mask_path: Path | None = None
+    conditions: tuple[str, ...] = ()
+    hidden_glints_px: tuple[tuple[float, float], ...] = ()
 
     def classes(self) -> Bytes | None:
         """Read the class of each pixel (0 skin, 1 sclera, 2 iris, 3 pupil, 4 a frame), None where they are unknown."""
@@ -111,6 +110,7 @@ def load_labelled(
     images = _load(Path(folder), eye_error_mm, pupil_class)
     out = []
     for image in images:
+        image = _described(image)
         stated = float(image.hints["gamma"])
         if image.gamma_from == "assumed" and gamma is not None:
             image = replace(image, hints={**image.hints, "gamma": gamma}, gamma_from="given")
@@ -120,11 +120,26 @@ def load_labelled(
     return out
 
 
+def _described(image: LabelledImage) -> LabelledImage:
+    """Add the looks of the glints, and the conditions that features and pixels show, to those that are known."""
+    spots = np.array([g.xy_px for g in image.glints]).reshape(-1, 2)
+    conditions = [set(image.conditions), of_shape(image.pupil, image.visible, image.size, spots)]
+    glints, mask = image.glints, image.classes()
+    if mask is not None or glints:
+        grey = read_any_image(image.path)[0]
+        conditions.append(of_pixels(grey, image.bit_depth, mask))
+        glints = measured(glints, grey, image.bit_depth, image.pupil, mask)
+    return replace(image, conditions=tags(*conditions), glints=glints)
+
+
 def _load(path: Path, eye_error_mm: float, pupil_class: int | None) -> list[LabelledImage]:
     if _is_ideal(path):
         return _load_ideal(path)
     if is_own(path):
         return _load_own(path, pupil_class)
+    layout = None if (path / DATASET).exists() else layout_of(path)
+    if layout is not None:
+        return _with_hints(path, read_layout(path, layout), exported_gamma(path))
     images = ImageFolder.load(path)
     truth = images.truth()
     scene_rig = _rig_of(images)
@@ -145,13 +160,21 @@ def _load(path: Path, eye_error_mm: float, pupil_class: int | None) -> list[Labe
 
 
 def _load_own(folder: Path, pupil_class: int | None) -> list[LabelledImage]:
-    out = []
+    return _with_hints(folder, own_labels(folder, pupil_class), None)
+
+
+def _with_hints(folder: Path, labels: Iterable[Labelled], gamma: float | None) -> list[LabelledImage]:
+    """Images with the hints that the folder states; `gamma` is that of its layout, if it states one."""
     told = FolderHints.load(folder)
-    hints, source = told.to_request(), "assumed" if told.gamma is None else "folder"
-    for name, path, pupil in own_labels(folder, pupil_class):
-        image, depth, _ = read_any_image(path)
-        found = _without_rig(name, path, (depth, image.shape), pupil)
-        out.append(replace(found, hints=hints, gamma_from=source))
+    gamma = told.gamma or gamma
+    hints, source = {**told.to_request(), "gamma": gamma or 1.0}, "assumed" if gamma is None else "folder"
+    out = []
+    for label in labels:
+        image, depth, _ = read_any_image(label.path)
+        pupil = None if label.visible == 0.0 else label.pupil
+        more: dict[str, Any] = {"visible": label.visible, "glints": label.glints}
+        found = _without_rig(label.name, label.path, (depth, image.shape), pupil, **more)
+        out.append(replace(found, hints=hints, gamma_from=source, subject=label.subject))
     if not out:
         raise InputError("holds no labelled images", source=str(folder))
     return out
@@ -192,12 +215,16 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int) -> LabelledImage
         if len(outline) < 6:
             outline = ellipse.points(120)
     shown = []
-    hidden = {g["light"] for g in labels.get("glints") or [] if not g.get("visible", True)}
+    hidden = []
+    shares = {g["light"]: _visible_share(g) for g in labels.get("glints") or []}
     for j in np.flatnonzero(glints.ok[row] & glints.in_image[row]):
         x, y = glints.xy_px[row, j] - corner
         light = int(glints.light[row, j])
-        if light not in hidden and -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5:
-            shown.append(TrueGlint(light, (float(x), float(y))))
+        share = shares.get(light, 1.0)
+        if share == 0.0:
+            hidden.append((float(x), float(y)))
+        elif -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5:
+            shown.append(TrueGlint(light, (float(x), float(y)), share))
     factors: dict[str, float] = {}
     azimuth, elevation = float(truth.pose.azimuth_rad[row]), float(truth.pose.elevation_rad[row])
     if math.isfinite(azimuth + elevation):
@@ -218,7 +245,15 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int) -> LabelledImage
         iris=_iris(labels, corner),
         lids_px=_lids(labels, corner),
         mask_path=entry.mask_path,
+        conditions=tuple(of_scene(entry.line, ellipse, corner)),
+        hidden_glints_px=tuple(hidden),
     )
+
+
+def _visible_share(glint: Mapping[str, Any]) -> float:
+    """Visible share of a glint's label; a rendered folder has no `visible`, and older ones have no share."""
+    share = glint.get("visible_share")
+    return (1.0 if share is None else float(share)) if glint.get("visible", True) else 0.0
 
 
 def _iris(labels: Mapping[str, Any], corner: Floats) -> Ellipse | None:

@@ -22,6 +22,7 @@ class BenchOptions:
         gamma: Encoding gamma of images whose folder states none (default: 1, linear).
         eye_error_mm: Standard deviation, per axis, by which the hinted position of the eye is off.
         pupil_class: Value of the pupil in masks of several classes.
+        quick: Take a tenth of the images, in which hard conditions are as frequent as in all.
         fresh: Ask the extractors again, also about images whose answers are stored.
         against: results.json of an earlier bench, to compare with.
         require: Figures that must be reached, such as `right>=.95` or `own-fast:right>=.95`.
@@ -34,6 +35,7 @@ class BenchOptions:
     gamma: float | None = None
     eye_error_mm: float = 5.0
     pupil_class: int | None = None
+    quick: bool = False
     fresh: bool = False
     against: str | Path | None = None
     require: tuple[str, ...] = ()

@@ -1,7 +1,9 @@
 """Folders of your own images with labels in a table (labels.csv) or as masks (masks/).
 
     images/a.png, images/b.png, ...      or the images beside labels.csv
-    labels.csv                           image,centre_x_px,centre_y_px,semi_axis_a_px,semi_axis_b_px,angle_deg
+    labels.csv                           image,centre_x_px,centre_y_px,semi_axis_a_px,semi_axis_b_px,angle_deg and, if
+                                         known, visible (share of the pupil) and subject
+    glints.csv                           image,x_px,y_px and, if known, light; a line per glint; optional
     masks/a.png, masks/b.png, ...        the pupil (its visible part, or all of it), or classes
     hints.json                           what the extractors may know (`hints`); optional
 
@@ -14,6 +16,7 @@ import csv
 import io
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,24 +24,49 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..folders.imagefile import read_any_image
-from ..folders.imagefolder import DATASET
+from ..folders.imagefolder import DATASET, RUN
 from ..geometry.ellipse import Ellipse, fit_ellipse_direct, signed_distance
 from ..storage.files import inside, read_text
+from .glintlabels import TrueGlint
 
 LABELS, MASKS, IMAGES = "labels.csv", "masks", "images"
 COLUMNS = ("centre_x_px", "centre_y_px", "semi_axis_a_px", "semi_axis_b_px", "angle_deg")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 MAX_IMAGES = 100_000
+GLINTS = "glints.csv"
 _TRIALS, _NEAR_PX, _OUTSIDE_PX = 200, 0.7, 1.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Labelled:
+    """Labels of an image.
+
+    Attributes:
+        name: name of the image.
+        path: file.
+        pupil: None where the image shows none.
+        visible: visible share of the pupil, None where it is unknown.
+        glints: those that the image shows.
+        subject: whose eye it is, "" where that is unknown.
+    """
+
+    name: str
+    path: Path
+    pupil: Ellipse | None
+    visible: float | None = None
+    glints: tuple[TrueGlint, ...] = ()
+    subject: str = ""
 
 
 def is_own(folder: Path) -> bool:
     """Whether a folder holds a person's own images with labels."""
-    return not (folder / DATASET).exists() and ((folder / LABELS).is_file() or (folder / MASKS).is_dir())
+    # A run that has not finished has run.json only.
+    ours = (folder / DATASET).exists() or (folder / RUN).exists()
+    return not ours and ((folder / LABELS).is_file() or (folder / MASKS).is_dir())
 
 
-def own_labels(folder: Path, pupil_class: int | None = None) -> Iterator[tuple[str, Path, Ellipse | None]]:
-    """Yield (name, file, pupil or None) of every labelled image.
+def own_labels(folder: Path, pupil_class: int | None = None) -> Iterator[Labelled]:
+    """Yield the labels of every image.
 
     Args:
         folder: the folder.
@@ -48,10 +76,34 @@ def own_labels(folder: Path, pupil_class: int | None = None) -> Iterator[tuple[s
         InputError: a table or mask cannot be used, or names an image that is not there; a mask has several classes, and
             none is given.
     """
-    return _of_table(folder) if (folder / LABELS).is_file() else _of_masks(folder, pupil_class)
+    glints = _glints(folder)
+    labels = _of_table(folder) if (folder / LABELS).is_file() else _of_masks(folder, pupil_class)
+    for label in labels:
+        yield replace(label, glints=tuple(glints.get(label.name, ())))
 
 
-def _of_table(folder: Path) -> Iterator[tuple[str, Path, Ellipse | None]]:
+def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
+    """Glints of every image that glints.csv names."""
+    out: dict[str, list[TrueGlint]] = {}
+    if not (folder / GLINTS).is_file():
+        return out
+    source = str(folder / GLINTS)
+    lines = csv.DictReader(io.StringIO(read_text(folder / GLINTS)))
+    missing = sorted({"image", "x_px", "y_px"} - set(lines.fieldnames or ()))
+    if missing:
+        raise InputError(f"has no column {missing[0]}", source=source)
+    for k, line in enumerate(lines):
+        try:
+            x, y, light = float(line["x_px"]), float(line["y_px"]), int(line.get("light") or -1)
+        except (TypeError, ValueError):
+            raise InputError("needs numbers", source=source, path=f"line {k + 2}") from None
+        if not (math.isfinite(x + y) and max(abs(x), abs(y)) < 1e5):
+            raise InputError("is no place in an image", source=source, path=f"line {k + 2}")
+        out.setdefault(str(line["image"]), []).append(TrueGlint(light, (x, y)))
+    return out
+
+
+def _of_table(folder: Path) -> Iterator[Labelled]:
     source = str(folder / LABELS)
     lines = csv.DictReader(io.StringIO(read_text(folder / LABELS)))
     missing = sorted({"image", *COLUMNS} - set(lines.fieldnames or ()))
@@ -65,7 +117,21 @@ def _of_table(folder: Path) -> Iterator[tuple[str, Path, Ellipse | None]]:
         home = folder / IMAGES if (folder / IMAGES).is_dir() and not (name or "").startswith(f"{IMAGES}/") else folder
         path = inside(home, name, source=source, path=where)
         cells = [line[column] for column in COLUMNS]
-        yield str(name), path, _ellipse(cells, source, where) if any(cells) else None
+        pupil = _ellipse(cells, source, where) if any(cells) else None
+        visible = _share(line.get("visible"), source, where)
+        yield Labelled(name=str(name), path=path, pupil=pupil, visible=visible, subject=str(line.get("subject") or ""))
+
+
+def _share(cell: str | None, source: str, where: str) -> float | None:
+    if not cell:
+        return None
+    try:
+        share = float(cell)
+    except ValueError:
+        share = math.nan
+    if not 0.0 <= share <= 1.0:
+        raise InputError("visible must be a number from 0 to 1", source=source, path=where)
+    return share
 
 
 def _ellipse(cells: list[str | None], source: str, where: str) -> Ellipse:
@@ -78,7 +144,7 @@ def _ellipse(cells: list[str | None], source: str, where: str) -> Ellipse:
     return Ellipse(np.array([x, y]), np.array([a, b]), math.radians(degrees))
 
 
-def _of_masks(folder: Path, pupil_class: int | None) -> Iterator[tuple[str, Path, Ellipse | None]]:
+def _of_masks(folder: Path, pupil_class: int | None) -> Iterator[Labelled]:
     home = folder / IMAGES if (folder / IMAGES).is_dir() else folder
     images = {p.stem: p for p in sorted(home.iterdir()) if p.suffix.lower() in SUFFIXES}
     masks = [p for p in sorted((folder / MASKS).iterdir()) if p.suffix.lower() in SUFFIXES]
@@ -94,7 +160,7 @@ def _of_masks(folder: Path, pupil_class: int | None) -> Iterator[tuple[str, Path
             values = ", ".join(str(v) for v in found[:6])
             raise InputError(f"has several classes ({values}); --pupil-class names the pupil's", source=str(mask))
         value = pupil_class if pupil_class is not None else (found[0] if len(found) else 1)
-        yield path.name, path, ellipse_of_mask(level == value, str(mask))
+        yield Labelled(name=path.name, path=path, pupil=ellipse_of_mask(level == value, str(mask)))
 
 
 def ellipse_of_mask(mask: Bools, source: str = "") -> Ellipse | None:

@@ -22,9 +22,14 @@ from .asking import Run
 from .curves import curves_of
 from .folder import LabelledImage
 from .score import Score
-from .summary import FACTORS, breakdown, failures, sizes, summarise
+from .summary import FACTORS, breakdown, by_condition, failures, sizes, summarise
 
 TIMES_SCHEMA = "eyerender/bench-times/1"
+_ORIGIN = (
+    "the centres are half a pixel off on both axes, so (0, 0) seems to be the {} of the first pixel, not its {} "
+    "(pixel_origin of the conventions)"
+)
+_LEAST_FOR_ORIGIN = 8
 
 
 def entry_of(
@@ -39,7 +44,9 @@ def entry_of(
         "conventions": greeting.conventions.to_mapping() if greeting else None,
         "reports": list(greeting.reports) if greeting else None,
         "summary": summarise(run.scores, sigmas, run.reports_glints),
+        "suggested_origin": suggested_origin(run),
         "breakdown": breakdown(run.scores, sigmas, factors, run.reports_glints),
+        "conditions": by_condition(run.scores, sigmas, [image.conditions for image in images], run.reports_glints),
         "curves": curves_of(run.scores),
         "failures": failures(run.scores, images),
         "answers": [
@@ -47,6 +54,25 @@ def entry_of(
             for i, s in zip(images, run.scores, strict=True)
         ],
     }
+
+
+def suggested_origin(run: Run) -> dict[str, str] | None:
+    """The pixel origin that an extractor's results suggest it uses, where it declares the other one.
+
+    With the wrong origin, the centres of right pupils are off by half a pixel on both axes. The mean offset must lie
+    within 0.15 px of that on both, and be known to a quarter of a pixel, so that no other bias looks like it.
+    """
+    offsets = np.array([s.offset_px for s in run.scores if s.outcome == "right" and s.offset_px is not None])
+    if run.greeting is None or len(offsets) < _LEAST_FOR_ORIGIN:
+        return None
+    declared = run.greeting.conventions.pixel_origin
+    expected = 0.5 if declared == "centre" else -0.5
+    off = np.abs(offsets.mean(axis=0) - expected)
+    scatter = offsets.std(axis=0, ddof=1) / np.sqrt(len(offsets))
+    if np.any(off > 0.15) or np.any(3.0 * scatter > 0.25):
+        return None
+    other = "corner" if declared == "centre" else "centre"
+    return {"declared": declared, "suggested": other, "text": _ORIGIN.format(other, declared)}
 
 
 def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors: dict[str, float]) -> dict[str, Any]:
@@ -77,6 +103,7 @@ def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors:
         "glints_named": g.named if g else None,
         "glints_swapped": g.swapped if g else None,
         "glint_px": float(np.mean([np.hypot(*e) for e in g.errors_px])) if g and g.errors_px else None,
+        "conditions": "; ".join(image.conditions),
         **{name: factors.get(name) for name in FACTORS},
     }
 

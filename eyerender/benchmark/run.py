@@ -22,6 +22,7 @@ from .answercache import AnswerCache, check_reference, image_key
 from .asking import Run, ask_extractors
 from .bound import Edge, edge_of, is_bounded
 from .checks import RESULTS_SCHEMA, Requirement, compare_with, problems_of, read_results
+from .conditions import CONDITIONS, balanced
 from .failurekinds import KINDS, kind_of
 from .folder import LabelledImage, load_labelled
 from .options import BenchOptions
@@ -56,7 +57,7 @@ def bench_extractors(
         changes: fields of `BenchOptions` by name, instead of those of `options`.
 
     Returns:
-        The content of results.json (schema eyerender/bench-extractors/2).
+        The content of results.json (schema eyerender/bench-extractors/3).
 
     Raises:
         InputError: the folder cannot be used, two extractors share a name, there is none, or a check cannot be made.
@@ -68,6 +69,9 @@ def bench_extractors(
     is_bench = options.overwrite or _is_bench(Path(output))
     refuse_non_empty(output, is_bench)
     images = load_labelled(folder, options.gamma, eye_error_mm=options.eye_error_mm, pupil_class=options.pupil_class)
+    if options.quick:
+        chosen_rows = balanced([i.conditions for i in images], [i.subject or i.name for i in images])
+        images = [images[k] for k in chosen_rows]
     sources = [check_reference(extractor, options.start_timeout_s) for extractor in chosen]
     keys = [image_key(image) for image in images]
     done, total = 0, len(chosen) * len(images)
@@ -135,6 +139,10 @@ def _results(
         "edge": _edge_summary(edges, images),
         "factors": {name: {"what": what, "unit": unit} for name, (what, unit) in FACTORS.items()},
         "failure_kinds": dict(KINDS),
+        "conditions": {
+            name: {"what": what, "images": [i.name for i in images if name in i.conditions]}
+            for name, what in CONDITIONS.items()
+        },
         "extractors": [entry_of(run, images, sigmas, factors) for run in runs],
         "common": common_errors(runs),
         "pairs": pairs_of(runs),

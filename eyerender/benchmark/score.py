@@ -11,13 +11,13 @@ from scipy.optimize import linear_sum_assignment
 
 from ..geometry.ellipse import Ellipse, iou, signed_distance
 from .folder import LabelledImage
+from .glintlabels import TrueGlint, false_kind
 from .protocol import Reply
 
 # right: IoU > 0.9. wrong: another ellipse. none: no pupil reported. error: no usable answer. Where the image shows no
 # pupil: absent when none was reported, else false.
 Outcome = Literal["right", "wrong", "none", "error", "absent", "false"]
 RIGHT_IOU = 0.9
-MATCH_PX = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +27,10 @@ class GlintScore:
     Attributes:
         true: number of glints that the image shows.
         reported: number of glints that the extractor reported.
-        errors_px: (dx, dy) of every match within 2 px.
+        errors_px: (dx, dy) of every match.
+        matches: whether each true glint is matched, with its visible share, saturation and place.
+        false_kinds: kinds of the reports that match none.
+        unnamed: number of matches without a light, in images whose lights are known.
         named: number of matches for which the extractor named a light.
         swapped: number of those for which it named the wrong light.
     """
@@ -37,6 +40,9 @@ class GlintScore:
     errors_px: tuple[tuple[float, float], ...] = ()
     named: int = 0
     swapped: int = 0
+    matches: tuple[tuple[bool, TrueGlint], ...] = ()
+    false_kinds: tuple[str, ...] = ()
+    unnamed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,29 +132,37 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
 
 def failed(image: LabelledImage, reason: str, reports_glints: bool) -> Score:
     """Score without a usable answer."""
-    glints = GlintScore(true=len(image.glints)) if reports_glints else None
+    missed = tuple((False, glint) for glint in image.glints)
+    glints = GlintScore(true=len(missed), matches=missed) if reports_glints else None
     return Score("error", reason, glints=glints, with_pupil=image.pupil is not None)
 
 
 def score_glints(image: LabelledImage, reply: Reply) -> GlintScore:
-    """Match reported to true glints one to one within 2 px: as many as possible, then the nearest."""
+    """Match reported to true glints one to one within a glint's radius: as many as possible, then the nearest."""
     true, reported = image.glints, reply.glints
-    if not true or not reported:
-        return GlintScore(true=len(true), reported=len(reported))
-    places = np.array([g.xy_px for g in true])
-    spots = np.array([xy for xy, _ in reported])
+    places = np.array([g.xy_px for g in true]).reshape(-1, 2)
+    spots = np.array([xy for xy, _ in reported]).reshape(-1, 2)
     offset = spots[None] - places[:, None]
     apart = np.hypot(offset[..., 0], offset[..., 1])
-    rows, columns = linear_sum_assignment(np.where(apart < MATCH_PX, apart - 10.0 * MATCH_PX, 0.0))
-    pairs = [(i, j) for i, j in zip(rows, columns, strict=True) if apart[i, j] < MATCH_PX]
+    reach = np.array([g.match_px for g in true]).reshape(-1, 1)
+    # A match outweighs any distance.
+    rows, columns = linear_sum_assignment(np.where(apart < reach, apart - 1000.0, 0.0))
+    pairs = [(i, j) for i, j in zip(rows, columns, strict=True) if apart[i, j] < reach[i, 0]]
+    matched, used = {i for i, _ in pairs}, {j for _, j in pairs}
+    false = [reported[j][0] for j in range(len(reported)) if j not in used]
+    mask = image.classes() if false else None
+    hidden = np.array(image.hidden_glints_px).reshape(-1, 2)
     lights = [(true[i].light, reported[j][1]) for i, j in pairs]
-    named = [(a, b) for a, b in lights if b is not None]
+    named = [(a, b) for a, b in lights if b is not None and a >= 0]
     return GlintScore(
         true=len(true),
         reported=len(reported),
         errors_px=tuple((float(offset[i, j, 0]), float(offset[i, j, 1])) for i, j in pairs),
         named=len(named),
         swapped=sum(a != b for a, b in named),
+        matches=tuple((i in matched, glint) for i, glint in enumerate(true)),
+        false_kinds=tuple(false_kind(xy, true, hidden, mask) for xy in false),
+        unnamed=0 if image.hints.get("rig") is None else len(pairs) - len(named),
     )
 
 

@@ -12,7 +12,9 @@ import numpy as np
 
 from ..arrays import Floats
 from .bound import MEDIAN_OF_RADIAL
+from .conditions import CONDITIONS
 from .folder import LabelledImage
+from .glintlabels import TrueGlint
 from .intervals import subject_interval, wilson
 from .score import Outcome, Score
 
@@ -33,6 +35,7 @@ _OUTCOMES: tuple[Outcome, ...] = ("right", "wrong", "none", "error")
 _BINS = 4
 # Ends of the tiers of visibility, as hidden shares of the pupil.
 HIDDEN_TIERS = (0.0, 0.02, 0.3, 0.7, 1.0)
+_VISIBLE_TIERS = ((0.99, "whole"), (0.5, "0.5 and more"), (0.0, "less than 0.5"))
 # A factor gets a breakdown where it varies by more than this share of its largest value.
 _VARIES = {"noise_dn": 0.25, "blur_px": 0.25, "contrast_to_noise": 0.25, "pupil_px": 0.1, "aspect": 0.05}
 
@@ -205,6 +208,21 @@ def breakdown(
     return out
 
 
+def by_condition(
+    scores: Sequence[Score],
+    sigmas_px: Sequence[float | None],
+    conditions: Sequence[Sequence[str]],
+    reports_glints: bool,
+) -> dict[str, dict[str, Any]]:
+    """Summaries of the images of every condition that occurs."""
+    out = {}
+    for name in CONDITIONS:
+        at = [k for k, found in enumerate(conditions) if name in found]
+        if at:
+            out[name] = summarise([scores[k] for k in at], [sigmas_px[k] for k in at], reports_glints)
+    return out
+
+
 def _glints(scores: Sequence[Score]) -> dict[str, Any]:
     parts = [s.glints for s in scores if s.glints is not None]
     true, reported = sum(g.true for g in parts), sum(g.reported for g in parts)
@@ -219,8 +237,31 @@ def _glints(scores: Sequence[Score]) -> dict[str, Any]:
         "named": named,
         "swapped": swapped,
         "swap_rate": _ratio(swapped, named),
+        "unnamed": sum(g.unnamed for g in parts),
+        "recall_by": _recall_by([match for g in parts for match in g.matches]),
+        "false_kinds": dict(sorted(Counter(kind for g in parts for kind in g.false_kinds).items())),
         "error_px": sizes(np.hypot(*errors.T)),
         "bias_px": _vector(errors),
+    }
+
+
+def _recall_by(matches: Sequence[tuple[bool, TrueGlint]]) -> dict[str, dict[str, Any]]:
+    """Recall by saturation, visible share and place, each as true, matched and recall."""
+    groups: dict[str, dict[str, list[bool]]] = {"saturation": {}, "visible": {}, "place": {}}
+    for matched, glint in matches:
+        tier = next(name for low, name in _VISIBLE_TIERS if glint.visible >= low)
+        names = {"visible": tier, "place": glint.look.place}
+        if glint.look.saturated is not None:
+            names["saturation"] = "saturated" if glint.look.saturated else "not saturated"
+        for group, name in names.items():
+            if name:
+                groups[group].setdefault(name, []).append(matched)
+    return {
+        group: {
+            name: {"true": len(hits), "matched": sum(hits), "recall": _ratio(sum(hits), len(hits))}
+            for name, hits in sorted(members.items())
+        }
+        for group, members in groups.items()
     }
 
 

@@ -27,6 +27,7 @@ def bench_extractors(
     against: Path | None = None,
     require: tuple[str, ...] = (),
     timeout: float = 30.0,
+    quick: bool = False,
     fresh: bool = False,
     overwrite: Overwrite = False,
     json: Result = None,
@@ -55,6 +56,7 @@ def bench_extractors(
         require: A figure that must be reached, such as right>=.95 or own-fast:centre_px<.1. Repeat the option for
             several.
         timeout: Seconds that an extractor may take for one image.
+        quick: Take a tenth of the images, in which hard conditions are as frequent as in all.
         fresh: Ask about every image again, also where an answer is stored.
     """
     from ..benchmark.options import BenchOptions
@@ -66,6 +68,7 @@ def bench_extractors(
         gamma=gamma,
         eye_error_mm=eye_error,
         pupil_class=pupil_class,
+        quick=quick,
         fresh=fresh,
         against=against,
         require=require,
@@ -101,6 +104,9 @@ def _table(data: dict[str, Any], times: dict[str, Any]) -> str:
             f"{'-' if g is None else '{}/{}'.format(g['matched'], g['true']):>9} "
             f"{_f(g['error_px']['median'] if g else None, 4):>7} {_f(time, 1):>6}"
         )
+    for e in data["extractors"]:
+        if e["suggested_origin"]:
+            lines.append(f"{e['name']}: {e['suggested_origin']['text']}")
     for e in data["extractors"]:
         lines += [f"{e['name']}: {f['count']} x {f['outcome']}: {f['reason']}" for f in e["failures"][:3]]
     for c in data["against"]:

@@ -42,20 +42,8 @@ class Thumbnail:
 
 def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: Sequence[Thumbnail] = ()) -> None:
     """Write one self-contained HTML file from the bench's JSON, its rows (per extractor and image), and thumbnails."""
-    entries, edge = data["extractors"], data["edge"]
-    best = [e for e in entries if e["summary"]["right"]]
+    entries, cards = data["extractors"], _cards(data)
     varying = [name for name in data["factors"] if any(e["breakdown"].get(name) for e in entries)]
-    cards = [Card(f"{data['with_pupil']} of {data['images']}", "images that show a pupil")]
-    if edge["n"]:
-        text = f"noise / pupil-iris step (DN of 8 bits) / sigma of the blurred edge (px), medians; {edge['source']}"
-        cards.append(Card(f"{edge['noise_dn']:.2f} / {edge['step_dn']:.1f} / {edge['sigma_px']:.2f}", text))
-    if best:
-        least = min(best, key=lambda e: e["summary"]["centre_px"]["median"])
-        cards.append(
-            Card(f"{least['summary']['centre_px']['median']:.4f} px", f"least median centre error: {least['name']}")
-        )
-        most = max(best, key=lambda e: e["summary"]["rates"]["right"])
-        cards.append(Card(_percent(most["summary"]["rates"]["right"]), f"most pupils right: {most['name']}"))
     lead = [
         "Every extractor ran in its own process, on the same images and with the same information: the image, its bit "
         "depth and, if the folder has a rig, the rig and the range of likely pupil sizes, but never the truth.",
@@ -64,7 +52,10 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
         "The errors are those of the right pupils.",
     ]
     sections = [
-        Section("Results", tables=(_pupil_table(entries), _rate_table(entries), _glint_table(entries))),
+        Section(
+            "Results",
+            tables=(_pupil_table(entries), _rate_table(entries), _glint_table(entries), _recall_table(entries)),
+        ),
         Section(
             "Compared in pairs",
             [
@@ -90,6 +81,14 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
             [Figure(factor_figure(data, name), f"By {data['factors'][name]['what']}.") for name in varying],
             [_factor_table(data, name) for name in varying],
         ),
+        Section(
+            "Hard conditions",
+            [
+                "Share of right answers on the images of each condition; an image may be of several. Where no pupil is "
+                "seen, the answer that there is none is right."
+            ],
+            tables=(_condition_table(data),),
+        ),
         Section("Failures", figures=_thumbnail_figures(thumbnails), tables=(_failure_table(entries),)),
         Section("How this was made", _how(data), tables=(_convention_table(entries),)),
     ]
@@ -100,8 +99,26 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
             caption="Not run",
             wide=(1,),
         )
-        sections[5] = replace(sections[5], tables=(_failure_table(entries), table))
+        sections[6] = replace(sections[6], tables=(_failure_table(entries), table))
     write_page(path, Page(f"{data['folder']}: extractors compared", lead, cards, sections))
+
+
+def _cards(data: Row) -> list[Card]:
+    """The figures at the top of the report."""
+    entries, edge = data["extractors"], data["edge"]
+    best = [e for e in entries if e["summary"]["right"]]
+    cards = [Card(f"{data['with_pupil']} of {data['images']}", "images that show a pupil")]
+    if edge["n"]:
+        text = f"noise / pupil-iris step (DN of 8 bits) / sigma of the blurred edge (px), medians; {edge['source']}"
+        cards.append(Card(f"{edge['noise_dn']:.2f} / {edge['step_dn']:.1f} / {edge['sigma_px']:.2f}", text))
+    if best:
+        least = min(best, key=lambda e: e["summary"]["centre_px"]["median"])
+        cards.append(
+            Card(f"{least['summary']['centre_px']['median']:.4f} px", f"least median centre error: {least['name']}")
+        )
+        most = max(best, key=lambda e: e["summary"]["rates"]["right"])
+        cards.append(Card(_percent(most["summary"]["rates"]["right"]), f"most pupils right: {most['name']}"))
+    return cards
 
 
 def _thumbnail_figures(thumbnails: Sequence[Thumbnail]) -> list[Figure]:
@@ -311,6 +328,21 @@ def _pupil_table(entries: Sequence[Row]) -> Table:
     return Table(header=header, rows=rows, caption=caption)
 
 
+def _condition_table(data: Row) -> Table:
+    """One row per condition that occurs: its images, and the share of right answers of every extractor."""
+    rows = []
+    for name, condition in data["conditions"].items():
+        if condition["images"]:
+            shares = []
+            for entry in data["extractors"]:
+                s = entry["conditions"][name]
+                absent = s["without_pupil"] - s["false"] - (s["errors"] - s["error"])
+                shares.append(_percent((s["right"] + absent) / s["images"]))
+            rows.append((name, condition["what"], str(len(condition["images"])), *shares))
+    header = ("condition", "what", "images", *(e["name"] for e in data["extractors"]))
+    return Table(header=header, rows=rows, caption="Right answers by condition", wide=(1,))
+
+
 def _rate_table(entries: Sequence[Row]) -> Table:
     rows = []
     for e in entries:
@@ -356,22 +388,47 @@ def _glint_table(entries: Sequence[Row]) -> Table:
     for e in entries:
         g = e["summary"]["glints"]
         if g is None:
-            rows.append((e["name"], *["-"] * 6))
+            rows.append((e["name"], *["-"] * 8))
             continue
         swaps = f"{g['swapped']} of {g['named']}" if g["named"] else "-"
         rows.append(
             (
                 e["name"], f"{g['matched']} of {g['true']}", _percent(g["recall"]), _percent(g["precision"]), swaps,
-                _px(g["error_px"]["median"]), _px(g["error_px"]["p95"]),
+                str(g["unnamed"]), _px(g["error_px"]["median"]), _px(g["error_px"]["p95"]),
+                ", ".join(f"{n} {kind}" for kind, n in g["false_kinds"].items()) or "-",
             )
         )  # fmt: skip
-    header = ("extractor", "found", "recall", "precision", "identity swaps", "error: median", "95 %")
+    header = (
+        "extractor",
+        "found",
+        "recall",
+        "precision",
+        "identity swaps",
+        "unnamed",
+        "error: median",
+        "95 %",
+        "false",
+    )
     return Table(
         header=header,
         rows=rows,
-        caption="Glints: a reported glint matches a true one within 2 px. Errors are in px. Swaps: matches with the"
-        " wrong light, of the matches with a light. A dash means that the extractor does not search for glints.",
+        caption="Glints: a reported glint matches a true one within 2 px, or within its radius and 1 px if that is "
+        "more. Errors are in px. Swaps: matches with the wrong light, of the matches with a light. Unnamed: matches "
+        "without a light, although the lights are known. A dash means that the extractor does not search for glints.",
+        wide=(8,),
     )
+
+
+def _recall_table(entries: Sequence[Row]) -> Table:
+    """Recall of glints by saturation, visible share and place."""
+    rows = []
+    for e in entries:
+        groups = (e["summary"]["glints"] or {}).get("recall_by", {})
+        for group, members in groups.items():
+            for name, g in members.items():
+                rows.append((e["name"], group, name, f"{g['matched']} of {g['true']}", _percent(g["recall"])))
+    header = ("extractor", "by", "glints", "found", "recall")
+    return Table(header=header, rows=rows, caption="Recall of glints by their look and place.")
 
 
 def _factor_table(data: Row, name: str) -> Table:
@@ -433,6 +490,7 @@ def _how(data: Row) -> list[str]:
     return [
         f"Each extractor uses one thread. {versions}.",
         f"Encoding gamma given to the extractors: {gammas}.",
+        *(f"{e['name']}: {e['suggested_origin']['text']}." for e in data["extractors"] if e["suggested_origin"]),
         "Cramér-Rao bound of the centre, per axis: (s / step) sqrt(2 sigma_b / (sqrt(pi) sqrt(a b))). Here s is "
         "the noise, step the grey-level step from pupil to iris, and sigma_b the blur of the edge, including the "
         "pixel. The median distance is 1.177 times the bound. It holds for a fully visible outline. In rendered "

@@ -67,7 +67,7 @@ def bench(drawn, tmp_path_factory):
 
 def test_the_figures_are_those_of_the_extractors(bench):
     out, data = bench
-    assert data["schema"] == "eyerender/bench-extractors/2"
+    assert data["schema"] == "eyerender/bench-extractors/3"
     own, contour, dead = data["extractors"]
     s = own["summary"]
     assert (s["right"], s["with_pupil"]) == (6, 6)

@@ -14,7 +14,8 @@ from scipy.stats import norm
 
 import make_ideal_images as ideal
 from eyerender.benchmark.bound import Edge, edge_of, is_bounded, measure_edge
-from eyerender.benchmark.folder import LabelledImage, TrueGlint, load_labelled
+from eyerender.benchmark.folder import LabelledImage, load_labelled
+from eyerender.benchmark.glintlabels import GlintLook, TrueGlint
 from eyerender.benchmark.protocol import Reply
 from eyerender.benchmark.score import GlintScore, Score, score, score_glints
 from eyerender.benchmark.summary import bins, breakdown, efficiency, failures, summarise
@@ -71,7 +72,27 @@ def test_glints_are_matched_one_to_one_and_swaps_are_counted():
     assert (got.named, got.swapped) == (2, 2)
     right = score_glints(IMAGE, found(PUPIL, [((50.0, 30.0), 2), ((45.0, 40.0), None)]))
     assert (right.named, right.swapped, len(right.errors_px)) == (1, 0, 2)
-    assert score_glints(IMAGE, found(PUPIL)) == GlintScore(true=3, reported=0)
+    none = score_glints(IMAGE, found(PUPIL))
+    assert none == GlintScore(true=3, reported=0, matches=tuple((False, glint) for glint in IMAGE.glints))
+
+
+def test_false_and_unnamed_glints_are_counted():
+    reported = [((45.5, 40.0), 1), ((55.0, 40.2), None), ((80.0, 70.0), None), ((45.0, 40.9), None)]
+    assert score_glints(IMAGE, found(PUPIL, reported)).unnamed == 0  # nobody could name them without a rig
+    got = score_glints(replace(IMAGE, hints={"rig": {}}), found(PUPIL, reported))
+    assert (got.named, got.unnamed) == (1, 1)
+    assert got.false_kinds == ("elsewhere", "repeated")
+    assert [matched for matched, _ in got.matches] == [True, True, False]
+    scores = [Score("right", offset_px=(0, 0), axes_px=(0, 0), iou=0.98, boundary_px=0.2, glints=got)]
+    recall = summarise(scores, [None], True)["glints"]["recall_by"]
+    assert recall["visible"] == {"whole": {"true": 3, "matched": 2, "recall": 2 / 3}}
+
+
+def test_a_large_glint_matches_within_its_radius():
+    far = [((45.0, 43.5), 0)]
+    assert len(score_glints(IMAGE, found(PUPIL, far)).errors_px) == 0
+    large = replace(IMAGE, glints=(replace(IMAGE.glints[0], look=GlintLook(radius_px=3.0)), *IMAGE.glints[1:]))
+    assert len(score_glints(large, found(PUPIL, far)).errors_px) == 1
 
 
 def test_rates_are_over_the_images_that_show_a_pupil():

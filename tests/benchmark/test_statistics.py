@@ -10,12 +10,16 @@ import pytest
 from scipy.stats import binom, binomtest
 
 from eyerender.benchmark.asking import Run
+from eyerender.benchmark.conventions import Conventions
 from eyerender.benchmark.curves import curves_of
 from eyerender.benchmark.failurekinds import kind_of
-from eyerender.benchmark.folder import LabelledImage, TrueGlint
+from eyerender.benchmark.folder import LabelledImage
+from eyerender.benchmark.glintlabels import TrueGlint
 from eyerender.benchmark.intervals import subject_interval, wilson
 from eyerender.benchmark.paired import common_errors, pairs_of
+from eyerender.benchmark.protocol import Greeting
 from eyerender.benchmark.registry import ExtractorCommand
+from eyerender.benchmark.results import suggested_origin
 from eyerender.benchmark.score import Outcome, Score
 from eyerender.benchmark.summary import bins, summarise
 from eyerender.geometry.ellipse import Ellipse
@@ -162,3 +166,16 @@ def test_a_summary_has_intervals_for_every_rate():
     assert got["intervals"]["false"]["subjects"] is None
     assert set(got["intervals"]) == {"right", "wrong", "none", "error", "false"}
     assert got["failure_kinds"] == {"shadow": 1}
+
+
+@pytest.mark.parametrize(("shift", "declared", "suggested"), [
+    ((0.5, 0.5), "centre", "corner"), ((-0.5, -0.5), "corner", "centre"), ((0.5, 0.0), "centre", None),
+    ((0.1, 0.1), "centre", None), ((-0.5, -0.5), "centre", None),
+])  # fmt: skip
+def test_half_a_pixel_suggests_the_other_origin(shift, declared, suggested):
+    rng = np.random.default_rng(2)
+    scores = tuple(Score("right", offset_px=tuple(np.add(shift, rng.normal(0.0, 0.2, 2)))) for _ in range(20))
+    greeting = Greeting("a", Conventions(pixel_origin=declared), ("pupil",))
+    got = suggested_origin(Run(ExtractorCommand("a", "a", ()), greeting, scores))
+    assert (got and got["suggested"]) == suggested
+    assert suggested_origin(Run(ExtractorCommand("a", "a", ()), greeting, scores[:7])) is None
