@@ -302,6 +302,7 @@ class LampPath:
         blocked = lamp_blocked(frame, path.entry, source, True, False, enters)
         whole = dr.select(path.found, lamp.radiant_intensity(path.leaving) * path.transfer, 0)
         return cls(
-            gain=whole * clear, whole=whole, out=out, entry=path.entry, enters=enters, blocked=blocked,
-            failed=path.failed,
+            # Where there is no path, its entry may not be a number.
+            gain=dr.select(enters, whole * clear, 0), whole=whole, out=out, entry=path.entry, enters=enters,
+            blocked=blocked, failed=path.failed,
         )  # fmt: skip
