@@ -26,7 +26,8 @@ def realism(
 ) -> int:
     """Measure how real pictures of eyes look: contrasts, edges, texture, highlights, noise.
 
-    With a second folder, such as frames of your own camera, the command compares both.
+    With a second folder, such as frames of your own camera, the command compares both, and a classifier says how well
+    patches of the two can be told apart (needs scikit-learn, which is not installed by default).
 
     Args:
         folder: A folder of images of one eye each: written by this package, exported by it, or your own.
@@ -66,7 +67,24 @@ def _table(data: dict[str, Any]) -> str:
             spread = f"[{_f(s['q25'])}, {_f(s['q75'])}]" if s["n"] else ""
             cells += f"{_f(s['median']):>10} {spread:>19}"
         lines.append(f"{name:<24}{cells}" + (f"{_f(ratios[name]):>9}" if ratios else ""))
-    return "\n".join(lines)
+    return "\n".join([*lines, *_test(data)])
+
+
+def _test(data: dict[str, Any]) -> list[str]:
+    """One line per kind of patch: how well the two folders can be told apart."""
+    if len(data["folders"]) < 2:
+        return []
+    if data["separability"] is None:
+        return ["", f"two-sample test: {data['separability_reason']}"]
+    lines = ["", f"{'told apart (.5 chance)':<24}{'AUC':>10} {'90 % interval':>19}{'images':>12}"]
+    for kind, found in data["separability"].items():
+        if found is None:
+            lines.append(f"{kind:<24}{'-':>10} {'too few images':>19}")
+            continue
+        low, high = found["interval_90"]
+        images = "{} and {}".format(*found["images"])
+        lines.append(f"{kind:<24}{found['auc']:>10.2f} {f'[{low:.2f}, {high:.2f}]':>19}{images:>12}")
+    return lines
 
 
 def _f(value: float | None) -> str:

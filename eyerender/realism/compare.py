@@ -14,8 +14,10 @@ from ..progress import Progress, followed
 from ..storage.files import read_json
 from .figures import FIGURES, RADIUS_PX, Scaled, measure, ratio
 from .folder import FolderFigures, Skipped, Source, open_source, pictures
+from .patches import patches
+from .separability import MISSING, available, separability, to_mapping
 
-SCHEMA = "eyerender/realism/1"
+SCHEMA = "eyerender/realism/2"
 DEFAULT_LIMIT = 200
 MAX_LIMIT = 10_000
 EXPORT = "export.json"
@@ -44,7 +46,7 @@ def measure_folder(
         raise InputError("must be between 0.1 and 10", source="--gamma")
     source = open_source(path, limit)
     known, origin = _encoding(source) if gamma is None else (gamma, "given")
-    rows, skipped, tiles = [], [], []
+    rows, skipped, tiles, cut = [], [], [], []
     found = pictures(source, known)
     for name in followed(source.names, progress):
         picture = next(found)
@@ -54,6 +56,7 @@ def measure_folder(
         scaled = Scaled.of(picture)
         rows.append((name, measure(picture, scaled)))
         tiles.append(_tile(scaled))
+        cut.append(patches(scaled, len(cut)))
     return FolderFigures(
         path=str(path),
         images=len(source.names),
@@ -63,6 +66,7 @@ def measure_folder(
         rows=tuple(rows),
         skipped=tuple(skipped),
         tiles=tuple(tiles),
+        patches=tuple(cut),
     )
 
 
@@ -109,8 +113,8 @@ def realism(
         progress: called with (images done, images in all, "") for each folder.
 
     Returns:
-        Schema eyerender/realism/1: the definitions, the figures of each folder, and for two folders the ratio of their
-        medians, first over second.
+        Schema eyerender/realism/2: the definitions, the figures of each folder, and for two folders the ratio of their
+        medians, first over second, and how separable their patches are.
 
     Raises:
         InputError: a folder or an argument cannot be used.
@@ -120,13 +124,16 @@ def realism(
     each = [gammas[k if len(gammas) > 1 else 0] if gammas else None for k in range(len(folders))]
     found = [measure_folder(f, gamma=g, limit=limit, progress=progress) for f, g in zip(folders, each, strict=True)]
     ratios = {name: ratio(*(f.median(name) for f in found)) for name in FIGURES} if len(found) == 2 else None
+    test = separability(*found) if len(found) == 2 and available() else None
     if output is not None:
         from .page import write
 
-        write(Path(output), found, ratios)
+        write(Path(output), found, ratios, test)
     return {
         "schema": SCHEMA,
         "definitions": dict(FIGURES),
         "folders": [f.to_mapping() for f in found],
         "ratios": ratios,
+        "separability": None if test is None else to_mapping(test),
+        "separability_reason": None if test is not None else MISSING if len(found) == 2 else "needs two folders",
     }

@@ -70,6 +70,7 @@ class FolderFigures:
         rows: name and figures of each measured image.
         skipped: images that could not be measured.
         tiles: every measured image about its eye, at equal scale.
+        patches: of every measured image, kind -> patches of it.
     """
 
     path: str
@@ -80,6 +81,7 @@ class FolderFigures:
     rows: tuple[tuple[str, dict[str, float | None]], ...]
     skipped: tuple[Skipped, ...]
     tiles: tuple[Bytes, ...]
+    patches: tuple[dict[str, tuple[Bytes, ...]], ...]
 
     def values(self, name: str) -> list[float]:
         """Return values of a figure in all images that have it."""

@@ -14,14 +14,22 @@ from ..report.page import Card, Figure, Page, Section, Table, write_page
 from ..report.style import ANALYTIC, IMAGE, figure, svg
 from .figures import FIGURES
 from .folder import FolderFigures
+from .separability import Separability
 
 _COLUMNS, _TILES, _GAP = 4, 24, 6
 
 
-def write(path: Path, found: Sequence[FolderFigures], ratios: Mapping[str, float | None] | None) -> None:
+def write(
+    path: Path,
+    found: Sequence[FolderFigures],
+    ratios: Mapping[str, float | None] | None,
+    test: Mapping[str, Separability | None] | None = None,
+) -> None:
     """Write the page of one or two folders."""
     title = "How real the pictures look" if len(found) == 1 else "Two folders of pictures compared"
     sections = [Section("Figures", figures=_spread(found) if len(found) == 2 else (), tables=[_table(found, ratios)])]
+    if test is not None:
+        sections.append(_separability(found, test))
     sections += [Section(f"Pictures of {f.path}", text=[_about(f)], figures=_montage(f)) for f in found]
     skipped = [[f.path, s.name, s.reason] for f in found for s in f.skipped[:50]]
     if skipped:
@@ -81,6 +89,26 @@ def _cell(f: FolderFigures, name: str) -> str:
     return f"{text(middle)} [{text(low)}, {text(high)}], n {len(values)}"
 
 
+def _separability(found: Sequence[FolderFigures], test: Mapping[str, Separability | None]) -> Section:
+    """How well a classifier tells the folders apart, with the patches that reveal most."""
+    rows, figures = [], []
+    for kind, result in test.items():
+        if result is None:
+            rows.append([kind, "-", "-", "too few images"])
+            continue
+        low, high = result.interval
+        rows.append([kind, f"{result.auc:.2f}", f"{low:.2f} to {high:.2f}", "{} and {}".format(*result.images)])
+        for f, shown in zip(found, result.revealing, strict=True):
+            figures.append(_enlarged(montage(shown, len(shown)), f"{kind}: most typical of {f.path}"))
+    table = Table(header=("patch", "area under the ROC curve", "90 % interval", "images"), rows=rows)
+    text = [
+        "A classifier was trained on patches of some images and asked to which folder those of other images belong; .5 "
+        "is chance, 1 is certainty. All patches have equal scale, blur, compression and noise. Read it beside the "
+        "same test of two folders of real frames of different cameras. The patches shown reveal their folder most."
+    ]
+    return Section("Can they be told apart?", text=text, tables=[table], figures=figures)
+
+
 def _spread(found: Sequence[FolderFigures]) -> list[Figure]:
     """Return the middle half of the images of both folders, over the median of the second."""
     names = [n for n in FIGURES if all(f.values(n) for f in found) and (found[1].median(n) or 0) > 0]
@@ -107,19 +135,24 @@ def _montage(f: FolderFigures) -> list[Figure]:
         return []
     count = min(len(f.tiles), _TILES)
     sheet = montage([f.tiles[k * len(f.tiles) // count] for k in range(count)])
+    return [_enlarged(sheet, f.path, 1)]
+
+
+def _enlarged(sheet: Bytes, caption: str, times: int = 3) -> Figure:
     height, width = sheet.shape
     data = base64.b64encode(png_bytes(sheet)).decode()
+    size = f'width="{width}" height="{height}"'
     picture = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}">'
-        f'<image href="data:image/png;base64,{data}" width="{width}" height="{height}"/></svg>'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{times * width}">'
+        f'<image href="data:image/png;base64,{data}" {size}/></svg>'
     )
-    return [Figure(picture, f.path)]
+    return Figure(picture, caption)
 
 
-def montage(tiles: Sequence[Bytes]) -> Bytes:
-    """Arrange tiles of equal size, four in a row."""
+def montage(tiles: Sequence[Bytes], columns: int = _COLUMNS) -> Bytes:
+    """Arrange tiles of equal size in rows."""
     height, width = tiles[0].shape
-    columns = min(_COLUMNS, len(tiles))
+    columns = min(columns, len(tiles))
     rows = -(-len(tiles) // columns)
     shape = (rows * (height + _GAP) - _GAP, columns * (width + _GAP) - _GAP)
     sheet = np.full(shape, 255, dtype=np.uint8)

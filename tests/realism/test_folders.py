@@ -46,7 +46,7 @@ def test_the_command_compares_two_folders(frames, tmp_path, capsys):
     argv = ["realism", str(frames), str(frames), "--gamma", "1", "--gamma", "2.2", "-o", str(page)]
     assert run([*argv, "--json", str(target)]) == 0
     data = json.loads(target.read_text())
-    assert data["schema"] == "eyerender/realism/1"
+    assert data["schema"] == "eyerender/realism/2"
     assert list(data["definitions"]) == list(FIGURES)
     first, second = data["folders"]
     assert (first["images"], first["measured"], first["gamma"], second["gamma"]) == (5, 3, 1.0, 2.2)
