@@ -92,6 +92,9 @@ class Lashes(Spec):
     )
     clumping: Share = Field(default=0.55, description="how far the tips of neighbours lean together (chosen)")
     spread_deg: float = _number(11.0, 2.0, 20.0, "standard deviation of direction (chosen)")
+    mascara: Share = Field(
+        default=0.0, description="make-up: lashes darker to the tips, thicker and in firmer tufts, and a dark lash line"
+    )
     albedo: float = _number(
         0.05, 0.02, 0.5, "albedo at 850 nm; melanin absorbs little there, but hair is still dark (chosen)"
     )
@@ -198,7 +201,7 @@ class Region(Spec):
 
     @classmethod
     def drawn(cls, seed: int, *, spread: float = 1.0, blink: float = 0.0) -> Self:
-        """Draw a subject: every bounded number is uniform over `spread` of its range about the default.
+        """Draw a subject without make-up: every bounded number is uniform over `spread` of its range about the default.
 
         Each number is a pure function of (seed, key).
         """
@@ -207,7 +210,9 @@ class Region(Spec):
 
 def _draw(kind: type[Spec], key: tuple[int, ...], spread: float) -> dict[str, object]:
     out: dict[str, object] = {}
-    fields = [(name, field) for name, field in sorted(kind.model_fields.items()) if name not in ("head", "map")]
+    fields = [
+        (name, field) for name, field in sorted(kind.model_fields.items()) if name not in ("head", "map", "mascara")
+    ]
     for i, (name, field) in enumerate(fields):
         if isinstance(field.annotation, type) and issubclass(field.annotation, Spec):
             out[name] = _draw(field.annotation, (*key, i), spread)

@@ -111,18 +111,18 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     along = np.clip(1 + 0.8 * _noise(rng, (1, ANGULAR), (0, 1), (3, 30), True), 0, 2.4)
     crest = np.exp(-((off / rng.uniform(0.015, 0.04)) ** 2)) * along
     height += iris.collarette * (0.06 * crest - 0.06 * (1 - ciliary) + 0.03 * np.exp(-((off / 0.12) ** 2)))
-    albedo += iris.collarette * (0.06 * crest + 0.05 * (1 - ciliary))
+    albedo += iris.collarette * (0.13 * crest + 0.08 * (1 - ciliary))
     slow = _noise(rng, shape, (0, 2.0), (0, 5))
     albedo += 0.045 * slow + 0.035 * _noise(rng, shape, (0, 14), (0, 60)) - 0.04 * step(s, 0.72, 1.0)
     height += 0.02 * slow
-    # The stroma is a felt of collagen, whose grain shows in every iris.
-    albedo += grained.uniform(0.052, 0.085) * _noise(grained, shape, (8, 32), (50, 200))
+    # The stroma is a felt of collagen, whose grain shows more in some irises than in others.
+    albedo += grained.uniform(0.02, 0.075) * _noise(grained, shape, (8, 32), (50, 200))
     albedo += 0.042 * _noise(grained, shape, (3, 12), (20, 70))
 
     grooves = iris.furrows * _furrows(furrowed, s, turn)
     depth, trabeculae = _crypts(holed, iris.crypts, s=s, off=off, turn=turn, warp=warp)
     height += 0.03 * trabeculae - 0.07 * grooves - 0.25 * depth
-    albedo = albedo * (1 + 0.45 * trabeculae) * (1 - 0.14 * grooves) * (1 - 0.85 * depth)
+    albedo = albedo * (1 + 0.45 * trabeculae) * (1 - 0.24 * grooves) * (1 - 0.85 * depth)
 
     # The ruff is the pigment epithelium turned over the margin, a dark beaded seam.
     beads = np.maximum(0.018 * (1 + 0.35 * _noise(rng, (1, ANGULAR), (0, 1), (30, 75), True)), 0.006)
@@ -190,7 +190,7 @@ def _crypts(
     # The lattice is in mm of an iris of 3.8 mm from margin to root, elongated along the radius.
     long_by = rng.uniform(1.5, 2.6)
     around, along = 2 * np.pi * 3.2, WIDTH_MM / long_by
-    count = int(rng.integers(180, 520))
+    count = int(rng.integers(70, 420))
     seeds = np.stack([rng.uniform(0, around, count), rng.uniform(0, along, count)], axis=-1)
     copies = np.concatenate([seeds + np.array([shift, 0.0]) for shift in (-around, 0.0, around)])
     share = rng.uniform(0.2, 0.55)

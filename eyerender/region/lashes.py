@@ -31,7 +31,7 @@ _CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
 _NEAR_COLUMNS = 6
 _SEARCH_MM = 1.5  # distance up to which skin lifts a lash
 _NEARLY = 0.2  # share by which the skin that is found may be farther away than the nearest
-_TIP = 0.3  # radius of the tip over that of the root; the map makes thin tips paler instead (`skin.lash_band`)
+_TIP = 0.22  # radius of the tip over that of the root; the map makes thin tips paler instead (`skin.lash_band`)
 _KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl is this sharp
 
 
@@ -96,8 +96,12 @@ def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
     curl = curl * np.clip(1 + both(0.16, 0.12), 0.4, 1.5)
     # The tips of a tuft lean together, some just past each other.
     offset_mm = 14.5 * (_means(a, tuft) - a)
-    tight = spec.clumping * _shared(rng.uniform(0.5, 1.4, count), tuft)
-    fan += tight * np.arctan(offset_mm / np.maximum(length, 1.0))
+    clumping = spec.clumping + 0.6 * spec.mascara * (1 - spec.clumping)
+    tight = clumping * _shared(rng.uniform(0.6, 1.5, count), tuft)
+    lean = tight * np.arctan(offset_mm / np.maximum(length, 1.0))
+    # Half of it is in their outer part, so they stand apart at the roots and meet at the tips.
+    fan += 0.5 * lean
+    sway += 0.8 * lean
     angle = np.arccos(np.clip(a, -1, 1)) if upper else 2 * np.pi - np.arccos(np.clip(a, -1, 1))
     stout = (1.0 if upper else 0.7) * np.clip(0.5 + 0.55 * length / most, 0.0, 1.0) * rng.uniform(0.75, 1.1, count)
     return angle, across, length, fan, start, curl, stout, sway
@@ -157,7 +161,8 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
         corner = np.flatnonzero(np.abs(np.sin(p.angle)) < 0.75)
         stuck = corner[_through_skin(sheet, p.angle[corner], points[corner, 1:])] if len(corner) else corner
         points[stuck, 1:] = points[stuck, :1] + 0.0005 * (straight[stuck, 1:] - points[stuck, :1])
-    radii = taper(len(root), spec.lashes.diameter_mm, np.linspace(0, 1, k), _TIP) * p.stout[:, None]
+    thick = spec.lashes.diameter_mm * (1 + 0.7 * spec.lashes.mascara)
+    radii = taper(len(root), thick, np.linspace(0, 1, k), _TIP) * p.stout[:, None]
     return Hairs(frozen(points), frozen(radii))
 
 

@@ -182,7 +182,7 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     # The plica is a low crescent on the globe, the caruncle a mound beside it.
     s = u[..., 0]
     size = step(c.along, 0.66, 0.9)[None, :] * (1 - spec.blink)
-    plica = 0.40 * np.exp(-(((s - 0.24) / 0.15) ** 2)) * size
+    plica = 0.16 * np.exp(-(((s - 0.34) / 0.22) ** 2)) * size
     caruncle = 1.2 * np.exp(-(((s - 0.6) / 0.2) ** 2)) * step(c.along, 0.86, 0.99)[None, :] * (1 - 0.6 * spec.blink)
     rows = rows + (plica + caruncle)[..., None] * c.normal
     # Long pieces are chords of the globe (0.7 of its radius for the cornea), so the points are raised until their

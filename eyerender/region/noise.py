@@ -27,14 +27,21 @@ def band_noise(
 ) -> Singles:
     """Gaussian noise (h, w) of unit variance that is periodic both ways; `(low, high)` cycles over width and height.
 
-    Only the waves that the band keeps are drawn.
+    A wave is kept if its frequencies are within an ellipse of the `high` ones and outside of one of the `low` ones.
+    Bands of width and height by themselves would leave diagonal waves alone, which look like a weave. Only the waves
+    that the band keeps are drawn.
     """
     h, w = shape
     kept = min(w // 2 + 1, int(_NEGLIGIBLE * across[1]) + 2)
     f = np.abs(fft.fftfreq(h) * h)
     rows = np.flatnonzero(f <= _NEGLIGIBLE * up[1])
     waves = rng.standard_normal((len(rows), 2 * kept), np.float32).view(np.complex64)
-    waves *= (gain(f[rows], *up)[:, None] * gain(np.arange(kept, dtype=float), *across)).astype(np.float32)
+    k = np.arange(kept, dtype=float)
+    left = gain(f[rows], 0, up[1])[:, None] * gain(k, 0, across[1])
+    if across[0] > 0 or up[0] > 0:
+        below = [(v / low) ** 2 if low > 0 else 0 * v for v, low in ((f[rows, None], up[0]), (k, across[0]))]
+        left *= 1 - np.exp(-(below[0] + below[1]))
+    waves *= left.astype(np.float32)
     spectrum = np.zeros((h, kept), np.complex64)
     spectrum[rows] = waves
     spectrum[0, 0] = 0

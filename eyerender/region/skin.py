@@ -42,6 +42,7 @@ _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STEEPEST = 2.0  # slope of the map, over the region's frame; margins are seen from their edges
 _STRIP = 32  # rows of the map that are made together, so that they stay in the processor's cache
 _HAIR_GLOSS = 0.2
+_MASCARA = 0.03  # albedo of lashes with mascara (chosen)
 _WET, _WET_ROOT = 0.97, 0.06  # gloss of wet tissue, and the share of a lash that is wet
 _SHOWN_MM = 25.0  # about the middle of the fissure: the skin whose mean albedo is that of the spec
 _REFERENCE_BLINK = 0.3  # at which the tissue is laid out: neither stretched nor hidden in the fold
@@ -141,6 +142,7 @@ def lash_band(spec: Region) -> tuple[Singles, Singles]:
     root = np.where(lower, lashes.lower_albedo, lashes.albedo)
     tip = np.where(lower, 0.5 * (lashes.lower_albedo + lashes.tip_albedo) + 0.1, lashes.tip_albedo)
     albedo = root + (np.maximum(tip, root) - root) * s**1.5
+    albedo += lashes.mascara * (np.minimum(albedo, _MASCARA) - albedo)
     gloss = np.where(s < _WET_ROOT, 0.93, _HAIR_GLOSS)
     return np.asarray(albedo, dtype=np.float32), np.asarray(gloss, dtype=np.float32)
 
@@ -221,7 +223,7 @@ class _Tiles:
     @cached_property
     def drawn(self) -> Padded:
         """Furrows of the lids, which are drawn out across."""
-        return Padded(furrows(self.spec.seed + 7, _TILE, 1500, 0.6))
+        return Padded(furrows(self.spec.seed + 7, _TILE, 1500, 2.5))
 
     @cached_property
     def hollows(self) -> Padded:
@@ -278,6 +280,7 @@ class _Slow:
             "bent": 0.25 * of_lids(31, (0, 9), (0, 6)),
             "wide": step(of_lids(37, (1, 7), (4, 16)), -0.7, 1.6),
             "fine": step(of_lids(39, (2, 12), (6, 22)), -0.9, 1.0),
+            "patch": step(tiles.at(16, places, (0, 7), (0, 7)), -0.9, 1.3),
             "way": 2.0 * tiles.at(51, places, (0, 4), (0, 4)),
             "veins": step(tiles.at(54, places, (0, 5), (0, 5)), -0.6, 0.9) * _hill(y, z, 22.0, 17.0),
         }
@@ -339,8 +342,8 @@ class _Strip:
         self.level = z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z * 0.25)
         self.places, self.along = _places(y, z), _places(y, self.level)
         self.within = 1 - step(rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
-        # The fold of the plica darkens the conjunctiva towards the caruncle.
-        self.flesh = step(np.cos(self.turn).astype(np.float32), 0.60, 0.85) * self.within * step(rows, 0.0, 2.2)
+        # The plica darkens the conjunctiva little by little towards the caruncle.
+        self.flesh = step(np.cos(self.turn).astype(np.float32), 0.55, 0.95) * self.within * step(rows, 0.0, 5.0)
         self.lids = _hill(y, z, 19.0, 13.0) * self.near
         self.roots = _bell(self.out_mm, 0.9, 2.4)  # of the lashes
 
@@ -355,9 +358,8 @@ class _Strip:
     def look(self, spots: Singles) -> tuple[Singles, Singles, Singles]:
         """Albedo, gloss and height (mm) of the relief; `spots` is the light that the freckles leave."""
         spec = self.spec
-        cells, creases, pores = self.cells(), self.creases(), self.pores()
-        oil, wet = self.oil(), self.wet()
-        height = self.relief(cells, oil) - (1 - oil) * (0.03 * pores + 0.17 * spec.skin.wrinkles * creases)
+        cells, creases, pores, wet = self.cells(), self.creases(), self.pores(), self.wet()
+        height = self.relief(cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases
         # Water fills the furrows.
         dry = self.lid * (1 - np.minimum(wet * (1 / 0.7), 1))
         height = height * dry + spec.tears.unevenness * self.lumps()
@@ -366,21 +368,11 @@ class _Strip:
             height = height + bumps * self.flesh * self.field(6, (10, 36), (10, 36))
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
         open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
-        film = 0.42 * self.slowly("film") * (0.4 + 0.6 * cells) * (1 - pores)
-        sheen = spec.skin.sheen * np.clip(film + oil, 0.04, 0.72 + 0.18 * self.roots)
+        # Oil stands in a thin film on the plateaus, more of it near the glands of the lash roots.
+        film = (0.9 * self.slowly("film") + 0.2 * self.roots) * (0.3 + 0.7 * cells) * (1 - pores) * (1 - 0.7 * creases)
+        sheen = spec.skin.sheen * np.clip(film, 0.04, 0.9)
         gloss = np.where(wet > 0, wet, np.minimum(sheen, 0.49) * self.lid)
         return self.albedo(open_, spots), gloss, height
-
-    def oil(self) -> Singles:
-        """Share, 0 to 1, of skin whose furrows oil fills: pools about the glands of the lash roots, few farther out.
-
-        It is thicker at the roots, so the lines of the skin shine there as streaks. Farther out the film follows the
-        relief, so the sheen is soft and grained.
-        """
-        beside = np.exp(-np.square(self.out_mm * (1 / 6.0)))
-        near = np.maximum(_bell(self.out_mm, 0.9, 1.7), 0.75 * beside)
-        pools = self.tiles.at(8, self.along, (10, 30), (18, 50))
-        return np.asarray(np.clip((pools + 2.1 * near - 1.0) * 0.9, 0, 0.25 + 0.75 * np.sqrt(beside)))
 
     def wet(self) -> Singles:
         """Gloss of the film of tears, which ends in tongues between the roots of the lashes; 0 beyond it.
@@ -390,9 +382,9 @@ class _Strip:
         out: Singles = np.zeros_like(self.y)
         if np.min(self.out_mm) < 4:
             tongues = self.tiles.at(43, _places(self.y, self.out_mm / 3), (10, 60), (10, 60))
-            reach = np.where(self.upper > 0, 1.5, 0.75)  # the upper lashes hold more of it
-            film = 1 - step(self.out_mm - reach - 0.9 * tongues, -0.2, 0.2)
-            out = film * np.clip(0.99 - 0.06 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
+            reach = np.where(self.upper > 0, 0.5, 0.25)  # the upper lashes hold more of it
+            film = 1 - step(self.out_mm - reach - 0.35 * tongues, -0.15, 0.15)
+            out = film * np.clip(0.95 - 0.03 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
         return out
 
     def lumps(self) -> Singles:
@@ -408,34 +400,30 @@ class _Strip:
         return out
 
     def cells(self) -> Singles:
-        """Plateaus (about 1) separated by furrows (0).
+        """Plateaus (about 1) separated by furrows (0), which are deep in patches and hardly there between them.
 
-        The fields are wide on the face, and narrow and drawn out across on the lids. Both contain finer ones.
+        The fields are wide on the face. On the lids they are drawn out along the margin, as its creases are.
         """
         y, z, tiles = self.y, self.z, self.tiles
-        coarse = Places(_TILE, y, z, 0.72 * _TILE_MM).sample(tiles.net)
-        # The finer net is rotated so that the two nets cross.
-        fine = Places(_TILE, 0.8 * y + 0.6 * z, 0.8 * z - 0.6 * y, 0.42 * _TILE_MM).sample(tiles.drawn)
+        cells = Places(_TILE, y, z, 0.72 * _TILE_MM).sample(tiles.net)
         some = self.lids > 1e-4
         if np.any(some):
-            narrow = Places(_TILE, y[some], self.level[some], 0.62 * _TILE_MM).sample(tiles.drawn)
-            coarse[some] += self.lids[some] * (narrow - coarse[some])
-        return np.asarray(coarse * (0.7 + 0.3 * fine))
+            narrow = Places(_TILE, y[some], self.level[some] + self.slowly("sway")[some], 0.8 * _TILE_MM)
+            cells[some] += self.lids[some] * (narrow.sample(tiles.drawn) - cells[some])
+        return np.asarray(1 - (0.2 + 0.8 * self.slowly("patch")) * (1 - cells))
 
-    def relief(self, cells: Singles, oil: Singles) -> Singles:
-        """Height (mm) of the relief: cells separated by furrows, both filled by `oil`, swellings, and lines.
+    def relief(self, cells: Singles) -> Singles:
+        """Height (mm) of the relief: cells separated by furrows, swellings, and lines.
 
         The lines run along the lids and, at the temple, away from the canthus.
         """
         skin, y = self.spec.skin, self.y
-        grain = self.field(3, (60, 200), (60, 200))
+        grain = self.field(3, (30, 90), (30, 90))
         along = self.tiles.mixed(self.along, (1.6, 14, (5, 15), (12, 34)), (0.5, 15, (12, 36), (24, 60)))
         swell = self.field(13, (7, 20), (7, 20))
         lines = self.tiles.at(11, _places(y, self.level + self.slowly("sway")), (0, 6), (22, 60))
-        filled = 0.2 + 0.65 * self.roots * self.roots * self.roots
-        fine = (1 - filled * oil) * (cells + 0.03 * grain)
-        height = skin.relief_mm * (fine + 1.3 * swell + along)
-        return np.asarray(height - (1 - 0.7 * oil) * self.slowly("lines") * np.abs(lines))
+        height = skin.relief_mm * (cells + 0.03 * grain + 1.3 * swell + along)
+        return np.asarray(height - self.slowly("lines") * np.abs(lines))
 
     def creases(self) -> Singles:
         """Depth, 0 to about 1, of the creases of the lids' thin skin.
@@ -508,13 +496,15 @@ class _Strip:
     def albedo(self, open_: Singles, spots: Singles) -> Singles:
         """Diffuse reflectance; `open_` is the light that leaves the furrows."""
         skin, rows, upper = self.spec.skin, self.rows, self.upper
-        slow, blotch, fine = ((c, c) for c in ((0, 4), (3, 22), (70, 260)))
-        mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.026, 22, *blotch), (0.155, 23, *fine))
+        # Finer mottling than half a millimetre would show the lattice of the map as a weave.
+        slow, blotch, fine = ((c, c) for c in ((0, 4), (3, 22), (25, 85)))
+        mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.03, 22, *blotch), (0.05, 23, *fine))
         tone = (1 + skin.mottling * mottled) * open_
         tone *= 1 - skin.veins * self.veins()
         tone *= self.slowly("shade")
-        # The lash line is darker.
-        tone *= 1 - 0.34 * _bell(rows, _LINE, 2.6) * np.abs(upper)
+        # The lash line is darker: roots stand close together there, and make-up may fill the gaps.
+        line = _bell(rows, _LINE, 2.6) * np.abs(upper) * np.where(upper > 0, 1.0, 0.7)
+        tone *= 1 - np.minimum(0.45 + 0.45 * self.spec.lashes.mascara, 0.9) * line
         tone *= 1 - 0.06 * step(rows, CONJUNCTIVA + MARGIN, CONJUNCTIVA + MARGIN + LID) * self.near * (upper > 0)
         tone *= 1 - self.under_brow()
         # In the crease, skin lies against skin.

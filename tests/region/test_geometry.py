@@ -235,7 +235,7 @@ def test_lower_lashes_are_thin_and_lashes_taper():
     upper, lower = hairs.radii[: spec.lashes.upper_count], hairs.radii[spec.lashes.upper_count :]
     assert np.median(lower[:, 0]) < 0.8 * np.median(upper[:, 0])
     assert np.all(np.diff(hairs.radii, axis=1) < 0)
-    assert hairs.radii[:, -1] == pytest.approx(0.3 * hairs.radii[:, 0])
+    assert hairs.radii[:, -1] == pytest.approx(0.22 * hairs.radii[:, 0])
 
 
 def test_the_lash_band_is_paler_at_tips_and_below():

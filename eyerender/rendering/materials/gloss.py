@@ -6,10 +6,12 @@ import drjit as dr
 import mitsuba as mi
 
 _F0_OIL, _F0_TEARS = 0.035, 0.0202  # reflectance at normal incidence (n 1.46 and 1.331)
-_ROUGH_OIL, _THINNER = 0.05, 0.15  # roughness of a film of oil at a gloss of 0.5, and how much it grows per gloss below
-_ROUGH_WET = 0.02
+_ROUGH_OIL, _THINNER = 0.13, 0.35  # roughness of a film of oil at a gloss of 0.5, and how much it grows per gloss below
+# Water that stands on tissue is smooth. A film follows the tissue, whose bumps are much finer than a pixel: the
+# roughness grows by `_BARER` per gloss below that of standing water.
+_ROUGH_WET, _STANDING, _BARER, _ROUGHEST = 0.02, 0.97, 3.2, 0.15
 _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
-_RIPPLES = ((0.13, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
+_RIPPLES = ((0.05, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
 
 
 def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, gloss: mi.Float) -> mi.Float:
@@ -18,8 +20,9 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
         f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
 
     with h half way between lamp and camera (GGX: Walter et al. 2007; the visibility term: Kelemen, Szirmay-Kalos 2001;
-    F: Schlick 1994). The roughness a of skin stands for what is finer than its map, so no oil on it mirrors like
-    water; it is rougher the thinner the film. Oil on tears, which makes their gloss higher than `_WATER`, mirrors more.
+    F: Schlick 1994). The roughness a stands for what is finer than a pixel: no oil on skin mirrors like water, and only
+    standing water does; films are rougher the thinner they are. Oil on tears, which makes their gloss higher than
+    `_WATER`, mirrors more.
     """
     wet = gloss > 0.5
     half = dr.normalize(to_lamp + to_camera)
@@ -27,7 +30,8 @@ def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, glo
     nh = dr.maximum(dr.dot(normal, half), 0)
     water = (2 * gloss - 1) * (1 + 10 * dr.maximum(gloss - _WATER, 0))
     weight = dr.select(wet, water, gloss * (1 / 0.45))
-    D = _ggx(nh, dr.select(wet, _ROUGH_WET, _ROUGH_OIL + _THINNER * (0.5 - gloss)))
+    film = dr.clip(_ROUGH_WET + _BARER * (_STANDING - gloss), _ROUGH_WET, _ROUGHEST)
+    D = _ggx(nh, dr.select(wet, film, _ROUGH_OIL + _THINNER * (0.5 - gloss)))
     return weight * D * _schlick(lh, dr.select(wet, _F0_TEARS, _F0_OIL)) * 0.25 / (lh * lh)
 
 
