@@ -46,7 +46,8 @@ def measure_folder(
         raise InputError("must be between 0.1 and 10", source="--gamma")
     source = open_source(path, limit)
     known, origin = _encoding(source) if gamma is None else (gamma, "given")
-    rows, skipped, tiles, cut = [], [], [], []
+    rows, skipped, tiles = [], [], []
+    cut: list[dict[str, tuple[Bytes, ...]]] = []
     found = pictures(source, known)
     for name in followed(source.names, progress):
         picture = next(found)
@@ -124,7 +125,7 @@ def realism(
     each = [gammas[k if len(gammas) > 1 else 0] if gammas else None for k in range(len(folders))]
     found = [measure_folder(f, gamma=g, limit=limit, progress=progress) for f, g in zip(folders, each, strict=True)]
     ratios = {name: ratio(*(f.median(name) for f in found)) for name in FIGURES} if len(found) == 2 else None
-    test = separability(*found) if len(found) == 2 and available() else None
+    test = separability(found[0], found[1]) if len(found) == 2 and available() else None
     if output is not None:
         from .page import write
 

@@ -84,4 +84,6 @@ def test_a_calibration_without_shapes_of_cornea_and_pupil_is_still_read(seen, tm
     data = json.loads((tmp_path / "new.json").read_text())
     data["eyes"]["right"]["person"] = data["eyes"]["right"]["person"][:9]
     (tmp_path / "old.json").write_text(json.dumps(data))
-    assert load_estimator(tmp_path / "old.json").persons[0] == pytest.approx(person)
+    found = load_estimator(tmp_path / "old.json")
+    assert isinstance(found, er.gaze.MaximumLikelihood)
+    assert found.persons[0] == pytest.approx(person)
