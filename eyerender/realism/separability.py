@@ -21,7 +21,7 @@ from .patches import KINDS, features
 
 LEAST_IMAGES = 5
 """Images with patches of a kind that each folder needs."""
-MISSING = "needs scikit-learn: pip install 'eyerender[realism]'"
+MISSING = "needs scikit-learn: pip install scikit-learn"
 _FOLDS, _TREES, _RESAMPLED = 5, 200, 1000
 _REVEALING = 8
 
