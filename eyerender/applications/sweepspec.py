@@ -20,7 +20,7 @@ from ..scene.spec import SceneSpec
 from ..spec import FileSpec, NonNegative, Positive, Spec, Vec3
 
 MAX_LAYOUTS = 100_000
-Count = Annotated[int, Field(ge=1, le=MAX_LIGHTS)]
+LightCount = Annotated[int, Field(ge=1, le=MAX_LIGHTS)]
 
 
 class Places(Spec):
@@ -33,7 +33,7 @@ class Places(Spec):
     surface_mm: Annotated[tuple[Vec3, ...], Field(min_length=4, max_length=4)] | None = Field(
         default=None, description="four corners, in order around; `count` is the number of columns and of rows"
     )
-    count: Count | tuple[Count, Count] | None = Field(default=None, description="number of places")
+    count: LightCount | tuple[LightCount, LightCount] | None = Field(default=None, description="number of places")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -82,7 +82,7 @@ class SweptLights(Spec):
     """LEDs in place of those of the scene; everything but place and intensity is that of the scene's first LED."""
 
     places: Places = Field(description="places of LEDs, or those from which `number` chooses")
-    number: Annotated[tuple[Count, ...], Field(min_length=1)] | None = Field(
+    number: Annotated[tuple[LightCount, ...], Field(min_length=1)] | None = Field(
         default=None, description="numbers of LEDs; of more places the best are chosen; default: all of them"
     )
     intensity_mw_sr: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = Field(

@@ -55,6 +55,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "setup-llvm": ("eyerender setup-llvm",),
         "status": ("eyerender status data", "eyerender status data --watch"),
         "study": ("eyerender study guestrin2006 -o study --eyes E1,E4",),
+        "sweep": ("eyerender sweep layouts.yaml -o layouts", "eyerender sweep layouts.yaml -o layouts --shard 2/8"),
         "validate": (
             "eyerender validate data",
             "eyerender validate data --quick --json -",

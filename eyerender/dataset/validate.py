@@ -62,7 +62,7 @@ def validate(
     if folder.dataset.get("kind") == "dataset":
         check_run(folder, quick, problems, step)
     total = len(folder.entries)
-    rows = range(total) if deep else sampled(total, str(folder.dataset.get("digest")))
+    rows = range(total) if deep else sampled(total, str(folder.dataset.get("digest")), SAMPLE)
     able = truth is not None and truth.stale is None
     recomputed = len(rows) if able else 0
     chosen = frozenset(rows if able and not deep else ())
@@ -138,7 +138,7 @@ def _find_files(entry: ImageEntry) -> None:
         entry.check(key)
 
 
-def sampled(total: int, digest: str, count: int = SAMPLE) -> list[int]:
+def sampled(total: int, digest: str, count: int) -> list[int]:
     """Lines that are computed again by default: one at a hashed place in each of `count` equal parts of the file.
 
     They are a pure function of the folder's digest, so two checks of a folder use the same lines.

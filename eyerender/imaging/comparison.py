@@ -139,11 +139,12 @@ class Comparison:
             lines.append(
                 f"gaze error of {people['n']} subjects, each calibrated alone, degrees   median      p95     n"
             )
-            lines += [
+            rows = [
                 f"  {key:<56} {d['median_deg']:>9.4f} {d['p95_deg']:>8.4f} {d['n']:>5}"
                 for key in ("analytic", "image")
                 if (d := people[key])["n"]
             ]
+            lines += rows or [f"  none ({data['gaze_reason'] or 'no frame has an estimate'})"]
         return "\n".join(lines)
 
 

@@ -296,7 +296,7 @@ TABLE = [
     (
         ["bench-extractors", "hollow", "-o", "out", "--extractor", "nonsense"],
         2,
-        "'nonsense' is neither an extractor (opencv",
+        "'nonsense' is neither an extractor (else, excuse, opencv",
     ),
     (["bench-extractors", "hollow", "-o", "out", "--extractor", "a 'b"], 2, "is not a valid command line"),
     (

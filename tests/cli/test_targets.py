@@ -42,6 +42,7 @@ COMMANDS = {
     "rig": ["scene.yaml", "--unknowns", "unknowns.yaml"],
     "status": ["folder"],
     "merge": ["folder", "other"],
+    "sweep": ["layouts.yaml"],
 }
 NO_OUTPUT = {"setup-llvm", "schema", "live"}
 OPTIONS = {"output": "-o", "overlay": "--overlay", "json": "--json"}
@@ -89,7 +90,7 @@ def test_every_command_and_every_output_is_in_the_table():
     inputs = {
         "scene", "images", "folder", "other", "spec", "records", "rig", "columns", "calibration", "eye", "eyes", "name",
         "preset", "extractor", "estimator", "reference", "function", "terms_x", "terms_y", "fixations", "side", "shard",
-        "address", "against", "recording", "population", "unknowns", "require",
+        "address", "against", "recording", "population", "unknowns", "require", "folders",
     }  # fmt: skip
     for name in sorted(names):
         function = (gaze[name[5:]] if " " in name else app[name]).default_command

@@ -438,7 +438,7 @@ def test_a_layout_without_its_library_is_one_line(tiny, tmp_path, monkeypatch, c
 
 
 def test_what_cannot_be_exported_is_refused(tiny, tmp_path):
-    with pytest.raises(InputError, match="must be one of webdataset, coco"):
+    with pytest.raises(InputError, match="must be one of webdataset, imagefolder, coco"):
         export(tiny, "zip", tmp_path / "out")
     (tmp_path / "taken").mkdir()
     write_png(tmp_path / "taken" / "a.png", np.zeros((4, 4), np.uint8))

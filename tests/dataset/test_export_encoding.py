@@ -128,7 +128,8 @@ def test_sixteen_bits_are_the_files_of_the_dataset(tiny, tmp_path):
     assert read_image(next((tmp_path / "gamma" / "train").iterdir()))[1] == 16
     for format in ("openeds", "ellseg", "teyed"):
         with pytest.raises(
-            InputError, match=f"--bits: the layout {format} holds 8 bits; webdataset, coco, csv, parquet can"
+            InputError,
+            match=f"--bits: the layout {format} holds 8 bits; webdataset, imagefolder, coco, csv, parquet can",
         ):
             export(tiny, format, tmp_path / "none", bits=16)
 

@@ -72,7 +72,7 @@ def test_damaged_shards_are_made_again(tiny, tmp_path):
         5: "is not valid JSON",
         7: "is of another shard",
     }
-    found = [json.loads(line)["what"] for line in lines if '"repair"' in line]
+    found = [json.loads(line)["what"] for line in lines if '"event": "repair"' in line]
     for what, (shard, word) in zip(found, words.items(), strict=True):
         assert what.startswith(f"shard {shard} is made again: ")
         assert word in what

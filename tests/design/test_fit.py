@@ -275,7 +275,9 @@ def test_a_calibration_finds_kappa():
     """Targets and images together give the line of sight; the eye file keeps it."""
     frames = frames_of("guestrin2006")
     seen = er.trace(frames)
-    prior = changed_file(frames.scene.eye_spec, np.array([0.0] * 9 + [np.radians(2.0), np.radians(-1.0)] + [0.0] * 4))
+    prior = changed_file(
+        frames.scene.eye_spec, np.array([0.0] * 9 + [np.radians(2.0), np.radians(-1.0)] + [0.0] * (COUNT - 11))
+    )
     (fit,) = fit_eye(seen, frames.scene.rig, Unknowns(kappa_deg="unknown"), prior=prior)
     assert np.degrees(fit.theta[0, 9:11]) == pytest.approx([-2.0, 1.0], abs=0.01)
     assert angular_error_deg(

@@ -290,7 +290,7 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "PLY of no vertices": (
         {"a.ply": ply().replace(b"element vertex ", b"element vertex -", 1)},
         {"path": "a.ply", "layout": "mesh", **AXES},
-        "the file cannot hold so many",
+        "more than the file can hold",
     ),
     "no PLY": ({"a.ply": b"ply\nnothing"}, {"path": "a.ply", "layout": "mesh", **AXES}, "is not a PLY file"),
     "axes": ({}, {"path": "a.csv", "layout": "points", **AXES, "z": "up"}, "file.z"),

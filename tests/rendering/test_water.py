@@ -102,6 +102,7 @@ def test_a_cylinder_of_water_mirrors_as_much_as_an_ideal_one(renderer, monkeypat
     # spreads this along the axis: slopes of GGX have the density 1 / (2 a) at 0, and a tilt m turns the mirrored ray
     # by 2 m cos(i). The camera at right angles to the axis sees E F r / (8 a).
     monkeypatch.setattr(glossiness, "_RIPPLES", ())
+    monkeypatch.setattr(glossiness, "_STANDING", glossiness._WATER)
     rough = glossiness._ROUGH_WET
     turn = np.linspace(-0.6, 0.6, 40001)
     normal = mi.Vector3f(*np.stack([np.cos(turn), np.sin(turn), 0 * turn]).astype(np.float32))
