@@ -138,7 +138,7 @@ def _find_files(entry: ImageEntry) -> None:
         entry.check(key)
 
 
-def sampled(total: int, digest: str, count: int) -> list[int]:
+def sampled(total: int, digest: str, count: int = SAMPLE) -> list[int]:
     """Lines that are computed again by default: one at a hashed place in each of `count` equal parts of the file.
 
     They are a pure function of the folder's digest, so two checks of a folder use the same lines.
