@@ -206,8 +206,10 @@ def _weights(columns: Array, right: Array, weight: Array, variance: float) -> Ar
 
 
 def lines(values: Array) -> str:
-    """A tuple of numbers as lines of the table."""
+    """A tuple of numbers as lines of the table, a short one on one line."""
     body = textwrap.fill(", ".join(f"{value:.4g}" for value in values), 106)
+    if "\n" not in body:
+        return " " * 8 + f"({body}),"
     return textwrap.indent(f"(\n{textwrap.indent(body, '    ')},\n),", " " * 8)
 
 

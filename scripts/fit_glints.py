@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 """Fit the weights by which the extractor tells glints from other bright spots, and print them.
 
-    fit_glints.py RENDERED [RENDERED ...] [--write]
+    fit_glints.py [RENDERED ...] [--write]
 
-RENDERED are folders of development images of `hard_eyes.py`. Drawn images of `make_ideal_images.py` are added: 30 of
-each of the CONDITIONS and 150 mixed ones. A spot within 2 px of a glint is one; spots near glints that are less than
-half visible do not count. The lost and false glints of ten-fold cross-validation over faces are printed, and `--write`
-replaces the weights in classification.py.
+RENDERED are folders of development images of `hard_eyes.py`. Drawn images of `make_ideal_images.py` and
+`led_images.py` are added. Without RENDERED, the weights that rendered images gave earlier are the prior's means. A spot
+within 2 px of a glint, or within 0.7 of its radius, is one; spots at the flanks of glints, and those near glints that
+are less than half visible, do not count. The lost and false glints of ten-fold cross-validation over faces are printed,
+and `--write` replaces the weights in classification.py.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from unittest.mock import patch
 
 import cv2
@@ -26,29 +27,39 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 import hard_eyes
+import led_images
 import make_ideal_images as ideal
 from extraction_tally import near
 from eyerender.extraction import ExtractionSettings, extract, pipeline
 from eyerender.extraction.glints import classification
 from eyerender.extraction.glints.classification import LEAST_ODDS, classify_spots, compared, features
 from eyerender.extraction.glints.fits import SpotFit
+from eyerender.geometry.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]
-CONDITIONS = (
-    "noise2", "noise8", "noise16", "noise2-13px", "blur4", "texture6", "edge-glint", "eight-glints", "lid", "remote",
-    "bright-pupil", "jpeg", "grey-pupil", "any-size", "ring-light", "head-mounted",
-)  # fmt: skip
+# Drawn images of each kind.
+COUNTS = {
+    "noise2": 6, "noise8": 8, "noise16": 8, "noise2-13px": 6, "blur4": 8, "texture6": 8, "edge-glint": 8,
+    "eight-glints": 10, "lid": 6, "remote": 12, "bright-pupil": 6, "jpeg": 16, "grey-pupil": 16, "any-size": 8,
+    "ring-light": 16, "head-mounted": 8, "mixed": 80, "led": 140,
+}  # fmt: skip
 # How much an image counts. Drawn glints before a drawn sclera may be as faint as highlights of skin. A webcam's single
 # lamp is often hidden, and its few pixels are the hardest to judge.
-WEIGHTS = {"webcam": 2.0, "stress": 0.5, "jpeg": 1.0}
-DRAWN_WEIGHT = 0.25
+WEIGHTS = {"webcam": 2.0, "stress": 0.5, "jpeg": 1.0, "led": 1.0}
+DRAWN_WEIGHT = 1.0
+FALSE_WEIGHT = 2.0  # how much more a false glint counts than a lost one
 PRIOR_SD = 4.0  # of a weight times the largest value of its feature
+SHIFT_SD = 1.5  # the same for the difference to the weights that rendered images gave
+RENDERED = (
+    np.array([-5.14, -2.86, -1.46, -5.29, 1.63, 0.0, 4.18, -0.267]),
+    np.array([0.85, 3.32, 3.7, -3.44, 0.0, 0.798]),
+)
 FOLDS = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """The spots of an image: its row and face, features (n, 7), fits, heights of large glints, and which are glints.
+    """The spots of an image: its row and face, features (n, 8), fits, clip level, and which are glints.
 
     `known` are the spots that count.
     """
@@ -57,82 +68,98 @@ class Observed:
     face: int
     features: Array
     fit: SpotFit
-    heights: list[float]
+    clip_dn: float
     true: NDArray[np.bool_]
     known: NDArray[np.bool_]
 
 
-def observe(row: str, face: int, eye: hard_eyes.HardEye) -> Observed | None:
-    """Collect the spots of one image; None if no pupil was found in it."""
+def observe(row: str, face: int, eye: hard_eyes.HardEye, radius: Array | None = None) -> Observed | None:
+    """Collect the spots of one image, whose glints have a radius in px; None if its pupil was not found."""
     kept: list[Any] = []
 
     def keep(*given: Any) -> Any:
         kept.append(given)
         return classify_spots(*given)
 
+    polarity: Literal["bright", "auto"] = "bright" if row == "bright-pupil" else "auto"
     with patch.object(pipeline, "classify_spots", keep):
-        extract(eye.image, bit_depth=eye.bit_depth, settings=ExtractionSettings(method="fast"))
-    if not kept:
+        settings = ExtractionSettings(method="fast", polarity=polarity)
+        found = extract(eye.image, bit_depth=eye.bit_depth, settings=settings).pupil.ellipse
+    if not kept or found is None or eye.pupil is None or iou(found, eye.pupil) <= 0.9:
         return None
-    _, fit, about, _, large = kept[0]
+    fit, _, about, _ = kept[0]
     fit = fit.taken(np.flatnonzero(fit.converged))
-    true, faint = (near(fit.xy_px, places) for places in (eye.glints, eye.faint))
-    heights = [one.glint.amplitude for one in large]
-    return Observed(row, face, features(fit, about), fit, heights, true, ~faint) if true.size else None
+    if not fit.converged.size:
+        return None
+    true, known = near(fit.xy_px, eye.glints), ~near(fit.xy_px, eye.faint)
+    if radius is not None and radius.size:
+        apart = np.linalg.norm(fit.xy_px[:, None] - eye.glints, axis=-1)
+        true = true | (apart < 0.7 * radius).any(axis=1)
+        known = true | (apart > 1.6 * radius + 3.0).all(axis=1)
+    return Observed(row, face, features(fit, about), fit, about.clip_dn, true, known)
 
 
-def images(rendered: list[Path]) -> Iterator[tuple[str, int, hard_eyes.HardEye]]:
-    """Row, face and image."""
+def images(rendered: list[Path]) -> Iterator[tuple[Any, ...]]:
+    """Row, face, image and, where they are not points, radii of its glints."""
     for path in sorted(path for folder in rendered for path in folder.glob("*.npz")):
         row, number = path.stem.rsplit("-", 1)
         eye = hard_eyes.load(path)
         if eye.pupil is not None and eye.visible > 0.3:
             yield row, zlib.crc32(f"{row}{int(number) // hard_eyes.FRAMES_OF_FACE}".encode()), eye
-    for condition, count in [*((name, 30) for name in CONDITIONS), ("mixed", 150)]:
-        for seed in range(count):
-            drawing = ideal.draw(condition, seed)
-            glints = [g["xy_px"] for g in drawing.label["glints"] if g["status"] == "ok"]
-            places, none = np.array(glints).reshape(-1, 2), np.zeros((0, 2))
-            depth = drawing.parameters["bit_depth"]
-            if drawing.parameters["visible_fraction"] > 0.3:
-                yield condition, seed, hard_eyes.HardEye("", drawing.image, depth, None, 1.0, places, none)
+    for condition, seed in ((name, seed) for name, count in COUNTS.items() for seed in range(count)):
+        drawing = led_images.draw(seed) if condition == "led" else ideal.draw(condition, seed)
+        if drawing.parameters["visible_fraction"] > 0.3:
+            glints = [g for g in drawing.label["glints"] if g["status"] == "ok"]
+            places, none = np.array([g["xy_px"] for g in glints]).reshape(-1, 2), np.zeros((0, 2))
+            about = drawing.label["pupil"]
+            pupil = Ellipse(about["centre_px"], about["semi_axes_px"], about["angle_rad"])
+            eye = hard_eyes.HardEye("", drawing.image, drawing.parameters["bit_depth"], pupil, 1.0, places, none)
+            yield condition, seed, eye, np.array([g.get("radius_px", 0.0) for g in glints])
 
 
-def logistic(rows: Array, true: Array, weight: Array) -> Array:
-    """Maximum a-posteriori weights of a logistic function; the last column is 1 and has no prior."""
+def logistic(rows: Array, true: Array, weight: Array, before: Array | None) -> Array:
+    """Maximum a-posteriori weights of a logistic function; the last column is 1 and has no prior but with `before`.
+
+    Args:
+        rows: (n, f) features.
+        true: (n,) 1 for glints, else 0.
+        weight: (n,) how much each spot counts.
+        before: (f,) means of the prior; None: zero.
+    """
     scale = np.abs(rows).max(axis=0) + 1e-9
-    pull = np.append(np.full(rows.shape[1] - 1, 0.5 / PRIOR_SD**2), 0.0)
+    mean = np.zeros(rows.shape[1]) if before is None else before * scale
+    pull = np.append(np.full(rows.shape[1] - 1, 0.5 / (PRIOR_SD if before is None else SHIFT_SD) ** 2), 0.0)
 
     def loss(guess: Array) -> tuple[float, Array]:
-        logit = (rows / scale) @ guess
-        cost = float(weight @ np.logaddexp(0.0, -logit * (2.0 * true - 1.0)) + pull @ guess**2)
-        return cost, (rows / scale).T @ (weight / (1.0 + np.exp(-logit)) - weight * true) + 2.0 * pull * guess
+        logit, moved = (rows / scale) @ guess, guess - mean
+        cost = float(weight @ np.logaddexp(0.0, -logit * (2.0 * true - 1.0)) + pull @ moved**2)
+        return cost, (rows / scale).T @ (weight / (1.0 + np.exp(-logit)) - weight * true) + 2.0 * pull * moved
 
-    return np.asarray(minimize(loss, np.zeros(rows.shape[1]), jac=True, method="L-BFGS-B").x / scale)
+    return np.asarray(minimize(loss, mean, jac=True, method="L-BFGS-B").x / scale)
 
 
-def fitted(observed: list[Observed]) -> tuple[Array, Array]:
+def fitted(observed: list[Observed], before: tuple[Array, Array] | None) -> tuple[Array, Array]:
     """Weights of both steps."""
     true = np.concatenate([one.true[one.known] for one in observed]).astype(np.float64)
     each = [np.full(one.known.sum(), WEIGHTS.get(one.row, _usual_weight(one.row))) for one in observed]
-    weight = np.concatenate(each)
-    first = logistic(np.concatenate([one.features[one.known] for one in observed]), true, weight)
-    second = [compared(one.fit, one.features @ first, one.heights)[one.known] for one in observed]
-    return first, logistic(np.concatenate(second), true, weight)
+    weight, means = np.concatenate(each) * np.where(true > 0.5, 1.0, FALSE_WEIGHT), before or (None, None)
+    first = logistic(np.concatenate([one.features[one.known] for one in observed]), true, weight, means[0])
+    second = [compared(one.fit, one.features @ first, one.clip_dn)[one.known] for one in observed]
+    return first, logistic(np.concatenate(second), true, weight, means[1])
 
 
 def _usual_weight(row: str) -> float:
     return 1.0 if row in hard_eyes.ROWS else DRAWN_WEIGHT
 
 
-def validated(observed: list[Observed]) -> None:
+def validated(observed: list[Observed], before: tuple[Array, Array] | None) -> None:
     """Print lost and false glints of every row, each judged by weights that its face did not enter."""
     fold = np.random.default_rng(0).integers(0, FOLDS, 1000)[[one.face % 1000 for one in observed]]
     table: dict[str, Array] = {}
     for k in range(FOLDS):
-        first, second = fitted([one for one, part in zip(observed, fold, strict=True) if part != k])
+        first, second = fitted([one for one, part in zip(observed, fold, strict=True) if part != k], before)
         for one in (one for one, part in zip(observed, fold, strict=True) if part == k):
-            glint = compared(one.fit, one.features @ first, one.heights) @ second > np.log(LEAST_ODDS)
+            glint = compared(one.fit, one.features @ first, one.clip_dn) @ second > np.log(LEAST_ODDS)
             counts = [one.true.sum(), (one.true & ~glint).sum(), (glint & ~one.true & one.known).sum()]
             table[one.row] = table.get(one.row, np.zeros(3)) + counts
     for row, (true, lost, false) in table.items():
@@ -141,16 +168,17 @@ def validated(observed: list[Observed]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("rendered", type=Path, nargs="+")
+    parser.add_argument("rendered", type=Path, nargs="*")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     ideal.CELLS = 2
     observed = [found for task in images(options.rendered) if (found := observe(*task)) is not None]
-    validated(observed)
+    before = None if options.rendered else RENDERED
+    validated(observed, before)
     path = Path(classification.__file__)
     text = path.read_text()
-    for name, weights in zip(("FIRST", "SECOND"), fitted(observed), strict=True):
+    for name, weights in zip(("FIRST", "SECOND"), fitted(observed, before), strict=True):
         line = f"{name} = np.array([{', '.join(f'{weight:.3g}' for weight in weights)}])"
         print(line)
         text = re.sub(rf"^{name} = .*$", line, text, flags=re.MULTILINE)

@@ -212,7 +212,7 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
     data = (image + rng.normal(0.0, 1.0, image.shape) * noise) * (full / 255.0)
     stored = np.clip(np.rint(data), 0, full).astype(np.uint8 if c.bit_depth == 8 else np.uint16)
     if c.jpeg is not None:
-        stored = _compressed(stored, int(rng.integers(*c.jpeg, endpoint=True)))
+        stored = compressed(stored, int(rng.integers(*c.jpeg, endpoint=True)))
     record = _record(pupil, glints, seed)
     parameters = {
         "condition": name, "seed": seed, "noise_dn": noise, "blur_px": blur, "step_dn": step, "texture_dn": texture,
@@ -223,7 +223,7 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
     return Drawing(stored, record, parameters)
 
 
-def _compressed(image: NDArray[Any], quality: int) -> NDArray[Any]:
+def compressed(image: NDArray[Any], quality: int) -> NDArray[Any]:
     """What JPEG leaves of an image."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "jpeg", quality=quality)

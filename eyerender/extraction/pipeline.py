@@ -12,13 +12,13 @@ import numpy as np
 from ..arrays import Bools, Floats
 from ..geometry.ellipse import signed_distance
 from ..jit import ensure_compiled
-from .glints.bloomed import bloomed_glints
 from .glints.classification import Eye, classify_spots
 from .glints.deblending import give_edges, split_blends
-from .glints.detection import Spots, detect_spots, widest
-from .glints.fits import SpotFit, joined
+from .glints.detection import Spots, detect_spots, search_reach, widest
+from .glints.fits import SpotFit
 from .glints.fitting import fit_spots
 from .glints.gaussian_model import Limits
+from .glints.patches import measure_patches
 from .glints.subtraction import affected_pixels, part_about, subtract_spots, well_fitted
 from .glints.windows import window_radius
 from .preprocessing import DN, Part, Prepared, prepare
@@ -101,12 +101,13 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
             model, pupil = pixels.model, by_pixels
     if not pupil.ok:
         return _nothing(pupil, noise, size)
-    large = bloomed_glints(prepared, model.ellipse, abs(model.step_dn))
     iris, step = _iris_level(prepared, found, model), model.step_dn
     inside = iris + step if found.image.inverted else iris - step
     support = found.boundary.support
-    eye = Eye(ellipse=model.ellipse, blur_px=model.sigma_px, pupil_dn=inside, iris_dn=iris, support=support)
-    accepted, rejected = classify_spots(spots, fit, eye, settings, large)
+    levels = {"pupil_dn": inside, "iris_dn": iris, "clip_dn": prepared.clip_dn}
+    eye = Eye(ellipse=model.ellipse, blur_px=model.sigma_px, support=support, **levels)
+    measured = measure_patches(prepared, model.ellipse, search_reach(model.ellipse, settings), spots, fit)
+    accepted, rejected = classify_spots(measured, spots.patches_px, eye, settings)
     return Extraction(pupil=pupil, glints=accepted, rejected=rejected, noise=noise, shape=size)
 
 
@@ -205,9 +206,7 @@ def _fitted_again(
     again = fit_spots(part.linear, _background(found.image, about), *starts, _limits(prepared, model)).fit
     again = replace(again, xy_px=again.xy_px + corner)
     good = again.converged & (again.residual_dn < 1.05 * fit.residual_dn[on_boundary])
-    index = np.arange(fit.converged.size)
-    index[np.nonzero(on_boundary)[0][good]] = fit.converged.size + np.nonzero(good)[0]
-    return joined([fit, again]).taken(index)
+    return fit.replaced(np.flatnonzero(on_boundary)[good], again.taken(np.flatnonzero(good)))
 
 
 def _agrees(fit: PixelFit, found: PupilCandidate) -> bool:

@@ -19,6 +19,8 @@ Image = Singles
 
 MAX_PIXELS = 64_000_000
 MIN_SIDE = 16
+# Lowest level at which a camera clips, in full scales; least pixels that are flat there, and largest share of them.
+WHITEST, FEW_WHITE, MOST_WHITE = 0.8, 6, 0.02
 DN = 255.0  # grey levels of full scale; every level inside the extractor is in these
 
 
@@ -95,6 +97,7 @@ def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | st
         linear, clip, quantum = scaled, float("inf"), 0.0
     else:
         linear, clip, quantum = _from_integers(array, bit_depth, gamma)
+        clip = _white_level(linear, clip)
     noise = estimate_noise(linear)
     if noise == 0.0 and linear.min() == linear.max():
         level = float(linear[0, 0])
@@ -152,6 +155,19 @@ def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: flo
     # This is the decoded step at the image's own middle level.
     middle = max(int(median(array[::4, ::4].ravel())), 1)
     return linear, DN, float(table[middle] - table[middle - 1])
+
+
+def _white_level(linear: Image, clip: float) -> float:
+    """Level at which a camera clips that does not use all levels: its brightest one, if glints are flat there.
+
+    More than half of the pixels within 3 % of that level have it, and they are few.
+    """
+    top = float(linear.max())
+    if not WHITEST * clip <= top < clip:
+        return clip
+    flat = np.count_nonzero(linear >= top)
+    few = FEW_WHITE <= flat <= MOST_WHITE * linear.size
+    return top if few and 2 * flat > np.count_nonzero(linear > 0.97 * top) else clip
 
 
 def _from_float(array: NDArray[np.generic], gamma: float) -> Image | str:

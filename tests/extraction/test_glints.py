@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+import led_images
 import make_ideal_images as ideal
 from eyerender.extraction import extract
 from eyerender.extraction.glints import deblending, fitting, gaussian_model, windows
 from eyerender.extraction.glints.classification import compared
-from eyerender.extraction.preprocessing import DN
+from eyerender.extraction.preprocessing import DN, Prepared, prepare
 from eyerender.status import Status
 from tests.support.extraction_oracles import pixel_profile
 
@@ -50,12 +51,13 @@ def test_clipped_glints_say_so_and_keep_their_amplitude():
     assert not any(g.saturated for g in extract(ideal.draw("noise2", SEEDS[0]).image).glints)
 
 
-def test_a_strongly_clipped_glint_hides_no_other():
+@pytest.mark.parametrize("height", [1000.0, 20_000.0])
+def test_a_strongly_clipped_glint_hides_no_other(height):
     drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[0])
     places = np.array(drawing.label["pupil"]["centre_px"]) + np.array([[-8.0, 6.0], [9.0, 5.0]])
     image = drawing.image.astype(np.float64)
-    for xy, height in zip(places, (160.0, 20_000.0), strict=True):
-        ideal._add_glint(image, {"xy": xy, "sigma": 1.0}, height)
+    for xy, peak in zip(places, (240.0, height), strict=True):
+        ideal._add_glint(image, {"xy": xy, "sigma": 1.0}, peak)
     found = extract(np.clip(np.rint(image), 0, 255).astype(np.uint8)).glints
     assert len(found) == 2
     assert all(min(np.hypot(*(g.xy_px - xy)) for g in found) < 0.1 for xy in places)
@@ -74,19 +76,50 @@ def _fainter_by(sigma: float, seed: int) -> float:
         clipped, lambda u, v: np.zeros_like(u), np.rint(places), wide, np.full(2, 200.0), limits
     ).fit
     assert fit.converged.all()
-    return float(compared(fit, np.array([9.0, -1.0]), ())[1, 2])
+    return float(compared(fit, np.array([9.0, -1.0]), 0.98 * DN)[1, 2])
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_glint_counts_as_high_as_its_flanks_show(seed):
-    # With sigma 0.8 px a dozen pixels are clipped, and the flanks give both heights to some 15 %.
-    assert _fainter_by(0.8, seed) == pytest.approx(np.log(2.0 / 8.0), abs=0.3)
+@pytest.mark.parametrize("sigma", [0.8, 1.6])
+def test_a_clipped_glint_does_not_make_other_clipped_glints_faint(sigma):
+    # Both are as bright as the sensor can show. The areas above half of that differ as ln 16 and ln 4 do: by 0.7.
+    assert _fainter_by(sigma, 0) > -1.0
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_wide_clipped_top_does_not_make_other_glints_faint(seed):
-    # With sigma 1.6 px over thirty pixels are clipped. The height is a guess, which must not refuse a real glint.
-    assert _fainter_by(1.6, seed) > np.log(0.5)
+@pytest.mark.parametrize("seed", range(20_000, 20_003))
+def test_glints_of_leds_are_found(seed):
+    """Clipped, oval, streaked and unequal glints between lids; the classifier was fitted to other seeds."""
+    drawing = led_images.draw(seed)
+    found = np.array([glint.xy_px for glint in extract(drawing.image).glints]).reshape(-1, 2)
+    assert len(drawing.label["glints"]) > 0
+    for glint in drawing.label["glints"]:
+        assert np.hypot(*(found - glint["xy_px"]).T).min() < max(2.0, 0.7 * glint["radius_px"])
+
+
+@pytest.mark.parametrize("middle", [1.0, 0.7])
+def test_a_large_oval_glint_lies_at_the_centroid_of_its_light(middle):
+    """A clipped ellipse of 10 x 6 px, also one whose middle an overloaded sensor shows darker."""
+    drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[0])
+    x, y = np.array(drawing.label["pupil"]["centre_px"]) + np.array([4.0, 6.0])
+    v, u = np.mgrid[: drawing.image.shape[0], : drawing.image.shape[1]] - np.array([y, x])[:, None, None]
+    radius = np.hypot((0.8 * u + 0.6 * v) / 5.0, (0.8 * v - 0.6 * u) / 3.0)
+    image = np.where(radius < 1.0, np.where(radius < 0.5, middle, 1.0) * 255.0, drawing.image)
+    found = extract(image.astype(np.uint8)).glints
+    assert len(found) == 1
+    assert found[0].saturated
+    assert np.hypot(*(found[0].xy_px - [x, y])) < 0.3  # a third of a pixel: the outline's pixels are whole or none
+
+
+def _clip_level(image: np.ndarray) -> float:
+    prepared = prepare(image, None, 1.0)
+    assert isinstance(prepared, Prepared)
+    return prepared.clip_dn
+
+
+def test_a_camera_that_clips_below_full_scale_is_recognised():
+    image = ideal.draw("saturated-glint", SEEDS[0]).image
+    assert 220.0 < _clip_level(np.minimum(image, 230)) < 230.0  # less three standard deviations of the noise
+    assert _clip_level(image) > 245.0
+    assert _clip_level(ideal.draw("noise2", SEEDS[0]).image) > 245.0  # its glints peak at 225 DN
 
 
 def test_a_glint_before_bright_sclera_is_found():
@@ -153,7 +186,7 @@ def test_spot_jacobian_is_the_models_slope(blur):
         np.array([3.0, 1.1]),
         255.0,
     )
-    assert pixels.count.tolist() == [np.count_nonzero(pixels.spot == i) for i in range(2)]
+    assert np.diff(pixels.first).tolist() == [np.count_nonzero(pixels.spot == i) for i in range(2)]
     rest = np.zeros(pixels.data.size)
     theta = np.array([[20.2, 19.7, 4.0, 0.2, 0.4, 10.0, 0.3, -0.2], [11.6, 12.3, 5.0, 0.1, 0.3, 20.0, -0.1, 0.2]])
     if blur is not None:

@@ -99,4 +99,4 @@ def test_a_highlight_of_bright_skin_is_no_glint():
     assert len(found.glints) == len(drawing.label["glints"])
     near = [one for one in found.rejected if np.hypot(*(one.xy_px - [x, below + 20.0])) < 2.0]
     assert near
-    assert "brighter than the iris" in near[0].reason
+    assert "highlights of skin" in near[0].reason

@@ -9,7 +9,6 @@ regression) from development images; `scripts/fit_glints.py` makes them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,20 +19,17 @@ from ...status import Status
 from ..preprocessing import DN
 from ..result import GlintResult
 from ..settings import ExtractionSettings
-from .bloomed import Patch
-from .detection import Spots, optics_sigma
+from .detection import optics_sigma
 from .fits import SpotFit
 
-# Heights in full scales up to which that of a single strongly clipped glint is trusted, and up to which heights are
-# compared; clipped pixels of a glint whose flanks still tell its height.
-TALL, HIGHEST, CLIPPED = 2.5, 10.0, 12
 # Steps by which the ground may be brighter than the iris; more is no worse, because the sclera is as bright.
 BRIGHTEST = 1.4
-# A large saturated patch is this many times as wide as the spots that are glints, at most.
-WIDER = 2.0
+ROUND = math.log(2.0)  # elongation that LEDs have; it counts twice, so this is an oval of 1.4 : 1
 # A spot is accepted if it is a glint with at least these odds.
 LEAST_ODDS = 2.0
 LIKELIEST = 12.0  # largest logit that counts
+# Glints of one rig are alike: largest differences of the logarithms of light, width and form; how many of them count.
+ALIKE, MOST_ALIKE = (1.0, 0.3, 0.3), 3.0
 # Reasons for which a spot is refused, in the order of the features.
 GROUNDS = (
     "before something brighter than the iris, as highlights of skin are",
@@ -41,14 +37,16 @@ GROUNDS = (
     "not as wide as the optics' image of a lamp",
     "elongated, as reflections off the sclera and wet lid margins are",
     "too faint for a glint",
+    "dimmer than reflections of lamps are",
     "much fainter than the brightest glint, as highlights of skin and lid margins are",
     "not as wide as the likeliest glint",
 )
-USUAL = (0.0, 0.0, 0.0, 0.0, math.log(10.0))  # features of a glint that speaks for itself, in the order of the reasons
+# Features of a glint that speaks for itself, in the order of the reasons.
+USUAL = (0.0, 0.0, 0.0, 0.0, math.log(10.0), 1.0)
 
 # Made by scripts/fit_glints.py: weights of the features and 1, and of the comparison.
-FIRST = np.array([-5.14, -2.86, -1.46, -5.29, 1.63, 4.18, -0.267])
-SECOND = np.array([0.85, 3.32, 3.7, -3.44, 0.798])
+FIRST = np.array([-1.75, -2.86, 0.952, -6.06, 1.91, 2.83, 3.82, -3.34])
+SECOND = np.array([0.897, 0.769, 3.1, -2.2, 0.367, 0.996])
 
 _PIXEL = 1.0 / 12.0  # variance of a pixel; without it a spot of one row of pixels would be a line
 
@@ -63,6 +61,7 @@ class Eye:
         pupil_dn: level inside it.
         iris_dn: level just outside it.
         support: share of its boundary that is seen.
+        clip_dn: level at which the sensor clips.
     """
 
     ellipse: Ellipse
@@ -70,36 +69,31 @@ class Eye:
     pupil_dn: float
     iris_dn: float
     support: float
+    clip_dn: float
 
 
 def classify_spots(
-    spots: Spots, fit: SpotFit, eye: Eye, settings: ExtractionSettings, large: Sequence[Patch] = ()
+    fit: SpotFit, patches_px: Floats, eye: Eye, settings: ExtractionSettings
 ) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
-    """Divide spots into (accepted, rejected), brightest first; spots of `large` patches are part of those.
+    """Divide spots into (accepted, rejected), brightest first.
 
     Args:
-        spots: the spots.
-        fit: their fits.
+        fit: the spots.
+        patches_px: (k, 2) peaks of bright patches that are not spots.
         eye: the eye.
         settings: settings of the extractor.
-        large: large saturated glints.
     """
+    accepted: list[GlintResult] = []
     rejected: list[GlintResult] = []
-    reasons = _objections(fit, eye, [patch.glint.amplitude for patch in large])
+    reasons = _objections(fit, eye)
     sigma = np.sqrt(fit.sigma_px.prod(axis=1))
-    alone = [not any(_in_patch(patch, xy) for patch in large) for xy in spots.xy_px]
-    widths = [width for width, reason, apart in zip(sigma, reasons, alone, strict=True) if reason is None and apart]
-    large = [patch for patch in large if patch.glint.sigma_px < WIDER * max(widths, default=math.inf)]
-    accepted = [patch.glint for patch in large]
     for i in np.argsort(-fit.amplitude_dn, kind="stable").tolist():
-        reason, converged = reasons[i], bool(fit.converged[i])
-        if any(_in_patch(patch, spots.xy_px[i]) for patch in large):
-            continue
+        reason = reasons[i]
         result = GlintResult(
             status=Status.OK if reason is None else Status.REJECTED,
             reason=reason,
-            xy_px=frozen(fit.xy_px[i]) if converged else frozen(spots.xy_px[i]),
-            covariance=frozen(fit.covariance[i]) if converged else None,
+            xy_px=frozen(fit.xy_px[i]),
+            covariance=frozen(fit.covariance[i]) if fit.converged[i] else None,
             amplitude=float(fit.amplitude_dn[i]) / DN,
             sigma_px=float(sigma[i]),
             saturated=bool(fit.clipped[i] > 0),
@@ -108,22 +102,18 @@ def classify_spots(
     reason = f"beyond the {settings.max_glints} brightest glints that the settings allow"
     surplus = [replace(glint, status=Status.REJECTED, reason=reason) for glint in accepted[settings.max_glints :]]
     strip = "a strip or a broad patch, as reflections off the sclera and wet lid margins are"
-    places = np.array([glint.xy_px for glint in accepted]).reshape(-1, 2)
-    far = (((spots.patches_px[:, None] - places) ** 2).sum(axis=-1) > 4.0**2).all(axis=1)
-    patches = [
-        GlintResult(status=Status.REJECTED, reason=strip, xy_px=frozen(xy))
-        for xy in spots.patches_px[far]
-        if not any(_in_patch(patch, xy) for patch in large)
-    ]
+    far = (((patches_px[:, None] - fit.xy_px) ** 2).sum(axis=-1) > 4.0**2).all(axis=1)
+    patches = [GlintResult(status=Status.REJECTED, reason=strip, xy_px=frozen(xy)) for xy in patches_px[far]]
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
 
 
 def features(fit: SpotFit, eye: Eye) -> Floats:
-    """Features (n, 7) of spots on which the first logit depends.
+    """Features (n, 8) of spots on which the first logit depends.
 
     They are: by how much the ground is brighter than the pupil or iris that should be there, in steps from pupil to
     iris; the distance outside the pupil in semi-axes a; the logarithms of the width over the blur, of the elongation
-    (of the fit and of the bright patch) and of the height in steps; the visible share of the pupil boundary; and 1.
+    (of the fit and of the bright patch) beyond ROUND and of the height in steps; the fourth power of the peak's level
+    over that at which the sensor clips, which little but lamps reach; the visible share of the pupil boundary; and 1.
     """
     step, wide2 = abs(eye.iris_dn - eye.pupil_dn), fit.sigma_px**2 + _PIXEL
     width = wide2.prod(axis=1) ** 0.25
@@ -139,45 +129,51 @@ def features(fit: SpotFit, eye: Eye) -> Floats:
         np.clip((fit.background_dn - expected) / step, 0.0, BRIGHTEST),
         np.clip(beyond / eye.ellipse.semi_axes_px[0], 0.0, 4.0),
         np.minimum(np.abs(np.log(width / eye.blur_px)), 1.5),
-        np.minimum(0.5 * np.log(stretch), 2.0),
+        np.clip(0.5 * np.log(stretch) - ROUND, 0.0, 2.0),
         np.log(np.clip(fit.amplitude_dn / step, 0.2, 60.0)),
+        np.clip((fit.background_dn + fit.amplitude_dn) / min(eye.clip_dn, DN), 0.0, 1.0) ** 4,
         np.full(width.size, eye.support),
         np.ones(width.size),
     )
     return np.stack(columns, axis=1)
 
 
-def compared(fit: SpotFit, logit: Floats, heights: Sequence[float]) -> Floats:
-    """Features (n, 5) on which the second logit depends.
+def compared(fit: SpotFit, logit: Floats, top_dn: float) -> Floats:
+    """Features (n, 6) on which the second logit depends.
 
     They are the first logit; whether the spot is another one than the likeliest; and for those, the logarithms of its
-    height over that of the brightest glint and of its width over the likeliest one's; and 1.
+    visible light (height times width) over that of the brightest glint and of its visible width over the likeliest
+    one's; how many glints are expected among the other spots like it; and 1.
+
+    Of a clipped spot, the flanks tell the height badly. So only what is visible counts: the height up to `top_dn`, at
+    which the sensor clips, and the width, from the area above half of that: 2 pi sigma^2 ln(A / (h / 2)) of a Gaussian.
 
     Args:
         fit: the n spots.
         logit: (n,) the first logit.
-        heights: of large glints, in full scales.
+        top_dn: level at which the sensor clips.
     """
     best = int(np.argmax(logit))
-    height, width = np.clip(fit.amplitude_dn / DN, 1e-3, HIGHEST), (fit.sigma_px**2 + _PIXEL).prod(axis=1) ** 0.25
-    # The fitted height of a strongly clipped glint may be many times too large. So it counts as TALL only, unless the
-    # next one is higher than that.
-    sure = np.where(fit.clipped > CLIPPED, np.minimum(height, TALL), height)
-    glints = np.flatnonzero(logit > 0.0) if len(heights) or np.any(logit > 0.0) else np.array([best])
-    likely = sorted([*heights, *height[glints].tolist()])
-    top = max(likely[-2] if len(likely) > 1 else 0.0, *np.minimum(heights, TALL), *sure[glints])
+    visible = np.minimum(fit.amplitude_dn, np.maximum(top_dn - fit.background_dn, 1.0))
+    wide2 = (fit.sigma_px**2 + _PIXEL).prod(axis=1) ** 0.5 * (1.0 + np.log2(fit.amplitude_dn / visible))
+    light, width = np.log(np.maximum(visible * np.sqrt(wide2), 1e-3)), 0.5 * np.log(wide2)
+    form = 0.5 * np.log((fit.sigma_px[:, 0] ** 2 + _PIXEL) / (fit.sigma_px[:, 1] ** 2 + _PIXEL))
+    near = (np.abs(one[:, None] - one) < most for one, most in zip((light, width, form), ALIKE, strict=True))
+    alike = np.logical_and.reduce(list(near)) & ~np.eye(logit.size, dtype=bool)
+    top = light[logit > 0.0].max(initial=float(light[best]))
     other = (np.arange(logit.size) != best) / (1.0 + math.exp(-float(np.clip(logit[best], -30.0, 30.0))))
     columns = (
         np.clip(logit, -LIKELIEST, LIKELIEST),
         other,
-        other * np.clip(np.log(height / top), -3.0, 0.0),
-        other * np.minimum(np.abs(np.log(width / width[best])), 1.0),
+        other * np.clip(light - top, -4.0, 0.0),
+        other * np.minimum(np.abs(width - width[best]), 1.0),
+        np.minimum(alike @ (1.0 / (1.0 + np.exp(-np.clip(logit, -30.0, 30.0)))), MOST_ALIKE),
         np.ones(logit.size),
     )
     return np.stack(columns, axis=1)
 
 
-def _objections(fit: SpotFit, eye: Eye, heights: Sequence[float]) -> list[str | None]:
+def _objections(fit: SpotFit, eye: Eye) -> list[str | None]:
     """Reasons (n,) why spots are not glints, None for glints."""
     reasons: list[str | None] = ["the spot's fit did not converge"] * fit.converged.size
     index = np.flatnonzero(fit.converged)
@@ -186,19 +182,12 @@ def _objections(fit: SpotFit, eye: Eye, heights: Sequence[float]) -> list[str | 
     fit = fit.taken(index)
     first = features(fit, eye)
     logit = first @ FIRST
-    second = compared(fit, logit, heights)
+    second = compared(fit, logit, eye.clip_dn)
     glint = second @ SECOND > math.log(LEAST_ODDS)
-    against = np.concatenate([(first[:, :5] - USUAL) * FIRST[:5] * SECOND[0], second[:, 2:4] * SECOND[2:4]], axis=1)
+    against = np.concatenate([(first[:, :6] - USUAL) * FIRST[:6] * SECOND[0], second[:, 2:4] * SECOND[2:4]], axis=1)
     sharp = fit.sigma_px.max(axis=1) < 0.5 * optics_sigma(eye.blur_px)
     for k, i in enumerate(index.tolist()):
         reasons[i] = None if glint[k] else GROUNDS[int(np.argmin(against[k]))]
         if sharp[k]:
             reasons[i] = f"sharper than the optics (sigma {fit.sigma_px[k].max():.1f} px): a bad pixel"
     return reasons
-
-
-def _in_patch(patch: Patch, xy: Floats) -> bool:
-    """Whether a bright pixel belongs to a large glint."""
-    height, width = patch.pixels.shape
-    column, row = (int(v) for v in np.rint(xy))
-    return 0 <= row < height and 0 <= column < width and bool(patch.pixels[row, column])

@@ -142,35 +142,26 @@ def split_blends(
         axis = _long_axis(fit.moments_px2[i])
         if axis is None:
             continue
-        offset, across = axis
-        sigma = fit.sigma_px[i]
+        (offset, across), sigma = axis, fit.sigma_px[i]
         if math.hypot(*offset) > LONGEST * widest_px or float(sigma.max()) > LONGEST_FIT * float(sigma.min()):
             continue
-        xy, width, height = starts
+        xy, width, _ = starts
         # Only the spots whose light reaches the patch are fitted again.
         reach = 3.0 * (window_radius(width) + window_radius(width[i]))
         near = (np.hypot(*(xy - fit.xy_px[i]).T) < reach) & (np.arange(width.size) != i)
         if np.count_nonzero(near) > MOST_NEAR:
             continue
-        trial = (
-            np.vstack([xy[near], fit.xy_px[i] - offset, fit.xy_px[i] + offset]),
-            np.append(width[near], [across, across]),
-            np.append(height[near], [height[i], height[i]]),
-        )
-        again = fit_spots(linear, known, *trial, limits).fit
-        halves = slice(-2, None)
-        sigma = again.sigma_px[halves]
-        good = bool(again.converged[halves].all()) and bool((sigma.max(axis=1) < 1.5 * sigma.min(axis=1)).all())
-        if good and float(again.residual_dn[halves].max()) < 0.6 * float(fit.residual_dn[i]):
+        halves = (fit.xy_px[i] + np.array([-offset, offset]), np.full(2, across), starts[2][[i, i]])
+        trial = [np.concatenate([whole[near], half]) for whole, half in zip(starts, halves, strict=True)]
+        again = fit_spots(linear, known, trial[0], trial[1], trial[2], limits).fit
+        sigma = again.sigma_px[-2:]
+        good = bool(again.converged[-2:].all()) and bool((sigma.max(axis=1) < 1.5 * sigma.min(axis=1)).all())
+        if good and float(again.residual_dn[-2:].max()) < 0.6 * float(fit.residual_dn[i]):
             far = ~near & (np.arange(width.size) != i)
             order = np.argsort(np.concatenate([np.nonzero(far)[0], np.nonzero(near)[0], [i, i]]), kind="stable")
-            halved = (
-                np.vstack([xy[far], trial[0]])[order],
-                np.append(width[far], trial[1])[order],
-                np.append(height[far], trial[2])[order],
-            )
+            halved = [np.concatenate([whole[far], part])[order] for whole, part in zip(starts, trial, strict=True)]
             together = joined([fit.taken(np.nonzero(far)[0]), again]).taken(order)
-            return split_blends(linear, known, halved, together, widest_px, limits)
+            return split_blends(linear, known, (halved[0], halved[1], halved[2]), together, widest_px, limits)
     return starts, fit
 
 

@@ -12,6 +12,7 @@ from ...arrays import Bools, Floats, Indices, Singles
 from ...geometry.ellipse import Ellipse
 from ...jit import compiled, inlined
 from ..preprocessing import Image, Prepared, as_image
+from ..pupil.glare import around
 from ..settings import ExtractionSettings
 from ..statistics import select
 from .prescreening import gaussian_like
@@ -62,12 +63,10 @@ def detect_spots(
         settings: settings; `glint_reach` limits the search.
     """
     linear = prepared.linear
-    reach = float(ellipse.semi_axes_px[0]) * settings.glint_reach + 8.0
-    cx, cy = ellipse.centre_px
-    x0, x1 = max(0, math.floor(cx - reach)), min(linear.shape[1], math.ceil(cx + reach) + 1)
-    y0, y1 = max(0, math.floor(cy - reach)), min(linear.shape[0], math.ceil(cy + reach) + 1)
-    x1, y1 = x1 - (x1 - x0) % 2, y1 - (y1 - y0) % 2  # whole blocks of the opening
-    crop = linear[y0:y1, x0:x1]
+    reach = search_reach(ellipse, settings)
+    (cx, cy), (columns, rows) = ellipse.centre_px, around(ellipse, reach, linear.shape)
+    x0, y0, crop = columns.start, rows.start, linear[rows, columns]
+    crop = crop[: crop.shape[0] // 2 * 2, : crop.shape[1] // 2 * 2]  # whole blocks of the opening
     if crop.shape[0] < 6 or crop.shape[1] < 6:
         return _no_spots()
     smooth = as_image(cv2.GaussianBlur(crop, (5, 5), SMOOTH_PX))
@@ -80,8 +79,8 @@ def detect_spots(
     opened = _opening(half, size)
     flat, stands = _maxima(smooth, half, opened, threshold)
     row, column = np.divmod(flat, smooth.shape[1])
-    around = (column + x0 - cx) ** 2 + (row + y0 - cy) ** 2 < reach**2  # the corners of the crop are beyond
-    flat, stands = flat[around], stands[around]
+    near = (column + x0 - cx) ** 2 + (row + y0 - cy) ** 2 < reach**2  # the corners of the crop are beyond
+    flat, stands = flat[near], stands[near]
     if flat.size == 0:
         return _no_spots()
     order = np.argsort(-stands, kind="stable")[:MOST_PEAKS]
@@ -106,6 +105,11 @@ def detect_spots(
         patches_px=patches + corner,
         clutter=(xy[clutter] + corner, width[clutter], height[clutter]),
     )
+
+
+def search_reach(ellipse: Ellipse, settings: ExtractionSettings) -> float:
+    """Distance, px, from the pupil's centre within which glints are searched."""
+    return float(ellipse.semi_axes_px[0]) * settings.glint_reach + 8.0
 
 
 @inlined

@@ -42,29 +42,11 @@ class SpotFit:
 
     def replaced(self, index: Indices, other: SpotFit) -> SpotFit:
         """Copy in which `other` replaces the spots with these indices."""
-        parts = {}
-        for one in fields(self):
-            values = getattr(self, one.name).copy()
-            values[index] = getattr(other, one.name)
-            parts[one.name] = values
-        return SpotFit(**parts)
+        order = np.arange(self.converged.size)
+        order[index] = order.size + np.arange(index.size)
+        return joined([self, other]).taken(order)
 
 
 def joined(parts: list[SpotFit]) -> SpotFit:
     """Join several batches."""
     return SpotFit(**{one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)})
-
-
-def no_spots() -> SpotFit:
-    """Return an empty batch."""
-    return SpotFit(
-        xy_px=np.zeros((0, 2)),
-        covariance=np.zeros((0, 2, 2)),
-        amplitude_dn=np.zeros(0),
-        sigma_px=np.zeros((0, 2)),
-        background_dn=np.zeros(0),
-        residual_dn=np.zeros(0),
-        moments_px2=np.zeros((0, 2, 2)),
-        clipped=np.zeros(0, dtype=np.intp),
-        converged=np.zeros(0, dtype=bool),
-    )

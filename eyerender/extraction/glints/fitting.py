@@ -17,7 +17,7 @@ from ...arrays import Bools, Floats
 from ...jit import compiled, inlined
 from ..preprocessing import Image
 from ..products import solve
-from .fits import SpotFit, no_spots
+from .fits import SpotFit
 from .gaussian_model import PARAMETERS, SAME_LIGHT, WITH_EDGE, Descent, Limits, descend, lost, prior, promising
 from .windows import WINDOWS, SpotPixels, Windows, cut, light_of_others, shining_pairs, window_radius
 
@@ -65,8 +65,6 @@ def fit_spots(
         height_dn: (n,) their heights.
         limits: noise, clip level and the prior of the slope.
     """
-    if start_px.shape[0] == 0:
-        return no_fit()
     noise = limits.noise_dn
     pixels = cut(linear, known, start_px, width_px, limits.clip_dn)
     apart, radius = _distance(start_px), window_radius(width_px)
@@ -102,24 +100,6 @@ def fit_spots(
             break
     ended = Descent(theta=theta, gram=gram, used=used, settled=settled & ~gone, moved=moved, falling=falling)
     return FittedSpots(report(pixels, ended, rest - light, limits), pixels, theta, rest - light)
-
-
-def no_fit() -> FittedSpots:
-    """Return the fit of no spots."""
-    none, index, pairs = np.zeros(0), np.zeros(1, dtype=np.intp), np.zeros((0, 2))
-    pixels = SpotPixels(
-        centre=pairs,
-        radius=none,
-        first=index,
-        spot=index[:0],
-        middle_dn=none,
-        plane=np.zeros((3, 0)),
-        data=none,
-        known=none,
-        clip=none > 0.0,
-        clipped=False,
-    )
-    return FittedSpots(no_spots(), pixels, np.zeros((0, PARAMETERS)), none)
 
 
 def _distance(start: Floats) -> Floats:

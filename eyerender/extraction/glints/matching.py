@@ -68,15 +68,6 @@ def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLik
     return np.asarray(centre + radius_mm * normal)
 
 
-def project(points_mm: ArrayLike, *, K: ArrayLike, R: ArrayLike, t_mm: ArrayLike) -> Floats:
-    """Project world points (n, 3) to pixels (n, 2) by K (R X + t), OpenCV's pinhole model without distortion."""
-    camera = np.asarray(points_mm, dtype=np.float64) @ np.asarray(R, dtype=np.float64).T + np.asarray(
-        t_mm, dtype=np.float64
-    )
-    image = camera @ np.asarray(K, dtype=np.float64).T
-    return np.asarray(image[:, :2] / image[:, 2:])
-
-
 def predict_glints(
     pupil_px: ArrayLike,
     *,
@@ -129,8 +120,8 @@ def predict_glints(
     cornea = cornea + (pupil - (rotation + ROTATION_TO_PUPIL_MM * gaze)) if reach2 > 0.0 else cornea
     depth = float((R3 @ cornea + t3)[2])
     scale = float(math.sqrt(abs(K3[0, 0] * K3[1, 1]))) / max(depth, 1e-6)
-    points = mirror_in_sphere(cornea, radius_mm, camera, lights_mm)
-    return project(points, K=K3, R=R3, t_mm=t3), scale
+    image = (mirror_in_sphere(cornea, radius_mm, camera, lights_mm) @ R3.T + t3) @ K3.T
+    return np.asarray(image[:, :2] / image[:, 2:]), scale
 
 
 def assign_lights(

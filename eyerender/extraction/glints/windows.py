@@ -62,11 +62,6 @@ class SpotPixels:
         return self.first, self.plane, self.centre, self.radius
 
     @property
-    def count(self) -> Floats:
-        """Number (n,) of each spot's pixels."""
-        return np.asarray(self.first[1:] - self.first[:-1], dtype=np.float64)
-
-    @property
     def dx(self) -> Floats:
         """Horizontal offset (P,) from the window's middle."""
         return np.asarray(self.plane[1], dtype=np.float64)
@@ -90,9 +85,8 @@ class SpotPixels:
         if spots.size == self.radius.size and bool((spots == np.arange(spots.size)).all()):
             return self
         count = self.first[spots + 1] - self.first[spots]
-        rows, clip = _ranges(self.first[spots], count), self.clip
-        if self.clipped:
-            clip = clip[rows]
+        rows = _ranges(self.first[spots], count)
+        clip = self.clip[rows]
         return SpotPixels(
             centre=self.centre[spots],
             radius=self.radius[spots],
@@ -102,8 +96,8 @@ class SpotPixels:
             plane=self.plane.take(rows, axis=1),
             data=self.data[rows],
             known=self.known[rows],
-            clip=clip[: rows.size],
-            clipped=self.clipped and bool(clip.any()),
+            clip=clip,
+            clipped=bool(clip.any()),
         )
 
     def total(self, values: NDArray[np.generic]) -> Floats:
@@ -113,10 +107,8 @@ class SpotPixels:
     def most(self, values: Floats) -> Floats:
         """Compute the largest value (n,) of a value (P,) among each spot's pixels, at least 0."""
         out = np.zeros(self.radius.size)
-        some = self.first[:-1] < self.first[1:]
-        if values.size:
-            out[some] = np.maximum.reduceat(values, self.first[:-1][some])
-        return np.maximum(out, 0.0)
+        np.maximum.at(out, self.spot, values)
+        return out
 
 
 def _starts(count: Indices) -> Indices:

@@ -22,6 +22,7 @@ from ..result import PupilResult
 from ..settings import LEAST_PX, Shape
 from .boundary import PupilCandidate, find_boundary
 from .candidates import Candidate, candidate_at, find_candidates, find_inside
+from .glare import around
 from .scoring import ScoredCandidate, score
 
 SURE = 0.9  # a hypothesis of this confidence ends the search
@@ -66,13 +67,9 @@ def find_pupil(
     if polarity == "dark" or not isinstance(dark, ScoredCandidate) or dark.candidate.core_dn >= 0.0:
         return dark
     bright = _search(invert(prepared), shape, before)
-    if (
-        isinstance(bright, ScoredCandidate)
-        and bright.confidence >= SURE
-        and _contains(dark.candidate, bright.candidate)
-    ):
-        return bright
-    return dark
+    if not isinstance(bright, ScoredCandidate) or bright.confidence < SURE:
+        return dark
+    return bright if _contains(dark.candidate, bright.candidate) else dark
 
 
 def _contains(outer: PupilCandidate, inner: PupilCandidate) -> bool:
@@ -99,8 +96,7 @@ def _search(work: Prepared, shape: Shape, prior: Ellipse | None) -> ScoredCandid
 
 def _likeliest(work: Prepared, shape: Shape) -> ScoredCandidate | PupilResult:
     best: ScoredCandidate | None = None
-    reason = ""
-    spent = 0.0
+    reason, spent = "", 0.0
     for late, found in hypotheses(work, shape):
         spent += 1.0
         if spent > MOST_WORK:
@@ -199,16 +195,13 @@ def _near(work: Prepared, shape: Shape, prior: Ellipse) -> Iterator[PupilCandida
     if candidate is not None:
         yield find_boundary(work, candidate, shape)
     a, b = prior.semi_axes_px.tolist()
-    (cx, cy), (height, width) = prior.centre_px.tolist(), work.linear.shape
-    reach = MOVED * a + 8.0
-    x0, x1 = max(0, math.floor(cx - reach)), min(width, math.ceil(cx + reach) + 1)
-    y0, y1 = max(0, math.floor(cy - reach)), min(height, math.ceil(cy + reach) + 1)
-    if min(x1 - x0, y1 - y0) < 16:
+    columns, rows = around(prior, MOVED * a + 8.0, work.linear.shape)
+    crop = replace(work, linear=np.ascontiguousarray(work.linear[rows, columns]))
+    if min(crop.linear.shape) < 16:
         return
     alike = replace(shape, least_px=max(shape.least_px, GROWN * b), most_px=min(shape.most_px, a / GROWN))
-    crop = replace(work, linear=np.ascontiguousarray(work.linear[y0:y1, x0:x1]))
     for found in find_candidates(crop, alike):
-        yield find_boundary(work, replace(found, ellipse=found.ellipse.shifted((x0, y0))), shape)
+        yield find_boundary(work, replace(found, ellipse=found.ellipse.shifted((columns.start, rows.start))), shape)
 
 
 def _same(first: Ellipse, second: Ellipse) -> bool:

@@ -1,0 +1,122 @@
+"""Glints that no Gaussian describes: clipped, oval, streaked or starred ones, and lamps seen as bars or rings.
+
+Such a glint is one patch of bright pixels. Its position is the centroid of its light, its size that of the area above
+half its height.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from ...arrays import Bytes, Floats, Indices
+from ...geometry.ellipse import Ellipse
+from ..preprocessing import DN, Image, Prepared
+from ..pupil.glare import around
+from ..statistics import median
+from .detection import Spots
+from .fits import SpotFit, joined
+
+NEARLY = 0.92  # share of the brightest level near the pupil that counts as saturated (compression lowers some pixels)
+LEAST_PX, MOST = 2, 24  # pixels of a saturated patch, since a single one is a Gaussian spot's peak; how many patches
+LONGEST = 1.1  # longest side of a patch in semi-axes b of the pupil; a lid margin's highlight is longer
+OUTLINE = (0.5, 0.75)  # shares of the height that outline a patch; the second parts patches that touch
+USUAL_PX = 2  # half the side of a spot whose fit failed
+POOR = 0.1  # residual, as a share of the visible height, with which a Gaussian does not describe a clipped spot
+_AREA = 2.0 * math.pi * math.log(2.0)  # of a Gaussian above half its height, in sigma^2
+Box = tuple[int, int, int, int]  # first and last column, first and last row
+
+
+def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, spots: Spots, fit: SpotFit) -> SpotFit:
+    """Replace the fits of spots that are patches by the patches, and append the patches that hold no spot.
+
+    Args:
+        prepared: the image.
+        ellipse: the pupil.
+        reach_px: distance from the pupil's centre within which patches count.
+        spots: the spots.
+        fit: their fits.
+    """
+    columns, rows = around(ellipse, reach_px, prepared.linear.shape)
+    crop, corner = prepared.linear[rows, columns], np.array([columns.start, rows.start])
+    fit = replace(fit, xy_px=np.where(fit.converged[:, None], fit.xy_px, spots.xy_px))
+    poor = ~fit.converged | ((fit.residual_dn > POOR * np.minimum(fit.amplitude_dn, DN)) & (fit.clipped > 0))
+    longest, owner = max(LONGEST * float(ellipse.semi_axes_px[1]), 8.0), np.zeros(crop.shape, dtype=np.intp)
+    peaks = np.rint(np.concatenate([fit.xy_px[poor], spots.clutter[0]]) - corner).astype(np.intp)
+    peaks = np.clip(peaks, USUAL_PX, np.array(crop.shape[::-1]) - 1 - USUAL_PX)
+    boxes = [(x - USUAL_PX, x + USUAL_PX, y - USUAL_PX, y + USUAL_PX) for x, y in peaks.tolist()]
+    parts: list[SpotFit] = []
+    for left, right, top, bottom in [*_saturated(crop, prepared.clip_dn, ellipse.centre_px - corner), *boxes]:
+        if max(right - left, bottom - top) < longest:
+            patch = _patch(crop, (left, right, top, bottom), prepared.clip_dn, owner, len(parts) + 1)
+            parts += [] if patch is None else [patch]
+    patches = joined([fit.taken(np.zeros(0, dtype=np.intp)), *parts])
+    place = np.rint(spots.xy_px - corner).astype(np.intp).clip(0, np.array(crop.shape[::-1]) - 1)
+    own = owner[place[:, 1], place[:, 0]]
+    described = np.isin(np.arange(len(parts) + 1), own[~poor])
+    described[0] = True
+    patches = replace(patches, xy_px=patches.xy_px + corner).taken(np.flatnonzero(~described[1:]))
+    return joined([fit.taken(np.flatnonzero(described[own])), patches])
+
+
+def _saturated(crop: Image, clip_dn: float, middle: Floats) -> list[Box]:
+    """Boxes of the saturated patches nearest to the pupil; some cameras show the middle of a bright glint as dark."""
+    if crop.size == 0:
+        return []
+    bright = (crop >= min(clip_dn, NEARLY * float(crop.max()))).view(np.uint8)
+    closed = cv2.morphologyEx(bright, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    stats = cv2.connectedComponentsWithStats(closed, connectivity=8)[2][1:].tolist()
+    boxes = [(x, x + w - 1, y, y + h - 1) for x, y, w, h, area in stats if area >= LEAST_PX]
+    return sorted(boxes, key=lambda box: math.hypot(box[0] - middle[0], box[2] - middle[1]))[:MOST]
+
+
+def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -> SpotFit | None:
+    """Measure the patch in a box and write its number to its pixels in `owner`; None if it is not closed or known."""
+    left, right, top, bottom = box
+    margin = max(right - left, bottom - top) // 2 + 4
+    rows = slice(max(top - margin, 0), bottom + margin + 1)
+    columns = slice(max(left - margin, 0), right + margin + 1)
+    window, known = crop[rows, columns], owner[rows, columns]
+    y, x = divmod(int(crop[top : bottom + 1, left : right + 1].argmax()), right - left + 1)
+    seed = y + top - rows.start, x + left - columns.start
+    ground = median(np.concatenate([window[0], window[-1], window[:, 0], window[:, -1]]))
+    height = float(window[seed]) - ground
+    outlined = (_outlined(window, ground + share * height, seed) for share in OUTLINE)
+    core = next((one for one in outlined if one is not None), None)
+    if core is None or height <= 0.0 or known[seed]:
+        return None
+    near = cv2.dilate(core, np.ones((3, 3), np.uint8)).astype(bool)
+    known[near] = number
+    light = np.where(core > 0, height, np.clip(window - ground, 0.0, height))
+    ys, xs = np.nonzero(near)
+    weight = light[ys, xs] / light[ys, xs].sum()
+    centre = np.array([weight @ xs, weight @ ys])
+    offset = np.stack([xs, ys]) - centre[:, None]
+    moments = (offset * weight) @ offset.T + np.eye(2) / 12.0
+    area = float(np.count_nonzero(core))
+    sigma2 = moments * (area / _AREA / math.sqrt(np.linalg.det(moments)))
+    return SpotFit(
+        xy_px=(centre + np.array([columns.start, rows.start]))[None],
+        # Of a saturated patch only the outline is known: each of its pixels is uncertain by its own size.
+        covariance=np.eye(2)[None] * (4.0 / 12.0 / math.sqrt(4.0 * math.pi * area)),
+        amplitude_dn=np.array([height]),
+        sigma_px=np.sqrt(np.diagonal(sigma2))[None],
+        background_dn=np.array([ground]),
+        residual_dn=np.array([math.inf]),
+        moments_px2=sigma2[None],
+        clipped=np.array([np.count_nonzero(window[near] >= clip_dn)], dtype=np.intp),
+        converged=np.array([True]),
+    )
+
+
+def _outlined(window: Image, level: float, seed: tuple[int, int]) -> Bytes | None:
+    """Mask (h, w) of the pixels above a level about a seed, with its holes; None if it reaches the window's border."""
+    labels = cv2.connectedComponents((window >= level).view(np.uint8), connectivity=8)[1]
+    core = (labels == labels[seed]).view(np.uint8)
+    if core[0].any() or core[-1].any() or core[:, 0].any() or core[:, -1].any():
+        return None
+    outline, _ = cv2.findContours(core, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(cv2.drawContours(core, outline, -1, 1, cv2.FILLED))
