@@ -110,6 +110,7 @@ def test_a_changed_pixel_is_found_by_rendering_again(tiny, tmp_path):
     assert any(f"{entry.name}: rendered again: 1 pixels differ, by up to 1 at x = 4, y = 3" in text for text in found)
 
 
+@pytest.mark.packaging
 def test_a_changed_byte_is_found_and_repaired(packed, tmp_path):
     folder = shutil.copytree(packed, tmp_path / "copy")
     tar = folder / "shards" / "00001" / "images.tar"
@@ -122,6 +123,7 @@ def test_a_changed_byte_is_found_and_repaired(packed, tmp_path):
     assert tree(folder) == tree(packed)
 
 
+@pytest.mark.packaging
 def test_it_grows_and_shrinks_and_goes_on(packed, tmp_path):
     folder = tmp_path / "grown"
     make(folder, plan(**PACKED, planned=24, count=8, choice="spread"))
@@ -159,6 +161,7 @@ def test_a_damaged_index_is_refused(packed, tmp_path):
         ImageFolder.load(folder)
 
 
+@pytest.mark.packaging
 def test_parts_of_machines_without_a_shared_disk_are_merged(packed, tmp_path):
     for k in (1, 2):
         make(tmp_path / f"part{k}", plan(**PACKED), part=(k, 2))
@@ -173,6 +176,7 @@ def test_parts_of_machines_without_a_shared_disk_are_merged(packed, tmp_path):
     assert not (tmp_path / "mixed").exists()
 
 
+@pytest.mark.packaging
 def test_it_is_overwritten(packed, tmp_path):
     folder = shutil.copytree(packed, tmp_path / "copy")
     small = {"count": 1, "subjects": 1, "shard_size": 1}

@@ -47,6 +47,7 @@ def edit_done(folder, number, **changes):
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
+@pytest.mark.packaging
 def test_damaged_shards_are_made_again(tiny, tmp_path):
     folder = shutil.copytree(tiny, tmp_path / "copy")
     first(folder, "images", 0).unlink()
@@ -228,6 +229,7 @@ def test_folders_of_older_versions_have_their_metadata_compared_with_the_shards(
     assert list(damage(folder)) == ["metadata.jsonl: differs from the shards"]
 
 
+@pytest.mark.packaging
 def test_a_part_withdraws_what_is_damaged_in_another(tiny, tmp_path):
     folder = shutil.copytree(tiny, tmp_path / "copy")
     flip_byte(first(folder, "images", 1))

@@ -215,6 +215,7 @@ def test_what_cannot_be_computed_is_reported(text):
         evaluate(text, {"x": 3.0, "v": [4, 7], "row": {"a": 5.0}})
 
 
+@pytest.mark.packaging
 def test_a_spec_with_variables_can_be_drawn_by_the_command(tmp_path):
     path = write(
         tmp_path / "spec.yaml", variables={"d": {"draw": "normal", "mean": 4, "sd": 0.1}}, **{PUPIL: {"var": "d"}}

@@ -36,6 +36,7 @@ def test_patches_have_equal_scale_and_exposure():
             assert np.abs(a.astype(int) - b).max() <= 3  # rounding before and after the compression
 
 
+@pytest.mark.packaging
 def test_only_different_folders_are_told_apart():
     pytest.importorskip("sklearn")
     from eyerender.realism.separability import separability

@@ -69,6 +69,7 @@ def test_iris_under_large_lamps_against_path(renderer, tmp_path):
     assert mine[iris].mean() == pytest.approx(truth[iris].mean(), rel=0.01)  # the oracle's standard error is .4 %
 
 
+@pytest.mark.packaging
 def test_mirror_image_of_a_large_lamp_in_the_film_of_tears_against_path(renderer, tmp_path):
     # The path tracer meets the mirrored lamp by itself. The exported film is a layer of its own.
     camera = Camera(
