@@ -17,7 +17,13 @@ pytestmark = pytest.mark.packaging
 PACKAGE = Path(eyerender.__file__).resolve().parent
 PROJECT = PACKAGE.parent / "pyproject.toml"
 # Distributions whose module has another name.
-MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml", "scikit-image": "skimage"}
+MODULES = {
+    "opencv-python-headless": "cv2",
+    "pillow": "PIL",
+    "pyyaml": "yaml",
+    "scikit-image": "skimage",
+    "scikit-learn": "sklearn",
+}
 # Holds shared libraries and no module; backends/libraries.py loads them.
 LIBRARIES = {"karellen_llvm_core"}
 # Runs in an environment of its own, as an extractor to compare with; see scripts/setup_pupil_detectors.sh.
