@@ -57,14 +57,21 @@ def _replaced(node: Any, factor: float) -> Any:
         raise InputError("a calibrated camera has one size", source=_OPTION)
     camera = {**node, "resolution_px": [round(factor * n) for n in _numbers(node["resolution_px"])]}
     if node.get("focal_length_px") is not None:
-        (focal,) = possible(node["focal_length_px"]) or [None]
-        if not isinstance(focal, int | float):
-            raise InputError("the focal length of a camera is drawn in pixels", source=_OPTION)
-        camera["focal_length_px"] = factor * focal
+        camera["focal_length_px"] = _focal_length(node["focal_length_px"], factor)
     if node.get("principal_point_px") is not None:
         # Pixel centres are at integers.
         camera["principal_point_px"] = [factor * (v + 0.5) - 0.5 for v in _numbers(node["principal_point_px"])]
     return camera
+
+
+def _focal_length(given: Any, factor: float) -> Any:
+    """Scale a focal length in pixels: a number, or an expression of variables."""
+    if isinstance(given, Mapping) and given.keys() == {"var"}:
+        return {"var": f"{factor!r} * ({given['var']})"}
+    (focal,) = possible(given) or [None]
+    if not isinstance(focal, int | float):
+        raise InputError("the focal length of a camera is drawn in pixels; make it a variable", source=_OPTION)
+    return factor * focal
 
 
 def _numbers(pair: Any) -> tuple[Any, ...]:

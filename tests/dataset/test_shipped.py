@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from eyerender.dataset.maker import Maker
+from eyerender.dataset.picturesize import scaled
 from eyerender.dataset.plan import Plan
+from eyerender.dataset.realise import frames_of
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
@@ -79,3 +82,14 @@ def test_all_are_covered():
         "head_mounted", "headset", "people_eyelink", "people_nvgaze", "people_openeds", "people_pupil_core",
         "quickstart", "stress", "webcam",
     ]  # fmt: skip
+
+
+@pytest.mark.packaging
+def test_a_window_at_grazing_incidence_leaves_the_picture_finite():
+    """Its light has no path to some places behind the cornea, where the search for one ends without a number."""
+    data = DatasetSpec.load(shipped_datasets()["people_pupil_core"]).to_mapping()
+    data["scene"] = scaled(data["scene"], (40, 40))
+    data["scene"]["ambient"] = {"map": {"place": "office", "place_seed": 51054, "azimuth_deg": -98.3}}
+    plan = Plan.of(DatasetSpec.from_mapping(data))
+    (sample,) = Maker(plan, frames_of(plan), threads=1).make_all([200])
+    assert len(sample.images) == 1
