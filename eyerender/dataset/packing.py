@@ -25,6 +25,7 @@ from ..storage.files import (
     read_bytes,
     remove_file,
     sync_folder,
+    sync_tree,
     write_bytes,
     write_json,
     written,
@@ -32,8 +33,9 @@ from ..storage.files import (
 from .done import KINDS, PACKED_SHARD_SCHEMA, SHARD_SCHEMA, sum_of
 from .interleaving import scrambled
 
-ENDINGS = {"images": "", "masks": ".mask", "amodal_masks": ".amodal", "noiseless": ".noiseless"}
-ENDINGS["highlights"] = ".highlights"
+ENDINGS = {
+    "images": "", "masks": ".mask", "amodal_masks": ".amodal", "noiseless": ".noiseless", "highlights": ".highlights"
+}  # fmt: skip
 _SHARD = "shard"  # folder of the lines of a partial shard
 
 
@@ -78,8 +80,11 @@ def pack(stage: Path, done: dict[str, Any], seed: int) -> dict[str, Any]:
 def unpack(stage: Path, done: dict[str, Any]) -> dict[str, Any]:
     """Turn a packed shard in a stage back into a partial one, and return the content of its checkpoint.
 
+    The packed files are removed last. A shard whose unpacking was interrupted is unpacked again.
+
     Raises:
         InputError: it is damaged.
+        ValueError: the same.
         OSError: the disk is full or not writable.
     """
     name = shard_name(done["shard"])
@@ -102,6 +107,7 @@ def unpack(stage: Path, done: dict[str, Any]) -> dict[str, Any]:
     files[f"{SHARDS}/{name}/{LINES}"] = {"bytes": len(text), "sha256": hashlib.sha256(text).hexdigest()}
     kept = {key: value for key, value in done.items() if key not in ("splits", "columns", "counts")}
     partial = {**kept, "schema": SHARD_SCHEMA, "files": files}
+    sync_tree(stage)
     write_json(stage / DONE, partial)
     for own in (TAR, LINES_GZ):
         remove_file(stage / _SHARD / own)
@@ -125,8 +131,8 @@ def _write_tar(stage: Path, lines: list[dict[str, Any]], file: Any) -> None:
                 data = read_bytes(stage / kind / path.name)
                 member = tarfile.TarInfo(f"{path.stem}{ENDINGS[kind]}.png")  # no times or owners
                 member.size = len(data)
+                own[key] = [tar.offset + tarfile.BLOCKSIZE, len(data)]  # behind the header
                 tar.addfile(member, io.BytesIO(data))
-                own[key] = [tar.offset - -(-len(data) // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE, len(data)]
                 tar.members.clear()  # type: ignore[attr-defined]  # the library keeps them for reading
 
 

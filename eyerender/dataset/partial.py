@@ -315,10 +315,10 @@ def _claimed(folder: Path, shard: int, stage: Path) -> dict[str, Any] | None:
 
 
 def _unpacked(stage: Path, done: dict[str, Any]) -> dict[str, Any] | None:
-    """Unpack a packed shard to go on with it; what is damaged is removed."""
+    """Unpack a packed shard to continue it; what is damaged is removed, but not what a full disk keeps packed."""
     try:
         return unpack(stage, done)
-    except (InputError, KeyError, TypeError, ValueError, OSError):
+    except (InputError, KeyError, TypeError, ValueError, FileNotFoundError):
         shutil.rmtree(stage, ignore_errors=True)
         return None
 

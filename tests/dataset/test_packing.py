@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from eyerender.dataset.realise import realise
 from eyerender.dataset.runfile import begin
 from eyerender.dataset.shard import Staged, commit
 from eyerender.dataset.status import status
+from eyerender.errors import EyerenderError
 from eyerender.folders.imagefolder import ImageFolder
 from eyerender.imaging.labels import EyeInWindow, known_labels
 from tests.support.dataset_specs import plan, tree
@@ -104,3 +107,18 @@ def test_shards_are_packed_read_grown_and_merged(samples, tmp_path):
     assert merge([tmp_path / "part0"], tmp_path / "joined")["shards_missing"] == 1
     assert merge([tmp_path / "part0", tmp_path / "part1"], tmp_path / "joined")["complete"]
     assert tree(tmp_path / "joined") == before
+
+
+def test_a_full_disk_while_a_shard_is_unpacked_loses_nothing(samples, tmp_path):
+    made, out = plan(**PACKED), tmp_path / "out"
+    make(out, made, samples)
+    reopen(out, 1, ())
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(EyerenderError, match="File too large"):
+            PartialShard(made, BACKEND, out, 1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with PartialShard(made, BACKEND, out, 1) as partial:
+        assert set(partial.made) == set(made.spec.shard_samples(1))
