@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, NoReturn, TypeGuard, overload
 
 import numpy as np
@@ -27,7 +27,6 @@ from ..storage.files import (
     MAX_FILE_BYTES,
     inside,
     is_plain,
-    make_folder,
     read_bytes,
     read_json,
     shown,
@@ -250,11 +249,11 @@ class PackedEntry(ImageEntry):
         data = self.data(key)
         if data is None:
             return None
-        name = str(self.line[key])
-        path = Path(_scratch()) / hashlib.sha256(f"{self.folder.resolve()}/{name}".encode()).hexdigest()[:16]
-        make_folder(path)
-        write_bytes(path / PurePosixPath(name).name, data, sync=False)
-        return path / PurePosixPath(name).name
+        # The name in the line is not to be trusted as one of a file.
+        name = hashlib.sha256(f"{self.folder.resolve()}/{self.line[key]}".encode()).hexdigest()[:16]
+        path = Path(_scratch()) / f"{name}.png"
+        write_bytes(path, data, sync=False)
+        return path
 
     def check(self, key: str) -> None:
         """Like `ImageEntry.check`."""

@@ -29,6 +29,7 @@ from ..errors import InputError
 from ..storage.files import inside, opened, parse_json
 from ..storage.jsonlines import MAX_LINE_BYTES
 from ..storage.sharing import common, lists, merged, places, rest
+from .imagefile import MAX_IMAGE_BYTES
 
 TAR, LINES_GZ, INDEX = "images.tar", "lines.jsonl.gz", "index.npy"
 LINES_SCHEMA = "eyerender/lines/2"
@@ -221,6 +222,8 @@ def read_member(folder: Path, shard: str, place: object, *, source: str, path: s
         raise InputError("must be a place in the tar", source=source, path=path)
     tar = inside(folder, f"{shard}/{TAR}", source=source, path=path)
     first, size = place
+    if size > MAX_IMAGE_BYTES:
+        raise InputError(f"is too large (at most {MAX_IMAGE_BYTES} bytes are read)", source=source, path=path)
     if first + size > os.path.getsize(tar):
         raise InputError("lies beyond the end of the tar", source=source, path=path)
     with opened(tar, limit=2**50, follow=False) as file:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,8 +17,8 @@ from eyerender.dataset.realise import realise
 from eyerender.dataset.runfile import begin
 from eyerender.dataset.shard import Staged, commit
 from eyerender.dataset.status import status
-from eyerender.errors import EyerenderError
-from eyerender.folders.imagefolder import ImageFolder
+from eyerender.errors import EyerenderError, InputError
+from eyerender.folders.imagefolder import ImageFolder, PackedEntry
 from eyerender.imaging.labels import EyeInWindow, known_labels
 from tests.support.dataset_specs import plan, tree
 
@@ -107,6 +108,21 @@ def test_shards_are_packed_read_grown_and_merged(samples, tmp_path):
     assert merge([tmp_path / "part0"], tmp_path / "joined")["shards_missing"] == 1
     assert merge([tmp_path / "part0", tmp_path / "part1"], tmp_path / "joined")["complete"]
     assert tree(tmp_path / "joined") == before
+
+
+def test_a_place_in_a_tar_and_a_name_are_not_trusted(samples, tmp_path):
+    made, out = plan(**PACKED), tmp_path / "out"
+    make(out, made, samples)
+    entry = ImageFolder.load(out).entries[0]
+    assert isinstance(entry, PackedEntry)
+    assert entry.data("file_name")[:4] == b"\x89PNG"
+    for place, reason in (([0, 2**31], "too large"), ([2**29, 2**29], "beyond the end"), ([-1, 4], "must be a place")):
+        with pytest.raises(InputError, match=reason):
+            replace(entry, members={"file_name": place}).data("file_name")
+    for name in ("..", "", "/" + 300 * "x"):
+        path = replace(entry, line={**entry.line, "file_name": name}).file("file_name")
+        assert path.is_file()
+        assert path.parent == entry.path.parent
 
 
 def test_a_full_disk_while_a_shard_is_unpacked_loses_nothing(samples, tmp_path):
