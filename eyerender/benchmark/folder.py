@@ -30,7 +30,7 @@ from ..storage.jsonlines import JsonLines
 from .conditions import of_pixels, of_scene, of_shape, tags
 from .glintlabels import TrueGlint, measured
 from .hints import FolderHints
-from .layouts import exported_gamma, layout_of, read_layout
+from .layouts import layout_of, read_layout, stated_gamma
 from .own import Labelled, is_own, own_labels
 
 IDEAL_SCHEMA = "eyerender/ideal-images/1"
@@ -139,7 +139,7 @@ def _load(path: Path, eye_error_mm: float, pupil_class: int | None) -> list[Labe
         return _load_own(path, pupil_class)
     layout = None if (path / DATASET).exists() else layout_of(path)
     if layout is not None:
-        return _with_hints(path, read_layout(path, layout), exported_gamma(path))
+        return _with_hints(path, read_layout(path, layout), stated_gamma(path))
     images = ImageFolder.load(path)
     truth = images.truth()
     scene_rig = _rig_of(images)

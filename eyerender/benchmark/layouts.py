@@ -21,6 +21,7 @@ from PIL import Image, ImageDraw
 
 from ..arrays import Bools
 from ..errors import InputError
+from ..folders.exported import EXPORT, exported_gamma
 from ..folders.video import unpacked
 from ..geometry.ellipse import Ellipse
 from ..storage.files import inside, read_json, read_text
@@ -28,7 +29,6 @@ from .glintlabels import TrueGlint
 from .own import MAX_IMAGES, SUFFIXES, Labelled, ellipse_of_mask
 
 PUPIL = 3
-EXPORT = "export.json"
 _ANNOTATIONS_BYTES = 2**30
 _MOST_PIXELS = 2**26
 
@@ -53,15 +53,16 @@ def read_layout(folder: Path, layout: str) -> Iterator[Labelled]:
     return {"openeds": _openeds, "coco": _coco, "teyed": _teyed}[layout](folder)
 
 
-def exported_gamma(folder: Path) -> float | None:
-    """Encoding gamma that an export of this package states, None for other folders."""
-    if not (folder / EXPORT).is_file():
-        return None
-    try:
-        image = read_json(folder / EXPORT)["image"]
-        return float(image["gamma"]) if image["encoding"] == "gamma" else 1.0
-    except (KeyError, TypeError, ValueError):
-        raise InputError("states no encoding", source=str(folder / EXPORT)) from None
+def stated_gamma(folder: Path) -> float | None:
+    """Return the encoding gamma that an export of this package states, None for other folders.
+
+    Raises:
+        InputError: an export states none.
+    """
+    gamma = exported_gamma(folder)
+    if gamma is None and (folder / EXPORT).is_file():
+        raise InputError("states no encoding", source=str(folder / EXPORT))
+    return gamma
 
 
 def _openeds(folder: Path) -> Iterator[Labelled]:

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..arrays import Bytes
 from ..errors import InputError
+from ..folders.exported import EXPORT, exported_gamma
 from ..progress import Progress, followed
-from ..storage.files import read_json
 from .figures import FIGURES, RADIUS_PX, Scaled, measure, ratio
 from .folder import FolderFigures, Skipped, Source, open_source, pictures
 from .patches import patches
@@ -20,7 +20,6 @@ from .separability import MISSING, available, separability, to_mapping
 SCHEMA = "eyerender/realism/2"
 DEFAULT_LIMIT = 200
 MAX_LIMIT = 10_000
-EXPORT = "export.json"
 _TILE_R = (5.6, 4.2)  # width and height of a tile of the montage, R
 _WHITE = 235.0  # grey level at which a tile shows the 98th percentile of its picture
 
@@ -75,14 +74,8 @@ def _encoding(source: Source) -> tuple[float, str]:
     """Return the gamma of a folder's images, and where it is known from."""
     if source.entries:
         return source.entries[0].gamma, "the folder"
-    stated = source.path / EXPORT
-    if not stated.is_file():
-        return 1.0, "assumed"
-    image = read_json(stated, follow=False).get("image")
-    gamma = image.get("gamma") if isinstance(image, dict) else None
-    if isinstance(gamma, bool) or not isinstance(gamma, int | float) or not 0.1 <= gamma <= 10:
-        return 1.0, "assumed"
-    return float(gamma), f"the folder's {EXPORT}"
+    gamma = exported_gamma(source.path)
+    return (1.0, "assumed") if gamma is None else (gamma, f"the folder's {EXPORT}")
 
 
 def _tile(s: Scaled) -> Bytes:

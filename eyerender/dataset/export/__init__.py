@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
+from ...folders.exported import EXPORT
 from ...folders.imagefolder import DATASET, ImageFolder
 from ...folders.outfolder import staged
 from ...progress import Progress
@@ -29,7 +30,7 @@ from .item import Item, Items
 Writer = Callable[[Items, Path], str | None]
 
 SCHEMA = "eyerender/export/2"
-EXPORT, CARD = "export.json", "README.md"
+CARD = "README.md"
 FORMATS: dict[str, Writer] = {
     "webdataset": webdataset.write,
     "imagefolder": imagefolder.write,
