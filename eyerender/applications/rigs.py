@@ -27,7 +27,7 @@ from ..design.crowd import (
     users_of,
 )
 from ..design.noise import FeatureNoise, sensor_noise
-from ..design.people import CALIBRATION, GRID, LOST, Figures, Survey, place_of
+from ..design.people import CALIBRATION_CELLS, GRID, LOST, Figures, Survey, place_of
 from ..design.safety import NOTE, eye_exposure
 from ..design.unknowns import Unknowns
 from ..errors import InputError
@@ -174,7 +174,7 @@ def estimator_errors(
     """
     cells = np.array([GRID * r + c for r in range(0, GRID, 2) for c in range(0, GRID, 2)])
     cells = cells if images else np.arange(GRID * GRID)
-    chosen = np.flatnonzero(np.isin(cells, [GRID * r + c for r in CALIBRATION for c in CALIBRATION]))
+    chosen = np.flatnonzero(np.isin(cells, CALIBRATION_CELLS))
     errors = {name: np.full((len(subjects), len(cells)), np.nan) for name in ESTIMATORS}
     reasons = dict.fromkeys(ESTIMATORS, "")
     for k, subject in enumerate(subjects):

@@ -164,7 +164,7 @@ def evaluate(spec: SweepSpec, layout: Layout) -> dict[str, Any]:
     scene = Scene.of(SceneSpec.from_mapping(layout.scene))
     sites, chosen = len(scene.rig.lights), tuple(range(len(scene.rig.lights)))
     if layout.lights < sites:
-        known = sites_seen(survey, noise_of_some(scene, layout.lights), min(CHOOSERS, spec.people))
+        (known,) = sites_seen(survey, [noise_of_some(scene, layout.lights)], min(CHOOSERS, spec.people))
         chosen = choose_lights(known, layout.lights)
         leds = [layout.scene["rig"]["lights"][k] for k in chosen]
         data = {**layout.scene, "rig": {**layout.scene["rig"], "lights": leds}}

@@ -86,7 +86,7 @@ def noise_of_some(scene: Scene, count: int) -> FeatureNoise:
 
 
 def site_matrices(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
-    """Information of each of n views: (n, 15, 15) of the outline and (m, n, 15, 15) of each LED's glint."""
+    """Information of each of n views: (n, 23, 23) of the outline and (m, n, 23, 23) of each LED's glint."""
     normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
     size = np.sqrt(length) / noise.outline_px[camera][:, None]
     across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * size[..., None]

@@ -11,7 +11,7 @@ the camera, on the sensor, and inside the projected inner margins of the lids. L
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,9 +38,11 @@ from .unknowns import AZIMUTH, COUNT, ELEVATION, LOCAL, PUPIL, Unknowns
 from .varied import Slopes, Views, diameters_mm, gaze_slopes, slopes_of, stacked_eyes
 
 POINTS = 16
+GRID = 9
 CALIBRATION = (0, 4, 8)
 """Rows and columns of the 9 x 9 directions that calibrate."""
-GRID = 9
+CALIBRATION_CELLS = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
+"""Their places among the 81 directions."""
 TOGETHER = 8
 _MARGIN_COLUMNS = 44
 _VAGUE, _LOST_DEG = 1e3, 60.0
@@ -176,26 +178,30 @@ def figures_of(survey: Survey, noise: FeatureNoise, first: int, count: int) -> F
     return Figures.joined(parts)
 
 
-def sites_seen(survey: Survey, noise: FeatureNoise, count: int) -> SiteInformation:
-    """What each LED adds for the first people with an eye, in the nine directions of the calibration."""
-    scene = Scene.of(SceneSpec.from_mapping(survey.scene))
-    unknowns, parts = Unknowns.from_mapping(survey.unknowns), []
-    chosen = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
-    for one in people_of(survey, 0, count)[0]:
-        case = _case(survey, scene.rig, [one])
-        instants, theta = case.instants.take(chosen), case.theta[chosen]
-        openings = _openings(survey, [one])[chosen] if survey.lids else None
-        total: tuple[Floats, Floats] | None = None
-        for number, camera in enumerate(scene.rig.cameras):
-            views = replace(instants, camera=np.full(len(chosen), number))
-            slopes, _ = visible(slopes_of(views, theta, POINTS), camera, openings)
-            found = site_matrices(slopes, noise, views.camera)
-            total = found if total is None else (total[0] + found[0], total[1] + found[1])
-        assert total is not None
-        parts.append(with_priors(*total, unknowns))
-    if not parts:
+def sites_seen(survey: Survey, noises: Sequence[FeatureNoise], count: int) -> list[SiteInformation]:
+    """Compute what each LED adds for the first people with an eye, in the nine directions of the calibration.
+
+    Everything is traced once, for any number of `noises`; the result has one item for each of them.
+    """
+    rig = Scene.of(SceneSpec.from_mapping(survey.scene)).rig
+    unknowns, people = Unknowns.from_mapping(survey.unknowns), people_of(survey, 0, count)[0]
+    if not people:
         raise InputError("nobody's eye can exist", path="population")
-    return joined(parts)
+    parts: list[list[SiteInformation]] = [[] for _ in noises]
+    for one in people:
+        case = _case(survey, rig, [one])
+        instants, theta = case.instants.take(CALIBRATION_CELLS), case.theta[CALIBRATION_CELLS]
+        openings = _openings(survey, [one])[CALIBRATION_CELLS] if survey.lids else None
+        numbers = [np.full(len(CALIBRATION_CELLS), number) for number in range(len(rig.cameras))]
+        seen = [
+            visible(slopes_of(replace(instants, camera=number), theta, POINTS), camera, openings)[0]
+            for number, camera in zip(numbers, rig.cameras, strict=True)
+        ]
+        for part, noise in zip(parts, noises, strict=True):
+            found = [site_matrices(slopes, noise, number) for slopes, number in zip(seen, numbers, strict=True)]
+            bases, sites = zip(*found, strict=True)
+            part.append(with_priors(np.sum(bases, axis=0), np.sum(sites, axis=0), unknowns))
+    return [joined(part) for part in parts]
 
 
 def _nobody(refused: list[int]) -> Figures:
@@ -336,13 +342,13 @@ def bounds(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns
 def _learned(case: Case, matrices: Floats, noise: FeatureNoise, parts: tuple[Floats, Indices, Indices]) -> Floats:
     """Compute the information (p, q, q) on each person after the calibration and with the prior, equation (7)."""
     prior, local, person = parts
-    chosen = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
-    rows = (GRID * GRID * np.arange(len(matrices) // GRID**2)[:, None] + chosen).ravel()
+    rows = (GRID * GRID * np.arange(len(matrices) // GRID**2)[:, None] + CALIBRATION_CELLS).ravel()
     whole = matrices[rows] + target_information(case, noise, rows)
     a = whole[:, local[:, None], local] + np.diag(prior[local])
     b = whole[:, local[:, None], person]
     learned = whole[:, person[:, None], person] - np.swapaxes(b, 1, 2) @ np.linalg.solve(a, b)
-    return np.asarray(np.diag(prior[person]) + learned.reshape(-1, len(chosen), len(person), len(person)).sum(axis=1))
+    each = learned.reshape(-1, len(CALIBRATION_CELLS), len(person), len(person))
+    return np.asarray(np.diag(prior[person]) + each.sum(axis=1))
 
 
 def _deviation_deg(matrices: Floats, slopes: Floats) -> Floats:

@@ -7,9 +7,8 @@ is told for the best LEDs of that number (greedy exchange, `design/choice.py`), 
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +26,10 @@ from ..progress import Progress
 from ..scene import Scene
 from ..scene.people import Population
 from ..scene.spec import SceneSpec
-from ..storage.files import write_json
+from ..storage.files import write_json, write_text
 from .layouts import KnownLayout, known_layouts
 from .options import StudyOptions
+from .results import csv_text
 from .rigs_page import write_rigs_page
 
 SCHEMA = "eyerender/study/1"
@@ -100,16 +100,15 @@ def run_rigs(
         rows = [result.to_mapping(own) for result, own in zip(results, traits, strict=True)]
         data = {"schema": SCHEMA, "study": "rigs", "population": "adults", "note": "noise only", "rows": rows}
         write_json(folder / "summary.json", data)
-        _write_csv(folder / "leds.csv", [{"layout": row["layout"], **one} for row in rows for one in row["leds"]])
-        _write_csv(
-            folder / "who.csv",
-            [
-                {"layout": row["layout"], "trait": name, "third": third, "lost": lost}
-                for row in rows
-                for name, losses in row["lost_by_third"].items()
-                for third, lost in zip(("low", "middle", "high"), losses, strict=True)
-            ],
+        leds = [{"layout": row["layout"], **one} for row in rows for one in row["leds"]]
+        write_text(folder / "leds.csv", csv_text(list(leds[0]), (list(one.values()) for one in leds)))
+        who = (
+            (row["layout"], name, third, lost)
+            for row in rows
+            for name, losses in row["lost_by_third"].items()
+            for third, lost in zip(("low", "middle", "high"), losses, strict=True)
         )
+        write_text(folder / "who.csv", csv_text(("layout", "trait", "third", "lost"), who))
         write_rigs_page(folder / "report.html", data, {r.layout.name: r.lost.mean(axis=0) for r in results})
     return data
 
@@ -138,17 +137,11 @@ def _result(layout: KnownLayout, people: int, workers: int | None, progress: Pro
 
 def bought(survey: Survey, scene: Scene, people: int) -> list[dict[str, Any]]:
     """What the best 1, 2, ... LEDs buy: noise of the optic axis with a known person, and glints."""
-    known_person = Unknowns(slippage_mm=max(3.0, survey.slippage_mm)).to_mapping()
-    rows, sites = [], len(scene.rig.lights)
-    for count in range(1, sites + 1):
-        own = Survey(
-            scene=survey.scene,
-            population=survey.population,
-            slippage_mm=survey.slippage_mm,
-            relief_mm=survey.relief_mm,
-            unknowns=known_person,
-        )
-        known = sites_seen(own, noise_of_some(scene, count), people)
+    known_person = replace(survey, unknowns=Unknowns(slippage_mm=max(3.0, survey.slippage_mm)).to_mapping())
+    counts = range(1, len(scene.rig.lights) + 1)
+    sites = sites_seen(known_person, [noise_of_some(scene, count) for count in counts], people)
+    rows = []
+    for count, known in zip(counts, sites, strict=True):
         chosen = choose_lights(known, count)
         noise = axis_deg(known, chosen)
         glints = np.any(known.sites[list(chosen)] != 0.0, axis=(2, 3)).sum(axis=0)
@@ -202,10 +195,3 @@ def thirds(lost: Bools, values: Floats) -> list[float]:
     """Share of lost directions of the third of people with the lowest values, of the middle, and of the highest."""
     order = np.argsort(values, kind="stable")
     return [float(lost[part].mean()) if len(part) else float("nan") for part in np.array_split(order, 3)]
-
-
-def _write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
