@@ -22,6 +22,7 @@ FLOORS = {
     "references": 0,
     "jit": 0,
     "progress": 0,
+    "processes": 0,
     "status": 0,
     "spec": 0,
     "versions": 0,

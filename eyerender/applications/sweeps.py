@@ -11,10 +11,9 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from itertools import islice
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from ..design.safety import eye_exposure
 from ..design.unknowns import Unknowns
 from ..errors import EyerenderError, InputError
 from ..folders.outfolder import clear, refuse_non_empty
+from ..processes import process_pool
 from ..progress import Progress, Say
 from ..scene import Scene
 from ..scene.spec import SceneSpec
@@ -144,7 +144,7 @@ def _evaluated(spec: SweepSpec, layouts: Sequence[Layout], workers: int | None) 
         yield from ((layout.number, evaluate(spec, layout)) for layout in layouts)
         return
     todo = iter(layouts)
-    with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
+    with process_pool(count) as pool:
         running: dict[Future[dict[str, Any]], int] = {}
 
         def start(some: int) -> None:

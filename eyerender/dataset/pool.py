@@ -16,6 +16,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
 from ..errors import EyerenderError
+from ..processes import signals_held
 from .shard import Staged
 from .worker import FAILURES, Job, work
 
@@ -239,16 +240,3 @@ def caller_hidden() -> Iterator[None]:
         yield
     finally:
         main.update(before)
-
-
-@contextmanager
-def signals_held() -> Iterator[None]:
-    """Block Ctrl-C while a child, which inherits the signal mask, still imports its modules."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import partial
 from itertools import repeat
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats
+from ..processes import mapper
 from ..progress import Progress
 from .noise import FeatureNoise
 from .people import Figures, Survey, figures_of
@@ -38,12 +36,9 @@ def figures_of_people(
     firsts = range(0, people, _PIECE)
     counts = [min(_PIECE, people - first) for first in firsts]
     workers = min(workers or os.cpu_count() or 1, len(firsts))
-    if workers == 1:
-        results: Iterator[Figures] = map(partial(figures_of, survey, noise), firsts, counts)
-        return Figures.joined(list(_told(results, counts, progress)))
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        results = pool.map(figures_of, repeat(survey), repeat(noise), firsts, counts)
-        return Figures.joined(list(_told(results, counts, progress)))
+    with mapper(workers) as mapped:
+        results = mapped(figures_of, repeat(survey), repeat(noise), firsts, counts)
+        return Figures.joined(list(_reported(results, counts, progress)))
 
 
 SHIFTS_MM = (-3.0, -1.5, 0.0, 1.5, 3.0)
@@ -61,15 +56,11 @@ def figures_of_shifts(
     plane = [(0.0, left, up) for up in SHIFTS_MM[::-1] for left in SHIFTS_MM]
     shifts = [*plane, *((x, 0.0, 0.0) for x in SHIFTS_MM)]
     surveys = [replace(survey, slippage_mm=0.0, relief_mm=0.0, shift_mm=shift) for shift in shifts]
-    workers = workers or os.cpu_count() or 1
-    if workers == 1:
-        return np.array(shifts), [figures_of(one, noise, 0, people) for one in surveys]
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        found = list(pool.map(figures_of, surveys, repeat(noise), repeat(0), repeat(people)))
-    return np.array(shifts), found
+    with mapper(workers or os.cpu_count() or 1) as mapped:
+        return np.array(shifts), list(mapped(figures_of, surveys, repeat(noise), repeat(0), repeat(people)))
 
 
-def _told(results: Iterator[Figures], counts: Sequence[int], progress: Progress | None) -> Iterator[Figures]:
+def _reported(results: Iterator[Figures], counts: Sequence[int], progress: Progress | None) -> Iterator[Figures]:
     done = 0
     for part, count in zip(results, counts, strict=True):
         done += count

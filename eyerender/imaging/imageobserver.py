@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +25,7 @@ from ..eye.spec import EyeSpec
 from ..folders.imagefile import image_files, read_any_image, write_png
 from ..folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
+from ..processes import mapper
 from ..progress import Progress, followed, followed_by
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigLike
@@ -150,7 +149,8 @@ class ImageObserver:
             _refuse_inputs([_picture_of(path, pictures) for path in paths], paths)
         parts, skipped, coloured = [], [], 0
         job = _FileJob(settings=self.settings, gamma=self.gamma, eyes=eyes, pictures=pictures, lenient=lenient)
-        with _mapper(processes if len(paths) >= LEAST_FOR_POOL else 1) as each:
+        count = processes if len(paths) >= LEAST_FOR_POOL else 1
+        with mapper(count, initializer=single_threaded, chunksize=4) as each:
             for k, done in enumerate(followed_by(each(job, paths), len(paths), progress)):
                 try:
                     if isinstance(done, InputError):
@@ -282,21 +282,6 @@ def colour_warning(count: int, what: str) -> InputWarning:
     return InputWarning(
         code="colour", reason=f"{count} {what} in colour; the luminance is taken, but near-infrared images are grey"
     )
-
-
-@contextmanager
-def _mapper(processes: int) -> Iterator[Callable[[_FileJob, Sequence[str | Path]], Iterable[Any]]]:
-    """Make a map of a job over paths, in this process or in several; results come in the order of the paths."""
-    if processes <= 1:
-        yield lambda job, paths: map(job, paths)
-        return
-    # New processes: those that are forked inherit the threads of OpenCV and of the renderer in a broken state.
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=single_threaded) as pool:
-        try:
-            yield lambda job, paths: pool.map(job, paths, chunksize=4)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 def detect(

@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
 from ..folders.outfolder import clear, refuse_non_empty
+from ..processes import mapper
 from ..progress import Progress, Say
 from ..scene import Scene
 from ..storage.files import read_json, write_json, write_text
@@ -189,22 +188,12 @@ def _collected(
     out = []
     if progress is not None:
         progress(0, len(items), "")
-    with _mapper(min(workers, len(items))) as mapped:
+    with mapper(min(workers, len(items))) as mapped:
         for k, part in enumerate(mapped(job, items)):
             out.append(part)
             if progress is not None:
                 progress(k + 1, len(items), names[k])
     return out
-
-
-@contextmanager
-def _mapper(workers: int) -> Iterator[Callable[..., Any]]:
-    """Choose `map`, or that of a pool of spawned processes, because a fork would copy the parent's threads."""
-    if workers <= 1:
-        yield map
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield pool.map
 
 
 @contextmanager
