@@ -187,7 +187,7 @@ class FileSpec(Spec):
     """A spec that is a YAML file of its own and states the version of its format."""
 
     FORMATS: ClassVar[tuple[int, ...]] = (FORMAT,)
-    """The versions that `load` reads; the last one is written."""
+    """The versions that `load` reads; new files state the last one."""
 
     format: int = Field(default=FORMAT, description="version of this file format")
 

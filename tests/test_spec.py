@@ -24,6 +24,21 @@ def quickstart():
     return yaml.safe_load(shipped_scenes()["quickstart"].read_text(encoding="utf-8"))
 
 
+def test_lights_without_an_aim_follow_the_rule_of_the_files_format(tmp_path):
+    data = quickstart()
+    data["rig"]["lights"] = [{"position_mm": [40, -50, 5]}, {"position_mm": [40, 50, 5], "aim_mm": [1, 2, 3]}]
+    aims = {}
+    for number in (1, 2):
+        data["format"] = number
+        path = tmp_path / "scene.yaml"
+        path.write_text(yaml.safe_dump(data), encoding="utf-8")
+        spec = SceneSpec.load(path)
+        aims[number] = [light.aim_mm for light in spec.rig.lights]
+        spec.dump(path)
+        assert SceneSpec.load(path) == spec
+    assert aims == {1: [(0, 0, 0), (1, 2, 3)], 2: ["nearest_eye", (1, 2, 3)]}
+
+
 def test_shipped_scenes_load_and_come_back_from_their_own_yaml(tmp_path):
     assert sorted(shipped_scenes()) == [
         "blignaut2014",
@@ -85,7 +100,7 @@ def test_spec_is_frozen():
         ("subject.head_positions_mm", [[0, 0, 0]] * 12_000, "make 216000 observations; a scene may have 200000"),
         ("image.spp", 10**9, "image.spp: must be <= 65536"),
         ("image.window_px", [10**6, 240], "image.window_px.0: must be <= 8192"),
-        ("format", 2, "format: is 2; this version reads format 1"),
+        ("format", 3, "format: is 3; this version reads format 1 and 2"),
         ("format", True, "format: is True"),
     ],
 )

@@ -342,7 +342,7 @@ class Plan:
         subject_attempt = self.identity(subject)[0]
         turn = Turn(sample=sample, subject=subject, sequence=sequence, attempt=attempt, subject_attempt=subject_attempt)
         tree, drawn = self._scene_of(turn)
-        tree.setdefault("format", 1)
+        tree.setdefault("format", spec.format)
         if spec.population is not None:
             tree["population"] = self.person_of(subject, subject_attempt).to_mapping()
         tree.setdefault("name", f"{spec.name} {sample}")

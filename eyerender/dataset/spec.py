@@ -8,14 +8,14 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from ..errors import InputError
 from ..population.people import PopulationSpec
 from ..scene import is_shipped_dataset, refuse_folder, shipped_files
-from ..scene.spec import DATASET_KIND, NOT_A_DATASET
+from ..scene.spec import DATASET_KIND, NOT_A_DATASET, SceneSpec
 from ..spec import FileSpec, Positive, Spec
 from .expressions import FUNCTIONS
 from .gathering import extended, with_tables
@@ -53,7 +53,12 @@ class LabelsSpec(Spec):
 
 
 class DatasetSpec(FileSpec):
-    """A dataset file; see the documentation for draws, which may replace any value of `scene`."""
+    """A dataset file; see the documentation for draws, which may replace any value of `scene`.
+
+    Its format is that of `scene`, unless the scene states its own.
+    """
+
+    FORMATS: ClassVar[tuple[int, ...]] = SceneSpec.FORMATS
 
     kind: Literal["dataset"] = Field(description="says that the file is a dataset, not a scene")
     name: Annotated[str, Field(min_length=1, max_length=100)] = Field(description="name of the dataset")

@@ -5,11 +5,13 @@ Radiant intensity in direction w: I(w) = I0 max(0, cos(angle to the axis))^m (m 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from numpy.typing import ArrayLike
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..arrays import ArrayValue, Floats, frozen
 from ..spec import NonNegative, Number, Positive, Spec, Vec3
@@ -18,6 +20,27 @@ from .camera import PinholeCamera
 # Largest number of LEDs of a rig, including each LED of a ring: each has a glint with a status and a reason in every
 # frame.
 MAX_LIGHTS = 1000
+
+NEAREST_EYE: Literal["nearest_eye"] = "nearest_eye"
+# Corneal apexes of an adult with the mean distance of the pupils, 63.5 mm, whose head is at the world's origin. A lamp
+# has one aim for all who sit before it.
+_EYES_MM = np.array([[0.0, -31.75, 0.0], [0.0, 31.75, 0.0]])
+
+
+def aimed(lights: Any) -> Any:
+    """Let the lights of a file of format 2, as parsed, aim at the nearest eye where they do not say at what."""
+    if not isinstance(lights, list | tuple):
+        return lights
+    return [{"aim_mm": NEAREST_EYE, **light} if isinstance(light, Mapping) else light for light in lights]
+
+
+def _aim_tag(value: Any) -> str:
+    return "TextSpec" if isinstance(value, str) else "PointSpec"
+
+
+Aim = Annotated[
+    Annotated[Literal["nearest_eye"], Tag("TextSpec")] | Annotated[Vec3, Tag("PointSpec")], Discriminator(_aim_tag)
+]
 
 
 class LedRing(Spec):
@@ -43,7 +66,11 @@ class Led(Spec):
     ring: LedRing | None = Field(default=None, description="a circle of LEDs about a camera, in place of one LED")
     radius_mm: NonNegative = Field(default=0.0, description="radius of the emitting disc; 0 is a point")
     inner_radius_mm: NonNegative = Field(default=0.0, description="radius of the hole of a ring-shaped emitter")
-    aim_mm: Vec3 = Field(default=(0, 0, 0), description="world point on its axis")
+    aim_mm: Aim = Field(
+        default=(0, 0, 0),
+        description="world point on its axis, or `nearest_eye`: the nearer of (0, -31.75, 0) and (0, 31.75, 0), where "
+        "an adult's corneas are, and the origin for a light midway; default: the origin, in files of format 2 the eye",
+    )
     intensity_mw_sr: Positive = Field(default=20.0, description="radiant intensity on the axis")
     lobe_exponent: NonNegative = Field(default=1.0, description="m of cos^m; 1 is Lambertian, 0 isotropic")
 
@@ -59,9 +86,18 @@ class Led(Spec):
             raise ValueError("give either position_mm or ring")
         if self.inner_radius_mm > 0 and self.inner_radius_mm >= self.radius_mm:
             raise ValueError("inner_radius_mm must be less than radius_mm")
-        if self.position_mm is not None and np.allclose(self.position_mm, self.aim_mm, atol=1e-6):
+        if self.position_mm is not None and np.allclose(self.position_mm, self._aim(self.position_mm), atol=1e-6):
             raise ValueError("aim_mm is the light's own position")
         return self
+
+    def _aim(self, place_mm: ArrayLike) -> Floats:
+        """Compute the world point, (3,) mm, that a light at a place, (3,) mm, aims at."""
+        if self.aim_mm != NEAREST_EYE:
+            return np.array(self.aim_mm, dtype=float)
+        right, left = np.linalg.norm(_EYES_MM - np.asarray(place_mm, dtype=float), axis=1)
+        if abs(right - left) < 1e-9:
+            return np.zeros(3)
+        return _EYES_MM[0 if right < left else 1]
 
     def build(self, cameras: tuple[PinholeCamera, ...]) -> tuple[Lamp, ...]:
         """Build the numeric lights of this entry."""
@@ -75,7 +111,6 @@ class Led(Spec):
                 camera.nodal_point_mm + self.ring.radius_mm * (np.cos(a) * camera.R[0] + np.sin(a) * camera.R[1])
                 for a in angles
             ]
-        aim = np.array(self.aim_mm, dtype=float)
         return tuple(
             Lamp(
                 position_mm=frozen(p),
@@ -86,7 +121,7 @@ class Led(Spec):
                 inner_radius_mm=self.inner_radius_mm,
                 duty_cycle=1.0 if self.duty_cycle is None else self.duty_cycle,
             )
-            for p in places
+            for p, aim in ((place, self._aim(place)) for place in places)
         )
 
 

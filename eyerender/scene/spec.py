@@ -21,6 +21,7 @@ from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
 from ..rig.imaging import Ambient, Lens, Motion
+from ..rig.light import aimed
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
 from ..spec import FileSpec, KeyProblem, Positive, Spec, Vec2, Vec3
@@ -221,7 +222,13 @@ LIFTED = ("eye", "person", "look", "region")
 
 
 class SceneSpec(FileSpec):
-    """A scene file."""
+    """A scene file.
+
+    In format 2 a light without `aim_mm` aims at the nearest eye, in format 1 midway between the eyes; nothing else
+    differs.
+    """
+
+    FORMATS: ClassVar[tuple[int, ...]] = (1, 2)
 
     name: Annotated[str, Field(min_length=1)] = Field(description="name of the scene, for reports")
     description: str = Field(default="", description="what the scene is for, in a sentence")
@@ -285,7 +292,10 @@ class SceneSpec(FileSpec):
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Move what the subject or its population says to the scene's own keys."""
+        """Move what the subject or its population says to the scene's own keys, and aim lights by the format's rule."""
+        rig = data.get("rig")
+        if data.get("format") == 2 and isinstance(rig, Mapping):
+            data = {**data, "rig": {**rig, "lights": aimed(rig.get("lights"))}}
         subject = data.get("subject")
         if isinstance(subject, Spec):
             rest = subject.to_mapping()

@@ -37,6 +37,37 @@ def test_light_axis_points_at_its_aim():
     np.testing.assert_allclose(rig.lights[0].axis, np.array([-2, 1, 0]) / np.sqrt(5), atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("place", "aim"),
+    [
+        ([12, -45, 5], [0, -31.75, 0]),
+        ([12, 45, 5], [0, 31.75, 0]),
+        ([600, 0, -50], [0, 0, 0]),
+        ([9, 2, 0], [0, 31.75, 0]),
+    ],
+)
+def test_a_light_aims_at_the_nearest_eye_and_one_midway_between_the_eyes(place, aim):
+    lights = [{"position_mm": place, "aim_mm": "nearest_eye"}]
+    lamp = Rig.from_mapping({"cameras": [CAMERA], "lights": lights}).build().lights[0]
+    way = np.subtract(aim, place)
+    np.testing.assert_allclose(lamp.axis, way / np.linalg.norm(way), atol=1e-12)
+
+
+def test_leds_of_a_ring_keep_their_aims_when_they_become_single_ones():
+    ring = {"ring": {"radius_mm": 40, "count": 5}, "aim_mm": "nearest_eye"}
+    rig = Rig.from_mapping({"cameras": [{**CAMERA, "position_mm": [30, 3, -15]}], "lights": [ring]})
+    single = rig.with_light(0, intensity_mw_sr=3.0)
+    assert len(single.lights) == 5
+    for one, other in zip(rig.build().lights, single.build().lights, strict=True):
+        np.testing.assert_array_equal(one.axis, other.axis)
+
+
+def test_a_word_that_is_no_aim_is_refused_in_one_line():
+    lights = [{"position_mm": [9, 2, 0], "aim_mm": "the eye"}]
+    with pytest.raises(InputError, match=r"lights\.0\.aim_mm: must be 'nearest_eye'"):
+        Rig.from_mapping({"cameras": [CAMERA], "lights": lights})
+
+
 def test_screen_grid_is_in_the_studys_order():
     screen = Screen.from_mapping({"centre_mm": [800, 0, -131.5], "size_mm": [495, 280]}).build()
     targets = screen.grid(15, 9)
