@@ -1,4 +1,4 @@
-"""What a sweep of rigs varies: a file of its own that names the scene, and the layouts that follow from it."""
+"""The spec of a sweep of rigs: a YAML file that names a scene and the values to vary, and the resulting layouts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LightCount = Annotated[int, Field(ge=1, le=MAX_LIGHTS)]
 
 
 class Places(Spec):
-    """Places in the world: a list, a curve, or a surface."""
+    """Positions in the world: a list, a curve, or a surface."""
 
     points_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = Field(default=None, description="a list")
     curve_mm: Annotated[tuple[Vec3, ...], Field(min_length=2)] | None = Field(
@@ -49,7 +49,7 @@ class Places(Spec):
         return self
 
     def places(self) -> Floats:
-        """The places, (n, 3) mm."""
+        """Return the positions (n, 3) mm in the world."""
         if self.points_mm is not None:
             return np.array(self.points_mm, dtype=float)
         if self.curve_mm is not None:
@@ -66,7 +66,7 @@ class Places(Spec):
 
 
 class SweptCamera(Spec):
-    """What varies of one camera."""
+    """Values of one camera to vary."""
 
     camera: Annotated[int, Field(ge=0)] = Field(default=0, description="which camera of the scene")
     places: Places | None = Field(default=None, description="its places; it goes on looking where it looked")
@@ -79,7 +79,7 @@ class SweptCamera(Spec):
 
 
 class SweptLights(Spec):
-    """LEDs in place of those of the scene; everything but place and intensity is that of the scene's first LED."""
+    """LEDs that replace those of the scene; all but position and intensity is copied from the scene's first LED."""
 
     places: Places = Field(description="places of LEDs, or those from which `number` chooses")
     number: Annotated[tuple[LightCount, ...], Field(min_length=1)] | None = Field(
@@ -91,7 +91,7 @@ class SweptLights(Spec):
 
 
 class Sweep(Spec):
-    """What varies; the layouts are all combinations."""
+    """Values to vary; the layouts are all combinations."""
 
     cameras: tuple[SweptCamera, ...] = Field(default=(), description="cameras that vary")
     lights: SweptLights | None = Field(default=None, description="LEDs that vary")
@@ -114,24 +114,24 @@ class SweepSpec(FileSpec):
     sweep: Sweep = Field(description="what varies")
 
     def people_of(self) -> Population:
-        """The population."""
+        """Return the population."""
         return Population(self.population) if isinstance(self.population, str) else self.population
 
     def base(self, folder: Path) -> Scene:
-        """The scene, from a file relative to a folder or a shipped one."""
+        """Load the base scene, from a file relative to a folder or a shipped one."""
         beside = folder / self.scene
         return load_scene(beside if beside.is_file() else self.scene)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """One layout.
+    """One layout of a sweep.
 
     Attributes:
         number: its number in the sweep.
-        values: what is varied, for tables.
+        values: the varied values, for tables.
         scene: mapping of its scene.
-        lights: number of LEDs that are chosen of those of the scene.
+        lights: number of LEDs to choose from those of the scene.
     """
 
     number: int
@@ -141,7 +141,7 @@ class Layout:
 
 
 def layouts_of(spec: SweepSpec, scene: Scene) -> list[Layout]:
-    """All layouts of a sweep, each checked.
+    """Return all layouts of a sweep, each validated.
 
     Raises:
         InputError: naming the key that does not fit the scene.
@@ -170,7 +170,7 @@ Axis = tuple[str, list[Any]]
 
 
 def _axes(sweep: Sweep, scene: Scene) -> Iterator[Axis]:
-    """Everything that varies."""
+    """Return the axes of a sweep: every varied value with its alternatives."""
     for k, swept in enumerate(sweep.cameras):
         yield from _camera_axes(swept, scene, f"sweep.cameras.{k}")
     if sweep.resolution_scale != (1.0,):
@@ -188,7 +188,7 @@ def _axes(sweep: Sweep, scene: Scene) -> Iterator[Axis]:
 
 
 def _camera_axes(swept: SweptCamera, scene: Scene, path: str) -> Iterator[Axis]:
-    """What varies of one camera."""
+    """Return the axes of one camera."""
     specs = scene.spec.rig.cameras
     if swept.camera >= len(specs):
         raise InputError(f"there is no camera {swept.camera}", path=f"{path}.camera")
@@ -207,7 +207,7 @@ def _camera_axes(swept: SweptCamera, scene: Scene, path: str) -> Iterator[Axis]:
 
 
 def _applied(base: Mapping[str, Any], sweep: Sweep, chosen: Mapping[str, Any]) -> dict[str, Any]:
-    """Mapping of the scene with the chosen values."""
+    """Apply the chosen values to the mapping of the scene."""
     rig = dict(base["rig"])
     cameras = [dict(camera) for camera in rig["cameras"]]
     for swept in sweep.cameras:
@@ -234,7 +234,7 @@ def _applied(base: Mapping[str, Any], sweep: Sweep, chosen: Mapping[str, Any]) -
 
 
 def _resized(camera: Mapping[str, Any], scale: float) -> dict[str, Any]:
-    """A camera with more or fewer pixels on the same sensor."""
+    """Return a camera with more or fewer pixels on the same sensor."""
     out = {**camera, "resolution_px": [max(1, round(scale * n)) for n in camera["resolution_px"]]}
     if camera.get("focal_length_px") is not None:
         out["focal_length_px"] = scale * camera["focal_length_px"]
