@@ -88,7 +88,7 @@ def with_kappa(spec: EyeSpec, wanted_deg: tuple[float, float], *, wavelength_nm:
 
 
 def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: float = 1500.0) -> tuple[float, float]:
-    """Compute angles (horizontal, vertical) of the nodal ray to the fovea from the optic axis, nasal and up, in degrees.
+    """Compute angles (horizontal, vertical) from the optic axis to the nodal ray of the fovea, nasal and up, degrees.
 
     Args:
         eye: the eye.

@@ -118,7 +118,7 @@ class Panel(Spec):
         return self
 
     def axes(self) -> tuple[Floats, Floats, Floats]:
-        """Return unit vectors (3,) in the world: the front's normal, along the width (which is level), along the height."""
+        """Return unit vectors (3,) in the world: the front's normal, along the level width, and along the height."""
         normal = np.subtract(self.aim_mm, self.centre_mm)
         normal /= np.linalg.norm(normal)
         right = np.cross((0.0, 0.0, 1.0), normal)
