@@ -87,7 +87,7 @@ def start(bound: BoundFrame, window: Window, spp: int, seed: int, *, layered: bo
 def _in_passes(
     request: FilmRequest, parts: int, size: int, render: Callable[[FilmRequest, int, int], tuple[Any, mi.UInt32]]
 ) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sum radiance and failures over as many passes as memory requires, for `parts` of each pixel of `size` samples each."""
+    """Sum radiance and failures over as many passes as memory requires: `parts` per pixel, of `size` samples each."""
     each = max(1, min(parts, _LANES // (request.window[2] * request.window[3] * size)))
     sums: list[mi.Float] = []
     failed = mi.UInt32(0)

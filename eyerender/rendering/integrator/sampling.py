@@ -32,7 +32,7 @@ _CALLS = 3  # pairs of further numbers of a sample
 
 @lru_cache(maxsize=64)
 def lattice_generator(count: int) -> int:
-    """Return the a, prime to `count`, whose lattice {(k, k a mod N)} / N maximises the smallest distance on the torus."""
+    """Return the a, prime to `count`, whose lattice {(k, k a mod N)} / N has the largest minimum distance (torus)."""
     if count <= 2:
         return 1
     # For long lattices every a near the golden section is good, so a few candidates suffice.

@@ -53,7 +53,7 @@ class PartLabels(ArrayValue):
 
 
 def part_labels(bound: BoundFrame, window: Window) -> Callable[[], PartLabels]:
-    """Start computing the labels of a window; reading them waits for the result. Rays that miss the globe are skipped."""
+    """Start computing the labels of a window; reading them waits for the result. Rays that miss the globe end."""
     _, _, width, height = window
     found = _parts(bound.frame.bare(), Pixels.of(window), width * height)
     return lambda: PartLabels(*(frozen(part.numpy().reshape(height, width), np.uint8) for part in found))
@@ -90,7 +90,7 @@ def highlights(bound: BoundFrame, window: Window) -> Bools:
 
 
 def _lamps_at(frame: Frame, window: Window, right: float, down: float) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Compute mirrored and scattered radiance of lamps at offsets (px) from pixel centres, and the share of the pixel."""
+    """Compute mirrored and scattered radiance of lamps at offsets (px) from pixel centres, and the pixel's share."""
     u, v = Pixels.of(window).at(dr.arange(mi.UInt32, window[2] * window[3]))
     right_of, below = (dr.opaque(mi.Float, x) for x in (right, down))
     o, d, _ = camera_ray(frame, mi.Float(u) + right_of, mi.Float(v) + below)

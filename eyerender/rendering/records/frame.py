@@ -60,7 +60,7 @@ def _apart(buffer: mi.Float, first: mi.UInt32, count: int) -> list[mi.Float]:
 
 
 def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
-    """Compute floor(a / b) of numbers below a million in floating point, because integer division does not vectorise."""
+    """Compute floor(a / b) of numbers below a million in floating point; integer division does not vectorise."""
     return mi.UInt32((mi.Float(a) + 0.5) / mi.Float(b))
 
 

@@ -113,7 +113,7 @@ def _mark_hairs(marked: Bools, curves: Floats, radii: Floats, camera: PinholeCam
 
 
 def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, bool]:
-    """Return the pixels on curves, in a window and a one-pixel border, and whether all curves are far enough to draw."""
+    """Return the pixels on curves, in a window and a one-pixel border, and whether no curve is too close to draw."""
     x0, y0, width, height = window
     marked, every = np.zeros((height + 2, width + 2), dtype=bool), True
     for curve in (c for c in curves if c.size):
