@@ -77,7 +77,7 @@ class IrisIrradiance:
 
     @syntax
     def at(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
-        """Interpolate the irradiance (mW/mm^2) at points of the iris plane (eye frame), and the lamps it lacks, as bits."""
+        """Interpolate the irradiance (mW/mm^2) at points of the iris plane (eye frame); also return missing lamps."""
         q = x - frame.stop.centre
         scale = 0.5 * (_SIDE - 1) / _half(frame)
         u, v = (dr.dot(q, axis) * scale + 0.5 * (_SIDE - 1) for axis in (frame.stop.u, frame.stop.v))
