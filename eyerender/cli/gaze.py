@@ -69,7 +69,7 @@ def fit(
         output: The calibration file to write.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
         rig: A rig file or a scene file, for its rig.
-        columns: A YAML file that says what the columns of a table are (default: as their names say).
+        columns: A YAML file with the meaning of a table's columns (default: recognised from their names).
         function: regression, direction-regression: the function, R1 to R12.
         terms_x: regression: your own terms of x instead of a function, such as 'x + xy + 1'.
         terms_y: regression: your own terms of y.

@@ -207,7 +207,7 @@ def estimate_noise(linear: Image) -> float:
 
 
 def _differences(linear: Image, step: int) -> Image:
-    """Compute the differences of `estimate_noise` at every `step`-th pixel of every `step`-th row, absolute and flattened."""
+    """Compute the differences of `estimate_noise`, absolute and flattened, at every `step`-th pixel and row."""
     a, b = linear[:-1:step, :-1:step], linear[:-1:step, 1::step]
     c, d = linear[1::step, :-1:step], linear[1::step, 1::step]
     return as_image(np.abs(a - b - c + d).ravel())

@@ -78,7 +78,7 @@ def features(ellipse: Ellipse, goodness: Goodness) -> Floats:
 
 
 def design(rows: Floats, low: Floats, high: Floats) -> Floats:
-    """Compute the design matrix (n, 1 + 3 x 22): 1, the features scaled to 0..1 within their limits, and two excesses each.
+    """Compute the design matrix (n, 1 + 3 x 22): 1, the features scaled to 0..1 within their limits, and excesses.
 
     The excesses are those over 1/3 and 2/3.
     """
