@@ -87,7 +87,7 @@ def _glint_row(truth: Observations, found: Observations | None, k: int, light: i
 
 
 def _row(name: str, exact: tuple[Any, Any], hidden: str, seen: tuple[Any, Any]) -> str:
-    """Build a table row: position and reason by ray optics, occluder in the scene, the extractor's position and reason."""
+    """Build a table row: position and reason by ray optics, occluder in the scene, extracted position and reason."""
     (place, _), (found, _) = exact, seen
     apart = f"{np.hypot(*(np.asarray(found) - place)):.2f}" if place is not None and found is not None else ""
     scene = "" if hidden in ("", "visible") else html.escape(hidden)

@@ -1,4 +1,4 @@
-"""Replication with one eye model: every protocol and variant, the waterfall, the restarts, the misprints."""
+"""Replicate a study with one eye model: every protocol and variant, the waterfall, the restarts, the misprints."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class BlignautPart(ModelResults):
 
 
 class _Scenes:
-    """Scenes and observations of one eye model and study, each made only once."""
+    """Scenes and observations of one eye model and study, each computed only once."""
 
     def __init__(self, module: Any, eye: str, observing: Observing) -> None:
         self.module, self.eye, self.observing = module, eye, observing
@@ -61,7 +61,7 @@ class _Scenes:
 
 
 def departures_of(module: Any, protocol: str) -> frozenset[str]:
-    """List the departures of a protocol, given by name."""
+    """Return the departures of a protocol, given by name."""
     return frozenset(module.PUBLISHED if protocol == "published" else module.CORRECTED)
 
 
@@ -71,7 +71,7 @@ def facing(module: Any) -> bool:
 
 
 def scenes_of(module: Any, eyes: Sequence[str], protocols: Sequence[str]) -> list[Scene]:
-    """List the scenes that a study observes in images."""
+    """Return the scenes that a study observes in images."""
     keys = dict.fromkeys(module.scene_key(departures_of(module, protocol)) for protocol in protocols)
     return [module.scene(eye, key) for eye in eyes for key in keys]
 
@@ -161,7 +161,7 @@ def _best_means(done: list[blignaut.Outcome]) -> dict[str, float | None]:
 
 
 def _waterfall(eye: str, module: Any, measure: Any) -> list[WaterfallStep]:
-    """Step from `published` to `corrected`, one departure after the other; also correct each of them alone."""
+    """Correct the departures of `published` one after the other; also correct each of them alone."""
     start = measure(module.PUBLISHED)
     steps = [WaterfallStep(eye, "published", start, start)]
     left = set(module.PUBLISHED)
