@@ -124,7 +124,7 @@ def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Fl
 
 
 def _of_ellipse(centre: Floats, axes: Floats, angle: float) -> tuple[Floats, Floats, Floats]:
-    """Compute an ellipse's points, their normal shifts by (cx, cy, a, b, angle) (k, 5), and |dp / df|, f its parameter."""
+    """Compute an ellipse's points, their normal shifts by (cx, cy, a, b, angle) (k, 5), and |dp / df|, f parameter."""
     f = 2.0 * np.pi * np.arange(ELLIPSE_POINTS) / ELLIPSE_POINTS
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     circle = np.stack([np.cos(f), np.sin(f)], axis=-1)

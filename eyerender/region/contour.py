@@ -100,7 +100,7 @@ def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
 
 @lru_cache(maxsize=4)
 def _columns(count: int) -> tuple[Floats, ...]:
-    """Compute angle, along and upper of `Contour`, the globe's share in the contour's centre, and outward directions."""
+    """Compute angle, along and upper of `Contour`, the globe's share in the contour's centre, outward directions."""
     angle = 2 * np.pi * np.arange(count) / count
     a = np.cos(angle)
     upper = np.where(np.sin(angle) >= -1e-12, 1.0, -1.0)

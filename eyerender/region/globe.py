@@ -150,7 +150,7 @@ def _posed(globe: Globe) -> _Posed:
 
 @lru_cache(maxsize=32)
 def _table(cornea: Surface, limbus_mm: float, centre: tuple[float, ...], radius_mm: float) -> Floats:
-    """Compute the cornea's height (mm) above the sphere over (polar angle, turn about x); the last column is the first."""
+    """Compute the cornea's height (mm) above the sphere over (polar angle, turn about x), closed in the turn."""
     polar = np.linspace(0, _WIDEST, _POLAR)[:, None]
     turn = (2 * np.pi * np.arange(_TURNS + 1) / _TURNS)[None, :]
     n = np.stack(

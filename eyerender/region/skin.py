@@ -382,7 +382,7 @@ class _Strip:
         out: Singles = np.zeros_like(self.y)
         if np.min(self.out_mm) < 4:
             tongues = self.tiles.at(43, _places(self.y, self.out_mm / 3), (10, 60), (10, 60))
-            reach = np.where(self.upper > 0, 0.5, 0.25)  # the upper lashes hold more of the mascara
+            reach = np.where(self.upper > 0, 0.5, 0.25)  # the upper lashes hold more water
             film = 1 - step(self.out_mm - reach - 0.35 * tongues, -0.15, 0.15)
             out = film * np.clip(0.95 - 0.03 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
         return out
@@ -479,7 +479,7 @@ class _Strip:
         return out
 
     def veins(self) -> Singles:
-        """Compute the loss of light, 0 to about 0.2, over veins in the skin of the lids: broad, blurred and scattered."""
+        """Compute the loss of light, 0 to about 0.2, over veins in the skin of the lids: broad and blurred."""
         tiles, where = self.tiles, self.slowly("veins")
         out: Singles = np.zeros_like(self.y)
         some = where > 1e-3
