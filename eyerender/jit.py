@@ -72,7 +72,7 @@ _CODE: Counter[str] = Counter()  # bytes of bytecode per module
 HELPER: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 ABOUT_S = 15  # time of compilation on two cores, for the message
 _MOST_WORKERS = 4
-_LOCK = threading.Lock()  # of `ensure_compiled`
+_LOCK = threading.Lock()  # lock of `ensure_compiled`
 
 
 class Program(NamedTuple):

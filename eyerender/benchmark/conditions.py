@@ -30,7 +30,7 @@ CONDITIONS = {
     "none of these": "none of the other conditions holds",
 }
 _EDGE_PX, _MOVES_PX, _CLIPPED, _QUALITY = 3.0, 1.0, 0.02, 50
-_ROTATION_MM = 10.5  # from an eye's centre of rotation to its pupil
+_ROTATION_MM = 10.5  # distance from an eye's centre of rotation to its pupil
 _PANEL_NODES = np.linspace(-0.5, 0.5, 7)
 
 

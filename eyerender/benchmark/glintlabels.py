@@ -15,7 +15,7 @@ from ..arrays import Bytes, Floats
 from ..folders.imagefolder import BACKGROUND, FRAME, SCLERA
 from ..geometry.ellipse import Ellipse, signed_distance
 
-MATCH_PX = 2.0  # of a glint that is a point
+MATCH_PX = 2.0  # matching distance for a glint that is a point
 Place = Literal["pupil", "edge", "iris", "sclera", "skin", ""]
 FALSE_KINDS = {
     "repeated": "a true glint that another report matches",

@@ -49,7 +49,9 @@ class PartialShard:
         self.plan, self.shard, self.folder = plan, shard, folder
         self.made: set[int] = set()
         self.images = 0
-        self._start = self._checkpoint = self._last = time.monotonic()  # of this worker, the checkpoint, the sample
+        self._start = self._checkpoint = self._last = (
+            time.monotonic()
+        )  # start of this worker, of the checkpoint and of the sample
         self._before = 0.0  # seconds of earlier workers
         self._made_by = {"digest": plan.digest, "versions": run_versions(), "backend": backend, "cpu": cpu_family()}
         self._rejections: list[dict[str, Any]] = []

@@ -178,7 +178,7 @@ class _Run:
     total: int = 0
     samples: int = 0  # sum of `made`
     loading_s: float = 0.0  # until the first worker could render
-    first_shards: dict[str, tuple[int, float]] = field(default_factory=dict)  # of each worker: samples, seconds
+    first_shards: dict[str, tuple[int, float]] = field(default_factory=dict)  # per worker: samples, seconds
     timed: int = 0  # samples of the other shards that this run has finished
     worker_seconds: float = 0.0  # and the time that they took
     staged_images: int = 0

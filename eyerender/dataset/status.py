@@ -38,7 +38,7 @@ class _Part:
     retries: int = 0
     last: str = ""
     bytes: int = 0
-    shard_images: int = 0  # of shards whose bytes are known
+    shard_images: int = 0  # images in shards whose size is known
 
     def take(self, event: dict[str, Any]) -> None:
         """Process an event of the log."""

@@ -36,7 +36,7 @@ from .statistics import median
 
 # Distance of a tenth of the edge points from a refined boundary that contradicts it: in their own scatter, and in px.
 APART, APART_PX = 4.0, 0.5
-SAME_LIGHT = 0.5  # in noise standard deviations; a smaller change of the spots' light does not move the boundary
+SAME_LIGHT = 0.5  # noise standard deviations; a smaller change of the spots' light does not move the boundary
 
 
 def extract(

@@ -21,7 +21,7 @@ from ..arrays import Bytes
 from ..errors import InputError
 from ..storage.files import opened, written
 
-ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")  # of images in a folder
+ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")  # suffixes of images
 MAX_FILES = 1_000_000
 
 # Size of the largest window that can be rendered; it limits the memory that a hostile file can make us allocate.

@@ -46,7 +46,7 @@ IMAGE_SCHEMAS = (IMAGE_SCHEMA, RENDERED_SCHEMA, "eyerender/image/2", "eyerender/
 DATASET_SCHEMA, PACKED_SCHEMA = "eyerender/dataset/1", "eyerender/dataset/2"
 """Schemas of dataset.json where each picture is a file, and where shards are packed."""
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
-RUN = "run.json"  # in a folder that `generate` fills, from its start
+RUN = "run.json"  # present from the start in a folder that `generate` fills
 RUN_SCHEMA, PACKED_RUN_SCHEMA = "eyerender/run/1", "eyerender/run/2"
 LOG = "log.jsonl"
 # Files of a finished shard. LINES is not called metadata.jsonl, because loaders of image folders would read it, too.

@@ -21,7 +21,7 @@ from scipy.optimize import brentq
 
 from ..arrays import Floats, frozen
 
-_TAIL = 60.0  # in units of d, beyond practically all light
+_TAIL = 60.0  # radius in units of d, beyond practically all light
 
 
 def half_space_length_mm(albedo: float, scattering_per_mm: float) -> float:

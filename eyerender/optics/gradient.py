@@ -220,7 +220,7 @@ class _Half(NamedTuple):
         turned = self._turned(q)
         lead = _dot(self.vector, q)
         s = np.sqrt(lead * lead + _dot(q, turned))
-        s = np.maximum(s, 1e-300)  # at the centre itself, every product with p vanishes
+        s = np.maximum(s, 1e-300)  # at the centre, every product with p vanishes
         size = lead + s
         return _Size(size, s, (turned + size * self.vector) / s)
 

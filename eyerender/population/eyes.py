@@ -33,7 +33,7 @@ FORWARD = 0.75
 """Share of the lens' thickening that moves its front forward (chosen; Dubbelman et al. 2005, from memory)."""
 _ROOT_GAP_MM = 0.1
 _IRIS_GAP_MM = 0.02
-_SHIFTED_MM = 0.3  # how far pupils move with their size
+_SHIFTED_MM = 0.3  # distance by which pupils may move with their size
 _LIMBUS_GAP_MM = 0.35
 _DESIGN_NM = 850.0
 

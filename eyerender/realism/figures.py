@@ -20,9 +20,9 @@ from ..folders.imagefolder import BACKGROUND, IRIS, PUPIL, SCLERA
 from ..geometry.ellipse import Ellipse
 
 RADIUS_PX = 50.0  # R in the resized picture
-CLIPPED_CODE = 245.0  # of 255; cameras clip slightly below full scale, and JPEG lowers clipped codes by a few
+CLIPPED_CODE = 245.0  # out of 255; cameras clip slightly below full scale, and JPEG lowers clipped codes by a few
 BANDS_R = ((0.0, 0.02), (0.02, 0.04), (0.04, 0.08), (0.08, 0.16))
-_HIGHLIGHTS_R = 2.0  # from the cornea to here lie the margins, the lash roots and the caruncle
+_HIGHLIGHTS_R = 2.0  # margins, lash roots and caruncle lie between the cornea and this radius
 _LEAST_PX = 40  # pixels of an area from which a level is taken
 _LEAST_TEXTURE_PX = 150
 

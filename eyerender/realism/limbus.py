@@ -13,7 +13,7 @@ from ..arrays import Floats, Singles
 from ..geometry.ellipse import Ellipse
 
 _WITHIN_DEG = 24
-_RATIOS = (1.35, 6.5)  # of the radii of iris and pupil: 11.8 mm over 8.2 and over 1.9 mm
+_RATIOS = (1.35, 6.5)  # ratio of the radii of iris and pupil: 11.8 mm over 8.2 and over 1.9 mm
 _MOST_OFF = 0.12  # offset of the iris' middle from the pupil's, R
 _STEP = 0.02  # step of the search, as a share of the radius
 _SIDE = 6  # number of steps on either side of a radius over which levels are averaged and compared

@@ -23,10 +23,10 @@ _BLUR_R = 0.04
 _JPEG_QUALITY = 75
 _NOISE_CODES = 2.0
 _WHITE = 200.0
-_SIDE_PX = 20  # of a patch, .8 R
+_SIDE_PX = 20  # side of a patch, .8 R
 _EYE_PX = (64, 100)  # height and width of a whole eye, 2.6 R x 4 R
 _DIRECTIONS = 8
-_CELLS = {(_SIDE_PX, _SIDE_PX): (2, 2), _EYE_PX: (4, 6)}  # in which directions of edges are counted
+_CELLS = {(_SIDE_PX, _SIDE_PX): (2, 2), _EYE_PX: (4, 6)}  # cells in which directions of edges are counted
 
 
 def patches(s: Scaled, seed: int) -> dict[str, tuple[Bytes, ...]]:

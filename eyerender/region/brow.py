@@ -16,7 +16,7 @@ from .contour import step
 from .face import face_depth
 from .hairs import Hairs, taper
 
-PLACES = np.array([0.0, 0.4, 1.0])  # of a hair's points, as shares of its length; it bends most at its root
+PLACES = np.array([0.0, 0.4, 1.0])  # positions of a hair's points along its length; it bends most at its root
 
 
 @lru_cache(maxsize=16)

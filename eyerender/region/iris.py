@@ -23,7 +23,7 @@ from .contour import step
 from .noise import band_noise, nearest_two
 
 RADIAL, ANGULAR = 256, 1024
-WIDTH_MM, MARGIN_MM = 3.8, 2.0  # of the iris that strengths and means refer to: from margin to root, and the margin
+WIDTH_MM, MARGIN_MM = 3.8, 2.0  # width and margin radius of the iris that strengths and means refer to
 _SOFT = (1.5, 1.5)  # standard deviation of the smoothing of heights, rows and columns
 _Strength = Annotated[float, Field(ge=0, le=1.5)]
 

@@ -25,8 +25,8 @@ from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
 from .lids import CONJUNCTIVA, EDGE_MM, FINE, LID, MARGIN, Sheet
 
-_ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points after the root, which is on the skin
-_REACH_ROWS = 12  # beyond the crease, about a centimetre, where lashes may meet skin
+_ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # height of the points after the root, which is on the skin
+_REACH_ROWS = 12  # rows beyond the crease, about a centimetre, where lashes may meet skin
 _CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
 _NEAR_COLUMNS = 6
 _SEARCH_MM = 1.5  # distance up to which skin lifts a lash

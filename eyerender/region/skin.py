@@ -44,8 +44,8 @@ _STRIP = 32  # number of map rows computed together, so that they stay in the pr
 _HAIR_GLOSS = 0.2
 _MASCARA = 0.03  # albedo of lashes with mascara (chosen)
 _WET, _WET_ROOT = 0.97, 0.06  # gloss of wet tissue, and the share of a lash that is wet
-_SHOWN_MM = 25.0  # about the middle of the fissure: the skin whose mean albedo is that of the spec
-_REFERENCE_BLINK = 0.3  # at which the tissue is laid out: neither stretched nor hidden in the fold
+_SHOWN_MM = 25.0  # radius about the middle of the fissure: the skin whose mean albedo is that of the spec
+_REFERENCE_BLINK = 0.3  # blink at which the tissue is laid out: neither stretched nor hidden in the fold
 
 
 def band_row(which: int) -> float:
@@ -345,7 +345,7 @@ class _Strip:
         # The plica gradually darkens the conjunctiva towards the caruncle.
         self.flesh = step(np.cos(self.turn).astype(np.float32), 0.55, 0.95) * self.within * step(rows, 0.0, 5.0)
         self.lids = _hill(y, z, 19.0, 13.0) * self.near
-        self.roots = _bell(self.out_mm, 0.9, 2.4)  # of the lashes
+        self.roots = _bell(self.out_mm, 0.9, 2.4)  # roots of the lashes
 
     def field(self, number: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
         """Sample a band of noise at the positions of the strip."""

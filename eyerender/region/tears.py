@@ -19,7 +19,7 @@ from .lids import Sheet
 
 ROWS = 5
 _OUT = 1.8  # width on the margin over the height on the globe, so that the radius is about 1.6 heights
-_TURN = np.linspace(0, np.pi / 2, ROWS)[:, None]  # of each row along the arc
+_TURN = np.linspace(0, np.pi / 2, ROWS)[:, None]  # angle of each row along the arc
 _LONG, _SHORT = (6, 40), (6, 20)  # waves once around the fissure, which is about 60 mm long
 _SLOPE = 0.12  # standard deviation of the slope of the short waves at an unevenness of 1
 

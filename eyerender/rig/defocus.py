@@ -36,12 +36,12 @@ from .sensor import Sensor
 MAX_CONFUSION_PX = 400
 _SHARP_PX = 0.1  # a smaller disc has no effect
 _RIPPLES_PX = 4
-_LARGEST_PX = 64.0  # in a layer: what is blurred more shows no structure
+_LARGEST_PX = 64.0  # largest disc in a layer; stronger blur leaves no structure
 _DISCS = 128  # kernels from one diameter to twice that, for large ones
 _ALIKE = 0.03  # relative difference of blurs' widths that does not matter
 _PIXEL_VARIANCE = 1 / 12
 _LEAST_ROOM = 0.02
-_LEAST_SHARE = 1e-3  # of a pixel: rounding of coverages leaves less
+_LEAST_SHARE = 1e-3  # smallest share of a pixel; rounding of coverages leaves less
 
 
 def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: Floats | float) -> Floats:

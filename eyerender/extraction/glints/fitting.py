@@ -26,7 +26,7 @@ from .windows import WINDOWS, SpotPixels, Windows, cut, light_of_others, shining
 TURNS, PATIENCE, WANDERING_PX = (1, 4), (1, 2), 0.3
 FEW_CLIPPED = 2  # a spot with more clipped pixels has a flat top
 SMOOTH_PX = 0.7  # smoothing of the image in which detection estimated the widths
-UNEXPLAINED = 2.0  # with a smaller misfit, in noise standard deviations, the Gaussian explains the pixels
+UNEXPLAINED = 2.0  # misfit in noise standard deviations below which the Gaussian explains the pixels
 NEARLY_STILL_PX = 0.02  # a spot that moves less has settled, even if its neighbour still answers its moves
 
 

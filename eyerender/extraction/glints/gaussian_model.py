@@ -21,7 +21,7 @@ from .windows import WINDOWS, SpotPixels, Windows, light_of_others, profile
 PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; with an edge also h, p, o
 LOST_PX = 12.0  # a spot that becomes wider or moves farther is not a glint
 ROUND_SD = 0.3  # prior standard deviation of ln sx - ln sy: glints are nearly round
-STEPS = 8  # of Levenberg-Marquardt in one descent
+STEPS = 8  # Levenberg-Marquardt steps in one descent
 # A descent ends when a step gains less, in squared standard deviations of the noise. That is also the squared length of
 # the step in standard deviations of the parameters. The second number is for spots that overlap others.
 SMALL_GAIN = (5e-2, 5e-3)

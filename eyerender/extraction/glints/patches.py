@@ -26,7 +26,7 @@ LONGEST = 1.1  # longest side of a patch in semi-axes b of the pupil; the highli
 OUTLINE = (0.5, 0.75)  # shares of the height that outline a patch; the second parts patches that touch
 USUAL_PX = 2  # half the side of a spot whose fit failed
 POOR = 0.1  # residual, as a share of the visible height, with which a Gaussian does not describe a clipped spot
-_AREA = 2.0 * math.pi * math.log(2.0)  # of a Gaussian above half its height, in sigma^2
+_AREA = 2.0 * math.pi * math.log(2.0)  # area of a Gaussian above half its height, in sigma^2
 Box = tuple[int, int, int, int]  # first and last column, first and last row
 
 

@@ -16,7 +16,7 @@ from ...jit import compiled, inlined
 from ..preprocessing import Image
 
 Windows = tuple[Indices, Floats, Floats, Floats]  # first, plane, centre and radius of SpotPixels
-WINDOWS = "Tuple((i8[::1], f8[:,::1], f8[:,::1], f8[::1]))"  # for `compiled`
+WINDOWS = "Tuple((i8[::1], f8[:,::1], f8[:,::1], f8[::1]))"  # type for `compiled`
 _T = TypeVar("_T", bound=np.generic)
 
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)

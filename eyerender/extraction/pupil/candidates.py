@@ -27,7 +27,7 @@ LEVELS = 20  # thresholds at even grey levels
 # hull is then a blob too.
 NOTCHED = 0.93
 ANGLES = 48  # samples around a blob
-MOST_BLOBS = 12  # that are ranked
+MOST_BLOBS = 12  # number of blobs that are ranked
 # Share of the thresholds, darkest first, that is tried first. The others are tried if these give no candidate.
 DARKER = 0.6
 # The statistics inside an ellipse of this semi-axis are good enough. From twice that on, every second pixel of every

@@ -26,7 +26,7 @@ ABOVE_IRIS, STANDS_OUT = 0.25, 0.75
 # interquartile ranges above the upper quartile. Source: Tukey (1977).
 FENCE, BESIDE_PX = 1.5, 3.0
 NO_PATCH = np.zeros((0, 0), dtype=np.float32)
-NOISE = 6.0  # in standard deviations: what noise alone does not reach in any pixel
+NOISE = 6.0  # standard deviations that noise alone does not reach in any pixel
 # Flank of a glint below these limits, px. A glint of sigma 2 and four steps falls from one step to a tenth of one in
 # 1.1 sigma.
 FLANK_PX = 3

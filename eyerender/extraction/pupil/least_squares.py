@@ -36,13 +36,13 @@ FIXED = SHAPE + 7
 # kurtosis of the blur; the lean of the inner level, in steps (scattered light only, so that noise does not produce a
 # lean).
 HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
-KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond this kurtosis the edge would not be monotonic
+KURTOSIS_LIMITS = (-1.5, 3.0)  # outside these limits the edge would not be monotonic
 STILL_PX = 1.5e-2  # a fit ends with a step smaller than this
 
 
 _Sums = tuple[Floats, float, Floats, Floats, Floats, Floats]  # the parts of `Sums`
 _Normal = tuple[Floats, Floats, float, Floats, Floats]  # parts of `Normal`, except `across`
-_SUMS = "Tuple((f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[::1], f8[::1]))"  # for `compiled`
+_SUMS = "Tuple((f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[::1], f8[::1]))"  # type for `compiled`
 _NORMAL = "Tuple((f8[:,::1], f8[::1], f8, f8[::1], f8[::1]))"
 
 

@@ -20,7 +20,7 @@ from .boundary import PupilCandidate
 from .glare import NO_PATCH, levels_beside
 from .places import SECTORS, holding, relative_to
 
-DARK = 0.35  # of the step: a lower level is the pupil's
+DARK = 0.35  # share of the step below which a level counts as the pupil's
 CLEAR = 0.15  # share of b: edge points farther from the ellipse do not belong to it
 # Of the median step at the ellipse's own points: the level of a shadow or a reflection outside it is lower.
 SHADED = 0.6

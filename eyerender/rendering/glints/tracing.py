@@ -41,7 +41,7 @@ from ..records.job import ring_radius_mm
 from .cutdiscs import POINT, Nodes, cut_nodes, quadrature, rim
 
 _PARALLAX_MM = 0.05
-_MAP_ERROR = 1e-3  # of the extent of a lamp's image
+_MAP_ERROR = 1e-3  # share of the extent of a lamp's image
 
 Visibility = Callable[[Floats, Floats], Bools]
 _ON_RIM = 16  # points: an edge that falls between them hides less than 0.2 % of a disc

@@ -29,7 +29,7 @@ from ...geometry.surfaces import Surface as ExactSurface
 from ..records.frame import aligned_copy, upload_array
 from ..records.surfaces import Bundle, NormalForm, Surface
 
-_ABOVE_MM = 40.0  # beyond every cornea along its axis
+_ABOVE_MM = 40.0  # height beyond every cornea along its axis
 _STEPS = 12
 _SETTLED = 1e-12
 _PARALLEL = 1e-9

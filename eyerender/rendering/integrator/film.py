@@ -33,7 +33,7 @@ from .visibility import GroupPass, HitTable, trace_region
 
 _LANES = 2**24  # samples at a time; more are rendered in several passes
 _TILE = 4  # pixels across and down
-_FEW_LAMPS = 2  # with so few lamps shadows are dark, and they are sampled finely
+_FEW_LAMPS = 2  # with at most so many lamps, shadows are dark and finely sampled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,7 +17,7 @@ from ..records.recording import syntax
 from ..transport.directlight import lamp_blocked, shadowless
 from .groups import PixelGroup
 
-_LIDS_MM = 18.0  # about the axis of the unrotated eye: the region of the lids, where lashes cast shadows
+_LIDS_MM = 18.0  # radius about the axis of the unrotated eye: the region of the lids, where lashes cast shadows
 
 
 @dataclass(kw_only=True)

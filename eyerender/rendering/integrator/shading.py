@@ -19,7 +19,7 @@ from ..records.frame import Frame
 from ..records.recording import syntax
 from ..transport.directlight import lamp_light, on_relief
 
-_FLAT_MM = 1e-2  # from the plane of the background
+_FLAT_MM = 1e-2  # distance from the plane of the background
 
 
 def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.UInt32]:

@@ -23,7 +23,7 @@ from ..records.frame import Frame
 from ..records.recording import recorded, syntax
 from ..transport.directlight import direct_light, lamp_blocked
 
-_HIGHLIGHT = 0.5  # of the scattered light
+_HIGHLIGHT = 0.5  # share of the scattered light
 _ACROSS = 3  # sample points of a pixel across and down
 
 
@@ -95,7 +95,7 @@ def _lamps_at(frame: Frame, window: Window, right: float, down: float) -> tuple[
     right_of, below = (dr.opaque(mi.Float, x) for x in (right, down))
     o, d, _ = camera_ray(frame, mi.Float(u) + right_of, mi.Float(v) + below)
     si = first_hit(frame, o, d, mi.Bool(True))
-    albedo = outer_albedo(frame, si)  # of what is below the water
+    albedo = outer_albedo(frame, si)  # albedo of the surface below the water
     si = on_water(frame, si, o, d)
     shine, irradiance = _shine(frame, si, (glossy_normal(si.normal, si.gloss), -frame.vector_to_eye(d)))
     there = si.other | si.sclera

@@ -43,7 +43,7 @@ from .parameters import (
 _SENSOR, _LOOK, _LENS, _AMBIENT = Sensor(), Look(), Lens(), Ambient()
 _SUN_MM = 1e6
 _POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
-_PANEL_PARTS = 4  # along each side
+_PANEL_PARTS = 4  # parts of a panel along each side
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
 

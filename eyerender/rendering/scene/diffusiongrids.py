@@ -15,13 +15,13 @@ from ...region.skin import SHEET_ROWS, sheet_place
 from ...rig.stray import misses_light
 from ..records.job import RenderJob
 
-GRID_ROWS, GRID_COLUMNS = 160, 768  # of the finer grid over the sheet of skin
-SIDE = 192  # of the grid over the front of the globe
-WIDTH = 2.5  # of this grid in units of the globe's radius, in Lambert's equal-area projection
-_REDUCTIONS = 2  # of the grid over the skin, by 2 each, whose cells have marks of their own
-_FINE_PX_PER_MM = 11.0  # in pictures of fewer pixels per mm every second row and column of the skin's grid will do
-_SPARE, _SPARE_MM = 24.0, 10.0  # beyond the window, from where light still arrives: in units of d, and at least
-_EDGE_MM = 0.4  # about the lids' margins, where the globe may be seen
+GRID_ROWS, GRID_COLUMNS = 160, 768  # size of the finer grid over the sheet of skin
+SIDE = 192  # size of the grid over the front of the globe
+WIDTH = 2.5  # width of this grid in units of the globe's radius, in Lambert's equal-area projection
+_REDUCTIONS = 2  # reductions of the skin's grid by 2 each, with separate marks of their cells
+_FINE_PX_PER_MM = 11.0  # in images with fewer pixels per mm, every second row and column of the skin's grid suffices
+_SPARE, _SPARE_MM = 24.0, 10.0  # reach outside the window from which light arrives: in units of d, and at least
+_EDGE_MM = 0.4  # distance from the lid margins within which the globe may be visible
 
 
 @dataclass(frozen=True, slots=True)

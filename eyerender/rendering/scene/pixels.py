@@ -15,7 +15,7 @@ from ...region.mesh import HAIRS, RegionMesh
 from ...rig.camera import PinholeCamera, Window
 
 _TILE_PX = 8
-_STEP_PX = 4.0  # between marked points of a curve
+_STEP_PX = 4.0  # distance between marked points of a curve
 _SPARE_PX = 1.0
 _HAIR_MM = 0.1  # no hair and no part of a margin is thicker
 _THICK_PX, _FINE_STEP_PX, _SLACK_PX = 2.0, 0.5, 0.02

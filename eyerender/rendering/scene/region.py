@@ -28,7 +28,7 @@ from ..records.frame import aligned_copy
 from .background import clear_between, rays_between
 from .diffusiongrids import GRID_COLUMNS, GRID_ROWS
 
-SHEET_COLUMNS = COLUMNS + 1  # of the sheet's grid, because the first column is repeated
+SHEET_COLUMNS = COLUMNS + 1  # columns of the sheet's grid; the first column is repeated
 
 
 class RegionScene:

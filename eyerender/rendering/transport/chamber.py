@@ -37,11 +37,11 @@ from ...region.look import LIMBAL_RING, Look
 from .chamberrays import ChamberShape, Walls, air_side, trace_inside
 
 IRIS_RINGS, TURNS = 16, 16  # points in the plane of the iris, over radius and angle
-ROOT_RINGS = 14  # of these on iris and pupil, the others beyond the root
+ROOT_RINGS = 14  # rings on iris and pupil; the others lie beyond the root
 IRIS = IRIS_RINGS * TURNS
-LEVELS = 2  # of points on the wall
+LEVELS = 2  # levels of points on the wall
 PATCHES = IRIS + TURNS * LEVELS
-RAYS = 256  # from each point
+RAYS = 256  # rays from each point
 _ROWS, _FINE = 8, 4  # points on the cornea's rim: across it, and in each sector
 _FAR_MM = 8.0  # distance of what rays that leave the eye meet: so far apart are two rays at an angle of 1
 _ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find

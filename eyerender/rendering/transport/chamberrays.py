@@ -11,11 +11,11 @@ from ...eye.meshes import chamber_rim
 from ...geometry.surfaces import Surface, components
 from ...optics.interface import fresnel
 
-_WEAK, _FEW = 0.25, 4  # of rays that the cornea mirrors less than this, one in four is traced for all
+_WEAK, _FEW = 0.25, 4  # one in _FEW is traced for all of the rays that the cornea mirrors less than _WEAK
 _STEPS = 20  # crossings and mirrorings of a ray
 _NEAR_MM = 1e-6
 _AHEAD_MM = 1e-4  # hits are searched from here on, because a root cannot be computed from a point on the surface itself
-_BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
+_BELOW_MM = 1.0  # depth of the wall's end below the plane of the iris
 _WALL_MM = 1.0  # thickness of the sclera
 _SECTORS = 16  # sectors over which the foot of the wall is averaged
 

@@ -31,7 +31,7 @@ from .tissuelight import TissueScene, light_on_globe, light_on_skin
 _RINGS, _TURNS = 6, 6
 _LEVEL_RINGS = (0, 1), (1, 4), (4, 6)  # whose light is found on the grid over the skin, and on its two reductions
 _FOOTPRINT = 0.8  # size of the cells that a ring reads, in units of its radius
-_RAYS = 6  # to the lamps from each cell, and at least one to each
+_RAYS = 6  # rays to the lamps from each cell, and at least one to each lamp
 _SMALL, _WIDE_RAYS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
 
 

@@ -32,7 +32,7 @@ from ..scene.exr import second_thread
 
 _WIDTH, _HEIGHT = 1024, 512
 _FINE, _BLOCKS, NORMALS = 256, 32, 48  # rows from which blocks are summed, and of blocks and normals
-_CEILING = 2.0  # of the soft part of a map, over its mean
+_CEILING = 2.0  # ceiling of a map's soft part, relative to its mean
 _CUTS = 6  # 2^6 directions
 _FORMATS = (".hdr", ".exr", ".pfm", ".npy")
 # Rec. 709.

@@ -39,11 +39,11 @@ from .patches import (
     skin_patches,
 )
 
-RAYS = 24  # from each patch on the globe or about it
-_SKIN_RAYS, _INNER_RAYS = 10, 2  # from patches on the skin, and on the lids' inner sides, which lie in the dark
-_HALVINGS = 14, 15  # of the rays that leave the eye into bundles, without and with light from afar
+RAYS = 24  # rays from each patch on the globe or around it
+_SKIN_RAYS, _INNER_RAYS = 10, 2  # rays from patches on the skin, and on the dark inner sides of the lids
+_HALVINGS = 14, 15  # halvings that bundle the rays that leave the eye, without and with light from afar
 LANES = 4096  # numbers of lanes are multiples of this, so that recordings serve many subjects
-_CLOSE_MM = 10.5  # from the cornea's centre to skin that it mirrors lamps to
+_CLOSE_MM = 10.5  # distance from the cornea's centre to skin onto which it mirrors lamps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,7 +224,7 @@ class Patches:
     """Cache of patches: keeps what does not change between frames of a subject."""
 
     def __init__(self) -> None:
-        self._plans: list[tuple[tuple[Any, ...], Globe, RayPlan]] = []  # of subjects
+        self._plans: list[tuple[tuple[Any, ...], Globe, RayPlan]] = []  # cached per subject
         self._bare: RayPlan | None = None
         self._interiors: EyeCache[Interior] = EyeCache()
 

@@ -26,7 +26,7 @@ from .directlight import LampPath, behind
 
 _SIDE = 68
 _NODES = _SIDE * _SIDE
-_SPARE_MM = 0.45  # beyond the root of the iris: two cells
+_SPARE_MM = 0.45  # margin beyond the root of the iris: two cells
 _STEADY = 0.02  # like BENT, of the light that enters: without shadow edges, the error of cubics is a hundredth of it
 _AHEAD_MM = 1.0  # distance in front of the back of the cornea, within which nodes continue the light behind it
 

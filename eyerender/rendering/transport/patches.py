@@ -11,20 +11,20 @@ from ...arrays import ArrayValue, Bools, Floats, Ints, Singles
 from ...region.globe import Globe
 from ...region.mesh import RegionMesh
 
-GLOBE_COLUMNS, GLOBE_ROWS = 40, 12  # between the lids
+GLOBE_COLUMNS, GLOBE_ROWS = 40, 12  # patches between the lids
 MAP_SIDE = 26  # grid over the front of a bare globe
 WIDEST = 0.55 * np.pi  # polar angle of the edge of that map
-_HALF_MM, _HIGH_MM = 14.0, 8.0  # of the opening of a head mesh, whose margins are unknown
+_HALF_MM, _HIGH_MM = 14.0, 8.0  # half width and half height of the opening of a head mesh, whose margins are unknown
 _FINE_MM, _NEAR_MM = (
     1.25,
     12.0,
 )  # distance of patches on skin this far from the middle of the fissure, and in proportion
 _NEIGHBOURS = 12
-_MARGIN_LEVEL = -2  # of the lids' margins: half the distance
+_MARGIN_LEVEL = -2  # level of the lid margins: half the distance
 # Across the margins light changes fast: so many times as fast with the height above the globe as along them. They are
 # between these heights: the conjunctiva is lower, and the lids' outer sides are higher.
 _STEEP, _LOW_MM, _TOP_MM = 4.0, 0.04, 1.6
-_LID_MM = 4.0  # from the sclera's sphere to the outside of a lid over the cornea
+_LID_MM = 4.0  # distance from the sclera's sphere to the outside of a lid over the cornea
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -33,8 +33,8 @@ from .directlight import LampPath, behind
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
 _CELL_PX, _LEAST, _MOST = 0.6, 320, 448  # size of a cell in the picture, cells across: fewer would flatten slopes
-_STEP = 16  # in the number of cells across: a new number has Dr.Jit record anew
-_STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
+_STEP = 16  # the number of cells across is a multiple of this, because Dr.Jit records anew for each number
+_STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for occluders of a lamp: steps, reach, and softness
 _BLOCK, _SLANT = 4, 0.6  # cells of a block across; lateral motion per mm of light that is not very slanting
 _FIXED_POINT_STEPS = 4
 _SPARE_MM, _RAISED_MM = 0.1, 0.2
@@ -235,7 +235,7 @@ def relief_shape(
 def _highest_nearby(heights: mi.Float, side: mi.UInt32, about: mi.UInt32, blocks: int) -> mi.Float:
     """Compute the largest height in and around every block of cells."""
     index, last = dr.arange(mi.UInt32, blocks * blocks), side - 1
-    count = last // _BLOCK + 1  # the same as `blocks`, but no kernel is compiled for it
+    count = last // _BLOCK + 1  # equal to `blocks`, but not compiled into the kernel
     down = index // count
     across = index - down * count
     largest = mi.Float(0)

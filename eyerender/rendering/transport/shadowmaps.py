@@ -28,9 +28,9 @@ from ..records.frame import quotient, upload_array
 from ..records.recording import recorded, syntax
 from ..scene.region import RegionScene, SkinGeometry
 
-_CELLS = 256  # along each side of a map
+_CELLS = 256  # cells along each side of a map
 _WIDTH = 16  # numbers of a lamp
-_REACH_MM = 72.0  # of the sheet about the apex of the eye
+_REACH_MM = 72.0  # radius of the sheet about the apex of the eye
 _HAIR_MM = 0.06  # half the thickness of hairs, with a margin
 _LARGEST = 0.85  # half the width of a map: tan of half the angle to the axis
 

@@ -20,7 +20,7 @@ from ..records.frame import aligned_copy
 from ..scene.diffusiongrids import SIDE, WIDTH, GlobeCells, SheetCells
 from ..scene.region import SHEET_COLUMNS, SkinGeometry
 
-_FINEST_MM = 0.02  # of a cell; about the corners of the eye they are smaller
+_FINEST_MM = 0.02  # smallest size of a cell; at the corners of the eye cells are smaller
 
 
 @dataclass(frozen=True, slots=True)

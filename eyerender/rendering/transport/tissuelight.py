@@ -24,7 +24,7 @@ from .directlight import irradiance, lamp_blocked
 from .tissuegrids import GlobeGrid, SheetGrid, SheetSize, globe_direction
 
 _LID_MM = 4.5  # thicker than any lid
-_BETWEEN_MM = 0.05  # between the two surfaces of a lid, at least
+_BETWEEN_MM = 0.05  # smallest distance between the two surfaces of a lid
 _JOINT_MM, _ABOVE_MM = 0.05, 0.15  # height above the globe at which the light on conjunctiva and globe is computed
 _KEYS = (0x51CA, 0x1A3B)
 _ALPHA = (0.7548776662466927, 0.5698402909980532)
