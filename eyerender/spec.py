@@ -148,7 +148,7 @@ class Spec(BaseModel):
                 problems.add(reason, path)
             raise problems.error() from None
         except (TypeError, ValueError) as error:
-            raise InputError(f"holds a value that is no number, text or list ({error})", source=source) from None
+            raise InputError(f"holds a value that is not a number, text or list ({error})", source=source) from None
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -147,8 +147,8 @@ class StreamDataset(IterableDataset[Any]):
         count: as for `eyerender.generate`.
         batch_size: number of samples in a batch.
         start: number of batches to leave out at the beginning, counted over all ranks.
-        lanes: number of lanes, a multiple of the number of workers of all ranks; by default that number. The
-            order of batches depends on it, so keep it when you resume with another number of workers.
+        lanes: number of lanes, a multiple of the number of workers of all ranks; by default that number. The order of
+            batches depends on it, so keep it when you resume with another number of workers.
         split: only the samples of this split, such as "train"; None takes all.
         rank: rank of this process in distributed training; by default that of torch.distributed.
         ranks: number of ranks; by default that of torch.distributed.

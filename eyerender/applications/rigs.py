@@ -139,7 +139,7 @@ def run_rig(
     with staged(output, overwrite=overwrite) as folder:
         found = figures_of_people(survey, noise, size.people, workers=size.workers, progress=progress)
         if not len(found.subject):
-            raise InputError("nobody's eye can exist", source="--population")
+            raise InputError("no eye of this population is physically possible", source="--population")
         biases = estimator_errors(survey, found.subject[: size.sample].tolist(), progress)
         pictured = estimator_errors(
             survey, found.subject[: size.images].tolist(), progress, images=True, backend=backend

@@ -171,7 +171,7 @@ def evaluate(spec: SweepSpec, layout: Layout) -> dict[str, Any]:
         survey, scene = _survey(spec, data), Scene.of(SceneSpec.from_mapping(data))
     found = figures_of(survey, sensor_noise(scene), 0, spec.people)
     if not len(found.subject):
-        raise InputError("nobody's eye can exist", path="population")
+        raise InputError("no eye of this population is physically possible", path="population")
     coverage = coverage_of(found)
     return {
         "number": layout.number,

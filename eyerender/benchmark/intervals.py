@@ -45,8 +45,8 @@ def subject_interval(
 ) -> tuple[float, float] | None:
     """Compute the interval of a share whose trials come from subjects, by resampling the subjects.
 
-    The bootstrap over subjects gives the variance of the share, and thereby the effective number of trials, which is
-    n p (1 - p) / (n variance) but not above n. Wilson's interval with that number and Student's quantile for the number
+    The bootstrap over subjects gives the variance of the share, and thereby the effective number of trials, which is n
+    p (1 - p) / (n variance) but not above n. Wilson's interval with that number and Student's quantile for the number
     of subjects is never empty, unlike the bootstrap's percentiles, which are [1, 1] if all trials succeeded. In that
     case the variance is unknown, and every subject counts as one trial.
 

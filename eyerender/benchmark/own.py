@@ -98,7 +98,7 @@ def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
         except (TypeError, ValueError):
             raise InputError("needs numbers", source=source, path=f"line {k + 2}") from None
         if not (math.isfinite(x + y) and max(abs(x), abs(y)) < 1e5):
-            raise InputError("is no place in an image", source=source, path=f"line {k + 2}")
+            raise InputError("is not a position in an image", source=source, path=f"line {k + 2}")
         out.setdefault(str(line["image"]), []).append(TrueGlint(light, (x, y)))
     return out
 
@@ -140,7 +140,7 @@ def _ellipse(cells: list[str | None], source: str, where: str) -> Ellipse:
     except ValueError:
         raise InputError("needs five numbers, or none", source=source, path=where) from None
     if not (math.isfinite(x + y + a + b + degrees) and 0.0 < b <= a and max(abs(x), abs(y), a) < 1e5):
-        raise InputError("is no ellipse; 0 < semi_axis_b_px <= semi_axis_a_px", source=source, path=where)
+        raise InputError("is not an ellipse; 0 < semi_axis_b_px <= semi_axis_a_px", source=source, path=where)
     return Ellipse(np.array([x, y]), np.array([a, b]), math.radians(degrees))
 
 

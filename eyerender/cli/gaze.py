@@ -61,11 +61,11 @@ def fit(
         records: Records as `features` or `extract` write them (JSON), one record per line (JSONL), or a table (CSV).
             Each needs its target.
         estimator: regression (polynomials of the pupil-glint vector; one light), direction-regression (polynomials of a
-            feature in pixels to directions; no screen needed), homography (normalisation by four
-            lights), cross-ratio (four lights at the screen's corners and one at the camera), hennessey (one camera, two
-            lights), shih-wu-liu (two cameras, two lights), guestrin-eizenman (one camera, two lights), or
-            maximum-likelihood (fits of a traced eye; any cameras and lights, rough positions of the eye);
-            or module:Class, a class of your own that can be made without arguments.
+            feature in pixels to directions; no screen needed), homography (normalisation by four lights), cross-ratio
+            (four lights at the screen's corners and one at the camera), hennessey (one camera, two lights), shih-wu-liu
+            (two cameras, two lights), guestrin-eizenman (one camera, two lights), or maximum-likelihood (fits of a
+            traced eye; any cameras and lights, rough positions of the eye); or module:Class, a class of your own that
+            can be made without arguments.
         output: The calibration file to write.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
         rig: A rig file or a scene file, for its rig.

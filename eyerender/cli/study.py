@@ -27,9 +27,8 @@ def study(
 ) -> int:
     """Replicate a published gaze study, or compare observers or conditions.
 
-    The folder receives summary.json, findings.json, both as CSV, and report.html. A folder of the same study is
-    updated in place. Rendered images form a dataset in images/: an interrupted run resumes, and finished images are
-    reused.
+    The folder receives summary.json, findings.json, both as CSV, and report.html. A folder of the same study is updated
+    in place. Rendered images form a dataset in images/: an interrupted run resumes, and finished images are reused.
 
     Args:
         name: guestrin2006 (model-based gaze), blignaut2014 (interpolation-based gaze), observers (analytic against

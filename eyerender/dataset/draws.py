@@ -191,7 +191,7 @@ class GridDraw(_Draw):
 
     @property
     def size(self) -> int:
-        """Number of values."""
+        """Number of values of the grid."""
         return len(self.values) if self.values is not None else self.steps or 1
 
     def point(self, k: int) -> Any:

@@ -49,9 +49,7 @@ class PartialShard:
         self.plan, self.shard, self.folder = plan, shard, folder
         self.made: set[int] = set()
         self.images = 0
-        self._start = self._checkpoint = self._last = (
-            time.monotonic()
-        )  # start of this worker, of the checkpoint and of the sample
+        self._start = self._checkpoint = self._last = time.monotonic()  # of worker, checkpoint and sample
         self._before = 0.0  # seconds of earlier workers
         self._made_by = {"digest": plan.digest, "versions": run_versions(), "backend": backend, "cpu": cpu_family()}
         self._rejections: list[dict[str, Any]] = []

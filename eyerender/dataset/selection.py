@@ -1,7 +1,7 @@
 """Select the samples of a plan to make: all, the first ones, or the first ones of each subject in turn.
 
-A plan of N samples and S subjects is continued in blocks: samples b N to (b + 1) N - 1 belong to the subjects b S to
-(b + 1) S - 1, divided as in the first block. So a dataset can grow beyond its plan, and no sample changes its subject.
+A plan of N samples and S subjects is continued in blocks: samples b N to (b + 1) N - 1 belong to the subjects b S to (b
++ 1) S - 1, divided as in the first block. So a dataset can grow beyond its plan, and no sample changes its subject.
 
 If a block is not made as a whole, `spread` takes its samples in rounds: the first one of each subject, then the second
 ones, and so on. A larger selection therefore includes every smaller one, and each subject's sequence starts at its

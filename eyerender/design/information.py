@@ -240,7 +240,7 @@ def joint_matrix(matrices: Floats, unknowns: Unknowns) -> tuple[Floats, Bools]:
 
     Args:
         matrices: (i, 23, 23) information of each instant, without priors.
-        unknowns: adds the priors.
+        unknowns: provides the priors.
     """
     count, own = len(matrices), LOCAL * len(matrices)
     prior, free = unknowns.precision(), unknowns.free()

@@ -187,7 +187,7 @@ def sites_seen(survey: Survey, noises: Sequence[FeatureNoise], count: int) -> li
     rig = Scene.of(SceneSpec.from_mapping(survey.scene)).rig
     unknowns, people = Unknowns.from_mapping(survey.unknowns), people_of(survey, 0, count)[0]
     if not people:
-        raise InputError("nobody's eye can exist", path="population")
+        raise InputError("no eye of this population is physically possible", path="population")
     parts: list[list[SiteInformation]] = [[] for _ in noises]
     for one in people:
         case = _case(survey, rig, [one])

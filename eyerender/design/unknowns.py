@@ -43,8 +43,8 @@ Knowledge = Literal["known", "unknown"] | Annotated[float, Field(gt=0, le=1e6)]
 class Unknowns(Spec):
     """Prior knowledge of every number: `known`, `unknown`, or the standard deviation of a prior.
 
-    A prior of a position or of a pair of angles holds for each component. The priors of
-    `Unknowns.population` are rounded standard deviations of adults (docs/population.md).
+    A prior of a position or of a pair of angles holds for each component. The priors of `Unknowns.population` are
+    rounded standard deviations of adults (docs/population.md).
     """
 
     gaze_deg: Knowledge = Field(default="unknown", description="direction of the optic axis, in every frame")

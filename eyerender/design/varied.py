@@ -136,7 +136,7 @@ def radius_of(surface: Surface) -> Floats:
         conic = np.all(m[..., 1, 1] == 1.0) and np.all(m[..., 2, 2] == 1.0) and np.all(surface.constant == 0.0)
         if conic and np.all(v[..., 0] > 0.0) and not np.any(v[..., 1:]):
             return np.asarray(v[..., 0])
-    raise InputError("the cornea is no sphere, conic or biconic, so it has no radius to vary", path="cornea")
+    raise InputError("the cornea is not a sphere, conic or biconic, so it has no radius to vary", path="cornea")
 
 
 def _scaled(surface: Surface, factor: Floats) -> Surface:

@@ -133,8 +133,8 @@ def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKi
 def far_sight_mm(eye: EyeModel) -> Floats:
     """Compute the position (y, z) mm of the line of sight, in the eye frame, for an eye that looks far along +x.
 
-    The chief ray to the fovea has a direction d in the eye. The torsion-free rotation that turns d to +x is
-    that of Listing's law for the gaze (d_x, -d_y, -d_z).
+    The chief ray to the fovea has a direction d in the eye. The torsion-free rotation that turns d to +x is that of
+    Listing's law for the gaze (d_x, -d_y, -d_z).
     """
     x, y, z = eye.chief_ray.direction
     pose = Poses.listing(np.arctan2(-y, x), np.arcsin(-z))

@@ -4,8 +4,8 @@ A lamp sends a pencil of rays through each point q of the pupil. On the retina t
 
     theta_L(q) = u_L + (F - V_L) q
 
-in object space, where u_L is the direction of the lamp, V_L = 1/d_L its vergence and F the vergence at which the eye
-is focused. The fundus spreads the light with a kernel K (1/sr) about that direction and returns a share rho of it. A
+in object space, where u_L is the direction of the lamp, V_L = 1/d_L its vergence and F the vergence at which the eye is
+focused. The fundus spreads the light with a kernel K (1/sr) about that direction and returns a share rho of it. A
 camera that looks through the pupil's point p sees the direction theta_C(p), so the radiance in air is
 
     L(p) = T_L T_C rho / (pi n'^2 f^2) * integral E(q) K(theta_C(p) - theta_L(q)) dA_q

@@ -8,9 +8,8 @@ pupil.)
 Sources: Wyatt (1995), "The form of the human pupil", Vision Res. 35, 2021-2036: noncircularity 0.0166 on average,
 mostly in the first 4 or 5 harmonics, about half of it (47.7 % in light, 59.6 % in the dark) an ellipse's; here 46 % go
 with k = 2. Yang, Thompson and Burns (2002), "Pupil location under mesopic, photopic, and pharmacologically dilated
-conditions", Invest. Ophthalmol. Vis. Sci. 43, 2508-2512: .133 mm towards the temple from 4.1 to 6.3 mm.
-Chosen without a source: the power law, one outline at every diameter, no vertical shift, and two eyes that are mirror
-images.
+conditions", Invest. Ophthalmol. Vis. Sci. 43, 2508-2512: .133 mm towards the temple from 4.1 to 6.3 mm. Chosen without
+a source: the power law, one outline at every diameter, no vertical shift, and two eyes that are mirror images.
 """
 
 from __future__ import annotations

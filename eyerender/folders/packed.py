@@ -204,7 +204,7 @@ def read_line(path: Path, row: int, block: int) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", source=name) from None
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
-        raise InputError(f"is no packed line ({type(error).__name__}: {error})", source=name, path=where) from None
+        raise InputError(f"is not a packed line ({type(error).__name__}: {error})", source=name, path=where) from None
 
 
 def _state(path: Path) -> tuple[int, ...]:
@@ -257,9 +257,9 @@ class PackedLines:
         try:
             rows: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
         except (ValueError, OSError, EOFError) as error:
-            raise InputError(f"is no index of images ({error})", source=str(path)) from None
+            raise InputError(f"is not an index of images ({error})", source=str(path)) from None
         if rows.dtype != INDEX_TYPE or rows.ndim != 1:
-            raise InputError("is no index of images", source=str(path))
+            raise InputError("is not an index of images", source=str(path))
         return rows
 
     def __getstate__(self) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def monomials(v: Floats, terms: Terms) -> Floats:
 
 
 def seen_shares(vectors: Floats, terms: Terms) -> Floats:
-    """Compute the visible shares (m,), in descending order, of the functions that m terms span at vectors (n, 2)."""
+    """Compute how much vectors (n, 2) see of the functions that m terms span: shares (m,), in descending order."""
     low, high = vectors.min(axis=0), vectors.max(axis=0)
     shares = np.zeros(len(terms))
     if not (high > low).all():

@@ -95,7 +95,7 @@ class OwnEstimator:
         self.check_storable()
         assert isinstance(self.estimator, StoredEstimator)
         if not isinstance(state, dict):
-            raise InputError("must hold what to_mapping gave", path="state")
+            raise InputError("must hold the result of to_mapping", path="state")
         try:
             with _calling(self.reference, "from_mapping"):
                 estimator = type(self.estimator).from_mapping(state)
@@ -107,7 +107,7 @@ class OwnEstimator:
 def _class(reference: str, source: str) -> type[Any]:
     found = load_reference(reference, source=source)
     if not isinstance(found, type):
-        raise InputError(f"{reference} is no class", source=source)
+        raise InputError(f"{reference} is not a class", source=source)
     missing = [name for name in ("fit", "predict") if not callable(getattr(found, name, None))]
     if missing:
         reason = f"{reference} has no method {' and no method '.join(missing)} (see er.gaze.GazeEstimator)"

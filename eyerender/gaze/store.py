@@ -104,7 +104,7 @@ class EstimatorSpec(Spec):
                 options |= {"name": "hennessey", "index": index}
             bare = replace(estimator, correction=None)
         else:
-            raise InputError(f"a {type(estimator).__name__} is no estimator of this package")
+            raise InputError(f"a {type(estimator).__name__} is not an estimator of this package")
         spec = cls.from_mapping(options)
         if spec.build() != bare:
             raise InputError(f"a {type(estimator).__name__} with these options cannot be written to a file")

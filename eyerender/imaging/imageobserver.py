@@ -128,8 +128,8 @@ class ImageObserver:
     ) -> Observations:
         """Extract the features of image files, or of a folder: one of this package, or any with image files.
 
-        Each image is a frame; with a scene its glints are assigned to lights. Images of a folder that cannot be
-        used are skipped with a warning; their frames are missing.
+        Each image is a frame; with a scene its glints are assigned to lights. Images of a folder that cannot be used
+        are skipped with a warning; their frames are missing.
 
         Args:
             paths: images, or one folder.

@@ -78,8 +78,8 @@ def render(
         backend: the render backend.
         threads: number of processor threads for rendering; None: all.
         progress: called with (done, total, "") after each image.
-        picture: fields of the scene that affect only its images: `image`, `sensor`, `look`, `region`, `lens`,
-            `motion`, `ambient`, `seed`.
+        picture: fields of the scene that affect only its images: `image`, `sensor`, `look`, `region`, `lens`, `motion`,
+            `ambient`, `seed`.
 
     Returns:
         One image for one frame, else a list with an image for each row.

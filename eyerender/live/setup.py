@@ -163,8 +163,8 @@ class Setup:
     def saved(self) -> SceneSpec:
         """Return the spec to save: the changes of the knobs, with all fixations and head positions of the loaded scene.
 
-        A gaze set by the user replaces the fixations. Files are absolute paths, so the scene means the
-        same in every folder.
+        A gaze set by the user replaces the fixations. Files are absolute paths, so the scene means the same in every
+        folder.
         """
         shown = self.scene.located()
         data = shown.to_mapping()

@@ -5,11 +5,11 @@ unit of area at a distance r from the point of entry is close to
 
     R(r) = (exp(-r / d) + exp(-r / (3 d))) / (8 pi d r)
 
-for any tissue (Burley 2015, "Extending the Disney BRDF to a BSDF with integrated subsurface scattering";
-Christensen and Burley 2015). The length d follows from mu' and the reflectance rho. The lines below were fitted to
-Monte Carlo simulations (isotropic scattering, index 1.4): a half space of absorption 0.005 to 0.25 per mm, and slabs
-0.4 to 1.3 mm thick before a dark layer of reflectance 0.05 to 0.2. With these fits, the light behind the edge of a
-shadow is accurate to 0.016 of the full light.
+for any tissue (Burley 2015, "Extending the Disney BRDF to a BSDF with integrated subsurface scattering"; Christensen
+and Burley 2015). The length d follows from mu' and the reflectance rho. The lines below were fitted to Monte Carlo
+simulations (isotropic scattering, index 1.4): a half space of absorption 0.005 to 0.25 per mm, and slabs 0.4 to 1.3 mm
+thick before a dark layer of reflectance 0.05 to 0.2. With these fits, the light behind the edge of a shadow is accurate
+to 0.016 of the full light.
 """
 
 from __future__ import annotations

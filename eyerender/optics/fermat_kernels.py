@@ -10,9 +10,9 @@ e_j^T) n_j / L_j,
     Hessian, next       -t_i . A_i t_{i+1}
 
 (Born & Wolf 1999, 3.3.2; the Hessian is that of Walter et al. 2009, "Single scattering in refractive media with
-triangle mesh boundaries", eq. 6, for any number of surfaces.) Newton needs no intersections, so a biconic costs as
-much as a sphere. A mirror point is the same problem with m = 1, equal indices and the object outside. This solver is
-fast and serves almost all rays; `shooting` is slower and more robust, and solves the rest.
+triangle mesh boundaries", eq. 6, for any number of surfaces.) Newton needs no intersections, so a biconic costs as much
+as a sphere. A mirror point is the same problem with m = 1, equal indices and the object outside. This solver is fast
+and serves almost all rays; `shooting` is slower and more robust, and solves the rest.
 
 Rays are solved `LANES` at a time, so that the loops over them become vector instructions. `nodes` (m + 2, ROWS, LANES)
 holds the viewpoints, the points on each surface outside in and the targets, with everything known at each.

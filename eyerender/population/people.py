@@ -173,10 +173,10 @@ class Person(Spec):
         *,
         side: Side | None = None,
     ) -> float:
-        """Compute the entrance pupil's diameter (mm) for a field's luminance and diameter (deg), and a demand.
+        """Compute the entrance pupil (mm) for a field of given luminance and diameter (deg), and a viewing demand (D).
 
-        The near response reduces it by the person's miosis per dioptre of accommodation. The
-        pupils of both eyes differ by the person's anisocoria; without a `side` it is their mean.
+        The near response reduces it by the person's miosis per dioptre of accommodation. The pupils of both eyes differ
+        by the person's anisocoria; without a `side` it is their mean.
         """
         table = default_table()
         luminance = table.constant("luminance_cd_m2") if luminance_cd_m2 is None else luminance_cd_m2

@@ -1,8 +1,8 @@
 """Solve for the eye that has a drawn refraction: its corneal astigmatism and its lens.
 
-All vergences are power matrices [[m + a, b], [b, m - a]] in the meridians y (nasal) and z (up), written (m, a, b) =
-(M, J0, J45), in 1/mm. The spectacles of power F at the distance d from the cornea leave light of vergence K = F / (1 -
-d F) at the cornea. With the powers P_a and P_p of the cornea's surfaces, its thickness t and index n, light behind the
+All vergences are power matrices [[m + a, b], [b, m - a]] in the meridians y (nasal) and z (up), written (m, a, b) = (M,
+J0, J45), in 1/mm. The spectacles of power F at the distance d from the cornea leave light of vergence K = F / (1 - d F)
+at the cornea. With the powers P_a and P_p of the cornea's surfaces, its thickness t and index n, light behind the
 cornea has the vergence
 
     W = V / (1 - V t / n) + P_p,   V = K + P_a.

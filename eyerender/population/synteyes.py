@@ -173,7 +173,7 @@ class SyntEyes(ArrayValue):
                 return found, self.eye_file(found, name=f"SyntEyes {seed}/{subject}", **keys)
             except InputError as error:
                 last = error
-        raise InputError(f"subject {subject}: {MAX_REFUSED} draws were no eye; the last one: {last}")
+        raise InputError(f"subject {subject}: {MAX_REFUSED} draws were not possible eyes; the last one: {last}")
 
     def _drawn(self, rng: np.random.Generator, refused: int) -> SyntEye:
         # The weighted sum of two draws, one of each component, would have the mixture's mean but too small a spread.

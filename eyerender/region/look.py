@@ -1,11 +1,11 @@
 """Appearance of the eye and its background at 850 nm: diffuse albedos and texture contrasts.
 
 Values without a source are chosen. Spectra of skin are published (Cooksey, Allen and Tsai 2017, J. Res. NIST 122, 26:
-forearms). The background is darker than that, because without lids it would otherwise outshine the eye. The
-sclera is a scattering slab over dark uvea. No measured diffuse albedo of the iris at 850 nm was available; its value
-reproduces near-infrared photographs, in which the iris has two thirds to nine tenths of the sclera's level. The cornea
-transmits (1 - F)^2 / n^2, about 0.53, of an iris' albedo to the camera. The grey of a pupil, a fifth to a half of the
-iris in photographs, is mostly stray light in the camera (`lens.glare`) and the sensor's black level.
+forearms). The background is darker than that, because without lids it would otherwise outshine the eye. The sclera is a
+scattering slab over dark uvea. No measured diffuse albedo of the iris at 850 nm was available; its value reproduces
+near-infrared photographs, in which the iris has two thirds to nine tenths of the sclera's level. The cornea transmits
+(1 - F)^2 / n^2, about 0.53, of an iris' albedo to the camera. The grey of a pupil, a fifth to a half of the iris in
+photographs, is mostly stray light in the camera (`lens.glare`) and the sensor's black level.
 """
 
 from __future__ import annotations

@@ -53,8 +53,8 @@ class Renderer:
         Args:
             job: the job to render.
             spp: samples per pixel; None: the renderer's default.
-            moments: sub-frames of an exposure with motion. The image is their mean, and they share the samples;
-                labels, glints and margins are those of `job`, at mid-exposure.
+            moments: sub-frames of an exposure with motion. The image is their mean, and they share the samples; labels,
+                glints and margins are those of `job`, at mid-exposure.
 
         Raises:
             InputError: numbers so extreme that the image is not finite.

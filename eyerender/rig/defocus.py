@@ -12,9 +12,9 @@ the share V of each pixel that the layers in front leave open,
 
     alpha_k = K*a / K*V,   picture = sum_k (prod_{j<k} (1 - alpha_j)) K*R / K*V
 
-Behind an edge, a layer is continued from its visible part, so nothing bleeds from one depth into another. Where
-all depths have the same kernel, this is the plain convolution. A symmetric kernel does not move centroids, so labels
-need no change. Vignetting multiplies by 1 - v (r / r_corner)^2.
+Behind an edge, a layer is continued from its visible part, so nothing bleeds from one depth into another. Where all
+depths have the same kernel, this is the plain convolution. A symmetric kernel does not move centroids, so labels need
+no change. Vignetting multiplies by 1 - v (r / r_corner)^2.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Read camera calibrations written by OpenCV and ROS.
 
-OpenCV's `cv2.FileStorage` writes YAML (with a special header and tags), XML or JSON. ROS writes `camera_info` in
-YAML. All of them are read as plain data, without OpenCV.
+OpenCV's `cv2.FileStorage` writes YAML (with a special header and tags), XML or JSON. ROS writes `camera_info` in YAML.
+All of them are read as plain data, without OpenCV.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Painted surroundings of the head: radiance over all directions of an office, a car, or a place outdoors.
 
-The values are chosen, in W/m^2/sr within a filter of about 50 nm around 850 nm. The sun gives some 40 W/m^2 there
-(0.85 W/m^2/nm, ASTM G173), which a white surface in it returns as 13 W/m^2/sr. Leaves reflect about half of the near
+The values are chosen, in W/m^2/sr within a filter of about 50 nm around 850 nm. The sun gives some 40 W/m^2 there (0.85
+W/m^2/nm, ASTM G173), which a white surface in it returns as 13 W/m^2/sr. Leaves reflect about half of the near
 infrared, so trees and grass are brighter than asphalt. An overcast sky gives 1.5, a clear one much less, because the
-near infrared is hardly scattered. Indoor walls lit by windows have a few hundredths. LED lamps and
-displays emit nearly nothing. There is no disc of the sun: the head is in the shade.
+near infrared is hardly scattered. Indoor walls lit by windows have a few hundredths. LED lamps and displays emit nearly
+nothing. There is no disc of the sun: the head is in the shade.
 """
 
 from __future__ import annotations

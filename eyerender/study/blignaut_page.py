@@ -37,7 +37,7 @@ def page(
     apart: Apart = ((), ()),
     made_of: Sequence[Budget] = (),
 ) -> Report:
-    """Compose the report of the replication of [29]."""
+    """Compose the report of the replication of Blignaut (2014)."""
     best = _best_by_key(parts)
     cells = {
         key: {m: f"{v[0]:.2f}/{v[1]:.2f}/{v[-1]:.3f}" for m, v in by_model.items()} for key, by_model in best.items()

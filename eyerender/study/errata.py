@@ -9,7 +9,7 @@ from .results import Erratum
 
 
 def guestrin(misprints: Mapping[str, Mapping[str, Any]]) -> list[Erratum]:
-    """Return the errata for the replication of [28].
+    """Return the errata for the replication of Guestrin & Eizenman (2006).
 
     `misprints` holds the effects: eye model -> case -> H1, H2, counts.
     """
@@ -52,7 +52,7 @@ def guestrin(misprints: Mapping[str, Mapping[str, Any]]) -> list[Erratum]:
 
 
 def blignaut() -> list[Erratum]:
-    """Return the errata for the replication of [29]."""
+    """Return the errata for the replication of Blignaut (2014)."""
     return [
         Erratum(
             where="Table 5, best functions",

@@ -37,7 +37,7 @@ def page(
     apart: Apart = ((), ()),
     made_of: Sequence[Budget] = (),
 ) -> Report:
-    """Compose the report of the replication of [28]."""
+    """Compose the report of the replication of Guestrin & Eizenman (2006)."""
     values: Values = {
         "overview": overview(_cells(parts)),
         "budget": budget_values(made_of, SHOWN),

@@ -79,7 +79,7 @@ def scenes_of(module: Any, eyes: Sequence[str], protocols: Sequence[str]) -> lis
 def guestrin_part(
     eye: str, protocols: Sequence[str], observing: Observing, *, starts: int = guestrin.STARTS
 ) -> GuestrinPart:
-    """Replicate [28] with one eye model and one observer."""
+    """Replicate Guestrin & Eizenman (2006) with one eye model and one observer."""
     scenes = _Scenes(guestrin, eye, observing)
     analytic = observing.kind == "analytic"
     out = GuestrinPart(eye_model=eye)
@@ -122,7 +122,7 @@ def _guestrin_vectors(scenes: _Scenes, departures: frozenset[str]) -> dict[str, 
 
 
 def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> BlignautPart:
-    """Replicate [29] with one eye model and one observer."""
+    """Replicate Blignaut (2014) with one eye model and one observer."""
     scenes = _Scenes(blignaut, eye, observing)
     out = BlignautPart(eye_model=eye)
     exposures = [_Scenes(blignaut, eye, one) for one in observing.exposures()]

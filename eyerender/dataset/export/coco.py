@@ -1,7 +1,7 @@
 """COCO: SPLIT/*.png (8 bits) and annotations/instances_SPLIT.json; pupil, iris and sclera as run-length masks.
 
-Each image has its gaze (`line_of_sight`, `optic_axis`, ...) and the diameters of its pupil.
-Each glint is a separate instance with one keypoint [x, y, v]: v is 2 if visible, 1 if hidden.
+Each image has its gaze (`line_of_sight`, `optic_axis`, ...) and the diameters of its pupil. Each glint is a separate
+instance with one keypoint [x, y, v]: v is 2 if visible, 1 if hidden.
 """
 
 from __future__ import annotations

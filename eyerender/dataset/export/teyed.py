@@ -8,8 +8,8 @@
     NAME.mp4validity_pupil.txt, iris, lid         FRAME;VALIDITY;
     NAME.mp4pupil_seg_2D.mp4, iris_seg_2D.mp4     white where visible
 
-Frames count from 1; -1 marks a missing value. Fuhl, Kasneci and Kasneci (2021), "TEyeD". The videos are
-lossless (FFV1, 8 bits); if a frame's width or height is odd, its last column or row is repeated.
+Frames count from 1; -1 marks a missing value. Fuhl, Kasneci and Kasneci (2021), "TEyeD". The videos are lossless (FFV1,
+8 bits); if a frame's width or height is odd, its last column or row is repeated.
 """
 
 from __future__ import annotations

@@ -67,8 +67,8 @@ def check_shards(images: ImageFolder, quick: bool, problems: Problems, step: Pro
 def compare_lines(folder: Path, problems: Problems) -> None:
     """Compare metadata.jsonl with the shards' lines as values; the order of lines and of keys does not matter.
 
-    Lines whose text differs are parsed and compared by image name. Whole numbers are equal to their
-    floating-point form. This takes some ten bytes of memory per line.
+    Lines whose text differs are parsed and compared by image name. Whole numbers are equal to their floating-point
+    form. This takes some ten bytes of memory per line.
     """
     mine = [folder / METADATA]
     theirs = [folder / SHARDS / shard_name(shard) / LINES for shard in sorted(finished(folder))]

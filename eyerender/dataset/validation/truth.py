@@ -1,7 +1,7 @@
 """Recompute metadata, from the plan of a dataset or from the scene of a rendered folder.
 
-This covers the values that do not depend on pixels: the image's identity, what was drawn, the names of its
-files, the analytic record, and the labels that follow from pose and parameters.
+This covers the values that do not depend on pixels: the image's identity, what was drawn, the names of its files, the
+analytic record, and the labels that follow from pose and parameters.
 """
 
 from __future__ import annotations

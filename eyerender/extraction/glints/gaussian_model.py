@@ -2,8 +2,8 @@
 
 The level in pixel (x, y) is B(x, y) + b0 + bx (x - xc) + by (y - yc) + A Gx(x) Gy(y). Gx is the mean over the pixel of
 exp(-(x - x0)^2 / (2 sx^2)), and Gy likewise. B is the image expected without spots: pupil, iris and the blurred edge
-between them. A spot beside an additional edge (limbus, lid) adds h Phi(((x - xc) cos p + (y - yc) sin p - o) / blur).
-A clipped pixel only gives a lower bound, so it counts only where the model is below the clip level.
+between them. A spot beside an additional edge (limbus, lid) adds h Phi(((x - xc) cos p + (y - yc) sin p - o) / blur). A
+clipped pixel only gives a lower bound, so it counts only where the model is below the clip level.
 """
 
 from __future__ import annotations

@@ -245,8 +245,8 @@ def _surface_parameters(surface: Surface, eta: float, limbus_mm: float) -> Surfa
 def boundary_waves(eye: EyeModel) -> Floats:
     """Compute Fourier coefficients (k, 2), c_k and -s_k, of the pupil's relative radius over the stop plane's angle.
 
-    For a left eye the stop's own angle runs in the opposite direction: f' = pi - f, cos(k f') = (-1)^k cos(k f),
-    sin(k f') = -(-1)^k sin(k f).
+    For a left eye the stop's own angle runs in the opposite direction: f' = pi - f, cos(k f') = (-1)^k cos(k f), sin(k
+    f') = -(-1)^k sin(k f).
     """
     cosines, sines = np.asarray(eye.stop.contour, dtype=float)
     if float(eye.stop.handed) < 0:

@@ -95,7 +95,7 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
 
 
 def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float, aspect: float = 1.0) -> Floats:
-    """Compute the share (PATCHES, TURNS) of light through each sector of the limbal tissue that lights each patch.
+    """Compute the share (PATCHES, TURNS) of the light through each limbal sector that reaches each patch.
 
     Args:
         eye: the eye.

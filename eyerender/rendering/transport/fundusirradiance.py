@@ -1,7 +1,7 @@
 """The light of the pupil: lamp light that the fundus returns, on a grid over the stop, once per frame.
 
-The fundus mixes the light of the whole pupil, so the result varies slowly and a small grid suffices. Each
-of its points sums over the lamps the irradiance of the stop times the return factor of `eye.fundus`.
+The fundus mixes the light of the whole pupil, so the result varies slowly and a small grid suffices. Each of its points
+sums over the lamps the irradiance of the stop times the return factor of `eye.fundus`.
 """
 
 from __future__ import annotations

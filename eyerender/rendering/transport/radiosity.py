@@ -1,7 +1,7 @@
 """Radiosity: interreflection of globe, lids, face or background, and of the iris in its chamber.
 
-Interreflected light varies slowly, so it is computed at some hundred patches per pose, and pixels interpolate.
-With the albedo rho_j of patch j and the form factors F_ij, the irradiance is
+Interreflected light varies slowly, so it is computed at some hundred patches per pose, and pixels interpolate. With the
+albedo rho_j of patch j and the form factors F_ij, the irradiance is
 
     E_i = E0_i + sum_j rho_j F_ij E_j        (so that the radiosity B = rho E obeys B_i = rho_i (E0_i + sum_j F_ij B_j))
 
