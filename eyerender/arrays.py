@@ -28,7 +28,7 @@ Bools = NDArray[np.bool_]
 Objects = NDArray[np.object_]
 Statuses = NDArray[np.int8]
 FloatLike = Floats | float
-"""One number for all eyes or rays of a batch, or one for each."""
+"""One number for all eyes or rays of a batch, or one for each of them."""
 
 
 def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
@@ -98,7 +98,7 @@ class Columns(ArrayValue):
     __slots__ = ()
 
     LEADING: ClassVar[int] = 1
-    """How many leading axes the columns share."""
+    """Number of leading axes shared by the columns."""
 
     def __post_init__(self) -> None:
         columns = dataclasses.fields(self)  # type: ignore[arg-type]

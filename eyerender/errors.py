@@ -121,7 +121,7 @@ class Problems:
 
 
 Refuse = Callable[[str, str], NoReturn]
-"""Raises `InputError` for a path in some input, with a reason."""
+"""Function that raises `InputError` for a path in some input, with a reason."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,7 +21,7 @@ from .status import Status
 from .storage.files import shown
 
 RECORD = 2
-"""The record's version that is written unless another one is asked for; `SCHEMAS` are those that are read."""
+"""Version of the records that are written by default; `SCHEMAS` are the versions that are read."""
 SCHEMAS = {1: "eyerender/record/1", 2: "eyerender/record/2"}
 EYES = ("right", "left")
 

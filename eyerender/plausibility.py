@@ -213,7 +213,7 @@ def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list
 
 
 def _differences(one: Any, other: Any, path: str) -> Iterator[str]:
-    """List the paths at which two values of the same kind differ by more than rounding."""
+    """Yield the paths at which two values of the same kind differ by more than rounding."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in one:
             yield from _differences(one[key], other.get(key), f"{path}.{key}")

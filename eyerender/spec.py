@@ -91,7 +91,7 @@ class Spec(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
     POSITIONAL: ClassVar[tuple[str, ...]] = ()
-    """The fields that the constructor also takes without their names, in this order."""
+    """Fields that the constructor also takes by position, in this order."""
 
     def __init__(self, *values: Any, **fields: Any) -> None:
         """Build a record from Python values; lists and NumPy arrays are accepted for tuples, mappings for records.
@@ -181,7 +181,7 @@ class Spec(BaseModel):
 
     @classmethod
     def json_schema(cls) -> dict[str, Any]:
-        """Make the JSON Schema (2020-12) for editors."""
+        """Return the JSON Schema (2020-12) for editors."""
         schema = cls.model_json_schema()
         return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
@@ -190,7 +190,7 @@ class FileSpec(Spec):
     """Base of specs that are a YAML file of their own and state the version of their format."""
 
     FORMATS: ClassVar[tuple[int, ...]] = (FORMAT,)
-    """The versions that `load` reads; the last one is written."""
+    """Versions that `load` reads; the last one is written."""
 
     format: int = Field(default=FORMAT, description="version of this file format")
 

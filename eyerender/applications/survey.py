@@ -94,7 +94,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveySize:
-    """What a survey draws.
+    """Size of a survey.
 
     Attributes:
         seed: seed of the draw.

@@ -42,7 +42,7 @@ MARKER, SUMMARY, TABLE, LAYOUTS, REPORT = "sweep.json", "summary.json", "layouts
 CHOOSERS = 12
 """People whose information chooses LEDs."""
 GOALS = ("noise_deg", "dropout", "leds", "cornea_w_m2")
-"""What a good layout has little of; the Pareto front is that of these."""
+"""Quantities of which a good layout has little; they define the Pareto front."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -68,8 +68,10 @@ class Places(Spec):
 class SweptCamera(Spec):
     """Values of one camera to vary."""
 
-    camera: Annotated[int, Field(ge=0)] = Field(default=0, description="which camera of the scene")
-    places: Places | None = Field(default=None, description="its places; it goes on looking where it looked")
+    camera: Annotated[int, Field(ge=0)] = Field(default=0, description="number of the camera in the scene")
+    places: Places | None = Field(
+        default=None, description="positions of the camera, which keeps its target or direction"
+    )
     focal_length_px: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = Field(
         default=None, description="focal lengths, for a camera with focal_length_px"
     )
@@ -81,9 +83,9 @@ class SweptCamera(Spec):
 class SweptLights(Spec):
     """LEDs that replace those of the scene; all but position and intensity is copied from the scene's first LED."""
 
-    places: Places = Field(description="places of LEDs, or those from which `number` chooses")
+    places: Places = Field(description="positions of LEDs, or those from which `number` chooses")
     number: Annotated[tuple[LightCount, ...], Field(min_length=1)] | None = Field(
-        default=None, description="numbers of LEDs; of more places the best are chosen; default: all of them"
+        default=None, description="numbers of LEDs, at the best of the positions; default: all of them"
     )
     intensity_mw_sr: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = Field(
         default=None, description="intensities of each LED"
@@ -104,14 +106,16 @@ class SweepSpec(FileSpec):
     """A sweep of rigs over a population."""
 
     scene: str = Field(description="scene file, relative to this file, or the name of a shipped one")
-    population: str | Population = Field(default="adults", description="whom the rigs are for")
+    population: str | Population = Field(default="adults", description="population for which the rigs are evaluated")
     people: Annotated[int, Field(ge=1, le=100_000)] = Field(default=40, description="number of people")
     seed: Annotated[int, Field(ge=0)] = Field(default=0, description="seed of the people")
     azimuth_deg: Annotated[float, Field(ge=1, le=60)] = Field(default=20.0, description="half range of gaze")
     elevation_deg: Annotated[float, Field(ge=1, le=60)] = Field(default=15.0, description="half range of gaze")
-    slippage_mm: NonNegative = Field(default=1.5, description="standard deviation of people's places, per axis")
-    relief_mm: NonNegative = Field(default=0.0, description="and of their distance, the eye relief of a headset")
-    sweep: Sweep = Field(description="what varies")
+    slippage_mm: NonNegative = Field(default=1.5, description="standard deviation of the eyes' positions, per axis")
+    relief_mm: NonNegative = Field(
+        default=0.0, description="additional standard deviation of their distance: eye relief of a headset"
+    )
+    sweep: Sweep = Field(description="values to vary")
 
     def people_of(self) -> Population:
         """Return the population."""
@@ -166,7 +170,7 @@ def _light_count(data: Mapping[str, Any]) -> int:
 
 
 Axis = tuple[str, list[Any]]
-"""Name and values of one thing that varies."""
+"""Name and values of one varied quantity."""
 
 
 def _axes(sweep: Sweep, scene: Scene) -> Iterator[Axis]:

@@ -21,7 +21,7 @@ PLACES = {
     "rays": "estimated as the origin of the estimator's gaze rays",
     "glints": "estimated from the glints, with an average cornea",
 }
-"""Source of the eye's place -> words for it."""
+"""Words for the source of the eye's position, by its code."""
 
 gaze = App(name="gaze", help="Estimate gaze from records of features, also from real images.")
 app.command(gaze)

@@ -1,4 +1,4 @@
-"""What produced a run, so that it can be repeated years later: source, packages, processor, options."""
+"""Record of what produced a run, so that it can be repeated years later: source, packages, processor, options."""
 
 from __future__ import annotations
 

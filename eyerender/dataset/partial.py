@@ -33,7 +33,7 @@ from .packing import pack, unpack
 from .plan import Plan
 
 CHECKPOINT_S = 10.0
-"""At most so much work is lost when a worker is killed."""
+"""Time between checkpoints: the most work lost when a worker is killed."""
 _SHARD = "shard"  # folder of the lines
 
 

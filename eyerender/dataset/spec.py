@@ -55,7 +55,7 @@ class LabelsSpec(Spec):
 class DatasetSpec(FileSpec):
     """Content of a dataset file. Draws may replace any value of `scene`; see the documentation."""
 
-    kind: Literal["dataset"] = Field(description="says that the file is a dataset, not a scene")
+    kind: Literal["dataset"] = Field(description="declares that the file is a dataset, not a scene")
     name: Annotated[str, Field(min_length=1, max_length=100)] = Field(description="name of the dataset")
     description: str = Field(default="", description="what the dataset is for, in a sentence")
     licence: Annotated[str, Field(min_length=1, max_length=200)] | None = Field(

@@ -22,7 +22,7 @@ from .selection import Selection
 
 SCHEMA = "eyerender/status/1"
 SILENT_S = 180.0
-"""A part at work writes to the log once a minute; one that has been silent for so long has stalled or was killed."""
+"""A part at work writes to the log once a minute; after this silence it counts as stalled or killed."""
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
 
 

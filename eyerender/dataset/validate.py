@@ -25,7 +25,7 @@ from .validation.shards import check_run
 from .validation.truth import Again, DatasetTruth, NoTruth, SceneTruth, truth_of
 
 SAMPLE = 64
-"""So many lines are computed again where not all are; folders of no more lines are checked whole."""
+"""Number of lines that are recomputed by default; smaller folders are checked completely."""
 _BATCH = 256
 
 

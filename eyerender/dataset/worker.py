@@ -20,7 +20,7 @@ from .plan import Plan
 from .shard import write_shard
 
 FAILURES: dict[str, type[EyerenderError]] = {"backend": BackendError, "input": InputError, "disk": EyerenderError}
-"""What the parent raises for each kind of failure; one of another kind may be tried again."""
+"""Error that the parent raises for each kind of failure; other kinds may be tried again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,7 +25,7 @@ from .unknowns import COUNT, Unknowns
 from .varied import Slopes, slopes_of
 
 VAGUE = 1e-6
-"""Precision of what is unknown, per rad^2 or mm^2, so that frames without features have a determinant."""
+"""Precision of unknown numbers, per rad^2 or mm^2, so that frames without features have a determinant."""
 _POINTS = 16
 
 

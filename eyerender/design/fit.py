@@ -51,7 +51,7 @@ from .varied import (
 
 Robust = Literal["geman-mcclure", "huber", "none"]
 CORE = 3.0
-"""Root mean square of a block's whitened residuals up to which it has its full weight."""
+"""Rms of a block's whitened residuals up to which the block has full weight."""
 _STEPS, _SETTLED = 40, 1e-10
 _POINTS = 30
 _START_AZIMUTH, _START_ELEVATION = np.radians(np.linspace(-36, 36, 9)), np.radians(np.linspace(-24, 24, 7))

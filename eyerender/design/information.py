@@ -27,7 +27,7 @@ from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, NAMES, PERSON, P
 from .varied import Slopes, Views, diameters_mm, gaze_slopes, lines_of_sight, slopes_of, stacked_eyes, target_slopes
 
 UNSEEN = 1e-11
-"""Eigenvalues of the information, scaled to a unit diagonal, below which a direction counts as not seen."""
+"""Eigenvalues of the information, scaled to a unit diagonal, below which a direction is undetermined."""
 _VIRTUAL_MM = 1000.0
 _ROWS = 256
 

@@ -31,9 +31,9 @@ from ..rig.sensor import Sensor
 from ..scene import Scene
 
 FIXATION_DEG = 0.3
-"""Noise of fixation per axis while a target is looked at (chosen)."""
+"""Noise of fixation on a target, per axis (chosen)."""
 PUPIL_SHARE = 0.1
-"""Light of the dark pupil as a share of the iris' (chosen)."""
+"""Light of the dark pupil, as a share of the iris' (chosen)."""
 CORNEAL_RADIUS_MM, CORNEAL_INDEX = 7.8, 1.376
 _CORNEAL_TRANSMITTANCE = 0.96
 _SAMPLES, _REACH = 400, 6.0

@@ -43,12 +43,12 @@ GRID = 9
 CALIBRATION = (0, 4, 8)
 """Rows and columns of the 9 x 9 directions that calibrate."""
 CALIBRATION_CELLS = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
-"""Their places among the 81 directions."""
+"""Indices of the calibration directions among all 81."""
 TOGETHER = 8
 _MARGIN_COLUMNS = 44
 _VAGUE, _LOST_DEG = 1e3, 60.0
 LOST = ("ray", "sensor", "lid")
-"""Why a glint is missing: no ray (off the cornea), off the sensor, behind a lid."""
+"""Reasons for a missing glint: no ray (off the cornea), off the sensor, behind a lid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

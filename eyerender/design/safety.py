@@ -26,7 +26,7 @@ from ..rig.light import Lamp
 from ..rig.rig import RigLike
 
 BOX_MM = (3.0, 3.0, 3.0)
-"""Half sizes of the eye box about the eye's place (chosen)."""
+"""Half sizes of the box that contains the eye (chosen)."""
 LONG_S = 1000.0
 _RETINA, _LEAST_RAD, _MOST_RAD = 6000.0, 0.011, 0.1
 _MEASURED_NM = (700.0, 1400.0)

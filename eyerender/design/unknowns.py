@@ -37,7 +37,7 @@ TORICITY, CENTRE, ELLIPTICITY, SHIFT = slice(15, 17), slice(17, 19), slice(19, 2
 ANGLES = np.array([name in ("azimuth", "elevation", "kappa_nasal", "kappa_up") for name in NAMES])
 
 Knowledge = Literal["known", "unknown"] | Annotated[float, Field(gt=0, le=1e6)]
-"""How well a number is known beforehand: exactly, not at all, or with a standard deviation."""
+"""Prior knowledge of a number: known, unknown, or a standard deviation."""
 
 
 class Unknowns(Spec):

@@ -19,9 +19,9 @@ _NUMBERS = tuple(f.name for f in fields(EyeModel) if f.name not in ("name", "sid
 _RECORDS = (LineOfSight, RotationCentres, Sphere, Stop)
 
 CHUNK_POINTS = 30000
-"""Points refracted at once: fewer leave the time to the interpreter, more leave the cache."""
+"""Points refracted at once: with fewer the interpreter's overhead dominates, more do not fit the cache."""
 FEW_EYES = 4
-"""Largest number of different eyes that are traced one after the other with plain numbers; more are stacked."""
+"""Largest number of different eyes that are traced one after the other; more are stacked."""
 
 
 def structure_of(eye: EyeModel) -> Structure:

@@ -274,6 +274,6 @@ def _tangents(direction: Xyz) -> tuple[Xyz, Xyz]:
 
 _ON_AXIS_RAD = 5e-5
 _ON_AXIS_MM = 1e-3
-"""A mean ray this close to the optic axis, in direction and in place, runs along it."""
+"""A mean ray this close to the optic axis, in direction and position, counts as lying on it."""
 _NUDGE_RAD = 1e-5
 _START_RAD = float(np.radians(85.0))

@@ -322,7 +322,7 @@ class EyeParts(FileSpec):
 
     format: int = Field(default=3, description="version of this file format")
     name: str = Field(description="name of the model")
-    description: str = Field(default="", description="what the model is, in a sentence")
+    description: str = Field(default="", description="description of the model, in a sentence")
     cornea: tuple[SurfaceSpec, ...] = Field(
         min_length=1, max_length=MAX_SURFACES, description="surfaces between air and the stop"
     )

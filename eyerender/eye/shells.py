@@ -12,7 +12,7 @@ from ..geometry.surfaces import Surface
 from .model import EyeModel
 
 SHELLS = 21
-"""Shells a half where a lens has to be made of bodies: in meshes and drawings."""
+"""Shells per half where a lens has to be made of bodies: in meshes and drawings."""
 
 
 class Layers(NamedTuple):

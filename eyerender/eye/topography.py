@@ -22,7 +22,7 @@ from ..storage.files import read_bytes, read_text, shown
 from .parts import MAX_NODES, GridSpec, TopographySpec
 
 MAX_FILE_BYTES, MAX_POINTS, MIN_POINTS = 64 * 2**20, 200_000, 50
-"""The fit holds sixteen numbers per point."""
+"""Limits of a file; the fit needs sixteen numbers per point."""
 _MM = {"mm": 1.0, "um": 1e-3, "m": 1e3}
 _FARTHEST_MM = 30.0
 _SECTORS = 36

@@ -226,7 +226,7 @@ def displacement(before: Floats, after: Floats, eye: Ints) -> tuple[float, dict[
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """How to calibrate on observations and compute error vectors of others."""
+    """Calibration of an estimator and error vectors of its estimates, per row or per frame."""
 
     rig: RigGeometry
     estimator: GazeEstimator

@@ -1,4 +1,4 @@
-"""How well calibration targets determine a polynomial, with a warning where they do not.
+"""Check how well calibration targets determine a polynomial, and warn if they do not.
 
 The functions that the terms span are scaled to a mean square of 1 over the area of the features. A singular value of
 the design matrix at the calibration's features is then the visible share of a function: 1 if the features see as much
@@ -20,7 +20,7 @@ from ..errors import InputWarning, Warn
 Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
 
 LEAST_SHARE = 0.2
-"""Share of a function's size below which the calibration does not determine it: errors grow fivefold."""
+"""Visible share of a function below which the calibration does not determine it: errors grow fivefold."""
 _STEPS = 15  # points per side of the grid that stands for the area; more than twice the highest power of Table 2
 
 

@@ -38,7 +38,7 @@ class EyeParameters:
 
     @classmethod
     def of(cls, values: Sequence[float] | Floats) -> EyeParameters:
-        """Make parameters from five numbers in the order of the fields."""
+        """Create parameters from five numbers in the order of the fields."""
         return cls(**{f.name: float(v) for f, v in zip(fields(cls), values, strict=True)})
 
     def to_mapping(self) -> dict[str, float]:

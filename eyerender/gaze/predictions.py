@@ -27,7 +27,7 @@ POINTS_SCHEMA, RAYS_SCHEMA = "eyerender/gaze/3", "eyerender/gaze/4"
 """Schemas of gaze points on a screen, and of gaze rays of a rig without one."""
 
 GIVEN, RAYS, GLINTS = "given", "rays", "glints"
-"""Where the place of an eye is from: the observations, the estimator's gaze rays, or the glints."""
+"""Sources of the eye's position: the observations, the estimator's gaze rays, or the glints."""
 
 
 def predictions(

@@ -109,7 +109,7 @@ def camera_of(observations: Observations, rig: RigGeometry) -> tuple[Ints, Objec
 
 
 OFF_PLANE_MM = 1.0
-"""Largest distance of a target from the screen's plane at which it counts as a point of the screen."""
+"""Largest distance from the screen's plane at which a target counts as a point of the screen."""
 
 
 def screen_of(rig: RigGeometry, instead: str = "") -> ScreenPlane:

@@ -24,10 +24,10 @@ from .columns import CsvColumns
 from .table import observations_from_csv
 
 ReadArray = Callable[[Any, tuple[int, ...], str], Floats]
-"""Turns a value into an array of a shape; raises `InputError` with the path."""
+"""Function that converts a value to an array of a shape; raises `InputError` with the path."""
 
 TABLES = (".csv", ".tsv")
-"""Names of files that are read as tables end with one of these."""
+"""Suffixes of files that are read as tables."""
 
 # About 40,000 observations. All of them are held in memory at once.
 MAX_RECORDS_BYTES = 128 * 2**20

@@ -22,7 +22,7 @@ _SCALE = np.array([1.0, 1.0, 0.05, 1.0, 1.0])
 MOST_ITERATIONS = 400
 
 Misses = Callable[[Floats], Floats]
-"""The misses (P, n, 3) mm of n targets at P sets of the five parameters (P, 5)."""
+"""Function that computes the misses (P, n, 3) mm of n targets at P sets of the five parameters (P, 5)."""
 
 
 class FreeParameters:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..rendering.renderer import Renderer
 
 PICTURE_FIELDS = frozenset({"image", "sensor", "look", "region", "lens", "motion", "ambient", "seed"})
-"""The fields of a scene that change its pictures alone."""
+"""Fields of a scene that affect only its images."""
 
 # A renderer keeps compiled kernels and scenes; a notebook needs one for each backend and number of threads.
 _renderer = lru_cache(maxsize=1)(make_renderer)

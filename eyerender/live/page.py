@@ -35,7 +35,7 @@ MAX_UNDO = 50
 SETTLED_S = 0.8
 """Changes in faster succession, such as those of a dragged slider, are undone together."""
 MAX_TABS = 20
-"""Pages at a time, those included whose WebSocket has not connected yet. Each takes some megabytes."""
+"""Largest number of pages, including those that have not connected yet. Each takes some megabytes."""
 STYLE = Path(__file__).with_name("page.css")
 Change = Callable[[Setup], Setup]
 

@@ -44,13 +44,13 @@ if TYPE_CHECKING:
 PREVIEW_SPP = 4
 GOAL_SPP = 64
 BUDGET_S = 0.2
-"""Time that a preview, or a band of a pass, should take at most."""
+"""Longest desired time of a preview, or of a band of a pass."""
 PREVIEW_PX = (20_000, 160_000, 640_000)
-"""Pixels that a preview may have: the fewest, those of the first one, and the most."""
+"""Pixels of a preview: the fewest, those of the first one, and the most."""
 REST_S = 0.25
-"""How long a tab must rest after a preview before its picture is refined."""
+"""Time without changes after a preview before its image is refined."""
 BAND_PX = 20_000
-"""The fewest pixels of a band: the preparation of each takes some time."""
+"""Fewest pixels of a band, because preparing a band takes time."""
 MAX_REASON = 300
 
 

@@ -13,7 +13,7 @@ from ..arrays import Floats
 from .drawing import Label, Strokes, colours_of, extent_mm
 
 _CM = 0.1
-"""The view's unit is 1 cm, which suits its near plane and its wheel."""
+"""The view's unit is 1 cm, which suits its near plane and mouse wheel."""
 _FIELD_DEG = 40.0
 _IDLE_FPS, _TURNED_FPS = 8, 30
 

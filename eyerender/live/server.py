@@ -27,9 +27,9 @@ from .painter import Painter
 
 HOST = "127.0.0.1"
 RECONNECT_S = 20.0
-"""How long a tab may be away, on a slow line or a busy machine, before it is deleted."""
+"""Time for which a tab may be disconnected, on a slow line or a busy machine, before it is deleted."""
 _CLOSING_S = 0.4
-"""How long open connections may take to close at the end."""
+"""Time for open connections to close at the end."""
 _ENDING_S = 1.2
 """Longest time between Ctrl-C and the end of the process, even while it computes, renders or serves a tab."""
 

@@ -8,7 +8,7 @@ from ..arrays import Floats
 from ..errors import InputError
 
 SMALLEST = 1e-6
-"""Smallest eigenvalue of a matrix that is used: it can be inverted, which conditions need."""
+"""Smallest eigenvalue of the matrices used, which must be invertible for conditions."""
 
 
 def nearest_correlation(matrix: Floats, *, smallest: float = SMALLEST, steps: int = 2000) -> Floats:

@@ -33,7 +33,7 @@ from .table import ROOTS, Distribution, Regression
 
 Condition = float | tuple[float, float]
 ATTEMPTS = 2000
-"""So often a subject is drawn until it meets the conditions."""
+"""Number of draws of a subject until it meets the conditions."""
 _FEW = 32
 _TAG = 0x9E0
 

@@ -16,7 +16,7 @@ from ..arrays import Floats
 from ..spec import ByKind, Number, Positive, Spec
 
 FARTHEST = 8.0
-"""Standard normal numbers are cut here; beyond it lies one of 1e15."""
+"""Standard normal numbers are clipped here; one in 1e15 lies beyond."""
 
 
 class Fixed(Spec):

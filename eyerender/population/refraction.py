@@ -33,9 +33,9 @@ CORNEA = (1.362994, 6009.687, -6.760760e8, 5.908450e13)
 AQUEOUS = (1.323031, 6070.796, -7.062305e8, 6.147861e13)
 VITREOUS = (1.323757, 5560.240, -5.817391e8, 5.036810e13)
 LENS = (6521.218, -6.11066e8, 5.908191e13)
-"""Coefficients of the lens after the first, as of the core of E5's lens."""
+"""Coefficients of the lens after the first, as in the core of E5's lens."""
 SMALLEST_INDEX, LARGEST_INDEX = 1.345, 1.6
-"""Limits of the lens' equivalent index; one outside makes an eye that cannot exist."""
+"""Limits of the lens' equivalent index; outside them an eye is physically impossible."""
 _START = 1.41
 _NEWTON = 8
 

@@ -24,7 +24,7 @@ from .pupil import watson_yellott_mm
 from .table import default_table
 
 REFERENCE_AGE = 28.58
-"""The age about which Watson and Yellott's formula turns."""
+"""Reference age of Watson and Yellott's formula."""
 _ROOT_GAP_MM = 0.1
 _DIRECTIONS = 16
 

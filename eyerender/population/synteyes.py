@@ -33,7 +33,7 @@ CORNEA_RADIUS_MM, LENS_RADIUS_MM = 3.25, 2.75
 LENS_FRONT_Q, LENS_BACK_Q = -3.1316, -1.0
 MAX_FILE_BYTES, MAX_ARRAY_BYTES = 16 * 2**20, 2**20
 MAX_REFUSED = 100
-"""Largest number of draws of one subject that are no eye."""
+"""Largest number of impossible draws of one subject."""
 _SHAPES: dict[str, tuple[int, ...]] = {
     "conv_ec_orig": (91, 12),
     "avg_ec_orig": (91,),

@@ -98,7 +98,7 @@ class Constant(Spec):
 class Preset(Spec):
     """A population: the reference population with other distributions."""
 
-    description: str = Field(description="who they are")
+    description: str = Field(description="description of the people")
     replace: dict[str, Distribution] = Field(default_factory=dict, description="quantity -> its distribution")
     sources: tuple[Source, ...] = Field(default=(), description="where the numbers come from")
 

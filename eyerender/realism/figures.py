@@ -41,7 +41,7 @@ FIGURES: dict[str, str] = {
     "fall-off": "90th over 10th percentile of the blurred surroundings of the eye",
     "noise (codes)": "standard deviation of a pixel's noise in stored codes",
 }
-"""The names of all figures, in the order of the table, with what they mean."""
+"""Names of all statistics, in the order of the table, with their meanings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ from .folder import FolderFigures
 from .patches import KINDS, features
 
 LEAST_IMAGES = 5
-"""Images with patches of a kind that each folder needs."""
+"""Smallest number of images with patches of a kind, per folder."""
 MISSING = "needs scikit-learn: pip install scikit-learn"
 _FOLDS, _TREES, _RESAMPLED = 5, 200, 1000
 _REVEALING = 8

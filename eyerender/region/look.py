@@ -20,7 +20,7 @@ from .iris import IrisPattern
 Albedo = Annotated[float, Field(ge=0, le=0.95)]
 Contrast = Annotated[float, Field(ge=0, le=1.5)]
 LIMBAL_RING = (0.62, 0.95)
-"""Share of the way from the pupil to the root over which a limbal ring grows dark."""
+"""Share of the way from pupil to root over which a limbal ring darkens."""
 
 
 class Fundus(Spec):

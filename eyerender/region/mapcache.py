@@ -30,7 +30,7 @@ from .anatomy import Region
 from .iris import DrawnPattern
 
 LIMIT = "EYERENDER_MAP_CACHE_MB"
-"""Environment variable: megabytes of maps that are kept; 0 keeps none and reads none."""
+"""Environment variable: size of the map cache in megabytes; 0 disables it."""
 DEFAULT_MB = 1000
 SCHEMA = "eyerender/map/1"
 _ENDING = ".map"

@@ -14,7 +14,7 @@ from ..scene import Scene
 from .style import ANALYTIC, IMAGE, TARGET, figure
 
 MAX_NOTES = 4
-"""Reasons for missing rays that a figure names."""
+"""Largest number of reasons for missing rays that a figure lists."""
 _LIGHT, _SIGHT, _SCREEN = "#E69F00", "#CC79A7", "#777777"
 
 

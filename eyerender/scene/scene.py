@@ -54,7 +54,7 @@ from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
 _BELOW_SKIN_MM, _FACE_MM = 2.0, 45.0
 
 EYE_WINDOW_MM = (32.0, 24.0)
-"""Default size (mm) of a window about each of two eyes: it shows both lids and the corners."""
+"""Default size (mm) of a window around each of two eyes: both lids and the corners are inside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

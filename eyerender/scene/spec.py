@@ -217,7 +217,7 @@ NOT_A_DATASET = (
 
 
 LIFTED = ("eye", "person", "look", "region")
-"""Keys of a scene that a subject in Python code may bring."""
+"""Keys of a scene that a subject in Python code may provide."""
 
 
 class SceneSpec(FileSpec):

@@ -44,7 +44,7 @@ DRAWN_PEOPLE = "drawn people"
 PEOPLE_PRESET, PEOPLE_SEED, PEOPLE = "adults", 0, 4
 FIXED, SHIFTED = "centre fixed", "centre shifts"
 CENTRES: dict[str, dict[str, Any]] = {FIXED: {}, SHIFTED: {"margin": {}}}
-"""How the pupil widens -> keys of the scene's eye."""
+"""Ways in which the pupil widens -> keys of the scene's eye."""
 QUALITY = tuple(field.name for field in fields(Quality))
 
 
@@ -89,7 +89,7 @@ class ConditionsPart:
     screen_maps: dict[str, Floats] = field(default_factory=dict)
     head_maps: dict[str, Floats] = field(default_factory=dict)
     diameters: dict[str, list[float]] = field(default_factory=dict)
-    """Mean errors over `DIAMETERS_MM` by the name of the curve: tracker, whose errors, how the pupil widens."""
+    """Mean errors over `DIAMETERS_MM`, by name of the curve: tracker, eyes, and how the pupil widens."""
     sensitivity: list[dict[str, Any]] = field(default_factory=list)
     precision: dict[str, dict[str, float]] = field(default_factory=dict)
     rows: list[Row] = field(default_factory=list)

@@ -21,7 +21,7 @@ _LOOK = {
 _OTHER = (("#D55E00", "P"), ("#777777", "X"), ("#F0E442", "h"), ("#000000", "*"))
 _MEASURED = "#222222"
 STYLES = (("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9"), ("P", "#777777"))
-"""Marker and colour of readings and observers, in their order."""
+"""Marker and colour of protocols and observers, in their order."""
 
 
 def look(model: str, others: Sequence[str] = ()) -> tuple[str, str]:

@@ -18,7 +18,7 @@ from .results import Departure, Erratum, Finding, WaterfallStep
 
 Apart = tuple[Sequence[FeatureDifference], Sequence[GazeDifference]]
 Values = dict[str, Any]
-"""What a template shows: text, numbers as text, rows of a table, <svg> elements."""
+"""Values of a template: text, numbers as text, rows of a table, <svg> elements."""
 T = TypeVar("T")
 _Key = tuple[str, str, str, str]  # panel, protocol, observer, eye model
 _Panels = dict[str, dict[str, dict[str, T]]]

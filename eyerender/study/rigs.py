@@ -45,7 +45,7 @@ TRAITS = {
     "distance of the pupils": ("ipd_mm",),
     "age": ("age_years",),
 }
-"""Traits by which people are divided into thirds, and the numbers of a person that they add up."""
+"""Traits that divide people into thirds, and the numbers of a person that are summed for each."""
 REGIONS = ("up", "down", "to the left", "to the right", "ahead")
 
 

@@ -20,7 +20,7 @@ SPACING_MM = 0.15
 _MARGIN_MM = 1.2
 _STEEPEST = 0.93
 _POWERS = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6.0
-"""Rows: what the powers 0 to 3 of the share of a cell get from its four B-spline coefficients."""
+"""Rows: contributions of the four B-spline coefficients of a cell to the powers 0 to 3 of the position in it."""
 
 
 class Lattice(NamedTuple):

@@ -178,7 +178,7 @@ def _faces(layout: RegionLayout, vertices: slice, faces: slice) -> mi.UInt32:
 
 
 def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
-    """Make a mesh of some of the triangles."""
+    """Create a mesh of some of the triangles."""
     corners, triangles = posed.vertices[vertices], _faces(posed.layout, vertices, faces)
     mesh = mi.Mesh("region", len(corners), len(triangles) // 3)
     params = mi.traverse(mesh)
@@ -189,7 +189,7 @@ def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
 
 
 def _instance(mesh: mi.Mesh) -> dict[str, Any]:
-    """Make a group of one mesh, and the group's only instance."""
+    """Create a group of one mesh, and the group's only instance."""
     group = mi.load_dict({"type": "shapegroup", "mesh": mesh})
     return {"group": group, "shown": mi.load_dict({"type": "instance", "of": group})}
 

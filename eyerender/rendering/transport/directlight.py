@@ -287,7 +287,7 @@ class LampPath:
         surfaces: tuple[Surface, ...] | None = None,
         ahead_mm: float = 0.0,
     ) -> LampPath:
-        """Find the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame).
+        """Solve for the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame).
 
         `ahead_mm` is as for `connect`.
         """

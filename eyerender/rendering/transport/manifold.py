@@ -70,7 +70,7 @@ def connect(
     mirror: bool = False,
     ahead_mm: float = 0.0,
 ) -> Connection:
-    """Find paths from `lamp` to `target` through all `surfaces`, all points in the eye frame (mm).
+    """Solve for paths from `lamp` to `target` through all `surfaces`; points in the eye frame (mm).
 
     Args:
         surfaces: refracting surfaces, from the front.

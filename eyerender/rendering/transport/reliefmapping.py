@@ -190,7 +190,7 @@ class ReliefSize(NamedTuple):
 
 
 def relief_grid(frame: Frame, count: mi.UInt32) -> ReliefGrid:
-    """Make the grid over the iris with the given number of nodes along a side."""
+    """Create the grid over the iris with the given number of nodes along a side."""
     return ReliefGrid(stop=frame.stop, half=frame.iris.root_radius + _SPARE_MM, count=count)
 
 
