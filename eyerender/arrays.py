@@ -1,4 +1,4 @@
-"""Arrays: the names of their types, and values made of them with read-only storage, equality and hash.
+"""Names of array types, read-only arrays, and base classes that compare and hash arrays by value.
 
 A computed result is a frozen, slotted dataclass with read-only arrays. `ArrayValue` gives such a class the equality and
 the hash that the dataclass machinery cannot provide (arrays compare element by element).
@@ -28,11 +28,11 @@ Bools = NDArray[np.bool_]
 Objects = NDArray[np.object_]
 Statuses = NDArray[np.int8]
 FloatLike = Floats | float
-"""One number for all eyes or rays of a batch, or one for each."""
+"""One number for all eyes or rays of a batch, or one for each of them."""
 
 
 def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
-    """Make a read-only array with memory of its own (`values` itself if it already is one)."""
+    """Return a read-only copy of an array (the array itself if it already is one)."""
     array = np.asarray(values, dtype=dtype)
     if array.flags.writeable:
         array = array.copy()
@@ -44,7 +44,7 @@ _Array = TypeVar("_Array", bound=NDArray[Any])
 
 
 def sealed(array: _Array) -> _Array:
-    """Make an array read-only without the copy of `frozen`, where no other code refers to it."""
+    """Make an array read-only in place, without the copy of `frozen`; for arrays that no other code refers to."""
     array.flags.writeable = False
     return array
 
@@ -55,7 +55,10 @@ _REMEMBERED = 8
 
 
 def remembered(function: Callable[_Values, _Result]) -> Callable[_Values, _Result]:
-    """Cache a function's results for the last few values, compared by identity because comparing arrays may be slow."""
+    """Cache a function's results for the last few arguments.
+
+    Arguments are compared by identity, because comparing arrays may be slow.
+    """
     known: list[tuple[tuple[object, ...], _Result]] = []
 
     @wraps(function)
@@ -88,13 +91,14 @@ class Columns(ArrayValue):
     """Mixin for frozen, slotted dataclasses (`eq=False, kw_only=True`) of arrays with common leading axes.
 
     A field's annotation, one of the names above, gives its dtype, and `column` gives its further axes. Any array-like
-    value is accepted and copied unless it is read-only. A column that is left out is unknown: NaN, -1, False or None.
+    value is accepted and copied unless it is read-only. A column that is left out is filled with NaN, -1, False or
+    None: unknown.
     """
 
     __slots__ = ()
 
     LEADING: ClassVar[int] = 1
-    """How many leading axes the columns share."""
+    """Number of leading axes shared by the columns."""
 
     def __post_init__(self) -> None:
         columns = dataclasses.fields(self)  # type: ignore[arg-type]
@@ -139,7 +143,7 @@ def _same(a: Any, b: Any) -> bool:
 
 def _key(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        # -0.0 equals 0.0, and all NaN are equal, so these differences must not reach the bytes.
+        # -0.0 equals 0.0, and all NaN count as equal, so the bytes must not differ either.
         if value.dtype.kind == "f":
             value = np.where(np.isnan(value), np.nan, value + 0.0)
         data = tuple(value.ravel().tolist()) if value.dtype == object else value.tobytes()

@@ -18,7 +18,7 @@ MAX_ERRORS = 20
 
 
 class UnfinishedRunWarning(UserWarning):
-    """A folder of an unfinished run is read: only its finished shards count."""
+    """Only the finished shards of an unfinished run were read."""
 
 
 class EyerenderError(Exception):
@@ -58,7 +58,7 @@ class InputError(EyerenderError):
         super().__init__(": ".join(part for part in (shown, self.path, self.reason) if part))
 
     def placed(self, *, source: str = "", under: str = "") -> InputError:
-        """Copy the error and its `others`, with `source` where they have none, and with paths below `under`."""
+        """Copy the error and its `others`, add `source` where they have none, and put their paths below `under`."""
         return InputError(
             self.reason,
             source=self.source or source,
@@ -80,19 +80,19 @@ class Problems:
         return self._count
 
     def add(self, reason: str, path: str = "") -> None:
-        """Note an error; only the first `MAX_ERRORS` are kept, further ones are counted."""
+        """Record an error; only the first `MAX_ERRORS` are kept, later ones are counted."""
         self._count += 1
         if len(self._listed) < MAX_ERRORS:
             self._listed.append(InputError(reason, source=self.source, path=path))
 
     def include(self, error: InputError) -> None:
-        """Note an error that was raised, with its others."""
+        """Record an error that was raised, and its `others`."""
         for one in (error, *error.others):
             self.add(one.reason, one.path)
         self._count += error.unlisted
 
     def attempt(self, call: Callable[[], Any]) -> Any:
-        """Return the result of a call; where it raises `InputError`, note the error and return None."""
+        """Call a function; if it raises `InputError`, record the error and return None."""
         try:
             return call()
         except InputError as error:
@@ -100,7 +100,7 @@ class Problems:
             return None
 
     def check(self) -> None:
-        """Raise what was noted, if anything was.
+        """Raise the recorded errors, if there are any.
 
         Raises:
             InputError: the first error, which carries the others.
@@ -109,7 +109,7 @@ class Problems:
             raise self.error()
 
     def error(self) -> InputError:
-        """Return the first error that was noted, which carries the others."""
+        """Return the first recorded error, which carries the others."""
         first, *others = self._listed
         return InputError(
             first.reason,
@@ -121,7 +121,7 @@ class Problems:
 
 
 Refuse = Callable[[str, str], NoReturn]
-"""Raises `InputError` for a path in some input, with a reason."""
+"""Function that raises `InputError` for a path in some input, with a reason."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,13 +157,13 @@ Warn = Callable[[Iterable[InputWarning]], None]
 
 
 class BackendError(EyerenderError):
-    """No backend renders; the message says how to fix it."""
+    """No backend can render; the message says how to fix it."""
 
     exit_code = 3
 
 
 def one_line(text: str, limit: int) -> str:
-    """Convert a text to one line of printable characters; the middle is left out if it is longer than `limit`.
+    """Convert a text to one line of printable characters; if it is longer than `limit`, cut out its middle.
 
     Control characters (terminals obey some of them) become question marks.
     """

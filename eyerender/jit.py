@@ -1,4 +1,4 @@
-"""Compilation by numba. The machine code is kept in $XDG_CACHE_HOME/eyerender/kernels.
+"""Compile functions with numba, and keep the machine code in $XDG_CACHE_HOME/eyerender/kernels.
 
 The index of that code is a pickle, so it is kept only in a private folder (`cachefolder`).
 
@@ -42,7 +42,7 @@ njit: Any = numba.njit  # its types lack some options
 
 
 def _folder() -> Path | None:
-    """Find the folder for the machine code of these files as they are; None where none is private and writable."""
+    """Return the folder for the machine code of the current source files; None if no private, writable one exists."""
     cache = cache_folder()
     if cache is None or not os.access(cache, os.W_OK):
         return None
@@ -53,7 +53,7 @@ def _folder() -> Path | None:
 
 
 def used(folder: Path) -> Path:
-    """Mark a folder of machine code as used; if it does not exist yet, remove old ones beside it."""
+    """Mark a folder of machine code as recently used; if it does not exist yet, remove outdated ones beside it."""
     with suppress(OSError):
         if folder.exists():
             os.utime(folder)
@@ -72,18 +72,18 @@ _CODE: Counter[str] = Counter()  # bytes of bytecode per module
 HELPER: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 ABOUT_S = 15  # time of compilation on two cores, for the message
 _MOST_WORKERS = 4
-_LOCK = threading.Lock()  # of `ensure_compiled`
+_LOCK = threading.Lock()  # lock of `ensure_compiled`
 
 
 class Program(NamedTuple):
     """Functions that are compiled together.
 
     Attributes:
-        title: name in messages.
-        about_s: time of compilation on two cores, for the message.
+        title: its name in messages.
+        about_s: compilation time on two cores in seconds, for the message.
         packages: packages of its modules.
-        module: module that imports them all, and compiles a share when it is run.
-        complete: file in FOLDER that says that all functions were compiled.
+        module: module that imports them all; run as a script, it compiles a share of them.
+        complete: file in FOLDER whose existence means that all functions are compiled.
     """
 
     title: str
@@ -104,7 +104,7 @@ RAYS = Program(
 
 
 def ensure_compiled(program: Program = EXTRACTOR) -> None:
-    """Compile a whole program in up to four processes, unless its machine code is kept on disk."""
+    """Compile a whole program in up to four processes, unless its machine code is on disk."""
     with _LOCK:
         _compile_missing(program)
 
@@ -119,7 +119,7 @@ def _compile_missing(program: Program) -> None:
         return
     print(f"compiling {program.title} (once per machine), about {program.about_s} s ...", file=sys.stderr)
     if FOLDER is None:
-        return  # no other process could use the machine code, so each function is compiled when it is called
+        return  # no other process could use the machine code, so each function is compiled at its first call
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
     null = subprocess.DEVNULL
@@ -136,11 +136,11 @@ def _compile_missing(program: Program) -> None:
 def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> None:
     """Compile the functions of a program, except those that other processes claimed.
 
-    Functions of one module or package share helpers, which every process compiles for itself. So even workers begin
-    with the modules of glints and odd ones with those of the pupil, the largest first.
+    Functions of one module share helpers, which every process has to compile for itself. So workers with even numbers
+    begin with the modules of glints and those with odd numbers with the pupil's, the largest function first.
 
     Args:
-        claims: folder in which a process claims a function by making a folder of its name.
+        claims: folder in which a process claims a function by creating a subfolder of the function's name.
         worker: number of this process.
         program: what is compiled.
     """
@@ -152,7 +152,7 @@ def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> No
 
     ordered = sorted(functions(program), key=place)
     collecting = gc.isenabled()
-    gc.disable()  # numba makes millions of objects, which the collector would visit again and again
+    gc.disable()  # numba creates millions of objects, which the garbage collector would scan again and again
     try:
         for one in ordered if worker % 2 == 0 else reversed(ordered):
             with suppress(FileExistsError):
@@ -164,20 +164,21 @@ def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> No
 
 
 def functions(program: Program = EXTRACTOR) -> list[Any]:
-    """Return the compiled functions of a program, as numba's dispatchers."""
+    """Return all compiled functions of a program as numba dispatchers."""
     return [one for one in FUNCTIONS if one.py_func.__module__.startswith(program.packages)]
 
 
 def argument_types(function: Any) -> tuple[Any, ...]:
-    """Return the types that are written beside a compiled function, as in numba's index of machine code."""
+    """Return the argument types declared for a compiled function, as in numba's index of machine code."""
     return tuple(normalize_signature(f"({FUNCTIONS[function]},)")[0])
 
 
 def compiled(types: str = "") -> Callable[[Function], Function]:
-    """Compile at the first call; the machine code is kept on disk if a private folder there can be written.
+    """Decorate a function so that numba compiles it at its first call and keeps the machine code on disk.
 
     Args:
-        types: those of the arguments that extraction passes, as numba writes them, for compilation beforehand.
+        types: argument types with which extraction calls the function, in numba's notation, for compilation ahead of
+            time.
     """
 
     def decorate(function: Function) -> Function:
@@ -190,13 +191,15 @@ def compiled(types: str = "") -> Callable[[Function], Function]:
 
 
 def _dispatcher(function: Callable[..., Any]) -> Any:
-    """Make what compiles a function at its first call."""
+    """Create the numba dispatcher that compiles a function at its first call."""
     if FOLDER is not None:
         before = config.CACHE_DIR
         config.CACHE_DIR = FOLDER
         try:
             kept = njit(cache=True, no_cfunc_wrapper=True, nogil=True, error_model="numpy")(function)
-            if str(kept.stats.cache_path).startswith(FOLDER):  # else numba chose a folder that nobody checked
+            if str(kept.stats.cache_path).startswith(
+                FOLDER
+            ):  # otherwise numba would choose a folder that nobody checked
                 return kept
         except (RuntimeError, OSError):  # numba found no folder to write to
             pass
@@ -206,12 +209,12 @@ def _dispatcher(function: Callable[..., Any]) -> Any:
 
 
 def summing(function: Function) -> Function:
-    """Compile a helper whose sums may be taken in any order, so that they use vector instructions."""
+    """Compile a helper whose sums may be reordered, which allows vector instructions."""
     return _helper(function, fastmath={"reassoc", "contract"})
 
 
 def inlined(function: Function) -> Function:
-    """Compile a helper as part of what calls it."""
+    """Compile a helper into its callers."""
     return _helper(function)
 
 

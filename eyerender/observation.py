@@ -1,4 +1,4 @@
-"""Observations: an observer's report of every (frame, eye), as structs of arrays; and their record.
+"""Observations: what an observer reports of every (frame, eye), as structs of arrays, and their JSON records.
 
 Both observers report this type, and gaze estimators take nothing else. A frame is one exposure of one camera and may
 contain both eyes; an observation belongs to (frame, eye). Where a status is not OK the numbers beside it are NaN in
@@ -21,14 +21,13 @@ from .status import Status
 from .storage.files import shown
 
 RECORD = 2
-"""The record's version that is written unless another one is asked for; `SCHEMAS` are those that are read."""
+"""Version of the records that are written by default; `SCHEMAS` are the versions that are read."""
 SCHEMAS = {1: "eyerender/record/1", 2: "eyerender/record/2"}
 EYES = ("right", "left")
 
-# Largest numbers of boundary points of one pupil (ten per degree) and of all pupils of a batch, which take 25 bytes
-# each.
+# Largest number of boundary points of one pupil (ten per degree) and of all pupils of a batch; a point takes 25 bytes.
 MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
-# Largest number of glints of all observations of a batch, which have a status and a reason each.
+# Largest number of glints of all observations of a batch; each has a status and a reason.
 MAX_GLINTS = 5_000_000
 # Limits in a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
 _MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
@@ -40,7 +39,8 @@ class Index(Columns):
 
     Attributes:
         frame: number of the frame.
-        fixation: counted from 0 in the scene's order, as are the next two; -1 where unknown.
+        fixation: index of the fixation. Fixations, cameras and heads are counted from 0 in the scene's order; -1 is
+            unknown.
         camera: index of the camera.
         head: index of the head position.
         eye: 0 for the right and 1 for the left eye, -1 where unknown.
@@ -66,7 +66,7 @@ class Index(Columns):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PoseTruth(Columns):
-    """Pose of the eye, arrays (n,) in radians, NaN where unknown; `residual_mm` of the fixation at the fovea."""
+    """True pose of the eye, arrays (n,) in radians, NaN where unknown; `residual_mm` is its miss of the target."""
 
     azimuth_rad: Floats
     elevation_rad: Floats = column()
@@ -84,7 +84,7 @@ class PupilFeatures(Columns):
     Attributes:
         status: (n,) of `Status`.
         reason: (n,) why it is not OK, in words, with details where there are any.
-        in_image: (n,) whether the pupil is on the sensor.
+        in_image: (n,) whether the pupil lies on the sensor.
         centre_px: (n, 2) centre of the direct least-squares ellipse of the boundary.
         semi_axes_px: (n, 2) a >= b of that ellipse.
         angle_rad: (n,) angle of a, in [0, pi).
@@ -137,7 +137,7 @@ class GlintFeatures(Columns):
         return np.asarray(self.status == Status.OK)
 
     def of_light(self, light: int) -> tuple[Floats, Bools]:
-        """Return the place (n, 2) of one light's glint, and whether it was found (n,)."""
+        """Return the position (n, 2) px of one light's glint, and whether it was found (n,)."""
         n, m = self.light.shape
         if m == 0:
             return np.full((n, 2), np.nan), np.zeros(n, dtype=bool)
@@ -164,7 +164,7 @@ class Observations(ArrayValue):
         return Observations(**{part.name: getattr(self, part.name).take(rows) for part in fields(self)})
 
     def with_targets(self, target_mm: ArrayLike) -> Observations:
-        """Replace the targets by (n, 3) or (3,) mm in the world, NaN where there is none."""
+        """Replace the targets by points (n, 3) or (3,) mm in the world, NaN where there is none."""
         targets = np.broadcast_to(np.asarray(target_mm, dtype=float), (len(self), 3))
         return replace(self, index=replace(self.index, target_mm=frozen(targets)))
 
@@ -179,7 +179,7 @@ class Observations(ArrayValue):
 
     def _record(self, i: int, version: int) -> dict[str, Any]:
         at, pose, pupil, glints = self.index, self.pose, self.pupil, self.glints
-        # Plain integers: a comparison of NumPy's with a Status takes 20 times as long.
+        # Plain integers: comparing a NumPy integer with a Status takes 20 times as long.
         status, glint_status = Status(int(pupil.status[i])), list(map(Status, glints.status[i].tolist()))
         if version == 1 and status == Status.PARTIAL:
             status = Status.NOT_FOUND
@@ -298,10 +298,10 @@ class Observations(ArrayValue):
 
 
 class _Reader:
-    """Reads columns from records, and notes the record and key of everything that is wrong.
+    """Read columns from records, and collect the record number and key of everything that is wrong.
 
     Raises:
-        InputError: something is no record at all.
+        InputError: an entry is not a record at all.
     """
 
     def __init__(self, records: list[dict[str, Any]], source: str, complete: bool) -> None:
@@ -323,7 +323,7 @@ class _Reader:
         self.problems.check()
 
     def values(self, path: str) -> list[Any]:
-        """List one value of each record; None where it is left out."""
+        """Return the value at a path of each record; None where it is missing."""
         return [self._value(k, path) for k in range(len(self.records))]
 
     def _value(self, k: int, path: str) -> Any:
@@ -349,7 +349,7 @@ class _Reader:
         return out
 
     def statuses(self, path: str, reasons: Objects, placed: Bools) -> Statuses:
-        """Read statuses; where a record has none, `placed` (n,) says whether there is a feature."""
+        """Read statuses; where a record has none, use `placed` (n,), which says whether there is a feature."""
         labels = self.texts(path)
         for k, label in enumerate(labels):
             if label is None and not self.complete:
@@ -377,7 +377,7 @@ class _Reader:
         return frozen(out, np.int64)
 
     def frames(self) -> Ints:
-        """Read the numbers of the frames; where no record has one, number the records."""
+        """Read the frame numbers; if no record has one, number the records."""
         given = [record.get("frame") is not None for record in self.records]
         if not self.complete and not any(given):
             return frozen(np.arange(len(given)), np.int64)
@@ -397,7 +397,7 @@ class _Reader:
         return frozen(out)
 
     def points(self, path: str, values: list[Any] | None = None, what: str = "points") -> Floats:
-        """Read lists of pairs of numbers as (n, longest, 2)."""
+        """Read lists of points as (n, longest, 2), padded with NaN."""
         values = self.values(path) if values is None else values
         for k, value in enumerate(values):
             if not (value is None or (isinstance(value, list) and len(value) <= MAX_BOUNDARY_POINTS)):
@@ -416,7 +416,7 @@ class _Reader:
         return frozen(out)
 
     def second(self, path: str) -> list[Any]:
-        """Read a key that records have from version 2 on; None in those of version 1."""
+        """Read a key that was added in version 2; None in records of version 1."""
         return [
             None if record["schema"] == SCHEMAS[1] else self._value(k, path) for k, record in enumerate(self.records)
         ]
@@ -473,7 +473,7 @@ class _Reader:
 
 
 def _arcs_of(pupil: PupilFeatures, i: int) -> dict[str, Any]:
-    """Make the additional keys of version 2 of the record."""
+    """Write the keys of a pupil that version 2 of the record added."""
     ellipse = _numbers(pupil.arc_ellipse[i])
     parts = None if ellipse is None else (ellipse[:2], ellipse[2:4], ellipse[4])
     return {
@@ -487,7 +487,7 @@ _NO_GLINT = dict.fromkeys(("light", "status", "reason", "in_image", "xy_px", "co
 
 
 def _glint_problem(g: Any) -> str | None:
-    """Describe what is wrong with an entry of a record's glints; None where nothing is."""
+    """Describe what is wrong with one glint of a record; None if nothing is."""
     if not isinstance(g, dict):
         return "must be an object"
     for key in _NO_GLINT:
@@ -515,7 +515,7 @@ def _is_count(value: Any) -> bool:
 
 
 def _array(value: Any) -> Floats | None:
-    """Convert plain numbers, of a size that can be squared, to an array; None for anything else."""
+    """Convert numbers to an array if they are small enough to be squared; None for anything else."""
     try:
         found = np.asarray(value)
     except (ValueError, OverflowError):  # rows of unequal length
@@ -526,7 +526,7 @@ def _array(value: Any) -> Floats | None:
 
 
 def _check_width(rows: int, width: int, limit: int, what: str, source: str = "") -> None:
-    """Limit the width to which rows are padded: one wide record among many must not take all the memory."""
+    """Limit the width to which rows are padded, so that one wide record cannot exhaust the memory."""
     if rows * width > limit:
         raise InputError(f"{rows} records of up to {width} {what} are more than {limit} {what}", source=source)
 
@@ -534,19 +534,19 @@ def _check_width(rows: int, width: int, limit: int, what: str, source: str = "")
 def count_heads(head_mm: Floats) -> Ints:
     """Number head positions (n, 3) from 0: equal positions have one number, in order of appearance.
 
-    Records do not contain this number.
+    Records store the positions only, not these numbers.
     """
     heads: dict[bytes, int] = {}
     return frozen([heads.setdefault((np.round(h, 9) + 0.0).tobytes(), len(heads)) for h in head_mm], np.int64)
 
 
 def version_of(record: dict[str, Any]) -> int:
-    """Read the version of a record; raises `KeyError` or `ValueError` where it is not a record."""
+    """Read the format version of a record; raise `KeyError` or `ValueError` if it is not a record."""
     return {schema: version for version, schema in SCHEMAS.items()}[str(record["schema"])]
 
 
 def concatenate(parts: Iterable[Observations]) -> Observations:
-    """Join batches, in order; glints and boundary points are padded to the widest."""
+    """Concatenate batches in order; pad glints and boundary points to the widest."""
     batches = list(parts)
     if len(batches) == 1:
         return batches[0]

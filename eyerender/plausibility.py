@@ -1,4 +1,4 @@
-"""Probable mistakes: values that the computation accepts but that make no sense.
+"""Warnings about probable mistakes: values that can be computed with but make no sense.
 
 Every function is pure and returns warnings. A scene collects its own (`Scene.warnings`), and a dataset's plan those of
 some of its samples (`Plan.warnings`). The command line prints them, or refuses them with `--strict`.
@@ -24,8 +24,8 @@ from .rig.sensor import Sensor
 PUPIL_MM = (1.0, 9.0)
 # Quantum efficiency, albedos and reflectances are those at 850 nm; silicon loses half of its efficiency by 940 nm.
 WAVELENGTHS_NM = (830.0, 870.0)
-# Lengths of a scene below these values were probably written in metres: 2 mm is a screen or an interpupillary distance
-# of 2 m, 0.02 mm an LED of 20 mm.
+# Lengths of a scene below these values were probably given in metres: 2 (mm) is a screen or an interpupillary distance
+# of 2 m, 0.02 (mm) an LED of 20 mm.
 _LEAST_MM = {
     "rig.screen.size_mm": 2.0,
     "subject.ipd_mm": 2.0,
@@ -35,13 +35,13 @@ _LEAST_MM = {
     "rig.cameras.*.sensor_mm": 0.2,
     "rig.lights.*.radius_mm": 0.02,
 }
-# The same for places: nothing can be this close to the world's origin, the bridge of the nose.
+# The same for positions: nothing can be this close to the world's origin, the bridge of the nose.
 _LEAST_DISTANCE_MM = 2.0
-# A globe and a head about the corneal apex and the head's position. Both are smaller than real ones, so that things
-# fixed to a face (a headset's lamps, a frame of glasses) do not count as a part of it.
+# Globe and head, as spheres about the corneal apex and the head's position. Both are smaller than real ones, so that
+# parts worn on a face (a headset's lamps, a frame of glasses) do not count as inside it.
 _GLOBE_CENTRE_MM, _GLOBE_RADIUS_MM = np.array([-12.0, 0.0, 0.0]), 13.0
 _HEAD_CENTRE_MM, _HEAD_SEMI_AXES_MM = np.array([-100.0, 0.0, 0.0]), np.array([85.0, 70.0, 115.0])
-# Depth from which something counts as behind a screen's surface: frames of screens are uneven.
+# Depth from which something counts as behind the screen's surface: the frames of screens are uneven.
 _BEHIND_MM = 1.0
 # Points of an eye that may be in view: the corneal apex and points of the limbus, within what rotation of the eye
 # moves.
@@ -49,7 +49,7 @@ _LIMBUS_MM = np.array([[0, 0, 0], [-3, 6, 0], [-3, -6, 0], [-3, 0, 6], [-3, 0, -
 # A camera that is farther than this from an eye's axis sees no cornea in any pose of the eye.
 _FURTHEST_RAD = np.radians(140.0)
 
-# A lamp that sends less of the intensity on its axis to the nearest eye is probably not aimed.
+# A lamp that sends a smaller share of its axial intensity to the nearest eye is probably not aimed.
 _LEAST_AIMED = 0.8
 # Largest distance of a target from the screen's plane; real screens are no flatter.
 _OFF_PLANE_MM = 1.0
@@ -58,7 +58,7 @@ SATURATED_SHARE = 0.2
 
 
 def pupil_warnings(diameter_mm: float, path: str) -> list[InputWarning]:
-    """Warn of a pupil size that no human eye has; `path` is the key of its diameter."""
+    """Warn of a pupil diameter (mm) that no human eye has; `path` is its key in the input."""
     low, high = PUPIL_MM
     if low <= diameter_mm <= high:
         return []
@@ -70,7 +70,7 @@ def pupil_warnings(diameter_mm: float, path: str) -> list[InputWarning]:
 
 
 def wavelength_warnings(wavelength_nm: float) -> list[InputWarning]:
-    """Warn of a wavelength for which quantum efficiency and albedos do not hold."""
+    """Warn of a wavelength at which the quantum efficiency and albedos used here do not hold."""
     low, high = WAVELENGTHS_NM
     if low <= wavelength_nm <= high:
         return []
@@ -82,7 +82,7 @@ def wavelength_warnings(wavelength_nm: float) -> list[InputWarning]:
 
 
 def length_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:
-    """Warn of lengths of a scene's mapping that were probably written in metres."""
+    """Warn of lengths in a scene's mapping that were probably given in metres."""
     found = []
     for pattern, least in _LEAST_MM.items():
         for path, value in _values(scene, pattern.split(".")):
@@ -108,8 +108,8 @@ def place_warnings(
         rig: the rig.
         eyes_mm: corneal apexes (3,) in the world by their name in a message.
         heads_mm: head positions (3,) in the world by their name in a message.
-        camera_paths: path of each camera of the rig in the input.
-        light_paths: the same for the lamps; lamps of one ring share a path and get one warning.
+        camera_paths: path of each camera in the input, for messages.
+        light_paths: path of each lamp in the input; lamps of one ring share a path and get one warning.
     """
     places = [
         *((path, "camera", camera.nodal_point_mm) for path, camera in zip(camera_paths, rig.cameras, strict=True)),
@@ -132,7 +132,7 @@ def place_warnings(
 
 
 def mirror_warnings(cameras: Sequence[Camera], eyes_mm: Mapping[str, Floats]) -> list[InputWarning]:
-    """Warn of a mirror that stands between its camera and an eye, where it shows the camera nothing of the eye.
+    """Warn of a mirror between its camera and an eye that hides the eye instead of showing it.
 
     Args:
         cameras: the authored cameras.
@@ -158,8 +158,8 @@ def view_warnings(
 
     Args:
         rig: the rig.
-        views: camera -> the windows (x0, y0, width, height) that are made, each with the corneal apex (3,) it is for.
-        camera_paths: path of each camera of the rig in the input.
+        views: camera -> the windows (x0, y0, width, height) to be rendered, each with the corneal apex (3,) it shows.
+        camera_paths: path of each camera in the input, for messages.
     """
     blind = [c for c, camera in enumerate(rig.cameras) if not any(_in_view(camera, w, eye) for w, eye in views[c])]
     everywhere = "; nothing of any eye is in view" if len(blind) == len(rig.cameras) else ""
@@ -172,7 +172,7 @@ def is_saturated(dn: NDArray[Any], sensor: Sensor) -> bool:
 
 
 def saturation_warnings(saturated: int, images: int, source: str) -> list[InputWarning]:
-    """Warn of images, `saturated` of `images`, that are mostly white."""
+    """Warn if some of the images, `saturated` out of `images`, are mostly white."""
     if not saturated:
         return []
     reason = (
@@ -183,7 +183,7 @@ def saturation_warnings(saturated: int, images: int, source: str) -> list[InputW
 
 
 def target_warnings(targets_mm: Floats, screen: ScreenPlane | None, source: str) -> list[InputWarning]:
-    """Warn of targets (n, 3) in the world that are not on the screen, where estimators place every gaze point."""
+    """Warn of targets (n, 3) in the world that are off the screen, where estimators place every gaze point."""
     if screen is None or not len(targets_mm):
         return []
     off = np.abs((targets_mm - screen.centre_mm) @ screen.normal)
@@ -198,7 +198,7 @@ def target_warnings(targets_mm: Floats, screen: ScreenPlane | None, source: str)
 
 
 def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list[InputWarning]:
-    """Warn of a rig that differs from the one of the estimator's calibration."""
+    """Warn if a rig differs from the rig on which the estimator was calibrated."""
     path = next(_differences(rig.to_mapping(), calibrated.to_mapping(), "rig"), None)
     if path is None:
         return []
@@ -213,7 +213,7 @@ def rig_warnings(rig: RigGeometry, calibrated: RigGeometry, source: str) -> list
 
 
 def _differences(one: Any, other: Any, path: str) -> Iterator[str]:
-    """List the paths at which two values of the same kind differ by more than rounding."""
+    """Yield the paths at which two values of the same kind differ by more than rounding."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in one:
             yield from _differences(one[key], other.get(key), f"{path}.{key}")
@@ -234,7 +234,7 @@ def _misplaced(
     eyes_mm: Mapping[str, Floats],
     heads_mm: Mapping[str, Floats],
 ) -> tuple[str, str] | None:
-    """Find code and reason of a warning about one place, if there is one."""
+    """Return code and reason of a warning about one position; None if it is plausible."""
     if np.linalg.norm(place) < _LEAST_DISTANCE_MM:
         return "metres", f"the {what} is at ({_shown(place)}) mm, in the face; {_METRES}"
     for name, eye in eyes_mm.items():
@@ -254,7 +254,7 @@ def _misplaced(
 
 
 def _unaimed(lamp: Lamp, eyes_mm: Mapping[str, Floats]) -> str | None:
-    """Find the reason of a warning about a lamp that points past the nearest eye, if it does."""
+    """Return the reason of a warning if a lamp points past the nearest eye; None if it is aimed."""
     ways = {name: eye - lamp.position_mm for name, eye in eyes_mm.items()}
     distances = {name: float(np.linalg.norm(way)) for name, way in ways.items()}
     name = min(distances, key=lambda eye: distances[eye])
@@ -264,7 +264,7 @@ def _unaimed(lamp: Lamp, eyes_mm: Mapping[str, Floats]) -> str | None:
 
 
 def _in_view(camera: PinholeCamera, window: Window, apex: Floats) -> bool:
-    """Return whether a window shows any part of an eye's front."""
+    """Return whether a window shows any part of the front of an eye."""
     towards = camera.nodal_point_mm - apex
     if towards[0] < np.cos(_FURTHEST_RAD) * np.linalg.norm(towards):
         return False

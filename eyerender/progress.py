@@ -1,4 +1,4 @@
-"""Types of the callbacks by which long work reports its progress."""
+"""Callback types with which long computations report progress, and helpers that call them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ T = TypeVar("T")
 
 
 def followed(items: Sequence[T], progress: Progress | None) -> Iterator[T]:
-    """Yield items and report after each; a first report, with 0 items done, states the total."""
+    """Yield items and report progress after each; the first report, with 0 items done, states the total."""
     return followed_by(items, len(items), progress)
 
 
 def one_behind(items: Iterable[T]) -> Iterator[T]:
-    """Yield each item after the next one has been fetched, so that work started for the next one overlaps with it.
+    """Yield each item only after fetching the next one, so that work started for the next item overlaps with it.
 
     Where fetching fails, the previous item is still yielded first.
     """
@@ -39,7 +39,7 @@ def one_behind(items: Iterable[T]) -> Iterator[T]:
 
 
 def followed_by(items: Iterable[T], total: int, progress: Progress | None) -> Iterator[T]:
-    """Yield `total` items that come one by one, and report like `followed`."""
+    """Yield items from an iterator that has no length, and report progress out of `total` like `followed`."""
     if progress is not None:
         progress(0, total, "")
     for k, item in enumerate(items):

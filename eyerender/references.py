@@ -18,15 +18,15 @@ _REFERENCE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*(\.[A-Za-z_]
 
 
 def is_reference(text: str) -> bool:
-    """Return whether a text has the form `module:name`; both parts may have dots."""
+    """Return whether a text has the form `module:name`; both parts may contain dots."""
     return _REFERENCE.fullmatch(text) is not None
 
 
 def load_reference(reference: str, *, source: str = "") -> Any:
-    """Load the object of `module:name`; the module is searched where Python searches, then in the current folder.
+    """Load the object `module:name`; the module is searched on Python's path, then in the current folder.
 
     Raises:
-        InputError: it has another form, there is no such module or name, or the module cannot be imported.
+        InputError: the reference has another form, the module or name does not exist, or the import fails.
     """
     if not is_reference(reference):
         raise InputError(f"must be module:name, not {shown(reference)}", source=source)

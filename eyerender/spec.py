@@ -32,8 +32,8 @@ from .errors import InputError, Problems
 from .storage.files import opened, read_text, shown
 
 FORMAT = 1
-# Limits of a YAML file. Nodes are counted as expanded: an alias counts as much as the value that it repeats. A scene
-# with a list of 20,000 targets has 80,000 nodes; reading 100,000 takes some five seconds.
+# Limits of a YAML file. Nodes are counted after expansion: an alias counts as much as the value that it repeats. A
+# scene with a list of 20,000 targets has 80,000 nodes; reading 100,000 takes some five seconds.
 MAX_YAML_BYTES, MAX_YAML_NODES, MAX_YAML_DEPTH = 2 * 2**20, 100_000, 64
 # Python's time grows with the square of an integer's digits.
 _LONGEST_NUMBER = 300
@@ -58,7 +58,7 @@ NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 
 @dataclass(frozen=True, slots=True)
 class ByKind:
-    """Choice among the specs of a union by their key `kind`: `Annotated[SphereSpec | ConicSpec, ByKind()]`."""
+    """Choose the member of a union of specs by their key `kind`: `Annotated[SphereSpec | ConicSpec, ByKind()]`."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
         members = {str(get_args(member.model_fields["kind"].annotation)[0]): member for member in get_args(source)}
@@ -73,12 +73,12 @@ class ByKind:
 
 
 def _kind_tag(value: object) -> str:
-    """Return pydantic's name for the member of a union of specs that differ in `kind`."""
+    """Return the tag by which pydantic selects a member of a union of specs, from its key `kind`."""
     return f"[{value.get('kind') if isinstance(value, Mapping) else getattr(value, 'kind', None)}]"
 
 
 class KeyProblem(ValueError):
-    """What a validator raises for a key inside its record."""
+    """Error that a validator raises for one key of its record."""
 
     def __init__(self, path: str, reason: str) -> None:
         super().__init__(reason)
@@ -91,17 +91,17 @@ class Spec(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
     POSITIONAL: ClassVar[tuple[str, ...]] = ()
-    """The fields that the constructor also takes without their names, in this order."""
+    """Fields that the constructor also takes by position, in this order."""
 
     def __init__(self, *values: Any, **fields: Any) -> None:
         """Build a record from Python values; lists and NumPy arrays are accepted for tuples, mappings for records.
 
         Args:
-            values: the first of the fields named in `POSITIONAL`.
-            fields: the remaining ones, by name.
+            values: fields by position, in the order of `POSITIONAL`.
+            fields: fields by name.
 
         Raises:
-            InputError: a value does not fit; the message is the one that a YAML file with this value gets.
+            InputError: a value does not fit; the message is the same as for a YAML file with this value.
         """
         named = dict(zip(self.POSITIONAL, values, strict=False))
         if len(named) < len(values) or named.keys() & fields.keys():
@@ -148,11 +148,14 @@ class Spec(BaseModel):
                 problems.add(reason, path)
             raise problems.error() from None
         except (TypeError, ValueError) as error:
-            raise InputError(f"holds a value that is no number, text or list ({error})", source=source) from None
+            raise InputError(f"holds a value that is not a number, text or list ({error})", source=source) from None
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Arrange the mapping in the order of a file; Python code may put values elsewhere."""
+        """Rearrange a mapping to the layout of a file before validation.
+
+        Subclasses that accept other layouts from Python code override it.
+        """
         return data
 
     def to_mapping(self) -> dict[str, Any]:
@@ -160,10 +163,10 @@ class Spec(BaseModel):
         return self.model_dump(mode="json", exclude_none=True)
 
     def replaced(self, option: str, changes: Mapping[str, Any]) -> Self:
-        """Replace top-level values by those of command-line options; a None removes a key.
+        """Replace top-level values by command-line options; a None removes a key.
 
         Raises:
-            InputError: they do not fit. It names the option, because the file itself was read without an error.
+            InputError: a value does not fit; the message names the option, because the file itself is valid.
         """
         data = {key: value for key, value in {**self.to_mapping(), **changes}.items() if value is not None}
         try:
@@ -178,13 +181,13 @@ class Spec(BaseModel):
 
     @classmethod
     def json_schema(cls) -> dict[str, Any]:
-        """Make the JSON Schema (2020-12) for editors."""
+        """Return the JSON Schema (2020-12) for editors."""
         schema = cls.model_json_schema()
         return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 class FileSpec(Spec):
-    """A spec that is a YAML file of its own and states the version of its format."""
+    """Base of specs that are a YAML file of their own and state the version of their format."""
 
     FORMATS: ClassVar[tuple[int, ...]] = (FORMAT,)
     """The versions that `load` reads; new files state the last one."""
@@ -216,7 +219,7 @@ class FileSpec(Spec):
 
     @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """Add the content of other files that become part of the spec to the mapping of a file in this folder."""
+        """Merge the content of other files that belong to the spec into its mapping; paths are relative to `folder`."""
         return data
 
     @classmethod
@@ -232,7 +235,7 @@ class FileSpec(Spec):
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
-        """Refuse a mapping of another kind of file, whose formats have other version numbers.
+        """Raise an error for a file of another kind, whose format has other version numbers.
 
         Raises:
             InputError: the mapping is of another kind.
@@ -278,7 +281,7 @@ def parse_yaml(text: str, source: str, *, mapping_tags: tuple[str, ...] = ()) ->
     except RecursionError:
         raise InputError("not valid YAML: nested too deeply", source=source) from None
     except ValueError as error:
-        # The scanner reads the numbers of a %YAML directive with int().
+        # The scanner converts the numbers of a %YAML directive with int(), which may raise ValueError.
         raise InputError(f"not valid YAML: {error}", source=source) from None
     if not isinstance(data, dict):
         raise InputError("must be a YAML mapping of keys to values", source=source)
@@ -301,8 +304,8 @@ def file_digest(path: Path) -> str:
 class _UniqueKeyLoader(yaml.SafeLoader):
     """The safe loader, with errors for duplicate keys (instead of a silent override) and for too large content.
 
-    Aliases count with the size of what they repeat, because later code processes all of it (ten lines can expand to a
-    thousand million nodes).
+    An alias counts with the size of the node that it repeats, because later code processes the expanded tree (ten lines
+    can expand to a thousand million nodes).
     """
 
     def __init__(self, stream: str) -> None:
@@ -380,10 +383,10 @@ _UniqueKeyLoader.add_implicit_resolver(
 
 
 def _problems(error: ValidationError) -> list[tuple[str, str]]:
-    """List dotted paths and reasons of the problems, the most informative one first.
+    """Return the path and reason of each problem, the most informative one first.
 
-    A problem above a deeper one, or at the same place, is often only its consequence, because each branch of a union
-    complains. It is left out.
+    Each branch of a union reports its own failure, so a problem above a deeper one, or at the same path, is often only
+    its consequence. Such problems are left out.
     """
     problems = error.errors(include_url=False)
     places = [tuple(part for part in p["loc"] if not _is_branch(part)) for p in problems]
@@ -400,7 +403,7 @@ def _problems(error: ValidationError) -> list[tuple[str, str]]:
 
 
 def _described(problem: Mapping[str, Any], path: str) -> tuple[str, str]:
-    """Describe one problem at a path: dotted path and reason."""
+    """Return one problem as (dotted path, reason)."""
     context = problem.get("ctx", {})
     kind = problem["type"]
     if kind == "extra_forbidden":
@@ -428,7 +431,7 @@ def _described(problem: Mapping[str, Any], path: str) -> tuple[str, str]:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value of Python code to what JSON holds."""
+    """Convert a Python value to JSON types."""
     if isinstance(value, Spec):
         return value.to_mapping()
     if isinstance(value, np.ndarray | np.generic):
@@ -437,5 +440,5 @@ def _plain(value: Any) -> Any:
 
 
 def _is_branch(part: object) -> bool:
-    """Return whether a part of pydantic's location names a union's branch rather than a key of the user's file."""
+    """Return whether a part of pydantic's error location names a union's branch, not a key of the user's file."""
     return isinstance(part, str) and ("[" in part or part.endswith("Spec"))

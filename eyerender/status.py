@@ -13,10 +13,9 @@ from .arrays import Bools, Statuses
 
 
 class Status(IntEnum):
-    """Outcome of a ray, of the search for one, of a fixation, of a feature or of an estimate.
+    """Outcome of a ray, a ray search, a fixation, a feature or an estimate.
 
-    Numbers hold for the whole only where the status is OK. NONE marks an entry that does not exist; it pads rows that
-    have fewer entries than others.
+    The numbers beside a status are complete only where it is OK. NONE marks padding: an entry that does not exist.
     """
 
     NONE = -1
@@ -44,17 +43,17 @@ class Status(IntEnum):
 
     @property
     def reason(self) -> str | None:
-        """Reason in words; None where nothing is wrong."""
+        """Reason in words; None if the status is OK."""
         return _REASONS.get(self)
 
     @property
     def label(self) -> str:
-        """Word in a record: "ok", "partial" or "missing"; "" for no entry at all."""
+        """Word for records: "ok", "partial" or "missing"; "" for padding."""
         return _LABELS.get(self, "missing")
 
     @classmethod
     def of_record(cls, label: str, reason: str | None = None) -> Status:
-        """Find the status for a record's word and reason; NOT_FOUND where the reason is unknown here.
+        """Convert the word and reason of a record to a status; NOT_FOUND if the reason is unknown.
 
         A reason may be followed by details in parentheses.
         """
@@ -88,5 +87,5 @@ _OF_REASON = {reason: status for status, reason in _REASONS.items() if status.la
 
 
 def mark(status: Statuses, where: Bools, value: Status) -> None:
-    """Set `value` where no failure is recorded yet, in place in the caller's `status`."""
+    """Set the status to `value` at `where`, in place, unless a failure is already recorded there."""
     status[(status == Status.OK) & where] = value

@@ -57,9 +57,9 @@ _STATE = ("start", "batch_size", "lanes")  # settings that must be equal when a 
 
 
 def collate(items: Sequence[Parts]) -> dict[str, Any]:
-    """Make a batch of the mappings of several images: tensors are stacked, numbers become a tensor, others a list.
+    """Collate the mappings of several images: stack tensors, convert numbers to a tensor, put other values into lists.
 
-    It is `torch.utils.data.default_collate`, except that it also takes lines of metadata, which hold None.
+    It is `torch.utils.data.default_collate`, except that it also accepts metadata, which contains None.
     """
     batch: dict[str, Any] = {}
     for key, first in items[0].items():
@@ -74,18 +74,18 @@ def collate(items: Sequence[Parts]) -> dict[str, Any]:
 class FolderDataset(Dataset[Any]):
     """The images of a folder that `generate` or `render` wrote, or those of one split.
 
-    It can be pickled, so it works with any number of workers, however they start. A line of metadata and its pictures
-    are read when their image is asked for.
+    It can be pickled, so it works with any number of workers, however they start. Metadata and pictures are read when
+    an item is requested.
 
     Args:
         path: the folder.
         split: only the images of this split, such as "train"; None takes all.
-        parts: what an image's mapping holds (see the module).
-        transform: called with the mapping of each image; what it returns takes the mapping's place.
+        parts: keys of each item, from the table of this module.
+        transform: called with the mapping of each image; its result becomes the item.
 
     Raises:
-        InputError: the folder cannot be read, a part is unknown, or the folder has no such split. A picture or a label
-            that is wrong or missing is reported when it is asked for.
+        InputError: the folder cannot be read, a part is unknown, or the folder has no such split. A wrong or missing
+            picture or label is reported when its item is requested.
     """
 
     def __init__(
@@ -128,8 +128,8 @@ class StreamDataset(IterableDataset[Any]):
 
     Sample i is the same pure function of (spec, i) as in `generate`, with the same pixels. A batch holds the images of
     `batch_size` consecutive samples. The samples are divided into `lanes`: stretches of consecutive batches, from which
-    batches are taken in turn. Each worker has lanes of its own, so only one worker prepares the skin and iris of a
-    subject. With one lane, the samples come in the order 0, 1, 2, ...
+    batches are taken in turn. Each worker has its own lanes, so the skin and iris of a subject are prepared by one
+    worker only. With one lane, the samples come in the order 0, 1, 2, ...
 
     `loader` makes the `DataLoader`. It always gives the same batches in the same order, and each sample once. With
     several ranks (processes that train together), rank r of n gets the batches r, r + n, ... of this order; one rank
@@ -147,12 +147,12 @@ class StreamDataset(IterableDataset[Any]):
         count: as for `eyerender.generate`.
         batch_size: number of samples in a batch.
         start: number of batches to leave out at the beginning, counted over all ranks.
-        lanes: number of lanes, a multiple of the number of workers of all ranks; by default this number itself. The
-            order of batches depends on it, so keep it when you resume with another number of workers.
+        lanes: number of lanes, a multiple of the number of workers of all ranks; by default that number. The order of
+            batches depends on it, so keep it when you resume with another number of workers.
         split: only the samples of this split, such as "train"; None takes all.
-        rank: which of the processes that train together this is; by default torch.distributed knows.
-        ranks: number of these processes; by default torch.distributed knows.
-        parts: what an image's mapping holds (see the module).
+        rank: rank of this process in distributed training; by default that of torch.distributed.
+        ranks: number of ranks; by default that of torch.distributed.
+        parts: keys of each item, from the table of this module.
         transform: called with the mapping of each image; it must return a mapping.
         backend: as for `eyerender.generate`.
         threads: processor threads of each worker; by default the workers share all that the process may use.
@@ -208,7 +208,7 @@ class StreamDataset(IterableDataset[Any]):
         self._begin = 0  # number of the batch at which the next iteration begins
 
     def loader(self, workers: int = 2, **options: Any) -> DataLoader[Any]:
-        """Make the loader of this stream: `workers` processes that render, 0 to render in this one.
+        """Create the `DataLoader` of this stream, with `workers` processes that render (0: render in this process).
 
         Args:
             workers: number of processes. They start by spawn, because a fork of a process with threads is not safe,
@@ -241,14 +241,14 @@ class StreamDataset(IterableDataset[Any]):
         self._next = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Say where this copy of the stream is: `next` is the number of the batch after its last one."""
+        """Return the position in the stream: `next` is the number of the batch after the last one yielded."""
         return {"digest": self.plan.digest, **{name: getattr(self, name) for name in _STATE}, "next": self._next}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume iteration from a saved state.
 
         Raises:
-            InputError: the state is of another spec, batch size or number of lanes.
+            InputError: the state belongs to another spec, batch size or number of lanes.
         """
         for name, own in (("digest", self.plan.digest), *((name, getattr(self, name)) for name in _STATE)):
             if state[name] != own:
@@ -270,7 +270,7 @@ class StreamDataset(IterableDataset[Any]):
 
 
 def place(batch: int, count: int, lanes: int) -> int:
-    """Find the place in the order of samples of a batch of `count` that are taken from `lanes` stretches in turn."""
+    """Return the number, in sample order, of the batch that is yielded as number `batch` when lanes take turns."""
     lane, step = batch % lanes, batch // lanes
     length, longer = divmod(count, lanes)  # the first lanes are longer by one
     return lane * length + min(lane, longer) + step
@@ -284,7 +284,7 @@ def _checked(parts: Sequence[str]) -> tuple[str, ...]:
 
 
 def _samples(plan: Plan, split: str | None) -> Sequence[int]:
-    """List the numbers of the samples of a split."""
+    """Return the sample numbers of a split."""
     spec = plan.spec
     if split is None:
         return spec.selection.samples

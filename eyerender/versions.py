@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 
 def package_version(name: str) -> str:
-    """Look up the installed version of a distribution, "unknown" where it is not installed."""
+    """Return the installed version of a distribution, "unknown" if it is not installed."""
     try:
         return version(name)
     except PackageNotFoundError:

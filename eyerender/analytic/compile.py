@@ -12,7 +12,7 @@ from ..optics import fermat_kernels
 from . import view_kernels
 
 MODULES = (graph_kernels, ellipse_kernels, fermat_kernels, pose_kernels, view_kernels)
-"""All modules with compiled functions of the ray optics."""
+"""Modules with compiled functions of the ray optics."""
 
 if __name__ == "__main__":
     compile_share(Path(sys.argv[1]), int(sys.argv[2]), RAYS) if len(sys.argv) > 2 else ensure_compiled(RAYS)

@@ -1,4 +1,4 @@
-"""Features of eyes in cameras by ray optics: the apparent pupil, the glints, further Purkinje images.
+"""Features of eyes in cameras by ray optics: apparent pupil, glints, and Purkinje images.
 
 A batch is n (frame, eye) pairs: eyes, their poses and positions, and the camera that sees each. Work is divided into
 chunks whose arrays stay in the cache, so memory beyond the result is bounded.
@@ -41,7 +41,7 @@ class Features(ArrayValue):
         ellipse_residual_px: (n,) deviation (rms) of the boundary from the ellipse.
         anatomical_centre_px: (n, 2) image of the stop's centre.
         point_in_image: (n, k).
-        glints_px: (n, m, p, 2) for each of m lights the requested Purkinje images; the first one is the glint.
+        glints_px: (n, m, p, 2) the p requested Purkinje images of each of m lights; the first one is the glint.
         glint_status: (n, m, p).
         glint_residual_mm: (n, m, p).
         glint_in_image: (n, m, p).
@@ -69,7 +69,7 @@ class Features(ArrayValue):
 
     @property
     def seen_in_image(self) -> Bools:
-        """Whether there are visible boundary points and all of them lie in the image, (n,)."""
+        """Whether any boundary point is visible and all visible ones lie in the image, (n,)."""
         seen = self.point_status == Status.OK
         return np.asarray((self.point_in_image | ~seen).all(axis=1) & seen.any(axis=1))
 
@@ -97,11 +97,11 @@ def features(
     """Compute the features of n eyes.
 
     Args:
-        eyes: different eyes.
+        eyes: distinct eyes.
         eye_index: (n,) the eye of each row.
         poses: n poses.
         position_mm: (n, 3) unrotated apex in the world, including the head's displacement.
-        cameras: different cameras.
+        cameras: distinct cameras.
         camera_index: (n,) the camera of each row.
         lights_mm: (m, 3) in the world.
         boundary_points: number of boundary points, >= 6.
@@ -166,7 +166,7 @@ def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> 
     """Check the options of `features` for this number of rows.
 
     Raises:
-        InputError: they are out of range.
+        InputError: an option is out of range.
     """
     if boundary_points < 6:
         raise InputError("must be >= 6", path="boundary_points")
@@ -193,7 +193,7 @@ class View:
 
     @classmethod
     def of(cls, eye: EyeModel, poses: Poses, position_mm: Floats, camera: PinholeCamera) -> View:
-        """Make the view of a camera on turned eyes at places (n, 3) in the world."""
+        """Create the view of a camera on posed eyes whose unrotated apexes are at positions (n, 3) in the world."""
         turn, shift = rigid_motion(poses, eye)
         whole = shift + position_mm
         rotation, translation, at = np.empty(turn.shape), np.empty(shift.shape), np.empty(shift.shape[::-1])
@@ -207,7 +207,7 @@ class View:
         )
 
     def rows(self, part: slice) -> View:
-        """Select the view of some of the eyes."""
+        """Select some of the eyes."""
         x, y, z = self.camera_mm
         turn, shift = self.motion
         return View(
@@ -225,7 +225,7 @@ class View:
         return inside[0], inside[1], inside[2]
 
     def project(self, points: Xyz, status: Statuses) -> tuple[Floats, Statuses]:
-        """Project points of the eye frame to pixels (n, k, 2); NaN where the status says there is none."""
+        """Project points of the eye frame to pixels (n, k, 2); NaN where the status is not OK."""
         camera, found = self.camera, np.array(status, dtype=np.int8)
         plain = not np.any(camera.distortion)
         scale = (

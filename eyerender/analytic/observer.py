@@ -1,4 +1,4 @@
-"""The analytic observer: frames traced by ray optics."""
+"""The analytic observer: observe frames by ray optics."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ARC_GAP_DEG = 120.0
 
 @dataclass(frozen=True, slots=True)
 class AnalyticObserver:
-    """The observer by ray optics: the exact apparent pupil and glints.
+    """Observer by ray optics: exact apparent pupil and glints.
 
     Args:
         boundary_points: number of traced points of each pupil boundary.
@@ -35,21 +35,21 @@ class AnalyticObserver:
     boundary_points: int = 30
 
     def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
-        """Trace every (frame, eye); `rig` replaces that of the frames."""
+        """Observe every (frame, eye); `rig` replaces that of the frames."""
         return self.observe_in_detail(frames, rig)[0]
 
     def observe_in_detail(
         self, frames: Frames, rig: RigLike | None = None, *, purkinje: Sequence[int] = (1,)
     ) -> tuple[Observations, Features]:
-        """Trace with all details: residuals, deviation of the pupil from an ellipse, Purkinje images.
+        """Observe with residuals, the pupil's deviation from an ellipse, and Purkinje images.
 
         Args:
-            frames: n of them.
+            frames: n frames.
             rig: replaces the rig of the frames.
-            purkinje: which images, from 1 (the glint) to 4.
+            purkinje: orders of the Purkinje images, from 1 (the glint) to 4.
 
         Returns:
-            The observations, and the features that a record has no place for.
+            The observations, and the detailed features, which records do not contain.
 
         Raises:
             InputError: the eye has no surface for one of the Purkinje images.
@@ -82,7 +82,7 @@ def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points
     """Compute the apparent pupils and glints of frames, or of all frames of a scene, by ray optics.
 
     Args:
-        frames: what to observe.
+        frames: frames, or a scene for all of its frames.
         rig: replaces the rig of the frames.
         boundary_points: number of traced points of each pupil boundary.
 
@@ -94,7 +94,7 @@ def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points
 
 
 def purkinje_records(observed: Observations, seen: Features, orders: Sequence[int]) -> list[dict[str, Any]]:
-    """List Purkinje images as plain records: frame, eye, light, image (1 to 4), status, reason, in_image, xy_px."""
+    """Convert Purkinje images to records: frame, eye, light, image (1 to 4), status, reason, in_image, xy_px."""
     index = observed.index
     out = []
     for i, j, p in np.ndindex(seen.glint_status.shape):
@@ -118,8 +118,7 @@ def purkinje_records(observed: Observations, seen: Features, orders: Sequence[in
 def pupil_features(seen: Features) -> PupilFeatures:
     """Compute the apparent pupils of a batch.
 
-    A pupil is missing where no boundary point has a ray or no ellipse fits. It is partial where only some points have a
-    ray.
+    A pupil is missing if no boundary point has a ray or no ellipse fits. It is partial if only some points have a ray.
 
     The arcs of a partial pupil run from the first to the last point of each run of visible points. The true arcs extend
     beyond these by less than one spacing of the points. An ellipse is fitted where there are at least `ARC_POINTS`
@@ -160,7 +159,7 @@ def pupil_features(seen: Features) -> PupilFeatures:
 
 
 def seen_arcs_deg(found: Bools) -> list[tuple[float, float]]:
-    """Find runs of visible points (k,), evenly spaced around the margin: (from, to) in degrees of its parameter.
+    """Return runs of visible points (k,), evenly spaced around the margin: (from, to) in degrees of its parameter.
 
     `from` lies in [0, 360) and `to` is not below it; an arc over the first point ends beyond 360.
     """
@@ -169,14 +168,14 @@ def seen_arcs_deg(found: Bools) -> list[tuple[float, float]]:
         return [(0.0, 360.0)]
     starts = np.flatnonzero(found & ~np.roll(found, 1))
     ends = np.flatnonzero(found & ~np.roll(found, -1))
-    # The end of a start is the next one around.
+    # The end of an arc is the next end around the margin.
     after = [int(ends[ends >= start][0]) if (ends >= start).any() else int(ends[0]) + count for start in starts]
     step = 360.0 / count
     return [(float(start * step), float(end * step)) for start, end in zip(starts, after, strict=True)]
 
 
 def _arc_ellipse(points_px: Floats, arcs: Sequence[tuple[float, float]]) -> Floats:
-    """Fit the ellipse (cx, cy, a, b, angle) of the visible points; NaN where they do not determine it."""
+    """Fit the ellipse (cx, cy, a, b, angle) to the visible points; NaN if they do not determine it."""
     gaps = [following[0] - arc[1] for arc, following in pairwise([*arcs, (arcs[0][0] + 360.0, 0.0)])]
     if len(points_px) < ARC_POINTS or max(gaps) > ARC_GAP_DEG + 1e-9:
         return np.full(5, np.nan)

@@ -18,11 +18,11 @@ _RIM_POINTS = 36
 
 
 def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
-    """Find where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
+    """Compute where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
 
-    A camera may be behind the plane of the iris, because the cornea bends light round to it. The status is BEHIND_IRIS
-    for a ray that would have to pass the iris, and BEHIND_SCLERA for one that meets the eyeball on its way to the
-    camera.
+    A camera may be behind the plane of the iris, because the cornea refracts light towards it. The status is
+    BEHIND_IRIS for a ray that would have to pass the iris, and BEHIND_SCLERA for one that meets the eyeball on its way
+    to the camera.
 
     Args:
         eye: the eyes.
@@ -58,7 +58,7 @@ def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats,
 
 
 def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
-    """Find where the light of lamps leaves the cornea for the camera.
+    """Compute where the light of lamps leaves the cornea towards the camera.
 
     The light is reflected at the surface of the given Purkinje image. Images 3 and 4 are seen through the pupil: their
     status is BEHIND_IRIS where the iris blocks the light on its way in or out.
@@ -92,7 +92,7 @@ def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tu
 
 
 def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> Bools:
-    """Return whether the camera is behind the tangent planes of the whole cornea, (n,); False in doubt.
+    """Return whether the camera is behind the tangent planes of the whole cornea, (n,); False if in doubt.
 
     The rim of a convex cap faces farthest to the back, so points of the limbus are tested. A tenth of the distance is
     allowed for the points between them.
@@ -110,7 +110,7 @@ def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> Bools:
 
 
 def _meets_sclera(eye: EyeModel, exits: Xyz, way: Xyz) -> Bools:
-    """Return whether rays that run on from the exits along `way` (unit, from the camera) enter the sclera's sphere."""
+    """Return whether rays continued from the exits along `way` (unit, from the camera) enter the sclera's sphere."""
     gap = shift(exits, eye.sclera.centre_mm, -1.0)
     along = -dot(gap, way)
     radius = fit(np.asarray(eye.sclera.radius_mm, dtype=np.float64), gap[0].ndim)

@@ -1,4 +1,4 @@
-"""How cameras see turned eyes, compiled."""
+"""Compiled functions for cameras that view posed eyes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..jit import compiled
 def see_all(
     turn: Floats, shift: Floats, R: Floats, t: Floats, rotation: Floats, translation: Floats, camera_mm: Floats
 ) -> None:
-    """Compute the motions from the eyes' frames to that of a camera, and the camera in each eye's frame.
+    """Compute the motions from the eyes' frames to a camera's frame, and the camera's position in each eye's frame.
 
     Args:
         turn: (n, 3, 3) rotation of each eye.

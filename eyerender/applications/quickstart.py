@@ -1,4 +1,4 @@
-"""The quickstart: fixate, render, extract, calibrate on both observers' features, compare, report."""
+"""The quickstart: fixate, render, extract, calibrate on both observers' features, compare, and report."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def run_quickstart(
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> Comparison:
-    """Render a scene into a folder, compare both observers on it, and write `report.html` there.
+    """Render a scene, compare both observers on it, and write images and `report.html` into a folder.
 
-    Existing images of the same scene, seed and versions in the folder are used again.
+    Images in the folder that have the same scene, seed and versions are reused.
 
     Args:
         folder: the folder.
@@ -45,14 +45,14 @@ def run_quickstart(
         eye: replaces the scene's eye model.
         backend: the render backend.
         threads: total number of processor threads; None: all.
-        overwrite: replace what the folder holds.
+        overwrite: replace the contents of the folder.
         progress: called with (done, total, note).
-        warn: called for probable mistakes, and may raise: for those of the scene before anything is done, and for
-            saturated images before they are put in place (or used again).
+        warn: called for probable mistakes in the scene before the work starts, and for saturated images before they are
+            written or reused; it may raise.
 
     Raises:
         InputError: the folder holds something else and `overwrite` is not given.
-        BackendError: there is nothing to render with.
+        BackendError: no backend can render.
     """
     folder = Path(folder)
     loaded = load_scene(scene, eye=eye)
@@ -100,16 +100,16 @@ def compare_folder(
     name: str = "",
     progress: Progress | None = None,
 ) -> Comparison:
-    """Extract the features of a folder's images and compare them with its analytic ones, in pixels and in gaze.
+    """Extract the features of a folder's images and compare them with the exact ones, in pixels and in gaze error.
 
     Args:
         path: a folder that `render`, `quickstart` or `generate` wrote.
-        estimator: gaze estimator for both; default: `er.gaze.Regression("R3")`.
+        estimator: gaze estimator used for both; default: `er.gaze.Regression("R3")`.
         name: name of the estimator in the result; default: as for `compare`.
         progress: called with (images done, images in all, "").
 
     Raises:
-        InputError: it is not such a folder, or contains an image or a record that cannot be read.
+        InputError: the folder is of another kind, or an image or a record in it cannot be read.
     """
     images = ImageFolder.load(path)
     return _compared(images, scene_of(images), estimator or Regression(), name, progress)
@@ -124,7 +124,7 @@ def _compared(
 
 
 def _subjects(images: ImageFolder) -> Ints | None:
-    """Subject of each record of a dataset; None for a rendered folder."""
+    """Return the subject of each record of a dataset; None for a rendered folder."""
     if images.dataset.get("kind") != "dataset":
         return None
     return np.array([int(entry.line["subject"]) for entry in images for _ in entry.records], dtype=np.int64)

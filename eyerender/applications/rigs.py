@@ -1,7 +1,7 @@
 """The report on a rig: bound, dropout and coverage over a population, errors of estimators, and eye safety.
 
-Ray optics gives all features; nothing is rendered. The features are exact, so the errors of estimators show what an
-estimator assumes wrongly about people's eyes (model bias), without any noise.
+Ray optics gives all features; nothing is rendered. The features are exact, so an estimator's errors are its model bias
+(wrong assumptions about people's eyes), without noise.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ class RigSize:
 
     Attributes:
         people: number of people.
-        sample: number of them whose gaze is estimated on exact features.
-        images: number of them whose gaze is estimated on rendered images, 25 each.
+        sample: number of people whose gaze is estimated on exact features.
+        images: number of people whose gaze is estimated on rendered images, 25 each.
         workers: processes; None: one for each processor.
         seed: seed of the people.
-        slippage_mm: standard deviation of people's places.
-        relief_mm: standard deviation of their distances from the rig, on top of it.
-        azimuth_deg: half range of gaze.
-        elevation_deg: half range of gaze.
+        slippage_mm: standard deviation of the eyes' positions along each axis.
+        relief_mm: additional standard deviation of the eyes' distance from the rig.
+        azimuth_deg: half range of gaze, horizontally.
+        elevation_deg: half range of gaze, vertically.
     """
 
     people: int = 200
@@ -79,7 +79,7 @@ class RigSize:
     elevation_deg: float = 15.0
 
     def __post_init__(self) -> None:
-        """Refuse numbers out of range, by the names of the command's options."""
+        """Raise an error for numbers out of range, naming the command's option."""
         for name, low, high in (
             ("people", 1, 10**6), ("sample", 0, 1000), ("images", 0, 1000), ("seed", 0, 2**63 - 1),
             ("slippage_mm", 0, 20), ("relief_mm", 0, 20),
@@ -110,20 +110,20 @@ def run_rig(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Write report.html, summary.json, people.csv and gaze.csv on a scene's rig into a folder.
+    """Evaluate a scene's rig over a population; write report.html, summary.json, people.csv and gaze.csv into a folder.
 
     Args:
-        scene: its rig, sensor, first eye and first head position.
+        scene: provides the rig, sensor, first eye and first head position.
         population: the people.
         output: the folder.
-        size: how many people, where they look.
-        unknowns: what is known beforehand; default: `Unknowns.population()`.
+        size: number of people, and range of gaze.
+        unknowns: the priors of the bound; default: `Unknowns.population()`.
         backend: renders the images.
         overwrite: replace the contents of the folder.
         progress: called with (people done, people in all, what).
 
     Raises:
-        InputError: the folder is not empty, or nobody's eye can exist.
+        InputError: the folder is not empty, or no drawn eye is physically possible.
     """
     survey = Survey(
         scene=scene.located().to_mapping(),
@@ -139,7 +139,7 @@ def run_rig(
     with staged(output, overwrite=overwrite) as folder:
         found = figures_of_people(survey, noise, size.people, workers=size.workers, progress=progress)
         if not len(found.subject):
-            raise InputError("nobody's eye can exist", source="--population")
+            raise InputError("no eye of this population is physically possible", source="--population")
         biases = estimator_errors(survey, found.subject[: size.sample].tolist(), progress)
         pictured = estimator_errors(
             survey, found.subject[: size.images].tolist(), progress, images=True, backend=backend
@@ -163,14 +163,14 @@ def estimator_errors(
     images: bool = False,
     backend: BackendChoice = "auto",
 ) -> list[Bias]:
-    """Compute errors of estimators for some people, calibrated on nine targets a metre away.
+    """Compute gaze errors of the estimators for some people, calibrated on nine targets a metre away.
 
     Args:
         survey: the rig and the people.
         subjects: numbers of the people.
         progress: called with (people done, people in all, what).
-        images: on features that the extractor finds in rendered images of 25 targets, instead of exact ones of 81.
-        backend: renders them.
+        images: use extracted features of rendered images of 25 targets, instead of exact features of 81.
+        backend: the render backend for these images.
     """
     cells = np.array([GRID * r + c for r in range(0, GRID, 2) for c in range(0, GRID, 2)])
     cells = cells if images else np.arange(GRID * GRID)
@@ -207,7 +207,7 @@ def _taken(rays: Any, rows: Any) -> Any:
 
 
 def _scene_of(survey: Survey, subject: int, cells: Ints) -> Scene:
-    """Build the scene of a person who looks at targets a metre away in some of the 81 directions."""
+    """Build the scene of a person who looks at targets a metre away in the directions `cells` of the 81."""
     spec = SceneSpec.from_mapping(survey.scene)
     person = Population.from_mapping(survey.population).person(subject, survey.seed)
     base = Scene.of(spec)
@@ -231,7 +231,7 @@ def _scene_of(survey: Survey, subject: int, cells: Ints) -> Scene:
 def summary(
     scene: Scene, survey: Survey, found: Figures, biases: Sequence[Bias], noise: FeatureNoise
 ) -> dict[str, Any]:
-    """Make the content of summary.json."""
+    """Return the content of summary.json."""
     side = scene.spec.subject.eyes[0]
     place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
     try:
@@ -274,7 +274,7 @@ def _errors_of(biases: Sequence[Bias]) -> dict[str, Any]:
 
 
 def _slippage_of(shifts_mm: Floats, found: Sequence[Figures]) -> list[dict[str, Any]]:
-    """Noise and coverage at each shift of the eye."""
+    """Compute noise and coverage at each shift of the eye."""
     return [
         {
             "shift_mm": shift.tolist(),
@@ -312,7 +312,7 @@ def _write_gaze(path: Path, survey: Survey, found: Figures) -> None:
 
 
 def page_of(scene: Scene, survey: Survey, found: Figures, data: dict[str, Any]) -> Page:
-    """Make the page of the report."""
+    """Compose the report's page."""
     share = data["coverage"]["outline_and_2_glints"]
     cards = [
         Card(_degrees(data["frame_to_frame_deg"]["U50E95"]), "noise of gaze, median person (U50E95, noise only)"),

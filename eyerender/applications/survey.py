@@ -59,7 +59,7 @@ _FACE_RIG = {
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Everything that a survey found."""
+    """Results of a survey."""
 
     population: PopulationSpec
     seed: int
@@ -94,12 +94,12 @@ class Result:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveySize:
-    """What a survey draws.
+    """Size of a survey.
 
     Attributes:
         seed: seed of the draw.
         count: number of people in the statistics and in the table.
-        check: number of people whose eyes are built, to see what physics refuses.
+        check: number of people whose eyes are built, to count the impossible ones.
         faces: number of people whose eyes are rendered; 0 for none.
         spp: samples per pixel of the faces.
     """
@@ -111,7 +111,7 @@ class SurveySize:
     spp: int = 16
 
     def __post_init__(self) -> None:
-        """Refuse numbers out of range, by the names of the command's options."""
+        """Raise an error for numbers out of range, naming the command's option."""
         for name, low, high in (
             ("count", 2, 10**7),
             ("check", 1, 10**5),
@@ -165,7 +165,7 @@ def run_survey(
 
 
 def _write_csv(path: Path, population: PopulationSpec, count: int, seed: int) -> None:
-    """Write the numbers of people, one line each; those of an eye end with .right and .left."""
+    """Write one row of numbers per person; columns of an eye end with .right and .left."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer, number = csv.writer(file), 0
         for piece in pieces(population, count, seed):
@@ -184,7 +184,7 @@ def _write_csv(path: Path, population: PopulationSpec, count: int, seed: int) ->
 
 
 def face_scene(subject: Subject, spp: int = 16) -> Scene:
-    """Place both eyes of a person before a camera half a metre away, looking straight ahead."""
+    """Build the scene of a person's two eyes, half a metre from a camera and looking straight ahead."""
     spec = SceneSpec.from_mapping(
         {
             "name": "face",
@@ -213,9 +213,9 @@ def _faces(
         try:
             scene = face_scene(Subject.of(person), size.spp)
         except InputError:
-            continue  # physics refuses this person
+            continue  # the eye of this person is physically impossible
         shots = list(render_windows(scene.frames(), renderer=renderer))
-        # The camera sees the right eye on its left.
+        # The right eye appears on the left of the image.
         white = np.full((shots[0].counts.shape[0], 12), 2**scene.spec.sensor.bit_depth - 1)
         both = np.concatenate([shots[0].counts, white, shots[1].counts], axis=1)
         text = (
@@ -229,7 +229,7 @@ def _faces(
 
 
 def page_of(found: Result, sheet: Image.Image | None) -> Page:
-    """Make the report's page."""
+    """Compose the report's page."""
     table, s, r = default_table(), found.statistics, found.refused
     told = [m for m in s.moments if np.isfinite(m.expected_mean)]
     worst = max((max(map(abs, m.errors)) for m in told), default=0.0)

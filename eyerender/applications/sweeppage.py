@@ -1,4 +1,4 @@
-"""The report of a sweep: a plot of bound against dropout, and the table of the layouts that no other one beats."""
+"""The report of a sweep: a plot of bound against dropout, and a table of the Pareto front."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOST_ROWS = 60
 
 
 def write_report(path: Path, data: Mapping[str, Any]) -> None:
-    """Write the page of a sweep's summary."""
+    """Write the report page of a sweep."""
     rows = data["rows"]
     front = [row for row in rows if row["pareto"]]
     seen = [row for row in front if row["noise_deg"] is not None]
@@ -73,7 +73,7 @@ def _plot(rows: Sequence[Mapping[str, Any]], key: str, label: str, factor: float
 
 
 def _table(front: Sequence[Mapping[str, Any]]) -> Table:
-    """The front, least noise first."""
+    """Return the table of the front, least noise first."""
     ordered = sorted(front, key=lambda row: np.inf if row["noise_deg"] is None else row["noise_deg"])
     rows = [
         [str(row["number"]), _values(row["values"]), _degrees(row["noise_deg"]),

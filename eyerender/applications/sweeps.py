@@ -1,7 +1,7 @@
 """Sweeps of rigs: each layout over a population, on all processors, resumable, in shards; then the Pareto front.
 
-Each finished layout is a file of its own in `layouts/`, which a later run finds and keeps. What one layout gives
-depends on the sweep and its number alone.
+Each finished layout is a file in `layouts/`, which a later run keeps. The result of a layout depends on nothing but the
+sweep and the layout's number.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ MARKER, SUMMARY, TABLE, LAYOUTS, REPORT = "sweep.json", "summary.json", "layouts
 CHOOSERS = 12
 """People whose information chooses LEDs."""
 GOALS = ("noise_deg", "dropout", "leds", "cornea_w_m2")
-"""What a good layout has little of; the Pareto front is that of these."""
+"""Quantities of which a good layout has little; they define the Pareto front."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepRun:
-    """How a sweep runs.
+    """Options of a sweep run.
 
     Attributes:
         workers: processes; None: one for each processor.
-        part: (K, N): only every N-th layout from the K-th on.
+        part: (K, N): evaluate only every N-th layout, beginning with the K-th.
         overwrite: replace the contents of the folder.
     """
 
@@ -69,18 +69,18 @@ def run_sweep(
     progress: Progress | None = None,
     say: Say = lambda _text: None,
 ) -> dict[str, Any]:
-    """Evaluate the layouts of a sweep that a folder lacks; write summary.json, layouts.csv and report.html at the end.
+    """Evaluate the missing layouts of a sweep; once all are there, write summary.json, layouts.csv and report.html.
 
     Args:
         spec: the sweep.
-        scene: its scene (`spec.base`).
+        scene: the sweep's base scene (`spec.base`).
         output: the folder, which may hold a part of the same sweep.
-        how: processes, part, overwriting.
+        how: options of the run.
         progress: called with (layouts done, layouts of this run, what).
-        say: called with what goes wrong on the way.
+        say: called with a message for each problem that does not end the run.
 
     Raises:
-        InputError: a layout cannot be, or the folder holds something else.
+        InputError: a layout is impossible, or the folder holds something else.
     """
     folder = Path(output)
     layouts = layouts_of(spec, scene)
@@ -113,11 +113,11 @@ def _digest(spec: SweepSpec, scene: Scene) -> str:
 
 
 def _claim(folder: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
-    """Make the folder this sweep's, or find that it is.
+    """Create the folder for this sweep, or check that it belongs to it.
 
     Raises:
-        InputError: it holds something else.
-        EyerenderError: it cannot be written.
+        InputError: the folder holds something else.
+        EyerenderError: the folder cannot be written.
     """
     marker = folder / MARKER
     try:
@@ -138,7 +138,7 @@ def _claim(folder: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
 
 
 def _evaluated(spec: SweepSpec, layouts: Sequence[Layout], workers: int | None) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Results of layouts as they come, from processes that start with a few layouts each."""
+    """Yield results of layouts as worker processes finish them."""
     count = min(workers or os.cpu_count() or 1, len(layouts))
     if count <= 1:
         yield from ((layout.number, evaluate(spec, layout)) for layout in layouts)
@@ -171,7 +171,7 @@ def evaluate(spec: SweepSpec, layout: Layout) -> dict[str, Any]:
         survey, scene = _survey(spec, data), Scene.of(SceneSpec.from_mapping(data))
     found = figures_of(survey, sensor_noise(scene), 0, spec.people)
     if not len(found.subject):
-        raise InputError("nobody's eye can exist", path="population")
+        raise InputError("no eye of this population is physically possible", path="population")
     coverage = coverage_of(found)
     return {
         "number": layout.number,
@@ -203,7 +203,7 @@ def _survey(spec: SweepSpec, scene: Mapping[str, Any]) -> Survey:
 
 
 def _exposure(scene: Scene) -> dict[str, Any]:
-    """Corneal irradiance at the scene's eye, or why there is none."""
+    """Compute the corneal irradiance at the scene's eye, or why it is unknown."""
     side = scene.spec.subject.eyes[0]
     place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
     try:
@@ -214,7 +214,7 @@ def _exposure(scene: Scene) -> dict[str, Any]:
 
 
 def pareto(rows: Sequence[Mapping[str, Any]]) -> Bools:
-    """Which rows no other row beats: at most as much of every goal and less of one; what is not known is the worst."""
+    """Return which rows no other row dominates; an unknown value counts as the worst."""
     table = np.array([[np.inf if row[goal] is None else float(row[goal]) for goal in GOALS] for row in rows])
     beaten = np.zeros(len(table), dtype=bool)
     for k, one in enumerate(table):
@@ -223,7 +223,7 @@ def pareto(rows: Sequence[Mapping[str, Any]]) -> Bools:
 
 
 def _finish(folder: Path, spec: SweepSpec, scene: Scene, layouts: Sequence[Layout]) -> dict[str, Any]:
-    """Gather all layouts and write the results."""
+    """Read all layouts and write the results."""
     rows = [_read(_path(folder, layout.number), layout.number) for layout in layouts]
     front = pareto(rows)
     rows = [
@@ -254,10 +254,10 @@ _KEYS = {
 
 
 def _read(path: Path, number: int) -> dict[str, Any]:
-    """A layout's result.
+    """Read the result of a layout.
 
     Raises:
-        InputError: the file is not what this package wrote.
+        InputError: this package did not write the file.
     """
     row = read_json(path)
     if row.get("schema") != LAYOUT_SCHEMA or row.get("number") != number or not row.keys() >= _KEYS:
@@ -266,7 +266,7 @@ def _read(path: Path, number: int) -> dict[str, Any]:
 
 
 def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """One row per layout."""
+    """Write a CSV table with one row per layout."""
     names = list(rows[0]["values"])
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

@@ -1,4 +1,4 @@
-"""What a sweep of rigs varies: a file of its own that names the scene, and the layouts that follow from it."""
+"""The spec of a sweep of rigs: a YAML file that names a scene and the values to vary, and the resulting layouts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LightCount = Annotated[int, Field(ge=1, le=MAX_LIGHTS)]
 
 
 class Places(Spec):
-    """Places in the world: a list, a curve, or a surface."""
+    """Positions in the world: a list, a curve, or a surface."""
 
     points_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = Field(default=None, description="a list")
     curve_mm: Annotated[tuple[Vec3, ...], Field(min_length=2)] | None = Field(
@@ -49,7 +49,7 @@ class Places(Spec):
         return self
 
     def places(self) -> Floats:
-        """The places, (n, 3) mm."""
+        """Return the positions (n, 3) mm in the world."""
         if self.points_mm is not None:
             return np.array(self.points_mm, dtype=float)
         if self.curve_mm is not None:
@@ -66,10 +66,12 @@ class Places(Spec):
 
 
 class SweptCamera(Spec):
-    """What varies of one camera."""
+    """Values of one camera to vary."""
 
-    camera: Annotated[int, Field(ge=0)] = Field(default=0, description="which camera of the scene")
-    places: Places | None = Field(default=None, description="its places; it goes on looking where it looked")
+    camera: Annotated[int, Field(ge=0)] = Field(default=0, description="number of the camera in the scene")
+    places: Places | None = Field(
+        default=None, description="positions of the camera, which keeps its target or direction"
+    )
     focal_length_px: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = Field(
         default=None, description="focal lengths, for a camera with focal_length_px"
     )
@@ -79,11 +81,11 @@ class SweptCamera(Spec):
 
 
 class SweptLights(Spec):
-    """LEDs in place of those of the scene; everything but place and intensity is that of the scene's first LED."""
+    """LEDs that replace those of the scene; all but position and intensity is copied from the scene's first LED."""
 
-    places: Places = Field(description="places of LEDs, or those from which `number` chooses")
+    places: Places = Field(description="positions of LEDs, or those from which `number` chooses")
     number: Annotated[tuple[LightCount, ...], Field(min_length=1)] | None = Field(
-        default=None, description="numbers of LEDs; of more places the best are chosen; default: all of them"
+        default=None, description="numbers of LEDs, at the best of the positions; default: all of them"
     )
     intensity_mw_sr: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = Field(
         default=None, description="intensities of each LED"
@@ -91,7 +93,7 @@ class SweptLights(Spec):
 
 
 class Sweep(Spec):
-    """What varies; the layouts are all combinations."""
+    """Values to vary; the layouts are all combinations."""
 
     cameras: tuple[SweptCamera, ...] = Field(default=(), description="cameras that vary")
     lights: SweptLights | None = Field(default=None, description="LEDs that vary")
@@ -104,34 +106,36 @@ class SweepSpec(FileSpec):
     """A sweep of rigs over a population."""
 
     scene: str = Field(description="scene file, relative to this file, or the name of a shipped one")
-    population: str | Population = Field(default="adults", description="whom the rigs are for")
+    population: str | Population = Field(default="adults", description="population for which the rigs are evaluated")
     people: Annotated[int, Field(ge=1, le=100_000)] = Field(default=40, description="number of people")
     seed: Annotated[int, Field(ge=0)] = Field(default=0, description="seed of the people")
     azimuth_deg: Annotated[float, Field(ge=1, le=60)] = Field(default=20.0, description="half range of gaze")
     elevation_deg: Annotated[float, Field(ge=1, le=60)] = Field(default=15.0, description="half range of gaze")
-    slippage_mm: NonNegative = Field(default=1.5, description="standard deviation of people's places, per axis")
-    relief_mm: NonNegative = Field(default=0.0, description="and of their distance, the eye relief of a headset")
-    sweep: Sweep = Field(description="what varies")
+    slippage_mm: NonNegative = Field(default=1.5, description="standard deviation of the eyes' positions, per axis")
+    relief_mm: NonNegative = Field(
+        default=0.0, description="additional standard deviation of their distance: eye relief of a headset"
+    )
+    sweep: Sweep = Field(description="values to vary")
 
     def people_of(self) -> Population:
-        """The population."""
+        """Return the population."""
         return Population(self.population) if isinstance(self.population, str) else self.population
 
     def base(self, folder: Path) -> Scene:
-        """The scene, from a file relative to a folder or a shipped one."""
+        """Load the base scene, from a file relative to a folder or a shipped one."""
         beside = folder / self.scene
         return load_scene(beside if beside.is_file() else self.scene)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """One layout.
+    """One layout of a sweep.
 
     Attributes:
         number: its number in the sweep.
-        values: what is varied, for tables.
+        values: the varied values, for tables.
         scene: mapping of its scene.
-        lights: number of LEDs that are chosen of those of the scene.
+        lights: number of LEDs to choose from those of the scene.
     """
 
     number: int
@@ -141,7 +145,7 @@ class Layout:
 
 
 def layouts_of(spec: SweepSpec, scene: Scene) -> list[Layout]:
-    """All layouts of a sweep, each checked.
+    """Return all layouts of a sweep, each validated.
 
     Raises:
         InputError: naming the key that does not fit the scene.
@@ -166,11 +170,11 @@ def _light_count(data: Mapping[str, Any]) -> int:
 
 
 Axis = tuple[str, list[Any]]
-"""Name and values of one thing that varies."""
+"""Name and values of one varied quantity."""
 
 
 def _axes(sweep: Sweep, scene: Scene) -> Iterator[Axis]:
-    """Everything that varies."""
+    """Return the axes of a sweep: every varied value with its alternatives."""
     for k, swept in enumerate(sweep.cameras):
         yield from _camera_axes(swept, scene, f"sweep.cameras.{k}")
     if sweep.resolution_scale != (1.0,):
@@ -188,7 +192,7 @@ def _axes(sweep: Sweep, scene: Scene) -> Iterator[Axis]:
 
 
 def _camera_axes(swept: SweptCamera, scene: Scene, path: str) -> Iterator[Axis]:
-    """What varies of one camera."""
+    """Return the axes of one camera."""
     specs = scene.spec.rig.cameras
     if swept.camera >= len(specs):
         raise InputError(f"there is no camera {swept.camera}", path=f"{path}.camera")
@@ -207,7 +211,7 @@ def _camera_axes(swept: SweptCamera, scene: Scene, path: str) -> Iterator[Axis]:
 
 
 def _applied(base: Mapping[str, Any], sweep: Sweep, chosen: Mapping[str, Any]) -> dict[str, Any]:
-    """Mapping of the scene with the chosen values."""
+    """Apply the chosen values to the mapping of the scene."""
     rig = dict(base["rig"])
     cameras = [dict(camera) for camera in rig["cameras"]]
     for swept in sweep.cameras:
@@ -234,7 +238,7 @@ def _applied(base: Mapping[str, Any], sweep: Sweep, chosen: Mapping[str, Any]) -
 
 
 def _resized(camera: Mapping[str, Any], scale: float) -> dict[str, Any]:
-    """A camera with more or fewer pixels on the same sensor."""
+    """Return a camera with more or fewer pixels on the same sensor."""
     out = {**camera, "resolution_px": [max(1, round(scale * n)) for n in camera["resolution_px"]]}
     if camera.get("focal_length_px") is not None:
         out["focal_length_px"] = scale * camera["focal_length_px"]

@@ -1,4 +1,4 @@
-"""Libraries from the package archive of Debian and Ubuntu, with the machine's own apt settings but without root."""
+"""Fetch libraries from the Debian or Ubuntu archive, with the machine's own apt settings but without root."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PAUSES_S = (3.0, 10.0)
 
 
 def fetch_library(package: str, name: str, store: Path) -> None:
-    """Fetch a package and keep one of its libraries; nothing on the system changes.
+    """Fetch a package and extract one of its libraries; nothing on the system changes.
 
     Args:
         package: the package.
@@ -23,7 +23,7 @@ def fetch_library(package: str, name: str, store: Path) -> None:
         store: folder that receives the file, replaced at once if another process wrote it meanwhile.
 
     Raises:
-        BackendError: the archive does not answer, or the package lacks the library.
+        BackendError: the archive does not respond, or the package lacks the library.
         OSError: the folder cannot be written.
     """
     store.mkdir(parents=True, exist_ok=True)
@@ -33,7 +33,7 @@ def fetch_library(package: str, name: str, store: Path) -> None:
         complaint = ""
         for pause in (0.0, *PAUSES_S):
             time.sleep(pause)
-            # A failing source, for instance a third party's, does not matter as long as another one has the package.
+            # A failing source, for instance of a third party, does not matter as long as another one has the package.
             update = _run(["apt-get", *options, "update"], folder)
             download = _run(["apt-get", *options, "download", package], folder)
             if download.returncode == 0:
@@ -53,7 +53,7 @@ def fetch_library(package: str, name: str, store: Path) -> None:
 
 
 def _private_options(folder: Path) -> list[str]:
-    """Write options that move apt's lists and caches to `folder`, so that it needs no root and no system-wide lock.
+    """Write options that move apt's lists and caches to `folder`, so that apt needs no root and no system-wide lock.
 
     The machine's own sources and proxies stay, its hooks on system folders do not. The empty status makes the archive's
     versions the candidates, even if other versions are installed.
@@ -89,6 +89,6 @@ def _run(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def _complaint(done: subprocess.CompletedProcess[str]) -> str:
-    """Find the last error that apt or dpkg printed."""
+    """Return the last error that apt or dpkg printed."""
     errors = [line for line in done.stderr.splitlines() if line.startswith(("E:", "dpkg-deb:"))]
     return errors[-1].partition(":")[2].strip() if errors else ""

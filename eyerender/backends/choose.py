@@ -34,7 +34,7 @@ VARIANTS: dict[BackendName, str] = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mon
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Backend:
-    """The backend with which this process renders.
+    """The backend that renders in this process.
 
     Attributes:
         name: cuda or llvm.
@@ -58,7 +58,7 @@ class Backend:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Versions that affect the pixels, by package."""
+        """Return the versions that affect the pixels, by package."""
         versions = {"mitsuba": self.mitsuba, "drjit": self.drjit}
         return versions | ({"llvm": self.llvm} if self.llvm else {})
 
@@ -74,10 +74,10 @@ class BackendState:
 
 
 def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> Backend:
-    """Make this process render with a backend that was tested successfully.
+    """Select a backend that was tested successfully for this process.
 
     Args:
-        name: "auto" takes the GPU where one renders, else the processor.
+        name: "auto" selects the GPU if one renders, else the processor.
         threads: threads of the processor to use, >= 1; None leaves Dr.Jit's choice, all of them.
 
     Raises:
@@ -104,10 +104,10 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
 
 
 def _keep_kernels_private() -> None:
-    """Make Dr.Jit keep its kernels, which are code, in a folder that nobody else can write to.
+    """Make Dr.Jit store its kernels, which are executable code, in a folder that only this user can write to.
 
-    Without such a folder they are kept in a temporary one while this process runs. Dr.Jit reads the variable when it is
-    first imported, so nothing can be done where that has happened.
+    Without such a folder, a temporary one is used while this process runs. Dr.Jit reads the variable when it is first
+    imported, so this has no effect afterwards.
     """
     if "drjit" in sys.modules:
         return
@@ -148,7 +148,7 @@ def _start(
 
 
 def cuda_state(*, refresh: bool = False) -> BackendState:
-    """Return whether an NVIDIA GPU renders here; `refresh` repeats a trial that failed earlier."""
+    """Return whether an NVIDIA GPU renders here; `refresh` repeats a test that failed earlier."""
     driver = _cuda_driver()
     if driver is None:
         return BackendState("cuda", False, "no NVIDIA driver on this machine", CUDA_FIX)
@@ -159,7 +159,7 @@ def cuda_state(*, refresh: bool = False) -> BackendState:
 
 
 def _cuda_driver() -> str | None:
-    """Identify the driver and the GPUs by a text; None, at no cost, where there is no driver to load."""
+    """Return a text that identifies the driver and the GPUs; None, at no cost, without a driver."""
     named = os.environ.get("DRJIT_LIBCUDA_PATH")
     library = named or ("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     try:

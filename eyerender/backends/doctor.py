@@ -1,4 +1,4 @@
-"""The state of an installation: which backends render here, and how to fix those that do not."""
+"""State of an installation: which backends render, and how to fix the others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .remedies import llvm_fix
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorReport:
-    """State of an installation: `ok` where a backend renders, `chosen` the one that "auto" takes."""
+    """State of an installation: `ok` if a backend renders, `chosen` is the one that "auto" selects."""
 
     ok: bool
     chosen: BackendName | None
@@ -30,12 +30,12 @@ class DoctorReport:
 
 
 def backend_states() -> list[BackendState]:
-    """Return whether each backend renders on this machine, tried in other processes so that this one is not changed."""
+    """Test each backend on this machine, in separate processes so that this one is not changed."""
     return [cuda_state(refresh=True), _llvm_state()]
 
 
 def doctor_report() -> DoctorReport:
-    """Report on the installation, for instance for a bug report."""
+    """Return a report on the installation, for instance for a bug report."""
     states = tuple(backend_states())
     packages = ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless", "scikit-image")
     return DoctorReport(

@@ -1,4 +1,4 @@
-"""Loading of shared libraries that are not where the system's loader searches."""
+"""Load shared libraries that are not in the system's search path."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _BESIDE_LLVM = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
 
 
 def runtime_store() -> Path | None:
-    """Find the folder of the libraries that `setup_llvm` has fetched; None without a private cache folder."""
+    """Return the folder of the libraries that `setup_llvm` fetched; None without a private cache folder."""
     folder = cache_folder()
     return folder / "lib" if folder else None
 
 
 def load_runtime() -> None:
-    """Load the libraries that Dr.Jit is linked with: the system's, else those that `setup_llvm` has fetched.
+    """Load the libraries that Dr.Jit is linked with: the system's, else those that `setup_llvm` fetched.
 
     Raises:
-        OSError: a library is nowhere; the message names the package.
+        OSError: a library is missing; the message names the package.
     """
     store = runtime_store()
     for name, (debian, fedora) in RUNTIME.items():
@@ -40,7 +40,7 @@ def load_runtime() -> None:
 
 
 def wheel_libraries() -> list[Path]:
-    """List where pip's libLLVM is recorded, and where `pip install --prefix` adds it to a `--target` folder."""
+    """Return the libLLVM files recorded by pip, and their paths in a `--target` folder after `pip install --prefix`."""
     try:
         wheel = distribution(WHEEL)
     except PackageNotFoundError:
@@ -52,11 +52,11 @@ def wheel_libraries() -> list[Path]:
 def load_llvm(library: Path) -> None:
     """Load a libLLVM and the libraries that it and Dr.Jit need.
 
-    Their symbols stay private (RTLD_LOCAL), since the loader finds a loaded dependency by its name alone. Public ones
-    would replace the system's C++ runtime in libraries that are loaded later.
+    Their symbols stay private (RTLD_LOCAL); the loader finds a loaded dependency by name anyway. Public symbols would
+    replace the system's C++ runtime in libraries that are loaded later.
 
     Raises:
-        OSError: a dependency is nowhere, or the library does not fit this system.
+        OSError: a dependency is missing, or the library does not fit this system.
     """
     load_runtime()
     for name in _BESIDE_LLVM:

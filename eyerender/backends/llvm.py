@@ -1,8 +1,9 @@
-"""The libLLVM of Mitsuba's llvm variants: finding one that renders, and making Dr.Jit load it.
+"""Find a libLLVM that renders for Mitsuba's llvm variants, and make Dr.Jit load it.
 
-On Linux x86-64 the wheel karellen-llvm-core provides it; elsewhere the system must. Some versions are refused, and some
-end the process at their first kernel, so each candidate is probed in a process of its own (`probe`). Dr.Jit loads a
-libLLVM only when drjit is first imported. `ensure_llvm` runs before that, or checks what was loaded.
+On Linux x86-64 the wheel karellen-llvm-core provides it; elsewhere it must be installed on the system. Some versions
+are rejected, and some end the process at their first kernel, so each candidate is probed in a separate process
+(`probe`). Dr.Jit loads a libLLVM only when drjit is first imported. `ensure_llvm` runs before that, or checks what was
+loaded.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ ENVIRONMENT = "DRJIT_LIBLLVM_PATH"
 
 @dataclass(frozen=True, slots=True)
 class LibLlvm:
-    """A libLLVM that renders: its file (None where the loader's choice is unknown) and version."""
+    """A libLLVM that renders: its file (None if only the loader knows) and version."""
 
     path: Path | None
     version: str
 
     @classmethod
     def probed(cls, path: Path, verdict: Verdict) -> LibLlvm:
-        """Make it from the verdict that it renders."""
+        """Create it from the verdict of a successful probe."""
         return cls(path, verdict.detail.removeprefix("LLVM "))
 
 
@@ -50,7 +51,7 @@ _active: LibLlvm | None = None
 
 
 def candidates() -> Iterator[Path]:
-    """Yield every libLLVM of this machine once: the one the user names, the wheel's, the system's from new to old."""
+    """Yield every libLLVM of this machine once: the user's choice, the wheel's, then the system's from new to old."""
     seen: set[Path] = set()
     for group in (_named, wheel_libraries, _installed):
         for path in sorted(group(), key=_order):
@@ -61,7 +62,7 @@ def candidates() -> Iterator[Path]:
 
 
 def examine(*, refresh: bool = False) -> Iterator[Examined]:
-    """Probe the candidates one by one, lazily; `refresh` ignores earlier refusals (never successes)."""
+    """Probe the candidates one by one, lazily; `refresh` ignores earlier failures (never successes)."""
     for path in candidates():
         verdict = probe(VARIANT, path)
         if refresh and not verdict.ok:
@@ -70,7 +71,7 @@ def examine(*, refresh: bool = False) -> Iterator[Examined]:
 
 
 def find_llvm() -> LibLlvm | None:
-    """Find the first candidate that renders."""
+    """Return the first candidate that renders."""
     for examined in examine():
         if examined.verdict.ok:
             return LibLlvm.probed(examined.path, examined.verdict)
@@ -78,7 +79,7 @@ def find_llvm() -> LibLlvm | None:
 
 
 def ensure_llvm() -> LibLlvm:
-    """Make this process's Dr.Jit use a libLLVM that renders.
+    """Make Dr.Jit in this process use a libLLVM that renders.
 
     Raises:
         BackendError: there is none, or drjit was imported before and has loaded another, or none; the message says how
@@ -91,7 +92,7 @@ def ensure_llvm() -> LibLlvm:
 
 
 def version_of(path: Path) -> tuple[int, ...]:
-    """Read the version in a file name such as "libLLVM-19.so" or "libLLVM.19.1.dylib"; () if there is none."""
+    """Parse the version in a file name such as "libLLVM-19.so" or "libLLVM.19.1.dylib"; () if there is none."""
     match = re.match(r"(?:lib)?LLVM(?:-C)?[-.](?:so\.)?(\d+(?:\.\d+)*)", path.name)
     return tuple(int(part) for part in match[1].split(".")) if match else ()
 
@@ -119,7 +120,7 @@ def _activate() -> LibLlvm:
 
 
 def _loaded() -> LibLlvm:
-    """Find the library that an earlier import of drjit has loaded, if it renders."""
+    """Return the library that an earlier import of drjit has loaded, if it renders."""
     import drjit as dr
 
     if not dr.has_backend(dr.JitBackend.LLVM):
@@ -146,7 +147,7 @@ def _too_late() -> str:
 
 
 def _mapped(version: tuple[int, ...]) -> Path | None:
-    """Find the file of the libLLVM with this version in this process; other packages may have loaded others."""
+    """Return the file of the libLLVM with this version in this process; other packages may have loaded others."""
     try:
         lines = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -157,7 +158,7 @@ def _mapped(version: tuple[int, ...]) -> Path | None:
 
 
 def _order(path: Path) -> tuple[bool, list[int], str]:
-    """Sort key: newest first, then names without a version, then versions too old for Mitsuba 3.9."""
+    """Return the sort key: newest first, then names without a version, then versions too old for Mitsuba 3.9."""
     version = version_of(path.resolve()) or version_of(path)
     return bool(version) and version[0] < 17, [-part for part in version] or [0], str(path)
 

@@ -1,4 +1,4 @@
-"""Test whether a backend renders, in a process of its own, because a wrong libLLVM ends the process that uses it.
+"""Test whether a backend renders, in a separate process, because a wrong libLLVM ends the process that uses it.
 
 `python -m eyerender.backends.probe VARIANT [LIBRARY]` is that process. `run_probe` starts it, `probe` also caches the
 result.
@@ -31,7 +31,7 @@ from ..versions import package_version
 from .libraries import load_llvm, load_runtime
 
 TIMEOUT_S = 180.0
-REFUSAL_AGE_S = 86400.0  # a refusal is checked again after a day, because the GPU may have been busy or memory short
+REFUSAL_AGE_S = 86400.0  # a failure is tested again after a day, because the GPU may have been busy or memory short
 _MARK = "eyerender-probe: "
 _VERDICT_BYTES = 2**20
 
@@ -53,7 +53,7 @@ class Verdict:
 
 
 def cpu_name() -> str:
-    """Read the name of the processor as its maker writes it."""
+    """Return the name of the processor as its maker writes it."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
             for line in lines:
@@ -65,13 +65,13 @@ def cpu_name() -> str:
 
 
 def probe(variant: str, library: Path | None = None, *, context: str = "", refresh: bool = False) -> Verdict:
-    """Run `run_probe`, with its result cached on disk for this library, interpreter, processor and these versions.
+    """Run `run_probe`, with its result cached on disk for this library, interpreter, processor and versions.
 
     Args:
         variant: Mitsuba's variant, "llvm_ad_mono" or "cuda_ad_mono".
         library: the libLLVM to use; None leaves the choice to Dr.Jit.
         context: anything else on which the verdict depends (the GPU's driver).
-        refresh: probe even where a verdict is cached.
+        refresh: probe even if a verdict is cached.
     """
     key: dict[str, Any] = {
         "variant": variant,
@@ -97,8 +97,8 @@ def run_probe(variant: str, library: Path | None = None, timeout_s: float = TIME
     """Render a small image with `variant` in a new process and check the result."""
     with tempfile.TemporaryDirectory(prefix="eyerender-probe-") as home:
         environment = dict(os.environ)
-        # The process has its own cache of kernels, because Dr.Jit would use one that another libLLVM compiled.
-        # Libraries that were fetched stay in the cache folder of the user.
+        # The process has its own kernel cache, because Dr.Jit would use a kernel that another libLLVM compiled. Fetched
+        # libraries stay in the user's cache folder.
         environment["HOME"] = environment["DRJIT_CACHE_DIR"] = home
         cache = cache_folder()
         if cache is not None:
@@ -129,7 +129,7 @@ def _judge(status: int, out: str, err: str) -> Verdict:
                 return Verdict(answer["ok"], answer["detail"], answer["lasting"])
     if status < 0:
         name = signal.Signals(-status).name if -status in set(signal.Signals) else f"signal {-status}"
-        # A kill comes from outside (memory, a person) and is no information about the library.
+        # A kill comes from outside (memory, a person) and says nothing about the library.
         return Verdict(False, f"rendering with it ends the process ({name})", lasting=name != "SIGKILL")
     return Verdict(False, (err.strip().splitlines() or [f"exit status {status}"])[-1], lasting=False)
 
@@ -154,7 +154,7 @@ def _read_verdict(file: Path) -> Verdict | None:
 
 
 def _write_verdict(file: Path, key: Mapping[str, Any], verdict: Verdict) -> None:
-    """Write atomically, so that no reader finds half a file. A cache that cannot be written is ignored."""
+    """Write a verdict atomically, so that no reader finds half a file; ignore a cache that cannot be written."""
     beside = file.with_suffix(f".{os.getpid()}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -166,7 +166,7 @@ def _write_verdict(file: Path, key: Mapping[str, Any], verdict: Verdict) -> None
 
 
 def _work(variant: str) -> str:
-    """Test arithmetic that wrong versions crash on, then a ray-traced image; returns the detail."""
+    """Test arithmetic on which wrong versions crash, then a ray-traced image; return the detail."""
     import drjit as dr
     import mitsuba as mi
 
@@ -206,7 +206,7 @@ def _work(variant: str) -> str:
 
 
 def _gpu_name() -> str:
-    """Read the name of the first GPU, from the driver that the process has just used."""
+    """Return the name of the first GPU, from the driver that the process has just used."""
     driver = ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
     device, name = ctypes.c_int(), ctypes.create_string_buffer(128)
     if driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0) or driver.cuDeviceGetName(name, 128, device):
@@ -215,7 +215,7 @@ def _gpu_name() -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the probing process: one line of JSON on stdout, exit status 0 where the variant renders."""
+    """Run the probing process: print one line of JSON; exit with 0 if the variant renders."""
     lasting = True
     try:
         if sys.platform != "win32":
@@ -223,7 +223,7 @@ def main(arguments: Sequence[str]) -> int:
 
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         library = Path(arguments[1]) if len(arguments) > 1 else None
-        lasting = False  # a library that does not load lacks something that may be installed later
+        lasting = False  # a library that does not load may lack something that is installed later
         load_runtime()
         if library:
             load_llvm(library)

@@ -1,4 +1,4 @@
-"""Instructions to install a missing backend: one line for this machine."""
+"""Instructions for installing a missing backend: one line for this machine."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _ATOMIC_BY_DISTRIBUTION = {
 
 
 def has_archive() -> bool:
-    """Return whether packages can be fetched and unpacked as on Debian and Ubuntu."""
+    """Return whether packages can be fetched and unpacked with Debian's and Ubuntu's tools."""
     return sys.platform == "linux" and all(shutil.which(tool) for tool in ("apt-get", "dpkg-deb"))
 
 
 def llvm_fix() -> str:
-    """Say what to install where no libLLVM renders: the libraries that Dr.Jit needs, or else a libLLVM."""
+    """Return what to install if no libLLVM renders: the libraries that Dr.Jit needs, or else a libLLVM."""
     try:
         load_runtime()
     except OSError:
@@ -46,17 +46,17 @@ def llvm_fix() -> str:
 
 
 def runtime_command() -> str:
-    """Name the command of this machine's package manager that installs libatomic."""
+    """Return the command of this machine's package manager that installs libatomic."""
     return _by_distribution(_ATOMIC_BY_DISTRIBUTION) or "install libatomic (libatomic.so.1)"
 
 
 def llvm_command() -> str:
-    """Name the command that installs a libLLVM here: pip's where there is a wheel, else the package manager's."""
+    """Return the command that installs a libLLVM: pip's if there is a wheel, else the package manager's."""
     return _wheel_command() or _system_command()
 
 
 def _wheel_command() -> str:
-    """Say how to install the wheel with libLLVM; "" where this machine has none, or has it installed in full."""
+    """Return the command that installs the wheel with libLLVM; "" if there is none, or it is fully installed."""
     if sys.platform != "linux" or platform.machine() != "x86_64" or any(path.is_file() for path in wheel_libraries()):
         return ""
     try:
@@ -84,7 +84,7 @@ def _by_distribution(commands: dict[str, str]) -> str:
 
 
 def _distribution() -> list[str]:
-    """List the ids of this Linux distribution and of those from which it derives, nearest first."""
+    """Return the ids of this Linux distribution and of those it derives from, nearest first."""
     try:
         text = Path("/etc/os-release").read_text(encoding="utf-8")
     except OSError:

@@ -1,6 +1,6 @@
 """`setup_llvm`: find a libLLVM that renders, and fetch the libraries of Dr.Jit that a bare Debian lacks.
 
-`python -m eyerender.backends.set_up` runs it and prints the paths of that libLLVM and of what was fetched.
+`python -m eyerender.backends.set_up` runs it and prints the paths of that libLLVM and of the fetched libraries.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def setup_llvm(*, say: Say = _silent) -> LibLlvm:
         say: receives one line for each step that takes time.
 
     Raises:
-        BackendError: something is missing that cannot be fetched; the message names the command that brings it.
+        BackendError: something is missing that cannot be fetched; the message names the command that installs it.
     """
     try:
         load_runtime()
@@ -63,7 +63,7 @@ def _fetch_runtime(reason: str, say: Say) -> None:
 
 
 def main() -> int:
-    """Run `python -m eyerender.backends.set_up`: one line on stderr where rendering will not work."""
+    """Run `python -m eyerender.backends.set_up`; print one line on stderr if rendering will not work."""
 
     def say(line: str) -> None:
         print(f"eyerender: {line} ...", file=sys.stderr, flush=True)

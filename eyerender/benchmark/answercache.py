@@ -1,4 +1,4 @@
-"""Stored answers of extractors, so that a bench asks only what it does not know yet.
+"""Stored answers of extractors, so that a repeated benchmark only computes what is new.
 
 There is one file per extractor in `$XDG_CACHE_HOME/eyerender/answers`, with a JSON line per answer. An extractor is
 identified by its command and the content of its code, and an image by its content and the hints that go with it. Only
@@ -31,7 +31,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 @dataclass(frozen=True, slots=True)
 class StoredAnswer:
-    """A line that an extractor sent, the id of the request it answers, its greeting, and the time of the round trip."""
+    """A line that an extractor sent, the id of its request, the extractor's greeting, and the round-trip time."""
 
     request_id: int
     line: str
@@ -49,7 +49,7 @@ class AnswerCache:
         if path is not None:
             with suppress(OSError):
                 for line in path.read_text(encoding="utf-8").splitlines():
-                    # The last line of a killed run may be cut.
+                    # The last line of a killed run may be truncated.
                     with suppress(ValueError, KeyError, TypeError):
                         data = json.loads(line)
                         image = data.pop("image")
@@ -74,11 +74,11 @@ class AnswerCache:
         return cls(folder / f"{_identity(extractor, sources)}.jsonl")
 
     def get(self, image: str) -> StoredAnswer | None:
-        """Look up the answer about an image, given by its `image_key`."""
+        """Return the stored answer for an image, given by its `image_key`."""
         return self._known.get(image)
 
     def put(self, image: str, answer: StoredAnswer) -> None:
-        """Store an answer; an unwritable cache is no error."""
+        """Store an answer; an unwritable cache is not an error."""
         with self._lock:
             self._known[image] = answer
             if self._path is not None:
@@ -97,8 +97,8 @@ def check_reference(extractor: ExtractorCommand, timeout_s: float) -> list[Path]
     """Load a `module:callable` in a separate process, before any image is read.
 
     Returns:
-        The files of the extractor's code. None where its process failed in another way than by a wrong reference; the
-        bench then reports how.
+        The files of the extractor's code; None if its process failed for another reason, which the benchmark then
+        reports.
 
     Raises:
         InputError: there is no such module or callable.
@@ -128,7 +128,7 @@ def _file_of(word: str) -> Path | None:
 
 
 def _identity(extractor: ExtractorCommand, sources: Iterable[Path]) -> str:
-    """Return the SHA-256 of an extractor's command, of the files of its code, and of the libraries here."""
+    """Compute the SHA-256 of an extractor's command, of the files of its code, and of the installed libraries."""
     digest = hashlib.sha256(json.dumps([extractor.argv, sys.version, versions()], sort_keys=True).encode())
     for path in sources:
         digest.update(str(path).encode())

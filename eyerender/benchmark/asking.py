@@ -1,4 +1,4 @@
-"""Asking extractors about images: several processes at a time, stored answers first, failures as results."""
+"""Run extractors on images: several processes at a time, stored answers first, failures as results."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from .protocol import Greeting, Reply, Request
 from .registry import ExtractorCommand
 from .score import Score, failed, score
 
-# Consecutive failures after which an extractor is not asked again.
+# Number of consecutive failures after which an extractor is no longer run.
 PATIENCE = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Results of one extractor: its greeting (None when it never came), and a score per image."""
+    """Results of one extractor: its greeting (None if it never came), and a score per image."""
 
     extractor: ExtractorCommand
     greeting: Greeting | None
@@ -37,7 +37,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
-    """A reply with the time of its round trip, or the reason of a failure."""
+    """A reply with its round-trip time, or the reason of a failure."""
 
     reply: Reply | None
     trip_s: float = 0.0
@@ -53,15 +53,15 @@ def ask_extractors(
     caches: Sequence[AnswerCache] = (),
     step: Callable[[str], None] = lambda _name: None,
 ) -> list[Run]:
-    """Ask every extractor about every image; the scores include every failure.
+    """Run every extractor on every image; the scores include every failure.
 
     The images of an extractor are divided among `options.jobs` processes. The results do not depend on their number.
 
     Args:
-        extractors: whom to ask.
+        extractors: the extractors.
         images: the images.
-        options: jobs, time limits, and whether stored answers count.
-        keys: `image_key` of every image, where there are caches.
+        options: jobs, time limits, and whether to use stored answers.
+        keys: `image_key` of every image, if there are caches.
         caches: stored answers of every extractor.
         step: called with an extractor's name after each of its answers.
     """
@@ -86,7 +86,7 @@ def ask_extractors(
 
 
 class _Asker:
-    """Asks one extractor about images, from several threads."""
+    """Runs one extractor on images, from several threads."""
 
     def __init__(
         self,
@@ -106,7 +106,7 @@ class _Asker:
         self._stopped = False
 
     def ask(self, rows: range) -> None:
-        """Ask about some images in turn; after `PATIENCE` failures in a row the remaining ones get no answer."""
+        """Process some images in turn; after `PATIENCE` consecutive failures the remaining ones get no answer."""
         process: ExtractorProcess | None = None
         failures = 0
         try:
@@ -134,7 +134,7 @@ class _Asker:
             process.close()
 
     def run(self) -> Run:
-        """Score all answers; whatever follows `PATIENCE` failures in a row counts as not asked."""
+        """Score all answers; images after `PATIENCE` consecutive failures count as not processed."""
         greeting = self._greeting
         reports = greeting.reports if greeting else ()
         scores, failures, given_up = [], 0, ""
@@ -154,7 +154,7 @@ class _Asker:
         return Run(self._extractor, greeting, tuple(named))
 
     def _answer(self, row: int, process: ExtractorProcess | None) -> tuple[_Answer, ExtractorProcess | None]:
-        """Return the answer about one image, stored or new, and the process that may be asked next."""
+        """Return the answer for one image, stored or new, and the process to use next."""
         stored = None if self._options.fresh else self._cache.get(self._keys[row])
         if stored is not None:
             with suppress(InputError):  # another version may have stored it

@@ -36,13 +36,13 @@ class Edge:
     sigma_px: float
 
     def centre_sigma_px(self, pupil: Ellipse) -> float:
-        """Return the standard deviation sigma_c per axis, px."""
+        """Compute the standard deviation sigma_c per axis, px."""
         radius = math.sqrt(float(pupil.semi_axes_px.prod()))
         return self.noise_dn / abs(self.step_dn) * math.sqrt(2.0 * self.sigma_px / (math.sqrt(math.pi) * radius))
 
 
 def is_bounded(visible: float | None, known: Mapping[str, float]) -> bool:
-    """Whether the bound covers an image: it shows the whole pupil (a drawn lid of unknown extent may hide some)."""
+    """Return whether the bound applies to an image: the pupil is wholly visible and no lid may hide it."""
     return not known if visible is None else visible >= _LEAST_VISIBLE
 
 
@@ -54,18 +54,18 @@ def edge_of(
     known: Mapping[str, float],
     shows: Bools | None = None,
 ) -> Edge | None:
-    """Return the edge as the folder states it (`known`), else measured along the true outline where it is visible.
+    """Return the edge as stated by the folder (`known`), or measured along the visible part of the true outline.
 
     Args:
         image: (h, w) as stored.
         bit_depth: bits of the file.
-        pupil: the true outline; None where the image shows no pupil, and then there is no edge.
-        glints_px: (n, 2) places to leave out.
-        known: noise, blur and step where the folder states them.
-        shows: (h, w) pixels that show pupil or iris, None where that is unknown.
+        pupil: the true outline; None if the image shows no pupil, and so no edge.
+        glints_px: (n, 2) positions to exclude.
+        known: noise, blur and step, if the folder states them.
+        shows: (h, w) pixels that show pupil or iris; None if unknown.
 
     Returns:
-        The edge, None where nothing can be measured.
+        The edge; None if nothing can be measured.
     """
     if pupil is None:
         return None
@@ -74,7 +74,7 @@ def edge_of(
         noise = math.hypot(known["noise_dn"], quantum / math.sqrt(12.0))
         return Edge(noise, known["step_dn"], math.sqrt(known["blur_px"] ** 2 + 1.0 / 12.0))
     grey = np.asarray(image, dtype=np.float64) * quantum
-    # The blur mixes the pixels beside a lid with it.
+    # The blur mixes a lid into the pixels beside it.
     inner = None if shows is None else binary_erosion(shows, iterations=2, border_value=1)
     return measure_edge(grey, pupil, glints_px, quantum, inner)
 
@@ -85,13 +85,13 @@ def measure_edge(
     """Measure noise, step and blur along a known outline.
 
     The levels inside and outside are linear in the distance d from the outline, with an error function between them
-    (robust least squares over |d| < 6 px, then over 5 sigma where the edge is wider). The noise is half the root mean
-    square of I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1) away from the edge, cut at 4 sigma, so no slope contributes.
+    (robust least squares over |d| < 6 px, then over 5 sigma where the edge is wider). The noise is half the rms of I(x,
+    y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1) away from the edge, clipped at 4 sigma; gradients cancel.
 
     Args:
-        grey_dn: (h, w).
+        grey_dn: (h, w) levels.
         pupil: the outline.
-        glints_px: (n, 2) places to leave out.
+        glints_px: (n, 2) positions to exclude.
         quantum_dn: smallest step of a stored value.
         shows: (h, w) pixels to use, None for all.
     """
@@ -113,7 +113,7 @@ def measure_edge(
 def _profile(
     grey_dn: Floats, pupil: Ellipse, glints_px: Floats, reach: float, usable: Bools
 ) -> tuple[float, float, Floats, Bools] | None:
-    """Step, sigma, the part of the image around the pupil, and its pixels off the edge and the glints."""
+    """Return step, sigma, the part of the image around the pupil, and its pixels away from edge and glints."""
     x0, y0 = np.maximum(np.floor(pupil.centre_px - pupil.semi_axes_px[0] - reach - 2), 0).astype(int)
     x1, y1 = np.ceil(pupil.centre_px + pupil.semi_axes_px[0] + reach + 3).astype(int)
     part = grey_dn[y0:y1, x0:x1]
@@ -142,7 +142,7 @@ def _profile(
     start = np.array([dark, light - dark, 0.0, 0.0, 0.0, 0.0])
     fit = least_squares(misfit, start, loss="soft_l1", f_scale=0.1)
     sigma = math.exp(min(float(fit.x[4]), 5.0))
-    # Pixels far outside are left out too, because the iris ends there.
+    # Pixels far outside are excluded too, because the iris ends there.
     flat = free & (distance < reach) & (np.abs(distance - fit.x[5]) > 2.5 * sigma + 1.0)
     return float(fit.x[1]), sigma, part, flat
 

@@ -1,4 +1,4 @@
-"""Checks for regression tests: required figures, and losses against an earlier bench."""
+"""Checks for regression tests: required results, and losses against an earlier benchmark."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ..storage.files import read_json, shown
 from .exact import mcnemar
 
 RESULTS_SCHEMA = "eyerender/bench-extractors/3"
-# Version 2 has no conditions and fewer figures of glints; what --against needs is the same.
+# Version 2 has no conditions and fewer results for glints; what --against needs is the same.
 RESULTS_SCHEMAS = (RESULTS_SCHEMA, "eyerender/bench-extractors/2")
 LEVEL = 0.05
 _RESULTS_BYTES = 2**30
 _OPERATORS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 _REQUIREMENT = re.compile(r"(?:(?P<name>.+):)?(?P<figure>[a-z_0-9]+)\s*(?P<how>>=|<=|>|<)\s*(?P<bar>[0-9.eE+-]+)")
-# Figures that can be required, and where they are in a summary.
+# Results that can be required, and their position in a summary.
 FIGURES = {
     **{name: ("rates", name) for name in ("right", "wrong", "none", "error", "false")},
     "centre_px": ("centre_px", "median"),
@@ -36,7 +36,7 @@ FIGURES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Requirement:
-    """A bar for a figure of one extractor, or of all (name "")."""
+    """A bar for a result of one extractor, or of all (name "")."""
 
     text: str
     name: str
@@ -49,7 +49,7 @@ class Requirement:
         """Parse `[NAME:]FIGURE>=NUMBER`, where NAME is one of the extractors' names.
 
         Raises:
-            InputError: it has another form, or there is no such figure or extractor.
+            InputError: the text has another form, or there is no such result or extractor.
         """
         found = _REQUIREMENT.fullmatch(text.strip())
         if found is None:
@@ -66,7 +66,7 @@ class Requirement:
         return cls(text=text, name=found["name"] or "", figure=found["figure"], how=found["how"], bar=bar)
 
     def check(self, entry: dict[str, Any]) -> dict[str, Any]:
-        """Compare the figure of an extractor's entry with the bar; a figure that does not exist does not reach it."""
+        """Compare an extractor's result with the bar; a missing result fails."""
         group, key = FIGURES[self.figure]
         value = (entry["summary"][group] or {}).get(key)
         met = value is not None and bool(_OPERATORS[self.how](value, self.bar))
@@ -74,10 +74,10 @@ class Requirement:
 
 
 def read_results(path: str | Path) -> dict[str, Any]:
-    """Read results.json of an earlier bench.
+    """Read results.json of an earlier benchmark.
 
     Raises:
-        InputError: it is not such a file.
+        InputError: the file is not such a result.
     """
     data = read_json(path, limit=_RESULTS_BYTES)
     if data.get("schema") not in RESULTS_SCHEMAS:
@@ -88,12 +88,12 @@ def read_results(path: str | Path) -> dict[str, Any]:
 
 
 def compare_with(old: dict[str, Any], new: dict[str, Any], source: str) -> list[dict[str, Any]]:
-    """Compare extractors with themselves in an earlier bench, on the images that both benches have.
+    """Compare extractors with themselves in an earlier benchmark, on the images that both have in common.
 
-    An image counts as a success if its pupil is right, or if none is reported where none is.
+    An image counts as a success if its pupil is right, or if it shows no pupil and none is reported.
 
     Raises:
-        InputError: the benches share no image.
+        InputError: the benchmarks have no image in common.
     """
     digests = old["image_digests"]
     shared = {name for name, digest in new["image_digests"].items() if digests.get(name) == digest}
@@ -124,7 +124,7 @@ def compare_with(old: dict[str, Any], new: dict[str, Any], source: str) -> list[
 
 
 def problems_of(data: dict[str, Any], gated: bool) -> list[str]:
-    """List reasons for exit code 1, one line each; with `gated`, any error of an extractor is one."""
+    """Return the reasons for exit code 1, one line each; with `gated`, every error of an extractor is one."""
     out = []
     for entry in data["extractors"]:
         errors = entry["summary"]["errors"]

@@ -1,4 +1,4 @@
-"""Hard conditions of an image, from its labels: tags by which figures are broken down, and a balanced selection."""
+"""Hard conditions of an image, from its labels: tags that break down the results, and a balanced selection."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ CONDITIONS = {
     "none of these": "none of the other conditions holds",
 }
 _EDGE_PX, _MOVES_PX, _CLIPPED, _QUALITY = 3.0, 1.0, 0.02, 50
-_ROTATION_MM = 10.5  # from an eye's centre of rotation to its pupil
+_ROTATION_MM = 10.5  # distance from an eye's centre of rotation to its pupil
 _PANEL_NODES = np.linspace(-0.5, 0.5, 7)
 
 
 def of_shape(pupil: Ellipse | None, visible: float | None, size: tuple[int, int], glints_px: Floats) -> set[str]:
-    """Conditions that follow from pupil, visible share, size of the image (width, height) and glints (n, 2)."""
+    """Return conditions that follow from pupil, visible share, image size (width, height) and glints (n, 2)."""
     if pupil is None:
         return {"no pupil"}
     out = set()
@@ -52,7 +52,7 @@ def of_shape(pupil: Ellipse | None, visible: float | None, size: tuple[int, int]
 
 
 def of_scene(line: Mapping[str, Any], pupil: Ellipse | None, corner: Floats) -> set[str]:
-    """Conditions that follow from a dataset's line of metadata; `corner` (2,) is the image's place on the sensor."""
+    """Return conditions that follow from a dataset's metadata; `corner` (2,) is the image's position on the sensor."""
     labels, parameters = line.get("labels") or {}, line.get("parameters") or {}
     out = set()
     world = (labels.get("space") or {}).get("world") or {}
@@ -87,10 +87,10 @@ def of_scene(line: Mapping[str, Any], pupil: Ellipse | None, corner: Floats) -> 
 
 
 def _mirrored(panel: Mapping[str, Any], centre_mm: Floats, apex_mm: Floats, lens_mm: Floats) -> Floats:
-    """Points (n, 3) of a spherical cornea that mirror a panel of light into the camera.
+    """Compute points (n, 3) of a spherical cornea that mirror a panel of light into the camera.
 
-    The normal there halves the angle between panel and camera, both seen from the centre of the sphere. At the distance
-    of a window this is good to a tenth of a millimetre.
+    The normal there bisects the directions to panel and camera from the centre of the sphere. For a window this is
+    accurate to a tenth of a millimetre.
     """
     width, height = panel["size_mm"]
     facing = centre_mm - np.asarray(panel["centre_mm"])
@@ -106,7 +106,7 @@ def _mirrored(panel: Mapping[str, Any], centre_mm: Floats, apex_mm: Floats, lens
 
 
 def of_pixels(image: NDArray[Any], bit_depth: int, mask: Bytes | None) -> set[str]:
-    """Conditions that follow from the pixels (h, w), where their classes are known."""
+    """Return conditions that follow from the pixels (h, w), as far as their classes are known."""
     if mask is None or image.dtype.kind == "f":
         return set()
     skin = image[mask == BACKGROUND]
@@ -114,16 +114,16 @@ def of_pixels(image: NDArray[Any], bit_depth: int, mask: Bytes | None) -> set[st
 
 
 def tags(*found: set[str]) -> tuple[str, ...]:
-    """All conditions of an image, in the order of `CONDITIONS`."""
+    """Return all conditions of an image, in the order of `CONDITIONS`."""
     every = set().union(*found) or {"none of these"}
     return tuple(name for name in CONDITIONS if name in every)
 
 
 def balanced(conditions: Sequence[Sequence[str]], subjects: Sequence[str], share: float = 0.1) -> list[int]:
-    """Choose a share of the images in which every condition is as frequent as in all of them.
+    """Select a share of the images in which every condition is as frequent as in all images.
 
-    Images are added one at a time: the one after which the counts of conditions are nearest to their share, and of
-    equal ones that of the subject with the fewest images so far.
+    Images are added one at a time, so that the counts of conditions stay as close to the share as possible; among
+    equals, the subject with the fewest images so far is preferred.
 
     Args:
         conditions: conditions of every image.

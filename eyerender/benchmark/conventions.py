@@ -17,7 +17,7 @@ from ..storage.files import shown
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Conventions:
-    """Conventions of an extractor for places, axes and angles; the defaults are this package's own.
+    """Conventions of an extractor for positions, axes and angles; the defaults are this package's.
 
     OpenCV's rotated rectangle is full, deg, first, down, centre.
 
@@ -38,7 +38,7 @@ class Conventions:
 
     @classmethod
     def of(cls, stated: object) -> Conventions:
-        """Make conventions from a mapping of some of the names above.
+        """Create conventions from a mapping of some of the names above.
 
         Raises:
             InputError: a name or a value is unknown.
@@ -65,12 +65,12 @@ class Conventions:
         return asdict(self)
 
     def point(self, xy: Sequence[float]) -> tuple[float, float]:
-        """Convert a place in the image to px."""
+        """Convert a position in the image to px."""
         shift = 0.5 if self.pixel_origin == "corner" else 0.0
         return xy[0] - shift, xy[1] - shift
 
     def ellipse(self, centre: Sequence[float], axes: Sequence[float], angle: float) -> Ellipse:
-        """Convert an ellipse.
+        """Convert an ellipse to centre, semi-axes (px) and angle (rad) of this package.
 
         Raises:
             InputError: an axis is not positive, or a number is not finite.
@@ -88,7 +88,7 @@ OPENCV = Conventions(axes="full", angle_unit="deg", angle_of="first")
 
 
 def number(value: Any, path: str, limit: float = 1e6) -> float:
-    """Read a finite number of plausible size.
+    """Parse a finite number of plausible size.
 
     Raises:
         InputError: naming the path.
@@ -101,7 +101,7 @@ def number(value: Any, path: str, limit: float = 1e6) -> float:
 
 
 def pair(value: Any, path: str) -> tuple[float, float]:
-    """Read two numbers.
+    """Parse two numbers.
 
     Raises:
         InputError: naming the path.

@@ -1,4 +1,4 @@
-"""Shares of right answers over their thresholds, so that no single threshold decides."""
+"""Curves of the share of right answers over the threshold, so that no single threshold decides."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ANSWERED = ("right", "wrong", "false")
 
 
 def curves_of(scores: Sequence[Score]) -> dict[str, Any]:
-    """Return curves over the images that show a pupil.
+    """Compute curves over the images that show a pupil.
 
     Returns:
         `iou`: share of images with at least this overlap; `centre_px` and `centre_radii`: share with at most this error

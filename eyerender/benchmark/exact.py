@@ -4,10 +4,10 @@ from __future__ import annotations
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """Return the two-sided p value of the exact McNemar test.
+    """Compute the two-sided p value of the exact McNemar test.
 
-    Of the images on which exactly one of two extractors succeeds, each is the first's with probability 1/2 if both are
-    equally good: p = min(1, 2 P(X <= min(n1, n2))), X ~ B(n1 + n2, 1/2).
+    If both extractors are equally good, each image on which exactly one succeeds is the first's with probability 1/2: p
+    = min(1, 2 P(X <= min(n1, n2))), X ~ B(n1 + n2, 1/2).
 
     Args:
         only_first: number of images on which only the first succeeds.

@@ -1,4 +1,4 @@
-"""What a wrong ellipse shows instead of the pupil."""
+"""Classify what a wrong ellipse shows instead of the pupil."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def kind_of(found: Ellipse, image: LabelledImage, grey: NDArray[Any], mask: Byte
     Args:
         found: the ellipse.
         image: the labels of the image.
-        grey: (h, w) its pixels.
-        mask: (h, w) classes of its pixels, None where they are unknown; then lids are known by their margins only.
+        grey: (h, w) pixels of the image.
+        mask: (h, w) classes of the pixels; None if unknown, when lids are known only by their margins.
     """
     true = image.pupil
     if true is not None and iou(found, true) >= _NEAR:

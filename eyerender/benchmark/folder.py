@@ -1,7 +1,7 @@
-"""A labelled folder for the bench: images, true features in image coordinates, hints, and factors that vary.
+"""A labelled folder for benchmarks: images, true features in image coordinates, hints, and factors that vary.
 
-Four kinds are read: what this package renders (docs/formats.md), folders of ideal images, a person's own images with
-labels (`own`), and public layouts (`layouts`).
+Four kinds are read: folders that this package rendered (docs/formats.md), folders of ideal images, the user's own
+labelled images (`own`), and public layouts (`layouts`).
 """
 
 from __future__ import annotations
@@ -41,27 +41,27 @@ EYE_ERROR_MM = 5.0
 
 @dataclass(frozen=True, slots=True)
 class LabelledImage:
-    """One image of one eye; places are relative to the image, pixel centres at integers.
+    """One image of one eye; positions are relative to the image, with pixel centres at integers.
 
     Attributes:
         name: name of the image.
         path: file.
         bit_depth: bits of the file.
         size: (width, height).
-        pupil: None where the image shows none.
+        pupil: the true pupil; None if the image shows none.
         outline_px: (n, 2) outline of the pupil.
-        visible: visible share of the pupil, None where unknown.
-        glints: those that the image shows.
-        hints: what an extractor may know.
-        known: what the folder itself states of noise (DN), blur (px) and step (DN).
+        visible: visible share of the pupil; None if unknown.
+        glints: glints that the image shows.
+        hints: information given to extractors.
+        known: noise (DN), blur (px) and step (DN), if the folder states them.
         factors: possible causes of an error, by name.
-        subject: the person; "" where unknown, and then each image counts as a separate subject.
-        iris: outline of the iris, None where unknown.
+        subject: the person; if "" (unknown), each image counts as a separate subject.
+        iris: outline of the iris; None if unknown.
         lids_px: (n, 2) margins of the lids, as far as they are known.
-        mask_path: file of the classes of the pixels, None where they are unknown.
-        hidden_glints_px: places of glints that the image does not show.
+        mask_path: file of the classes of the pixels; None if unknown.
+        hidden_glints_px: positions of glints that are hidden in the image.
         conditions: hard conditions (`conditions.CONDITIONS`).
-        gamma_from: where the gamma of the hints comes from: the folder, an option (`given`), or nowhere (`assumed`).
+        gamma_from: source of the gamma: the folder, an option (`given`), or neither (`assumed`).
     """
 
     name: str
@@ -84,7 +84,7 @@ class LabelledImage:
     hidden_glints_px: tuple[tuple[float, float], ...] = ()
 
     def classes(self) -> Bytes | None:
-        """Read the class of each pixel (0 skin, 1 sclera, 2 iris, 3 pupil, 4 a frame), None where they are unknown."""
+        """Read the class of each pixel (0 skin, 1 sclera, 2 iris, 3 pupil, 4 a frame); None if unknown."""
         return None if self.mask_path is None else np.asarray(read_image(self.mask_path)[0], dtype=np.uint8)
 
 
@@ -100,12 +100,12 @@ def load_labelled(
     Args:
         folder: the folder.
         gamma: encoding gamma of images whose folder states none; None assumes 1.
-        eye_error_mm: standard deviation per axis of the error of the hinted position of the eye.
+        eye_error_mm: standard deviation, per axis, of the error of the eye position given to extractors.
         pupil_class: value of the pupil in masks of several classes.
 
     Raises:
-        InputError: it is not such a folder, an image is missing or has another size, or does not have exactly one eye;
-            the folder states another gamma than `gamma`.
+        InputError: the folder is of another kind; an image is missing, has another size or does not show exactly one
+            eye; or the folder states another gamma than `gamma`.
     """
     images = _load(Path(folder), eye_error_mm, pupil_class)
     out = []
@@ -121,7 +121,7 @@ def load_labelled(
 
 
 def _described(image: LabelledImage) -> LabelledImage:
-    """Add the looks of the glints, and the conditions that features and pixels show, to those that are known."""
+    """Add measured properties of the glints, and the conditions that features and pixels show."""
     spots = np.array([g.xy_px for g in image.glints]).reshape(-1, 2)
     conditions = [set(image.conditions), of_shape(image.pupil, image.visible, image.size, spots)]
     glints, mask = image.glints, image.classes()
@@ -164,7 +164,7 @@ def _load_own(folder: Path, pupil_class: int | None) -> list[LabelledImage]:
 
 
 def _with_hints(folder: Path, labels: Iterable[Labelled], gamma: float | None) -> list[LabelledImage]:
-    """Images with the hints that the folder states; `gamma` is that of its layout, if it states one."""
+    """Yield images with the hints stated by the folder; `gamma` is that of its layout, if it states one."""
     told = FolderHints.load(folder)
     gamma = told.gamma or gamma
     hints, source = {**told.to_request(), "gamma": gamma or 1.0}, "assumed" if gamma is None else "folder"
@@ -191,7 +191,7 @@ def _without_rig(
     polarity: str = "auto",
     known: Mapping[str, float] | None = None,
 ) -> LabelledImage:
-    """Return an image, with `stored` bit depth and shape, of which no camera or lights are known."""
+    """Return an image, with `stored` bit depth and shape, whose camera and lights are unknown."""
     bit_depth, (height, width) = stored
     size, outline = (width, height), np.zeros((0, 2)) if pupil is None else pupil.points(120)
     hints = {"polarity": polarity, "gamma": 1.0, "radius_px": None, "rig": None}
@@ -251,7 +251,7 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int) -> LabelledImage
 
 
 def _visible_share(glint: Mapping[str, Any]) -> float:
-    """Visible share of a glint's label; a rendered folder has no `visible`, and older ones have no share."""
+    """Return the visible share of a glint's label, which older folders lack in part."""
     share = glint.get("visible_share")
     return (1.0 if share is None else float(share)) if glint.get("visible", True) else 0.0
 
@@ -289,10 +289,10 @@ def _ellipse_factors(pupil: Ellipse | None, visible: float | None) -> dict[str, 
 def _hints(
     entry: ImageEntry, truth: Observations, row: int, scene_rig: RigGeometry | None, eye_error_mm: float
 ) -> dict[str, Any]:
-    """Return the information that an extractor may have, but never the truth.
+    """Return the information given to an extractor, which never includes the truth.
 
-    It is the rig, a rough place of the eye, and thus a range of sizes. The place has a normal error of its own for each
-    image, which follows from the image's name.
+    It consists of the rig, an approximate position of the eye, and the resulting range of pupil sizes. The position's
+    random error is derived from the image's name.
     """
     line, corner = entry.line, np.array(entry.window[:2], dtype=np.float64)
     seed = int.from_bytes(hashlib.sha256(str(line["file_name"]).encode()).digest()[:8], "big")
@@ -328,7 +328,7 @@ def _hints(
 def _camera_and_lights(
     line: Mapping[str, Any], camera: int, rig: RigGeometry | None
 ) -> tuple[PinholeCamera | None, Floats]:
-    """Camera and lights of an image from its labels where they are there (datasets vary them), else from the scene."""
+    """Return camera and lights of an image from its labels if they are there, else from the scene."""
     labels = line.get("labels") or {}
     own, lights = labels.get("camera"), labels.get("lights_mm")
     if own and lights is not None:
@@ -341,7 +341,7 @@ def _camera_and_lights(
 
 
 def _rig_of(folder: ImageFolder) -> RigGeometry | None:
-    """Find the rig of the scene from which the folder was rendered; None for a dataset, whose images have their own."""
+    """Return the rig of the scene from which the folder was rendered; None for a dataset, whose images differ."""
     spec = folder.dataset.get("spec")
     if not isinstance(spec, dict) or folder.dataset.get("kind") == "dataset":
         return None

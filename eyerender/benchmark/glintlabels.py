@@ -1,4 +1,4 @@
-"""How the true glints of an image look, and what false ones show instead."""
+"""Appearance of an image's true glints, and classification of false ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..arrays import Bytes, Floats
 from ..folders.imagefolder import BACKGROUND, FRAME, SCLERA
 from ..geometry.ellipse import Ellipse, signed_distance
 
-MATCH_PX = 2.0  # of a glint that is a point
+MATCH_PX = 2.0  # matching distance for a glint that is a point
 Place = Literal["pupil", "edge", "iris", "sclera", "skin", ""]
 FALSE_KINDS = {
     "repeated": "a true glint that another report matches",
@@ -31,12 +31,12 @@ _REACH_PX, _EDGE_PX, _MARGIN_PX = 12, 3.0, 4.0
 
 @dataclass(frozen=True, slots=True)
 class GlintLook:
-    """How a glint looks in the image.
+    """Appearance of a glint in the image.
 
     Attributes:
-        radius_px: radius of a disc with the area of its pixels above half of its peak; 0 where it is not measured.
-        saturated: whether a pixel of it is at full scale; None where that is unknown.
-        place: what lies behind it; "" where that is unknown.
+        radius_px: radius of a disc with the area of its pixels above half of its peak; 0 if not measured.
+        saturated: whether one of its pixels is at full scale; None if unknown.
+        place: part of the eye behind it; "" if unknown.
     """
 
     radius_px: float = 0.0
@@ -49,8 +49,8 @@ class TrueGlint:
     """A glint that the image shows.
 
     Attributes:
-        light: its light, -1 where that is unknown.
-        xy_px: its place in px of the image.
+        light: its light, -1 if unknown.
+        xy_px: its position in px of the image.
         visible: visible share.
         look: size, saturation and place, as far as they are measured.
     """
@@ -62,21 +62,21 @@ class TrueGlint:
 
     @property
     def match_px(self) -> float:
-        """Farthest distance of a report that matches it: two pixels beyond a point, and the radius of a large spot."""
+        """Largest distance of a matching report: two pixels for a point, plus the radius of a large spot."""
         return max(MATCH_PX, 1.0 + self.look.radius_px)
 
 
 def measured(
     glints: Sequence[TrueGlint], grey: NDArray[Any], bit_depth: int, pupil: Ellipse | None, mask: Bytes | None
 ) -> tuple[TrueGlint, ...]:
-    """Add size, saturation and place to glints.
+    """Measure size, saturation and place of glints.
 
     Args:
         glints: the glints.
         grey: (h, w) the image.
         bit_depth: its bits.
         pupil: the true outline.
-        mask: (h, w) classes of the pixels, None where they are unknown.
+        mask: (h, w) classes of the pixels; None if unknown.
     """
     full = np.inf if grey.dtype.kind == "f" else 2**bit_depth - 1
     out = []
@@ -88,7 +88,7 @@ def measured(
 
 
 def _spot(grey: NDArray[Any], xy: tuple[float, float]) -> tuple[float, float] | None:
-    """Radius and peak of the bright spot at a place, None outside the image."""
+    """Measure radius and peak of the bright spot at a position; None outside the image."""
     x, y = round(xy[0]), round(xy[1])
     height, width = grey.shape
     if not (0 <= x < width and 0 <= y < height):
@@ -119,13 +119,13 @@ def _place(xy: tuple[float, float], pupil: Ellipse | None, mask: Bytes | None) -
 
 
 def false_kind(xy: tuple[float, float], true: Sequence[TrueGlint], hidden_px: Floats, mask: Bytes | None) -> str:
-    """Kind of a report that matches no glint: the first of `FALSE_KINDS` that applies.
+    """Classify a report that matches no glint: the first of `FALSE_KINDS` that applies.
 
     Args:
-        xy: its place.
+        xy: its position.
         true: glints that the image shows.
-        hidden_px: (n, 2) places of glints that it does not show.
-        mask: (h, w) classes of the pixels, None where they are unknown.
+        hidden_px: (n, 2) positions of hidden glints.
+        mask: (h, w) classes of the pixels; None if unknown.
     """
     if any(math.hypot(xy[0] - g.xy_px[0], xy[1] - g.xy_px[1]) < g.match_px for g in true):
         return "repeated"

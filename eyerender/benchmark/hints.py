@@ -1,4 +1,4 @@
-"""What extractors may know of a person's own images: hints.json in the folder."""
+"""Hints for extractors about the user's own images: hints.json in the folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HINTS_SCHEMA = "eyerender/hints/1"
 
 
 class RigHints(Spec):
-    """Camera and lights, in the form that extractors get them.
+    """Camera and lights, in the form given to extractors.
 
     Attributes:
         K: camera matrix, px.
@@ -24,7 +24,7 @@ class RigHints(Spec):
         t_mm: translation from the world to the camera.
         distortion: OpenCV's coefficients.
         lights_mm: positions of the lights in the world.
-        eye_mm: rough position of the eye in the world.
+        eye_mm: approximate position of the eye in the world.
         eye_sd_mm: its standard deviation per axis.
     """
 
@@ -38,7 +38,7 @@ class RigHints(Spec):
 
 
 class FolderHints(Spec):
-    """Hints for every image of a folder; a key that is left out is unknown.
+    """Hints for every image of a folder; a missing key is unknown.
 
     Attributes:
         gamma: encoding gamma of the pixel values, 1 for linear ones.
@@ -54,7 +54,7 @@ class FolderHints(Spec):
 
     @classmethod
     def load(cls, folder: Path) -> FolderHints:
-        """Read hints.json of a folder; without one, nothing is known.
+        """Read hints.json of a folder; without the file, nothing is known.
 
         Raises:
             InputError: naming the wrong key.
@@ -69,7 +69,7 @@ class FolderHints(Spec):
         return cls.from_mapping(data, source=str(path))
 
     def to_request(self) -> dict[str, Any]:
-        """Return the hints of a request; the gamma is 1 where it is unknown."""
+        """Return the hints of a request; an unknown gamma becomes 1."""
         rig = None if self.rig is None else self.rig.model_dump(mode="json")
         radius = None if self.radius_px is None else list(self.radius_px)
         return {"polarity": self.polarity, "gamma": self.gamma or 1.0, "radius_px": radius, "rig": rig}

@@ -1,4 +1,4 @@
-"""95 % intervals of rates: Wilson's, and one that knows that images of one subject are alike."""
+"""95 % intervals of rates: Wilson's, and one for images that are correlated within subjects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SEED = 20_001
 
 
 def wilson(part: float, whole: float, quantile: float | None = None) -> tuple[float, float] | None:
-    """Return Wilson's score interval of a share.
+    """Compute Wilson's score interval of a share.
 
         (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n),   p = part / whole, n = whole
 
@@ -27,7 +27,7 @@ def wilson(part: float, whole: float, quantile: float | None = None) -> tuple[fl
         quantile: z, by default that of a 95 % interval, 1.96.
 
     Returns:
-        Lower and upper end, None without trials.
+        Lower and upper end; None without trials.
     """
     from scipy.special import ndtri
 
@@ -43,12 +43,12 @@ def wilson(part: float, whole: float, quantile: float | None = None) -> tuple[fl
 def subject_interval(
     parts: Sequence[float] | Floats, wholes: Sequence[float] | Floats, subjects: Sequence[str]
 ) -> tuple[float, float] | None:
-    """Return the interval of a share whose trials come from subjects, by resampling the subjects.
+    """Compute the interval of a share whose trials come from subjects, by resampling the subjects.
 
-    The bootstrap over subjects gives the variance of the share, and thereby the effective number of trials, which is
-    n p (1 - p) / (n variance) but not above n. Wilson's interval with that number and Student's quantile for the number
-    of subjects is never empty, unlike the percentiles of the bootstrap, which say [1, 1] where all trials succeeded.
-    There the variance is unknown, and every subject counts as one trial.
+    The bootstrap over subjects gives the variance of the share, and thereby the effective number of trials, which is n
+    p (1 - p) / (n variance) but not above n. Wilson's interval with that number and Student's quantile for the number
+    of subjects is never empty, unlike the bootstrap's percentiles, which are [1, 1] if all trials succeeded. In that
+    case the variance is unknown, and every subject counts as one trial.
 
     Args:
         parts: successes of each image.

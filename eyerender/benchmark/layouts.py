@@ -1,11 +1,11 @@
-"""Readers of public layouts: OpenEDS (segmentation), COCO and TEyeD, as other programs and `export-dataset` write them.
+"""Read public layouts: OpenEDS (segmentation), COCO and TEyeD, written by other programs or `export-dataset`.
 
     SPLIT/images/NAME.png, SPLIT/labels/NAME.npy       OpenEDS 2019: 0 background, 1 sclera, 2 iris, 3 pupil
     annotations/*.json with images and annotations     COCO: the category `pupil`, an instance per image
     VIDEOS/NAME.mp4, ANNOTATIONS/NAME.mp4pupil_eli.txt TEyeD: FRAME;ANGLE;CENTER X;CENTER Y;WIDTH;HEIGHT;
 
-The ellipse of a COCO instance is its `ellipse` (centre x, y, semi-axes a, b, angle in rad) where it has one, as in
-exports of this package; else it is fitted to the mask, as for OpenEDS. Frames of a video are unpacked into the cache.
+The ellipse of a COCO instance is its `ellipse` (centre x, y, semi-axes a, b, angle in rad) if it has one, as in exports
+of this package; otherwise it is fitted to the mask, as for OpenEDS. Frames of a video are unpacked into the cache.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MOST_PIXELS = 2**26
 
 
 def layout_of(folder: Path) -> str | None:
-    """Name of the layout that a folder has: openeds, coco or teyed, None for any other."""
+    """Return the layout of a folder: openeds, coco or teyed; None for any other."""
     if (folder / "VIDEOS").is_dir() and (folder / "ANNOTATIONS").is_dir():
         return "teyed"
     if any((folder / "annotations").glob("*.json")):
@@ -48,13 +48,13 @@ def read_layout(folder: Path, layout: str) -> Iterator[Labelled]:
     """Yield every labelled image of a folder.
 
     Raises:
-        InputError: a label cannot be used, or names an image that is not there.
+        InputError: a label cannot be used, or names a missing image.
     """
     return {"openeds": _openeds, "coco": _coco, "teyed": _teyed}[layout](folder)
 
 
 def stated_gamma(folder: Path) -> float | None:
-    """Return the encoding gamma that an export of this package states, None for other folders.
+    """Return the encoding gamma that an export of this package states; None for other folders.
 
     Raises:
         InputError: an export states none.
@@ -119,7 +119,7 @@ def _coco(folder: Path) -> Iterator[Labelled]:
 
 
 def _coco_image(folder: Path, file: Path, name: str) -> Path:
-    """File of an image: beside the annotations' folder, or in a folder named as the split or `images`."""
+    """Return the file of an image: beside the annotations' folder, or in a folder named as the split or `images`."""
     split = file.stem.removeprefix("instances_")
     for home in (folder / split, folder / "images", folder):
         if (home / name).is_file():
@@ -153,7 +153,7 @@ def _ellipse_numbers(numbers: Any) -> list[float]:
 
 
 def _decoded(counts: Any, shape: tuple[int, int], source: str) -> Bools:
-    """Mask of uncompressed run lengths, down the columns."""
+    """Decode uncompressed run lengths, column by column, to a mask."""
     if isinstance(counts, str):
         raise InputError("has compressed run lengths, which are not read", source=source)
     runs = np.asarray(counts, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Options of a bench, shared by Python and the command line."""
+"""Options of a benchmark, shared by Python and the command line."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ LONGEST_S = 86400.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BenchOptions:
-    """Options of a bench.
+    """Options of a benchmark.
 
     Attributes:
         jobs: Number of extractor processes that run at the same time.
         timeout_s: Longest time for an image, s.
-        start_timeout_s: Longest time until an extractor greets, s.
+        start_timeout_s: Longest time until an extractor is ready, s.
         gamma: Encoding gamma of images whose folder states none (default: 1, linear).
-        eye_error_mm: Standard deviation, per axis, by which the hinted position of the eye is off.
+        eye_error_mm: Standard deviation, per axis, of the error of the eye position given to extractors.
         pupil_class: Value of the pupil in masks of several classes.
-        quick: Take a tenth of the images, in which hard conditions are as frequent as in all.
-        fresh: Ask the extractors again, also about images whose answers are stored.
-        against: results.json of an earlier bench, to compare with.
-        require: Figures that must be reached, such as `right>=.95` or `own-fast:right>=.95`.
+        quick: Use a tenth of the images, with hard conditions in the same proportion.
+        fresh: Ignore stored answers and run on every image again.
+        against: results.json of an earlier benchmark to compare with.
+        require: Results that must be reached, such as `right>=.95` or `own-fast:right>=.95`.
         overwrite: Replace the contents of the output folder.
     """
 

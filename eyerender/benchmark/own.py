@@ -1,13 +1,13 @@
-"""Folders of your own images with labels in a table (labels.csv) or as masks (masks/).
+"""Read folders of the user's own images with labels in a table (labels.csv) or as masks (masks/).
 
     images/a.png, images/b.png, ...      or the images beside labels.csv
     labels.csv                           image,centre_x_px,centre_y_px,semi_axis_a_px,semi_axis_b_px,angle_deg and, if
                                          known, visible (share of the pupil) and subject
     glints.csv                           image,x_px,y_px and, if known, light; a line per glint; optional
     masks/a.png, masks/b.png, ...        the pupil (its visible part, or all of it), or classes
-    hints.json                           what the extractors may know (`hints`); optional
+    hints.json                           information for the extractors (`hints`); optional
 
-A line without numbers, and an empty mask, say that the image shows no pupil.
+A line without numbers, or an empty mask, means that the image shows no pupil.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class Labelled:
     Attributes:
         name: name of the image.
         path: file.
-        pupil: None where the image shows none.
-        visible: visible share of the pupil, None where it is unknown.
-        glints: those that the image shows.
-        subject: whose eye it is, "" where that is unknown.
+        pupil: the true pupil; None if the image shows none.
+        visible: visible share of the pupil; None if unknown.
+        glints: glints that the image shows.
+        subject: the person; "" if unknown.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Labelled:
 
 
 def is_own(folder: Path) -> bool:
-    """Whether a folder holds a person's own images with labels."""
+    """Return whether a folder holds the user's own labelled images."""
     # A run that has not finished has run.json only.
     ours = (folder / DATASET).exists() or (folder / RUN).exists()
     return not ours and ((folder / LABELS).is_file() or (folder / MASKS).is_dir())
@@ -73,8 +73,8 @@ def own_labels(folder: Path, pupil_class: int | None = None) -> Iterator[Labelle
         pupil_class: value of the pupil in masks of several classes.
 
     Raises:
-        InputError: a table or mask cannot be used, or names an image that is not there; a mask has several classes, and
-            none is given.
+        InputError: a table or mask cannot be used, or names a missing image; or masks have several classes and
+            `pupil_class` is not given.
     """
     glints = _glints(folder)
     labels = _of_table(folder) if (folder / LABELS).is_file() else _of_masks(folder, pupil_class)
@@ -83,7 +83,7 @@ def own_labels(folder: Path, pupil_class: int | None = None) -> Iterator[Labelle
 
 
 def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
-    """Glints of every image that glints.csv names."""
+    """Return the glints of every image named in glints.csv."""
     out: dict[str, list[TrueGlint]] = {}
     if not (folder / GLINTS).is_file():
         return out
@@ -98,7 +98,7 @@ def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
         except (TypeError, ValueError):
             raise InputError("needs numbers", source=source, path=f"line {k + 2}") from None
         if not (math.isfinite(x + y) and max(abs(x), abs(y)) < 1e5):
-            raise InputError("is no place in an image", source=source, path=f"line {k + 2}")
+            raise InputError("is not a position in an image", source=source, path=f"line {k + 2}")
         out.setdefault(str(line["image"]), []).append(TrueGlint(light, (x, y)))
     return out
 
@@ -140,7 +140,7 @@ def _ellipse(cells: list[str | None], source: str, where: str) -> Ellipse:
     except ValueError:
         raise InputError("needs five numbers, or none", source=source, path=where) from None
     if not (math.isfinite(x + y + a + b + degrees) and 0.0 < b <= a and max(abs(x), abs(y), a) < 1e5):
-        raise InputError("is no ellipse; 0 < semi_axis_b_px <= semi_axis_a_px", source=source, path=where)
+        raise InputError("is not an ellipse; 0 < semi_axis_b_px <= semi_axis_a_px", source=source, path=where)
     return Ellipse(np.array([x, y]), np.array([a, b]), math.radians(degrees))
 
 
@@ -164,11 +164,11 @@ def _of_masks(folder: Path, pupil_class: int | None) -> Iterator[Labelled]:
 
 
 def ellipse_of_mask(mask: Bools, source: str = "") -> Ellipse | None:
-    """Ellipse of a pupil of which a mask shows all or a part; None where it is empty.
+    """Compute the ellipse of a pupil from a mask of all or a part of it; None if it is empty.
 
-    An ellipse that covers the mask as it is has the mask's second moments (each pixel is a square). If their overlap is
-    worse than the raggedness of pixels explains, something hides a part of the pupil. Then the ellipse is fitted to the
-    mask's contour, without what hides it: the contour's points are weighted down the farther they lie inside the fit.
+    The ellipse has the mask's second moments (each pixel is a square). If its overlap with the mask is worse than the
+    pixel grid explains, a part of the pupil is hidden. Then the ellipse is fitted to the mask's contour, and points
+    count less the farther they lie inside the fit.
 
     Raises:
         InputError: too few pixels are marked.
@@ -180,18 +180,18 @@ def ellipse_of_mask(mask: Bools, source: str = "") -> Ellipse | None:
         raise InputError(f"marks only {x.size} pixels", source=source)
     whole = _of_moments(x, y)
     points = _contour(mask)
-    # Half a pixel is what a whole outline strays from its ellipse.
+    # The largest distance of a whole outline from its ellipse is half a pixel.
     if np.max(np.abs(signed_distance(whole, points))) < 1.0 + 0.02 * float(whole.semi_axes_px[0]):
         return whole
     return _of_visible_arc(points) or whole
 
 
 def _of_visible_arc(points: Floats) -> Ellipse | None:
-    """The ellipse that holds a contour and follows the longest stretches of it.
+    """Fit the ellipse that contains a contour and follows its longest stretches.
 
-    Ellipses through stretches of the contour are tried. An ellipse is supported by the points within 0.7 px of it, and
-    none of the others may lie more than 1 px outside, because nothing adds to a pupil. The best one is fitted again to
-    the points that support it.
+    Candidates are ellipses through stretches of the contour. Points within 0.7 px support a candidate; no point may lie
+    more than 1 px outside, because occlusion only removes parts of a pupil. The best candidate is refitted to its
+    supporting points.
     """
     rng = np.random.default_rng(0)
     best, most = None, 0
@@ -214,9 +214,9 @@ def _of_visible_arc(points: Floats) -> Ellipse | None:
 
 
 def _contour(mask: Bools) -> Floats:
-    """Points (n, 2) on the border of a mask, between its pixels and those beside it, in order of their direction.
+    """Return points (n, 2) on the border of a mask, between its pixels and their neighbours, sorted by direction.
 
-    Pixels at the frame's edge are no border: the pupil goes on behind it.
+    The edge of the image does not count as a border, because the pupil continues beyond it.
     """
     y, x = np.nonzero(mask)
     height, width = mask.shape

@@ -15,12 +15,12 @@ from .summary import sizes
 
 
 def is_success(score: Score) -> bool:
-    """Return whether the pupil is right, or none is reported where none is."""
+    """Return whether the pupil is right, or none is reported for an image without a pupil."""
     return score.outcome in ("right", "absent")
 
 
 def pairs_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Compare every two extractors: successes of only one of them, and errors on the pupils that both find.
+    """Compare every two extractors: successes of only one of them, and errors on the pupils that both detect.
 
     `p` is that of the exact McNemar test. It is not corrected for the number of pairs.
     """
@@ -46,7 +46,7 @@ def pairs_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def common_errors(runs: Sequence[Run]) -> dict[str, Any]:
-    """Return errors on the pupils that every extractor finds, of those that find any."""
+    """Return errors on the pupils that all extractors detect, among extractors that detect any."""
     some = [run for run in runs if any(s.outcome == "right" for s in run.scores)]
     rows = [k for k in range(len(some[0].scores)) if all(r.scores[k].outcome == "right" for r in some)] if some else []
     return {

@@ -1,4 +1,4 @@
-"""An extractor as a process that answers over pipes, has time limits, and is killed with all its children."""
+"""Run an extractor as a process that answers over pipes, with time limits, and kill it with all its children."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _ONE_CORE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREA
 
 
 class Failed(Exception):
-    """The extractor did not answer properly; the message is the reason."""
+    """The extractor gave no proper answer; the message is the reason."""
 
 
 class _Tail:
     """The end of a pipe's output.
 
-    A separate thread reads the pipe, so that the writer never waits. Only the end is kept, so that a process may
-    print without limit.
+    A separate thread reads the pipe, so that the writer never blocks. Only the end is kept, so that a process may print
+    without limit.
     """
 
     def __init__(self, pipe: IO[bytes]) -> None:
@@ -44,14 +44,14 @@ class _Tail:
             self._kept = (self._kept + chunk)[-_TAIL_BYTES:]
 
     def read(self) -> bytes:
-        """Return last bytes so far; all of the last ones where the writer has ended."""
+        """Return the last bytes so far; if the writer has ended, wait for all of them."""
         self._thread.join(timeout=0.5)
         return self._kept
 
     def close(self) -> None:
         """Close the pipe once its writers have ended."""
         self._thread.join(timeout=0.5)
-        # A process that has left the group may still hold the pipe. Its reader then continues until that process ends.
+        # A process that has left the group may still hold the pipe. The reader then continues until that process ends.
         if not self._thread.is_alive():
             self._pipe.close()
 
@@ -74,7 +74,7 @@ class ExtractorProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                # It has a group of its own, so that killing the group also kills its children.
+                # A separate process group, so that killing the group also kills its children.
                 start_new_session=True,
                 env={**os.environ, **_ONE_CORE, **(env or {})},
             )
@@ -83,7 +83,7 @@ class ExtractorProcess:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         assert self._process.stderr is not None
-        # It may stop reading at any time, and writing must not wait longer than for an answer.
+        # It may stop reading at any time, and writing must not block longer than waiting for an answer.
         os.set_blocking(self._process.stdin.fileno(), False)
         self._stderr = _Tail(self._process.stderr)
         try:
@@ -99,7 +99,7 @@ class ExtractorProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether it can be asked again."""
+        """Whether it can answer further requests."""
         return not self._closed
 
     def ask(self, request: Request) -> tuple[Reply, float]:
@@ -113,7 +113,7 @@ class ExtractorProcess:
         try:
             return Reply.parse(line, request.id, self.greeting.conventions), seconds
         except InputError as error:
-            # Its next answer may belong to any image, so it is not trusted any more.
+            # Its next answer may belong to any image, so it is no longer trusted.
             self.close()
             raise Failed(f"unusable answer: {error}") from None
 
@@ -122,7 +122,7 @@ class ExtractorProcess:
         if self._closed:
             return
         self._closed = True
-        # This is also needed when it has ended by itself, because its children may still run in its group.
+        # Needed even if it has ended by itself, because its children may still run in its group.
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -141,7 +141,7 @@ class ExtractorProcess:
         self.close()
 
     def _send(self, data: bytes) -> None:
-        """Write to its input; raises `Failed` when it has ended or does not read."""
+        """Write to its input; raise `Failed` if it has ended or does not read."""
         assert self._process.stdin is not None
         pipe = self._process.stdin.fileno()
         end = time.monotonic() + self._timeout_s
@@ -163,7 +163,7 @@ class ExtractorProcess:
         """Read the next line of its output.
 
         Raises:
-            Failed: it takes too long or ends, or the line does not end.
+            Failed: the process takes too long or ends, or the line is too long.
         """
         assert self._process.stdout is not None
         end = time.monotonic() + timeout_s
@@ -185,7 +185,7 @@ class ExtractorProcess:
         return line.decode("utf-8", "replace")
 
     def _died(self) -> Failed:
-        """Return the reason why it ended: its exit status and the last line it wrote to stderr."""
+        """Return the reason why it ended: its exit status and its last line on stderr."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=0.5)
         code = self._process.poll()

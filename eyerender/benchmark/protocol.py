@@ -1,9 +1,9 @@
-"""Versioned JSON lines between the bench and an extractor.
+"""Protocol between the benchmark and an extractor: versioned JSON lines.
 
     extractor -> bench  {"schema": "eyerender/extractor/1", "name", "conventions": {..}, "reports": ["pupil", "glints"]}
     bench -> extractor  {"schema": "eyerender/extractor/1", "id", "image", "bit_depth", "hints": {..}}
     extractor -> bench  {"id", "record": {"pupil": {..}, "glints": [..]}, "cpu_s": null, "wall_s": null}
-                    or  {"id", "error": "why this image could not be looked at"}
+                    or  {"id", "error": "why this image could not be processed"}
 
 Every line is one object. The greeting comes once, then an answer to each request in turn; the extractor ends with its
 input. The record is the package's (eyerender/record/2). Only `pupil.status` is required, and with "ok" centre, axes and
@@ -33,32 +33,32 @@ Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 
 
 class Extractor(Protocol):
-    """Interface of an extractor in Python: a function of an image, without state.
+    """Interface of an extractor in Python: a stateless function of an image.
 
     Two optional attributes of the function declare more: `conventions`, the meaning of the numbers in its records (the
-    keys of `Conventions`; without it this package's own), and `reports`, the features for which it looks (`FEATURES`).
+    keys of `Conventions`; by default this package's), and `reports`, the features that it detects (`FEATURES`).
     """
 
     def __call__(self, image: Image, request: Mapping[str, Any], /) -> Mapping[str, Any]:
-        """Return the record of an image: `{"pupil": {..}, "glints": [..]}`, as in the protocol above.
+        """Extract features from an image: `{"pupil": {..}, "glints": [..]}`, as in the protocol above.
 
         Args:
-            image: (h, w) numbers as the file stores them.
-            request: the request above; `bit_depth` and `hints` are useful.
+            image: (h, w) values as stored in the file.
+            request: the request above, with `bit_depth` and `hints`.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Greeting:
-    """Description that an extractor gives of itself.
+    """Self-description of an extractor.
 
     Attributes:
         name: its name and version.
         conventions: the meaning of its numbers.
-        reports: the features for which it looks.
-        warms_up: whether its first answer takes longer, because it loads libraries or compiles; that answer then has
-            the time limit of the start in addition.
+        reports: the features that it detects.
+        warms_up: whether its first answer takes longer, because it loads libraries or compiles; the time limit of the
+            start is then added for that answer.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Greeting:
         """Parse a line.
 
         Raises:
-            InputError: saying what is wrong with the line.
+            InputError: the line is wrong; the message says why.
         """
         data = _object(line)
         if data.get("schema") != SCHEMA:
@@ -87,7 +87,7 @@ class Greeting:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One image to process; `hints` is what any extractor may know, never the truth."""
+    """One image to process; `hints` is the information given to every extractor, never the truth."""
 
     id: int
     image: str
@@ -95,22 +95,22 @@ class Request:
     hints: Mapping[str, Any]
 
     def to_line(self) -> str:
-        """Return the line that is sent."""
+        """Return the request as a line of JSON."""
         data = {"schema": SCHEMA, "id": self.id, "image": self.image, "bit_depth": self.bit_depth}
         return json.dumps({**data, "hints": dict(self.hints)}, allow_nan=False) + "\n"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """Result of an extractor, in this package's conventions.
+    """Answer of an extractor, in this package's conventions.
 
     Attributes:
-        ellipse: the pupil; None where it found none.
+        ellipse: the pupil; None if it found none.
         reason: why it found none.
-        confidence: its confidence, if it gives one.
+        confidence: its confidence, if reported.
         glints: ((x, y), light or None) in px.
-        cpu_s: processor time that the extractor reports, None where it gives none.
-        wall_s: the same for elapsed time.
+        cpu_s: processor time, if reported.
+        wall_s: elapsed time, if reported.
         error: why it failed on this image, in its own words; the rest is then empty.
         line: the answer as it was sent.
     """
@@ -129,7 +129,7 @@ class Reply:
         """Parse a line.
 
         Raises:
-            InputError: saying what is wrong with the line.
+            InputError: the line is wrong; the message says why.
         """
         data = _object(line)
         if data.get("id") != request_id:
@@ -170,7 +170,7 @@ def _ellipse(pupil: Mapping[str, Any], conventions: Conventions) -> Ellipse:
     if "semi_axes_px" in pupil:
         axes = pair(pupil["semi_axes_px"], "pupil.semi_axes_px")
         angle = number(pupil.get("angle_rad"), "pupil.angle_rad")
-        # The names define these values; only the origin is left to declare.
+        # The names define these values; only the origin remains to be declared.
         conventions = Conventions(pixel_origin=conventions.pixel_origin)
     else:
         axes = pair(pupil.get("axes_px"), "pupil.axes_px")
@@ -198,7 +198,7 @@ def _glints(entries: Any, conventions: Conventions) -> tuple[tuple[tuple[float, 
 
 
 def _words(value: Any) -> str:
-    """Make the text of an extractor as one line that may be shown."""
+    """Convert the text of an extractor to one printable line."""
     return one_line(" ".join(str(value).split()), 200)
 
 

@@ -20,7 +20,7 @@ WORKER = "eyerender.benchmark.worker"
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Object of an entry point for an extractor that is a program: its command, or why it cannot be run here."""
+    """Entry-point object of an extractor that is a program: its command, or why it cannot run here."""
 
     argv: tuple[str, ...] | None
     missing: str = ""
@@ -28,7 +28,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class ExtractorCommand:
-    """An extractor to be run: its label, the request, and the command that runs it."""
+    """An extractor to run: its label, the reference given by the user, and the command."""
 
     name: str
     given: str
@@ -36,15 +36,15 @@ class ExtractorCommand:
 
 
 def names() -> tuple[str, ...]:
-    """List names in the entry-point group `eyerender.extractors`, sorted."""
+    """Return the names in the entry-point group `eyerender.extractors`, sorted."""
     return tuple(sorted(_installed()))
 
 
 def resolve(given: str) -> ExtractorCommand:
-    """Resolve a name of the entry-point group, `module:callable`, or a command line, each optionally after `LABEL=`.
+    """Resolve an entry-point name, `module:callable` or a command line, each optionally after `LABEL=`.
 
     Raises:
-        InputError: it is none of these, or the program does not exist.
+        InputError: the reference is none of these, or the program does not exist.
     """
     label, _, rest = given.partition("=")
     spec = rest.strip() if rest and re.fullmatch(r"[\w.-]+", label) else given.strip()
@@ -68,7 +68,7 @@ def resolve(given: str) -> ExtractorCommand:
 
 
 def defaults() -> tuple[list[ExtractorCommand], dict[str, str]]:
-    """List the installed extractors that can run here, and the reasons why the remaining ones cannot."""
+    """Return the installed extractors that can run here, and the reasons why others cannot."""
     ready, absent = [], {}
     for name, entry in sorted(_installed().items(), key=lambda item: item[0]):
         try:
@@ -84,7 +84,7 @@ def _installed() -> dict[str, EntryPoint]:
 
 def _of_entry_point(name: str, given: str, entry: EntryPoint) -> ExtractorCommand:
     argv: tuple[str, ...] = (sys.executable, "-m", WORKER, entry.value, name)
-    # Code of other packages is loaded only in the worker, which is all that it can harm.
+    # Code of other packages is loaded only in the worker, so that it can harm nothing else.
     if entry.value.startswith("eyerender."):
         found: Any = entry.load()
         if isinstance(found, Command):

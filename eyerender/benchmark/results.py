@@ -1,6 +1,6 @@
-"""Results of a bench as JSON, rows and tables: what extractors answered apart from how long it took.
+"""Results of a benchmark as JSON, rows and tables, with the timing kept separate.
 
-results.json and results.csv are the same for identical runs; times.json holds what differs from run to run.
+results.json and results.csv are identical for identical runs; times.json holds the values that differ between runs.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LEAST_FOR_ORIGIN = 8
 def entry_of(
     run: Run, images: Sequence[LabelledImage], sigmas: Sequence[float | None], factors: Sequence[dict[str, float]]
 ) -> dict[str, Any]:
-    """Return results of one extractor."""
+    """Return the results of one extractor."""
     greeting = run.greeting
     return {
         "name": run.extractor.name,
@@ -57,10 +57,10 @@ def entry_of(
 
 
 def suggested_origin(run: Run) -> dict[str, str] | None:
-    """The pixel origin that an extractor's results suggest it uses, where it declares the other one.
+    """Return the pixel origin that an extractor's results suggest, if it declares the other one.
 
     With the wrong origin, the centres of right pupils are off by half a pixel on both axes. The mean offset must lie
-    within 0.15 px of that on both, and be known to a quarter of a pixel, so that no other bias looks like it.
+    within 0.15 px of that on both axes and be known to a quarter of a pixel, to exclude other biases.
     """
     offsets = np.array([s.offset_px for s in run.scores if s.outcome == "right" and s.offset_px is not None])
     if run.greeting is None or len(offsets) < _LEAST_FOR_ORIGIN:
@@ -76,7 +76,7 @@ def suggested_origin(run: Run) -> dict[str, str] | None:
 
 
 def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors: dict[str, float]) -> dict[str, Any]:
-    """Return one line of results.csv: the answer of an extractor about an image."""
+    """Return one line of results.csv: the answer of an extractor for an image."""
     s = run.scores[k]
     dx, dy = s.offset_px or (None, None)
     da, db = s.axes_px or (None, None)
@@ -109,7 +109,7 @@ def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors:
 
 
 def times_of(runs: Sequence[Run], images: Sequence[LabelledImage]) -> dict[str, Any]:
-    """Make the content of times.json: the machine, and the times of every extractor in all and per image, in ms."""
+    """Return the content of times.json: the machine, and each extractor's times in total and per image, in ms."""
     return {
         "schema": TIMES_SCHEMA,
         "machine": {"system": platform.platform(), "processor": _processor(), "threads": 1},
@@ -128,14 +128,14 @@ def times_of(runs: Sequence[Run], images: Sequence[LabelledImage]) -> dict[str, 
 
 
 def digest_of(image: LabelledImage, key: str) -> str:
-    """Return the digest of an image, its hints and its truth, by which benches recognise the same task."""
+    """Compute the digest of an image, its hints and its truth, by which benchmarks recognise the same task."""
     pupil = None if image.pupil is None else image.pupil.numbers()
     truth = [key, pupil, image.visible, [[g.light, *g.xy_px] for g in image.glints]]
     return hashlib.sha256(json.dumps(truth).encode()).hexdigest()[:16]
 
 
 def gammas_of(images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
-    """List the encoding gammas given to the extractors, their origins, and the number of images of each."""
+    """Return the encoding gammas given to the extractors, their sources, and the number of images of each."""
     counts = Counter((float(image.hints["gamma"]), image.gamma_from) for image in images)
     return [{"gamma": gamma, "from": source, "images": n} for (gamma, source), n in sorted(counts.items())]
 
@@ -144,7 +144,7 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write rows as a CSV file.
 
     Raises:
-        EyerenderError: it cannot be written.
+        EyerenderError: the file cannot be written.
     """
     try:
         with open(path, "w", encoding="utf-8", newline="") as file:

@@ -1,4 +1,4 @@
-"""The bench: run every extractor over every image of a folder, then write figures, a table and plots."""
+"""The benchmark: run every extractor on every image of a folder, then write results, a table and plots."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def bench_extractors(
     progress: Progress | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """Run extractors over a labelled folder and write report.html, results.json, results.csv and times.json.
+    """Run extractors on a labelled folder; write report.html, results.json, results.csv and times.json.
 
     Args:
         folder: the labelled images.
         output: the folder that receives the results.
-        extractors: what to run, each under its own name: an installed name, `module:callable` (see `Extractor`), or
-            a command line, each perhaps after `NAME=`. By default all installed ones; the results name those that
-            cannot run here, and why.
+        extractors: an installed name, `module:callable` (see `Extractor`), or a command line, each optionally after
+            `NAME=`; names must differ. By default all installed ones; the results list those that cannot run here, with
+            the reason.
         options: jobs, time limits, checks and the like.
         progress: called with (done, total, note).
         changes: fields of `BenchOptions` by name, instead of those of `options`.
@@ -103,7 +103,7 @@ def bench_extractors(
 
 
 def _chosen(extractors: Sequence[str | ExtractorCommand] | None) -> tuple[list[ExtractorCommand], dict[str, str]]:
-    """Return the extractors to run, and why installed ones cannot be run if none were given."""
+    """Return the extractors to run; if none were given, also why installed ones cannot run."""
     absent: dict[str, str] = {}
     if extractors is None:
         chosen, absent = defaults()
@@ -121,7 +121,7 @@ def _chosen(extractors: Sequence[str | ExtractorCommand] | None) -> tuple[list[E
 def _results(
     folder: Path, runs: Sequence[Run], images: Sequence[LabelledImage], keys: Sequence[str]
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Make the content of results.json without its checks, and rows of results.csv."""
+    """Return the content of results.json without its checks, and the rows of results.csv."""
     edges = [_edge(image) for image in images]
     sigmas = [
         e.centre_sigma_px(i.pupil) if e and i.pupil and is_bounded(i.visible, i.known) else None
@@ -157,12 +157,12 @@ def _edge(image: LabelledImage) -> Edge | None:
     classes = None if image.known else image.classes()
     shows = None if classes is None else np.isin(classes, (PUPIL, IRIS))
     if shows is None and not image.known and image.visible is not None and image.visible < 1.0:
-        return None  # what hides the outline is unknown
+        return None  # the occluder of the outline is unknown
     return edge_of(grey, image.bit_depth, image.pupil, glints, image.known, shows)
 
 
 def _classified(run: Run, images: Sequence[LabelledImage]) -> Run:
-    """Add to every wrong ellipse what it shows instead of the pupil."""
+    """Add to every wrong ellipse the kind of object that it shows."""
     scores = []
     for s, image in zip(run.scores, images, strict=True):
         if s.outcome in ("wrong", "false") and s.ellipse is not None:
@@ -172,7 +172,7 @@ def _classified(run: Run, images: Sequence[LabelledImage]) -> Run:
 
 
 def _thumbnails(run: Run, images: Sequence[LabelledImage]) -> list[Thumbnail]:
-    """Return pictures of the first images of every kind of failure, the most frequent kinds first."""
+    """Return crops of the first images of every kind of failure, the most frequent kinds first."""
     kinds: dict[tuple[str, str], list[int]] = {}
     for k, s in enumerate(run.scores):
         if s.outcome not in ("right", "absent"):
@@ -195,7 +195,7 @@ def _thumbnails(run: Run, images: Sequence[LabelledImage]) -> list[Thumbnail]:
 
 
 def _factors(image: LabelledImage, edge: Edge | None) -> dict[str, float]:
-    """Return possible causes of an error; noise and blur as the folder states them, else as measured."""
+    """Return possible causes of an error; noise and blur as stated by the folder, else as measured."""
     out = dict(image.factors)
     if image.known:
         out |= {"noise_dn": image.known["noise_dn"], "blur_px": image.known["blur_px"]}
@@ -218,7 +218,7 @@ def _edge_summary(edges: Sequence[Edge | None], images: Sequence[LabelledImage])
 
 
 def _is_bench(output: Path) -> bool:
-    """Return whether a folder holds a bench's files and nothing else."""
+    """Return whether a folder holds a benchmark's files and nothing else."""
     try:
         found = {p.name for p in output.iterdir()}
     except OSError:

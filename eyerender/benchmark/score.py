@@ -1,4 +1,4 @@
-"""The score of one answer against one label: the outcome, and the errors of pupil and glints."""
+"""Score of one answer against one label: the outcome, and the errors of pupil and glints."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from .folder import LabelledImage
 from .glintlabels import TrueGlint, false_kind
 from .protocol import Reply
 
-# right: IoU > 0.9. wrong: another ellipse. none: no pupil reported. error: no usable answer. Where the image shows no
-# pupil: absent when none was reported, else false.
+# right: IoU > 0.9. wrong: another ellipse. none: no pupil reported. error: no usable answer. If the image shows no
+# pupil: absent if none was reported, else false.
 Outcome = Literal["right", "wrong", "none", "error", "absent", "false"]
 RIGHT_IOU = 0.9
 
@@ -32,7 +32,7 @@ class GlintScore:
         false_kinds: kinds of the reports that match none.
         unnamed: number of matches without a light, in images whose lights are known.
         named: number of matches for which the extractor named a light.
-        swapped: number of those for which it named the wrong light.
+        swapped: number of matches for which it named the wrong light.
     """
 
     true: int = 0
@@ -55,18 +55,18 @@ class Score:
         outcome: see `Outcome`.
         reason: why there is no ellipse.
         offset_px: (dx, dy) reported minus true centre.
-        axes_px: (da, db).
-        angle_deg: in (-90, 90].
+        axes_px: (da, db) reported minus true semi-axes.
+        angle_deg: reported minus true angle, in (-90, 90].
         iou: overlap of the ellipses.
         boundary_px: mean distance of the true outline from the reported ellipse (Sampson).
         confidence: confidence of the extractor.
         glints: scores of the glints.
         cpu_s: processor time that the extractor reports.
         wall_s: elapsed time that the extractor reports.
-        trip_s: time from question to answer.
-        ellipse: the ellipse that was reported.
+        trip_s: time from request to answer.
+        ellipse: the reported ellipse.
         with_pupil: whether the image shows a pupil.
-        subject: whose eye the image shows; "" where unknown.
+        subject: the person; "" if unknown.
         kind: what a wrong ellipse shows instead of the pupil (`failurekinds`).
         radius_px: sqrt(a b) of the true pupil.
     """
@@ -91,7 +91,7 @@ class Score:
 
     @property
     def centre_px(self) -> float | None:
-        """Length of the offset."""
+        """Length of the centre's offset, px."""
         return None if self.offset_px is None else math.hypot(*self.offset_px)
 
 
@@ -131,14 +131,14 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
 
 
 def failed(image: LabelledImage, reason: str, reports_glints: bool) -> Score:
-    """Score without a usable answer."""
+    """Return the score of an image without a usable answer."""
     missed = tuple((False, glint) for glint in image.glints)
     glints = GlintScore(true=len(missed), matches=missed) if reports_glints else None
     return Score("error", reason, glints=glints, with_pupil=image.pupil is not None)
 
 
 def score_glints(image: LabelledImage, reply: Reply) -> GlintScore:
-    """Match reported to true glints one to one within a glint's radius: as many as possible, then the nearest."""
+    """Match reported to true glints one to one within a glint's radius: first as many as possible, then the nearest."""
     true, reported = image.glints, reply.glints
     places = np.array([g.xy_px for g in true]).reshape(-1, 2)
     spots = np.array([xy for xy, _ in reported]).reshape(-1, 2)

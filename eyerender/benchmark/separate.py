@@ -1,4 +1,4 @@
-"""Detectors of other packages behind the protocol; it runs in their own environment and does not import this package.
+"""Run detectors of other packages behind the protocol, in their own environment and without importing this package.
 
     .../bin/python separate.py pupil-detectors|PuRe|ElSe|ExCuSe|Swirski2D
 
@@ -56,7 +56,7 @@ def main(name: str) -> int:
 
 
 def _pupil_labs(radii: Any) -> Callable[[Any], dict[str, Any]]:
-    """Return the pupil Labs' detector for a span of radii, px."""
+    """Return Pupil Labs' 2-D detector, set to a range of radii in px."""
     from pupil_detectors import Detector2D  # type: ignore[import-not-found,unused-ignore]
 
     size = {} if radii is None else {"pupil_size_min": 2 * radii[0], "pupil_size_max": 2 * radii[1]}
@@ -65,7 +65,7 @@ def _pupil_labs(radii: Any) -> Callable[[Any], dict[str, Any]]:
 
 
 def pupil_of(found: dict[str, Any]) -> dict[str, Any]:
-    """Return the pupil of the record; the detector reports "none" by a confidence of 0 or an empty ellipse."""
+    """Convert the detector's result to the record's pupil; a confidence of 0 or an empty ellipse means "none"."""
     ellipse = found["ellipse"]
     if found["confidence"] <= 0.0 or min(ellipse["axes"]) <= 0.0:
         return {"status": "missing", "reason": "no pupil detected (confidence 0)"}
@@ -73,13 +73,13 @@ def pupil_of(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _cheshm(name: str) -> Callable[[Any], dict[str, Any]]:
-    """Return a detector of cheshm with its own settings, which know nothing of the hints."""
+    """Return a detector of cheshm with default settings, ignoring the hints."""
     module: Any = importlib.import_module(f"cheshm.pupil_detectors.{name}")
     return lambda image: cheshm_pupil(module.detect_pupil(image))
 
 
 def cheshm_pupil(found: dict[str, Any] | None) -> dict[str, Any]:
-    """Return the pupil of the record; without an ellipse, such as a mere position, there is none."""
+    """Convert a result of cheshm to the record's pupil; a position without an ellipse counts as none."""
     centre, axes, angle = (found or {}).get("ellipse") or ((0.0, 0.0), (0.0, 0.0), 0.0)
     if not (min(axes) > 0.0 and np.isfinite([*centre, *axes, angle]).all()):
         return {"status": "missing", "reason": "no ellipse" if found else "no pupil detected"}
@@ -97,7 +97,7 @@ def _rectangle(centre: Any, axes: Any, angle: Any, confidence: Any) -> dict[str,
 
 
 def eight_bits(path: str, bit_depth: int) -> Any:
-    """Return the image as a writable (h, w) uint8 array."""
+    """Read an image as a writable (h, w) uint8 array."""
     with Image.open(path) as file:
         data = np.array(file)
     if data.dtype != np.uint8:

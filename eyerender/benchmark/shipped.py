@@ -1,4 +1,4 @@
-"""Extractors that come with the package: its own, the contour baseline, and programs that run detectors of others."""
+"""Extractors that come with the package: its own, the contour baseline, and wrappers of external detectors."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ CHESHM_PYTHON = "EYERENDER_CHESHM"
 PUPIL_LABS = "pupil-detectors"
 # Detectors of cheshm by the name of the object here.
 _CHESHM = {"pure": "PuRe", "else_": "ElSe", "excuse": "ExCuSe", "swirski": "Swirski2D"}
-# Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
+# Distance of a real eye's reflections from those of a typical eye placed at its pupil.
 _PLACE_MM = 1.5
 
 
 def own_fast(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
-    """Run this package's extractor: edges and an algebraic fit."""
+    """Extract with this package's extractor: edges and an algebraic fit."""
     return _own(FAST, image, request)
 
 
 def own_refined(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
-    """Run this package's extractor with a maximum-likelihood fit of the pixel model as well."""
+    """Extract with this package's extractor, including a maximum-likelihood fit of the pixel model."""
     return _own(REFINED, image, request)
 
 
 def opencv_contour(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
-    """Run the contour baseline."""
+    """Extract with the contour baseline."""
     from ..extraction.baseline import contour_pupil
 
     hints = request["hints"]
@@ -53,15 +53,15 @@ opencv_contour.reports = ("pupil",)  # type: ignore[attr-defined]
 
 
 def pupil_labs_python() -> Path | None:
-    """Return the interpreter of the environment with `pupil-detectors`, if there is one.
+    """Return the interpreter of the environment with `pupil-detectors`; None if there is none.
 
-    EYERENDER_PUPIL_DETECTORS names it; else it is where scripts/setup_pupil_detectors.sh puts it.
+    EYERENDER_PUPIL_DETECTORS names it; by default it is where scripts/setup_pupil_detectors.sh puts it.
     """
     return _interpreter(PUPIL_LABS_PYTHON, PUPIL_LABS)
 
 
 def cheshm_python() -> Path | None:
-    """Interpreter of the environment with `cheshm`: EYERENDER_CHESHM, else where scripts/setup_cheshm.sh puts it."""
+    """Return the interpreter with `cheshm`: EYERENDER_CHESHM, else that of scripts/setup_cheshm.sh."""
     return _interpreter(CHESHM_PYTHON, "cheshm")
 
 
@@ -81,7 +81,7 @@ def _separate(python: Path | None, detector: str, script: str) -> Command:
 
 
 def __getattr__(name: str) -> Command:
-    # It is looked up at each use, because the environment may have been made in the meantime.
+    # Looked up at each use, because the environment may have been created in the meantime.
     if name == "pupil_detectors":
         return _separate(pupil_labs_python(), PUPIL_LABS, "setup_pupil_detectors.sh")
     if name in _CHESHM:
@@ -118,7 +118,7 @@ def _own(settings: ExtractionSettings, image: NDArray[Any], request: Mapping[str
 
 
 def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None]:
-    """Return the light of each glint, where the rig is known."""
+    """Return the light of each glint, if the rig is known."""
     if rig is None or not found.glints or found.pupil.ellipse is None:
         return [None] * len(found.glints)
     camera = PinholeCamera.of(rig["K"], rig["R"], rig["t_mm"], (1, 1), rig["distortion"])

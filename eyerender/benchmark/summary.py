@@ -1,4 +1,4 @@
-"""Summary of the scores of many images: overall, and by the factors that vary."""
+"""Summaries of the scores of many images: overall, and by the factors that vary."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _VARIES = {"noise_dn": 0.25, "blur_px": 0.25, "contrast_to_noise": 0.25, "pupil_
 
 
 def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], reports_glints: bool) -> dict[str, Any]:
-    """Summarise some images; `sigmas_px` are the bound's sigma_c of each, None where it does not apply.
+    """Summarise some images; `sigmas_px` holds the bound's sigma_c of each, None where it does not apply.
 
     Errors are those of correctly found pupils (IoU > 0.9); `centre_px_of_all_found` includes wrong ones.
     """
@@ -78,7 +78,7 @@ def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], report
 
 
 def _intervals(scores: Sequence[Score], reports_glints: bool) -> dict[str, Any]:
-    """95 % intervals of every rate: `wilson` for independent trials, `subjects` for images that are alike."""
+    """Compute 95 % intervals of every rate: `wilson` for independent trials, `subjects` for correlated images."""
     shown = [s for s in scores if s.with_pupil]
     trials: dict[str, tuple[Sequence[float], Sequence[float], list[Score]]] = {}
     trials |= {o: ([s.outcome == o for s in shown], [1] * len(shown), shown) for o in _OUTCOMES}
@@ -101,7 +101,7 @@ def _intervals(scores: Sequence[Score], reports_glints: bool) -> dict[str, Any]:
 
 
 def efficiency(scores: Sequence[Score], sigmas_px: Sequence[float | None]) -> dict[str, Any]:
-    """Efficiency 1 / median of (centre error / 1.177 sigma_c) over the right ones; 1 reaches the Cramer-Rao bound."""
+    """Compute 1 / median of (centre error / 1.177 sigma_c) over right pupils; 1 reaches the Cramer-Rao bound."""
     pairs = [
         (c, MEDIAN_OF_RADIAL * sigma)
         for s, sigma in zip(scores, sigmas_px, strict=True)
@@ -137,7 +137,7 @@ def failures(scores: Sequence[Score], images: Sequence[LabelledImage]) -> list[d
 
 
 def failure_kind(score: Score) -> str:
-    """Reason of a failure, as it is counted; of a missing pupil without numbers, which differ from image to image."""
+    """Return the reason of a failure for counting, without numbers, which differ from image to image."""
     if score.outcome == "wrong":
         return score.kind or "another ellipse than the pupil's"
     reason = score.reason or "gave no reason"
@@ -145,7 +145,7 @@ def failure_kind(score: Score) -> str:
 
 
 def _joined(reasons: Sequence[str]) -> str:
-    """Return one text for reasons that differ only by their numbers, with the span of each number."""
+    """Join reasons that differ only by their numbers into one text with the range of each number."""
     columns = zip(*([m.group() for m in _NUMBER.finditer(reason)] for reason in reasons), strict=True)
     ordered = [sorted(column, key=float) for column in columns]
     spans = iter(c[0] if c[0] == c[-1] else f"{c[0]} to {c[-1]}" for c in ordered)
@@ -157,14 +157,14 @@ def bins(values: Sequence[float | None], name: str) -> list[tuple[float, float, 
 
     A factor with up to six values has one bin per value. A phase has quarters of a pixel, the hidden share has its
     tiers (whole, more than 0.7 visible, 0.3 to 0.7, less than 0.3), and any other factor has quarters of the images.
-    There are no bins where the factor hardly varies or is unknown for all images.
+    There are no bins if the factor hardly varies or is unknown for all images.
     """
     known = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
     there = np.flatnonzero(np.isfinite(known))
     if not len(there):
         return []
     some = known[there]
-    # Measured values differ at least by rounding.
+    # Measured values always differ by rounding.
     single = np.unique(np.round(some, 6))
     if name.startswith("phase"):
         edges = np.linspace(0.0, 1.0, _BINS + 1)
@@ -193,7 +193,7 @@ def breakdown(
     factors: Sequence[dict[str, float]],
     reports_glints: bool,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return summaries for every bin of every factor that varies, over the images that show a pupil."""
+    """Summarise every bin of every factor that varies, over the images that show a pupil."""
     shown = [i for i, s in enumerate(scores) if s.with_pupil]
     out: dict[str, list[dict[str, Any]]] = {}
     for name in FACTORS:
@@ -214,7 +214,7 @@ def by_condition(
     conditions: Sequence[Sequence[str]],
     reports_glints: bool,
 ) -> dict[str, dict[str, Any]]:
-    """Summaries of the images of every condition that occurs."""
+    """Summarise the images of every condition that occurs."""
     out = {}
     for name in CONDITIONS:
         at = [k for k, found in enumerate(conditions) if name in found]
@@ -246,7 +246,7 @@ def _glints(scores: Sequence[Score]) -> dict[str, Any]:
 
 
 def _recall_by(matches: Sequence[tuple[bool, TrueGlint]]) -> dict[str, dict[str, Any]]:
-    """Recall by saturation, visible share and place, each as true, matched and recall."""
+    """Compute the recall by saturation, visible share and place, each as true, matched and recall."""
     groups: dict[str, dict[str, list[bool]]] = {"saturation": {}, "visible": {}, "place": {}}
     for matched, glint in matches:
         tier = next(name for low, name in _VISIBLE_TIERS if glint.visible >= low)
@@ -266,7 +266,7 @@ def _recall_by(matches: Sequence[tuple[bool, TrueGlint]]) -> dict[str, dict[str,
 
 
 def sizes(values: Floats, low: bool = False) -> dict[str, Any]:
-    """Summarise sizes: number, median, 95th percentile (5th where low is bad) and worst value."""
+    """Summarise values: number, median, 95th percentile (5th if low is bad) and worst value."""
     tail = "p5" if low else "p95"
     if not len(values):
         return {"n": 0, "median": None, tail: None, "worst": None}

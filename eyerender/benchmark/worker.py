@@ -1,10 +1,10 @@
-"""A Python callable behind the protocol: `python -m eyerender.benchmark.worker module:callable [NAME]`.
+"""Run a Python callable behind the protocol: `python -m eyerender.benchmark.worker module:callable [NAME]`.
 
-With `--check` before it, the callable is only loaded: the files of its code are printed as a JSON list, or the exit
-code is 2 if there is no such callable.
+With `--check` first, the callable is only loaded: the files of its code are printed as a JSON list, or the exit code is
+2 if there is no such callable.
 
-The callable follows `protocol.Extractor`. What it prints goes to stderr. A `registry.Command` may take the place of a
-callable; it is then run instead.
+The callable follows `protocol.Extractor`; its output goes to stderr. If the name refers to a `registry.Command`, that
+command is run instead.
 """
 
 from __future__ import annotations
@@ -66,14 +66,14 @@ def main(argv: list[str]) -> int:
             record = extractor(image, request)
             spent = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
             text = json.dumps({"id": request["id"], "record": record, **spent}, default=_plain)
-        except Exception as error:  # a defect of the extractor on one image is that image's result
+        except Exception as error:  # an error of the extractor on one image is that image's result
             text = json.dumps({"id": request["id"], "error": f"{type(error).__name__}: {error}"})
         _send(answers, text)
     return 0
 
 
 def _check(reference: str, answers: TextIO) -> int:
-    """Load a callable and print the files of its module and of others that no installation holds."""
+    """Load a callable, and print the files of its module and of other modules outside installed packages."""
     try:
         found = load_reference(reference)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""The command line: `eyerender COMMAND`."""
+"""The command line, `eyerender COMMAND`."""
 
 from .main import main
 

@@ -1,4 +1,4 @@
-"""The application, which every command registers with."""
+"""The application with which every command registers."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from ..versions import __version__
 
 
 def option_name(field: str) -> str:
-    """Name a parameter or field on the command line: `timeout_s` is --timeout, with its unit in the help."""
+    """Return the command-line name of a parameter or field: `timeout_s` is --timeout, with its unit in the help."""
     return cyclopts.default_name_transform(field).removesuffix("-s")
 
 
 def shown_default(value: object) -> str | None:
-    """Format a default for the help; a switch that is off and an option that is not given have none."""
+    """Format a default for the help; switches that are off and options that are not given have none."""
     return None if value is None or value is False or value == () else str(value)
 
 

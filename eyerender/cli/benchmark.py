@@ -36,7 +36,7 @@ def bench_extractors(
 
     The output folder receives report.html, results.json, results.csv and times.json; only times.json differs between
     identical runs. Each extractor runs in its own process. If it crashes, hangs or returns invalid answers, only its
-    own result fails, with a reason. Answers are stored, so a second run asks only about what is new.
+    own result fails, with a reason. Answers are stored, so a second run only computes what is new.
 
     The exit code is 1 if an extractor gives no usable answer to any image. With --against or --require it is also 1 if
     an extractor fails on any image, if a required figure is not reached, or if significantly more images were lost than
@@ -50,14 +50,14 @@ def bench_extractors(
             Repeat the option for several extractors (default: all installed ones).
         jobs: The number of extractor processes that run at the same time.
         gamma: The encoding gamma of images whose folder states none (default: 1, linear).
-        eye_error: The standard deviation per axis, in mm, by which the hinted position of the eye is off.
+        eye_error: Standard deviation, per axis and in mm, of the error of the eye position given to extractors.
         pupil_class: The value of the pupil in masks of several classes.
         against: The results.json of an earlier bench to compare with.
-        require: A figure that must be reached, such as right>=.95 or own-fast:centre_px<.1. Repeat the option for
+        require: A result that must be reached, such as right>=.95 or own-fast:centre_px<.1. Repeat the option for
             several.
         timeout: Seconds that an extractor may take for one image.
-        quick: Take a tenth of the images, in which hard conditions are as frequent as in all.
-        fresh: Ask about every image again, also where an answer is stored.
+        quick: Use a tenth of the images, with hard conditions in the same proportion.
+        fresh: Ignore stored answers and run on every image again.
     """
     from ..benchmark.options import BenchOptions
     from ..benchmark.run import REPORT, TIMES, bench_extractors
@@ -86,7 +86,7 @@ def bench_extractors(
 
 
 def _table(data: dict[str, Any], times: dict[str, Any]) -> str:
-    """Write one line per extractor, then the reasons of failures."""
+    """Format one line per extractor, then the reasons of failures."""
     lines = [
         f"{'':<18} {'right':>5} {'wrong':>5} {'none':>5} {'error':>5} {'centre px':>10} {'p95':>8} {'bias x':>8} "
         f"{'bias y':>8} {'eff.':>5} {'axis a':>8} {'axis b':>8} {'bound.':>7} {'IoU':>6} "

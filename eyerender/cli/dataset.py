@@ -1,4 +1,4 @@
-"""Commands about datasets: generate, sample, preview, validate, status, merge, export-dataset."""
+"""Commands for datasets: generate, sample, preview, validate, status, merge, export-dataset."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def generate(
 ) -> int:
     """Make a labelled dataset, or resume an interrupted one.
 
-    When started again on the same folder, the command makes only what is missing. Ctrl-C or SIGTERM (`kill PID`) ends
-    it and keeps what is finished. In the background of a shell script only SIGTERM does, because the shell lets the
-    command ignore Ctrl-C there.
+    Started again on the same folder, the command makes only what is missing. Ctrl-C or SIGTERM (`kill PID`) stops it
+    and keeps what is finished. For a command in the background of a shell script, use SIGTERM: the shell makes it
+    ignore Ctrl-C.
 
     Args:
         spec: A dataset file, or the name of a shipped one.
@@ -45,7 +45,7 @@ def generate(
         dry_run: Only estimate the time and the disk space, from the last measured rate of this spec on this machine.
         measure: With --dry-run, make a few samples to measure the rate.
         count: Make COUNT samples of the spec's plan, spread over its subjects. Beyond the plan, new subjects are added.
-            A folder that holds more or fewer samples keeps those that are wanted.
+            If the folder has more or fewer samples, the required ones are kept.
     """
     part = part_of(shard)
     if measure and not dry_run:
@@ -160,9 +160,9 @@ def validate(
         folder: A folder written by render, quickstart or generate.
         quick: Do not open or hash the pictures. This still finds missing files and wrong sizes, but no changed bytes or
             wrong masks.
-        deep: Compute every line again. By default, 64 lines are computed again, one at a hashed position in each 64th
-            of the file; a folder with at most 64 lines is checked completely.
-        render: Render so many of a dataset's images again, and compare all of their pixels.
+        deep: Recompute every line of metadata. By default 64 lines are recomputed, one from each 64th of the file; a
+            folder with at most 64 lines is checked completely.
+        render: Number of a dataset's images to render again and compare pixel by pixel.
     """
     from ..dataset.validate import validate as check
 
@@ -174,11 +174,11 @@ def validate(
 
 @app.command(name="status")
 def status(folder: Annotated[Path, Parameter(name="DIR")], /, *, watch: bool = False, json: Result = None) -> int:
-    """Show how far a dataset's run is: rates by host, the time left, retries, stalled parts, and the disk.
+    """Show the progress of a dataset's run: rates by host, time left, retries, stalled parts, and disk space.
 
     Args:
-        folder: A folder that generate fills.
-        watch: Show it again every ten seconds until the run has ended.
+        folder: A folder that generate writes.
+        watch: Repeat every ten seconds until the run has ended.
     """
     import time
 
@@ -203,7 +203,7 @@ def merge(
 
     Args:
         folders: The folders of the parts.
-        output: The folder to write, or one that holds some of the shards already.
+        output: The folder to write; it may already hold some of the shards.
     """
     from ..dataset.merge import merge as join
 
@@ -251,10 +251,10 @@ def export_dataset(
 
 
 def part_of(text: str | None) -> tuple[int, int]:
-    """K and N of --shard K/N; all of it without the option.
+    """Parse K/N of --shard; without the option, return the whole.
 
     Raises:
-        InputError: it is not of this form.
+        InputError: the text has another form.
     """
     if text is None:
         return 1, 1
@@ -313,7 +313,7 @@ def _status_text(found: dict[str, Any]) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Format a time for people, in seconds up to days."""
+    """Format a duration for reading, in seconds up to days."""
     if seconds < 3600:
         minutes, rest = divmod(round(seconds), 60)
         return f"{minutes} min {rest} s"
@@ -321,13 +321,13 @@ def _duration(seconds: float) -> str:
 
 
 def _size(count: int) -> str:
-    """Format a size for people, in MB up to TB."""
+    """Format a size for reading, in MB up to TB."""
     unit, name = next(u for u in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if count >= u[0] or u[0] == 1e6)
     return f"{count / unit:.1f} {name}"
 
 
 def _short(value: Any) -> str:
-    """Format a statistic for people: numbers with four digits, the items of lists and mappings side by side."""
+    """Format a statistic for reading: numbers with four digits, lists and mappings on one line."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {_short(one)}" for key, one in value.items())
     if isinstance(value, list | tuple):

@@ -15,7 +15,7 @@ from .output import emit, say
 def doctor(*, json: Result = None) -> int:
     """Show which backends can render here, and how to fix those that cannot.
 
-    The exit code is 3 if none can render.
+    The exit code is 3 if no backend can render.
     """
     from ..backends.doctor import doctor_report
 
@@ -39,9 +39,9 @@ def doctor(*, json: Result = None) -> int:
 
 @app.command(name="setup-llvm")
 def setup_llvm() -> int:
-    """Find a libLLVM that renders on the CPU, or say how to install one.
+    """Find a libLLVM that renders on the CPU, or print how to install one.
 
-    On Debian and Ubuntu it also fetches the library libatomic where that is missing, without root rights.
+    On Debian and Ubuntu it also fetches the library libatomic if that is missing, without root rights.
     """
     from ..backends.set_up import setup_llvm as bring
 

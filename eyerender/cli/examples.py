@@ -64,7 +64,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "view": ("eyerender view eye E4 -o eye.svg", "eyerender view scene quickstart -o rig.pdf"),
     }
 )
-"""Command lines by command."""
+"""Example command lines, by command."""
 
 
 def add_examples(app: App) -> None:

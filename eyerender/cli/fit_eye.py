@@ -1,4 +1,4 @@
-"""The command fit-eye: an eye and its gaze from a recording's features."""
+"""The command fit-eye: fit an eye and its gaze to a recording's features."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ def fit_eye(
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
-    """Fit the eye behind a recording's features, and its gaze in every frame, with covariances.
+    """Fit the eye and its gaze in every frame to a recording's features, with covariances.
 
     The folder receives one eye file per eye (right.yaml, left.yaml), which every other command accepts, and fit.json:
-    gaze, pupil and slippage of every frame, what belongs to the person with its standard deviations, chi^2, and what
-    the recording does not show.
+    gaze, pupil and slippage of every frame, the person's parameters with standard deviations, chi^2, and the parameters
+    that the recording does not determine.
 
     Args:
         recording: Records as `features` or `extract` write them (JSON, JSONL), or a table (CSV).
         output: The folder to write.
         rig: A rig file or a scene for its rig (default: the rig in the recording).
         unknowns: A YAML file with the keys of `er.Unknowns` (default: the priors of a population, 3 mm of slippage).
-        eye: The eye that the fit begins with and the mean of its priors: a name or an eye file.
-        columns: A YAML file that says what the columns of a table are.
-        targets: Use the known targets, which give the line of sight.
-        robust: Weights against wrong features.
-        outline_px: Standard deviation of one pixel of outline, where records have no covariance.
-        glint_px: Standard deviation of a glint along each axis, where records have none.
+        eye: Start of the fit and mean of its priors: a catalogue name or an eye file.
+        columns: A YAML file with the meaning of a table's columns.
+        targets: Use the known targets, which determine the line of sight.
+        robust: Reduce the weight of wrong features.
+        outline_px: Standard deviation of one pixel of outline, for records without covariance.
+        glint_px: Standard deviation of a glint along each axis, for records without covariance.
     """
     from ..design.fit import fit_eye as fit
     from ..design.fitfolder import write_fits

@@ -21,7 +21,7 @@ PLACES = {
     "rays": "estimated as the origin of the estimator's gaze rays",
     "glints": "estimated from the glints, with an average cornea",
 }
-"""Source of the eye's place -> words for it."""
+"""Words for the source of the eye's position, by its code."""
 
 gaze = App(name="gaze", help="Estimate gaze from records of features, also from real images.")
 app.command(gaze)
@@ -61,15 +61,15 @@ def fit(
         records: Records as `features` or `extract` write them (JSON), one record per line (JSONL), or a table (CSV).
             Each needs its target.
         estimator: regression (polynomials of the pupil-glint vector; one light), direction-regression (polynomials of a
-            feature in pixels to directions; no screen needed), homography (normalisation by four
-            lights), cross-ratio (four lights at the screen's corners and one at the camera), hennessey (one camera, two
-            lights), shih-wu-liu (two cameras, two lights), guestrin-eizenman (one camera, two lights), or
-            maximum-likelihood (fits of a traced eye; any cameras and lights, rough positions of the eye);
-            or module:Class, a class of your own that can be made without arguments.
+            feature in pixels to directions; no screen needed), homography (normalisation by four lights), cross-ratio
+            (four lights at the screen's corners and one at the camera), hennessey (one camera, two lights), shih-wu-liu
+            (two cameras, two lights), guestrin-eizenman (one camera, two lights), or maximum-likelihood (fits of a
+            traced eye; any cameras and lights, rough positions of the eye); or module:Class, a class of your own that
+            can be made without arguments.
         output: The calibration file to write.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
         rig: A rig file or a scene file, for its rig.
-        columns: A YAML file that says what the columns of a table are (default: as their names say).
+        columns: A YAML file with the meaning of a table's columns (default: recognised from their names).
         function: regression, direction-regression: the function, R1 to R12.
         terms_x: regression: your own terms of x instead of a function, such as 'x + xy + 1'.
         terms_y: regression: your own terms of y.

@@ -8,7 +8,7 @@ from cyclopts import CycloptsError, MissingArgumentError, UnknownCommandError, U
 
 
 def usage_error(error: CycloptsError) -> str:
-    """Write one line that says what is wrong with a command line, and what to write instead."""
+    """Write one line that states what is wrong with a command line, and what to write instead."""
     command = " ".join(("eyerender", *(error.command_chain or ())))
     spare = [token for token in error.unused_tokens or () if not token.startswith("-")]
     if isinstance(error, UnknownCommandError) and error.unused_tokens:

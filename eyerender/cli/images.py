@@ -38,8 +38,8 @@ def render(
         spp: Replace the scene's samples per pixel.
         surfaces: Render the cornea as exact surfaces or as triangles (image.surfaces).
         exr: Also write the noise-free linear irradiance as EXR.
-        auto_exposure: Choose one exposure time for the whole run, so that 98 % of the pixels are at most at this share
-            of full scale (0.7, for instance; more than 1 clips).
+        auto_exposure: Choose one exposure time for the whole run, so that 98 % of the pixels do not exceed this share
+            of full scale (for instance 0.7; a value above 1 clips).
     """
     from ..folders.outfolder import refuse_non_empty
     from ..imaging.images import auto_exposed, render_folder

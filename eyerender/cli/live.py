@@ -1,4 +1,4 @@
-"""The command that shows a scene live: live."""
+"""The command live: show a scene on an interactive page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def live(
     threads: Threads = None,
     strict: Strict = False,
 ) -> int:
-    """Show a scene on a page of this machine: its rig in 3-D, and its image, which follows what you move.
+    """Show a scene on a local web page: its rig in 3-D, and its image, which follows your changes.
 
     The command prints the page's address, which holds a random token, and runs until Ctrl-C. It needs the extra `live`.
 

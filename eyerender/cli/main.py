@@ -1,4 +1,4 @@
-"""Running a command, and the error policy: lines on stderr, an exit code, no traceback without --debug."""
+"""Run a command, with the error policy: one line on stderr, an exit code, and no traceback without --debug."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def run(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except BrokenPipeError:
-        # The reader has gone (`| head`). This is no error, and the interpreter must not complain at exit.
+        # The reader has closed the pipe (`| head`). This is not an error, and the interpreter must not complain at
+        # exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (Exception, KeyboardInterrupt) as error:
@@ -78,10 +79,10 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _called(tokens: Sequence[str]) -> Any:
-    """Parse the tokens and call their command."""
+    """Parse the tokens and call the command."""
     try:
         command, given, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
-    except InputError as error:  # a record of options that refuses one of its fields
+    except InputError as error:  # a record of options rejects one of its fields
         raise InputError(error.reason, source=f"--{option_name(error.path)}") from None
     check_outputs(given.arguments)
     return command(*given.args, **given.kwargs)
@@ -89,7 +90,7 @@ def _called(tokens: Sequence[str]) -> Any:
 
 @contextmanager
 def _one_line_warnings() -> Iterator[None]:
-    """Print warnings about unfinished runs as one line each, like other warnings of a command."""
+    """Print warnings about unfinished runs as single lines, like other warnings of a command."""
     with warnings.catch_warnings():
         before = warnings.showwarning
 
@@ -112,7 +113,7 @@ def _without_cache() -> AbstractContextManager[None]:
 
 
 def _reported(error: BaseException) -> int | None:
-    """Print an expected error as one line and return the exit code; for other errors print nothing and return None."""
+    """Print an expected error as one line and return the exit code; for other errors return None."""
     if isinstance(error, ValidationError) and error.argument is not None:
         return _fail(f"{error.argument.name}: {error.exception_message}", InputError.exit_code)
     if isinstance(error, CycloptsError):
@@ -130,7 +131,7 @@ def _reported(error: BaseException) -> int | None:
     if isinstance(error, OSError):
         name = f"{error.filename}: " if error.filename else ""
         return _fail(f"{name}{error.strerror or error}", 1)
-    # Libraries that call back into Python can turn the interrupt into an error of their own.
+    # Libraries that call back into Python may turn the interrupt into other errors.
     if isinstance(error, KeyboardInterrupt) or _interrupted.is_set():
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -143,7 +144,7 @@ def _fail(message: str, code: int) -> int:
 
 
 def _terminate_like_interrupt() -> dict[int, Any]:
-    """Let SIGTERM and SIGHUP unwind as Ctrl-C does, so that nothing half-written remains, and remember the signal."""
+    """Let SIGTERM and SIGHUP unwind like Ctrl-C, so that nothing half-written remains, and record the signal."""
     _interrupted.clear()
 
     def handler(_number: int, _frame: FrameType | None) -> None:
@@ -153,7 +154,7 @@ def _terminate_like_interrupt() -> dict[int, Any]:
     previous = {}
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
-        # A signal that a shell or nohup made us ignore stays ignored.
+        # A signal that a shell or nohup told this process to ignore stays ignored.
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
             try:
                 previous[number] = signal.signal(number, handler)

@@ -79,20 +79,21 @@ def extract(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Find the pupil ellipse and the glints in images or in a video.
+    """Extract the pupil ellipse and the glints from images or a video.
 
     An image without a detected pupil is a result with a reason, not an error. In a video, the search starts where the
-    pupil was in the previous frame. Files of a folder that are no images are skipped, and the reasons are printed.
+    pupil was in the previous frame. Files of a folder that are not images are skipped, and the reasons are printed.
 
     Args:
         images: Greyscale images, one folder of images, or one video.
-        scene: A scene; its rig assigns the glints to lights, and they are listed in the order of its lights.
+        scene: A scene with the rig; glints are assigned to its lights and listed in their order.
         gamma: Encoding gamma of the pixel values; 1 is linear.
         method: fast: edges and an algebraic fit; refined: also a maximum-likelihood fit.
         eyes: 2 for images of both eyes. The eye on the image's left is then called the right eye.
         output: File for the records, one per line (JSON lines).
-        overlay: Draw what was found: a folder for images (PNG), or a file for a video (.mp4, .avi or .mkv).
-        processes: Number of images that are worked on at the same time (default: one for each processor).
+        overlay: Draw the results over the images: a folder for images (PNG), or a file for a video (.mp4, .avi or
+            .mkv).
+        processes: Number of images processed at the same time (default: one per processor).
         record: Version of the records in the JSON, 1 or 2.
     """
     from ..extraction.settings import ExtractionSettings
@@ -136,7 +137,7 @@ def extract(
             file.writelines(json_module.dumps(one, allow_nan=False).encode() + b"\n" for one in records)
     data = {"schema": "eyerender/features/1", "rig": None, "records": records}
     names = None
-    if observed.index.camera.max() < 0:  # not rendered by this package
+    if observed.index.camera.max() < 0:  # another program rendered the folder
         paths = files_of(images)
         names = [str(paths[frame]) for frame in observed.index.frame]
     emit(data, _feature_table(observed, names), json, heed)
@@ -153,7 +154,7 @@ def compare(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Compare the features found in a folder's images with its analytic ones.
+    """Compare the features extracted from a folder's images with the exact ones.
 
     The differences are given in pixels and in degrees of gaze.
 

@@ -1,4 +1,4 @@
-"""Options with the same meaning in several commands, with their help."""
+"""Options shared by several commands, with their help."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def at_least_one(_type: Any, value: float | None) -> None:
     """Check that a given count is at least 1.
 
     Raises:
-        ValueError: it is below 1.
+        ValueError: the count is below 1.
     """
     if value is not None and value < 1:
         raise ValueError(f"must be >= 1, not {value}")

@@ -1,4 +1,4 @@
-"""Output of results and progress: results to stdout (or a JSON file), progress and logs to stderr."""
+"""Output of results to stdout or a JSON file, and of progress and logs to stderr."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from ..storage.files import write_json
 
 
 def say(text: str) -> None:
-    """Print a line of log on stderr."""
-    # In one piece: an interrupt between text and line end would join two lines.
+    """Print a line of the log on stderr."""
+    # In one write: an interrupt between text and line end would join two lines.
     sys.stderr.write(f"{text}\n")
     sys.stderr.flush()
 
 
 class Heed:
-    """Warnings of a command: one line each on stderr and a list in the JSON; with `strict` errors instead."""
+    """Collector of a command's warnings: lines on stderr and a list in the JSON; with `strict`, errors instead."""
 
     def __init__(self, strict: bool) -> None:
         self.strict = strict
         self.found: list[InputWarning] = []
 
     def __call__(self, warnings: Iterable[InputWarning]) -> None:
-        """Print each warning once; raises the first as an `InputError` where the command is strict."""
+        """Print each warning once; if the command is strict, raise the first as an `InputError`."""
         new = [warning for warning in dict.fromkeys(warnings) if warning not in self.found]
         if new and self.strict:
             more = f"; {len(new) - 1} more" if len(new) > 1 else ""
@@ -41,10 +41,10 @@ class Heed:
 
 
 def emit(data: dict[str, Any], text: str, target: str | None, heed: Heed | None = None) -> None:
-    """Print the result: `text` on stdout, or the data of a JSON target.
+    """Print a result: `text` to stdout, or `data` to a JSON target.
 
-    The JSON target is stdout ('-') or a file; with a file, the text is printed as well. The data get a list `warnings`
-    if the command collects any.
+    The JSON target is stdout ('-') or a file; with a file, the text is printed as well. If the command collects
+    warnings, the data contain a list `warnings`.
     """
     if heed is not None:
         data = {**data, "warnings": [warning.to_mapping() for warning in heed.found]}
@@ -58,7 +58,7 @@ def emit(data: dict[str, Any], text: str, target: str | None, heed: Heed | None 
 
 @contextmanager
 def progress(what: str) -> Iterator[Progress]:
-    """Show progress on stderr while the block runs: a bar on a terminal, else a line about every two seconds."""
+    """Show progress on stderr during the block: a bar on a terminal, otherwise a line about every two seconds."""
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn

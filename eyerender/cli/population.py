@@ -54,7 +54,7 @@ def population(
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
-    """Draw people and compare them with the sources of their joint distribution.
+    """Draw people, and compare them with the sources of their joint distribution.
 
     The output folder receives report.html (histograms and correlations next to the table's values, with standard
     errors, faces, sources), people.csv, faces.png and summary.json.
@@ -63,7 +63,7 @@ def population(
         preset: adults, emmetropic_adults, myopes, children or elderly, or a YAML file with the keys of `population`.
         output: The folder to write.
         count: Number of people in the statistics and in people.csv.
-        check: Number of people whose eyes are built, to count what physics refuses.
+        check: Number of people whose eyes are built, to count the impossible ones.
         faces: Number of people whose eyes are rendered (0: none).
         spp: Samples per pixel of the faces.
         seed: The seed of the draw.

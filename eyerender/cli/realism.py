@@ -24,17 +24,17 @@ def realism(
     limit: int = 200,
     json: Result = None,
 ) -> int:
-    """Measure how real pictures of eyes look: contrasts, edges, texture, highlights, noise.
+    """Measure image statistics of eye pictures: contrasts, edges, texture, highlights, noise.
 
-    With a second folder, such as frames of your own camera, the command compares both, and a classifier says how well
-    patches of the two can be told apart (needs scikit-learn, which is not installed by default).
+    With a second folder, such as frames of your own camera, the command compares both. A classifier then measures how
+    well patches of the two can be told apart; this needs scikit-learn, which is not installed by default.
 
     Args:
         folder: A folder of images of one eye each: written by this package, exported by it, or your own.
         other: A second folder, to compare with.
         output: An HTML page to write, with the table and montages at equal scale.
-        gamma: Encoding gamma of the pixel values; give it twice for two folders. Default: what a folder of this package
-            or an export states, else 1 (linear).
+        gamma: Encoding gamma of the pixel values; give it twice for two folders. Default: the value that a folder of
+            this package or an export states, else 1 (linear).
         limit: The largest number of images of a folder, chosen evenly.
     """
     from ..realism import realism as measured
@@ -50,7 +50,7 @@ def realism(
 
 
 def _table(data: dict[str, Any]) -> str:
-    """Write one line per figure: median and middle half of each folder's images, and the ratio of the medians."""
+    """Format one line per statistic: median and middle half of each folder's images, and the ratio of the medians."""
     folders, ratios = data["folders"], data["ratios"]
     lines = []
     for k, f in enumerate(folders):
@@ -71,7 +71,7 @@ def _table(data: dict[str, Any]) -> str:
 
 
 def _test(data: dict[str, Any]) -> list[str]:
-    """One line per kind of patch: how well the two folders can be told apart."""
+    """Format one line per kind of patch: how well the two folders can be told apart."""
     if len(data["folders"]) < 2:
         return []
     if data["separability"] is None:

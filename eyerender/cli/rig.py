@@ -1,4 +1,4 @@
-"""The command rig: how well a rig can see a population's gaze."""
+"""The command rig: how well a rig determines a population's gaze."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def rig(
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
-    """Tell how well gaze can be known with a rig, for whom it fails, and whether its LEDs are safe.
+    """Report how well a rig determines gaze, for whom it fails, and whether its LEDs are safe.
 
     The folder receives report.html, summary.json, people.csv (one row per person) and gaze.csv (one row per direction):
     the bound by noise alone, visible outline and glints, errors of estimators on exact features, and eye safety.
@@ -46,13 +46,13 @@ def rig(
             `population`.
         people: Number of people.
         sample: Number of people for the errors of estimators on exact features.
-        images: Number of people for their errors on rendered images, 25 each (a few seconds an image).
+        images: Number of people for errors on rendered images, 25 each (a few seconds per image).
         workers: Number of processes (default: one per processor). Results do not depend on it.
         seed: The seed of the people.
-        slippage_mm: Standard deviation of people's places about the scene's, along each axis.
-        relief_mm: Standard deviation of the eye relief of a headset, along x, on top of it (3 is a good choice).
+        slippage_mm: Standard deviation of the eyes' positions about the scene's, along each axis.
+        relief_mm: Additional standard deviation along x, for the eye relief of a headset (3 is a good choice).
         azimuth_deg: Half range of the directions of gaze, horizontally.
-        elevation_deg: Half range, vertically.
+        elevation_deg: Half range of the directions of gaze, vertically.
         unknowns: A YAML file with the keys of `er.Unknowns` (default: priors of a population, 3 mm of slippage).
     """
     from ..applications.rigs import REPORT, RigSize, run_rig

@@ -27,15 +27,14 @@ def study(
 ) -> int:
     """Replicate a published gaze study, or compare observers or conditions.
 
-    The folder receives summary.json, findings.json, both as CSV, and report.html. A folder of the same study is
-    updated in place. Rendered images form a dataset in images/: an interrupted run resumes, and finished images are
-    reused.
+    The folder receives summary.json, findings.json, both as CSV, and report.html. A folder of the same study is updated
+    in place. Rendered images form a dataset in images/: an interrupted run resumes, and finished images are reused.
 
     Args:
         name: guestrin2006 (model-based gaze), blignaut2014 (interpolation-based gaze), observers (analytic against
             image-derived features on the head-mounted rig), conditions (analytic errors over the screen, head
-            positions, pupil sizes and eye parameters), or rigs (six known layouts over a population: who is lost where,
-            and what each LED buys).
+            positions, pupil sizes and eye parameters), or rigs (six known layouts over a population: for whom each
+            fails where, and the effect of each LED).
         output: The folder to write.
         eyes: Eye models separated by commas, as catalogue names or eye files (default: E1 to E5).
         people: rigs: Number of people (default: 100).
@@ -75,7 +74,7 @@ def _rigs(output: Path, people: int | None, eyes: str | None, options: StudyOpti
 
 
 def _table(summary: dict[str, Any]) -> str:
-    """Write the most important means, one line each."""
+    """Format the most important means, one line each."""
     rows = summary["rows"]
     if summary["study"] == "blignaut2014":
         lines = [f"{'protocol':<12} {'observer':<15} {'eye':<18} {'set':<5} {'best':<5} {'mean deg':>9}"]

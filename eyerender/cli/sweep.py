@@ -1,4 +1,4 @@
-"""The command sweep: many layouts of a rig, and which of them are worth a look."""
+"""The command sweep: compare many layouts of a rig."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def sweep(
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
-    """Compare layouts of a rig: places of cameras and LEDs, focal length, resolution, number and intensity of LEDs.
+    """Compare layouts of a rig: positions of cameras and LEDs, focal length, resolution, number and intensity of LEDs.
 
-    The folder receives report.html, summary.json and layouts.csv with the layouts that no other one beats in bound,
-    dropout, number of LEDs and light on the cornea. A run that was stopped resumes.
+    The folder receives report.html, summary.json and layouts.csv. The report shows the Pareto front of bound, dropout,
+    number of LEDs and light on the cornea. An interrupted run resumes.
 
     Args:
         spec: A YAML file that names a scene and has the key `sweep`.
         output: The folder to write.
-        people: Number of people (default: the file's).
+        people: Number of people (default: that of the file).
         workers: Number of processes (default: one per processor). Results do not depend on it.
         shard: K/N: evaluate only every N-th layout, starting with the K-th (1 <= K <= N), for array jobs that write to
             one folder.

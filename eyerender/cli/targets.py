@@ -14,19 +14,19 @@ from ..storage.files import parse_json, read_text, refuse_address, refuse_specia
 
 # Names of the parameters that say where a command writes; all other paths of a command are inputs.
 OUTPUTS = ("output", "overlay", "json")
-_MAX_DEPTH = 4  # of files that name files: a dataset's spec, its scene, a head's manifest, its meshes
+_MAX_DEPTH = 4  # depth of files that name files: a dataset's spec, its scene, a head's manifest, its meshes
 _MAX_NAME = 1024
 
 
 def check_outputs(arguments: Mapping[str, Any]) -> None:
-    """Check where a command will write, before it does anything.
+    """Check all paths that a command will write to, before it does anything.
 
     Args:
         arguments: the command's arguments by the names of its parameters.
 
     Raises:
-        InputError: an output is an address; is an input, also by another name; is a file that an input names, or a
-            file of an input folder; is the JSON target and no file; or will be emptied and holds an input.
+        InputError: an output is an address; is an input, also by another name; is a file that an input names, or a file
+            of an input folder; is the JSON target but not a file; or will be emptied although it holds an input.
     """
     arguments = dict(_flattened(arguments))
     said = {name: arguments[name] for name in OUTPUTS if arguments.get(name) is not None}
@@ -70,7 +70,7 @@ def _refuse_inputs(place: Path, state: os.stat_result, given: Sequence[Path], *,
 
 
 def _paths(value: Any) -> Iterator[Path]:
-    """List the existing files among the values of an argument, and folders where it is a path and not a name."""
+    """Return the existing files among an argument's values, and folders if the value is a path rather than a name."""
     if isinstance(value, tuple | list):
         for one in value:
             yield from _paths(one)
@@ -81,7 +81,7 @@ def _paths(value: Any) -> Iterator[Path]:
 
 
 def _with_named(paths: Iterable[Path]) -> Iterator[tuple[Path, os.stat_result]]:
-    """List the paths that exist, and the files that scenes, specs and manifests among them name."""
+    """Return the paths that exist, and the files named by scenes, specs and manifests among them."""
     seen = set()
     for _ in range(_MAX_DEPTH):
         named: list[Path] = []
@@ -95,7 +95,7 @@ def _with_named(paths: Iterable[Path]) -> Iterator[tuple[Path, os.stat_result]]:
 
 
 def _content(path: Path) -> Any:
-    """Read what a YAML or JSON file holds; None for other files, and for those that cannot be read."""
+    """Return the content of a YAML or JSON file; None for other files, and for unreadable ones."""
     from ..spec import MAX_YAML_BYTES, parse_yaml
 
     kind = path.suffix.lower()
@@ -104,7 +104,7 @@ def _content(path: Path) -> Any:
     try:
         text = read_text(path, limit=MAX_YAML_BYTES)
         return parse_json(text) if kind == ".json" else parse_yaml(text, str(path))
-    except InputError:  # the command says so
+    except InputError:  # the command itself reports this
         return None
 
 

@@ -1,6 +1,6 @@
 """Assembly of the finished dataset from its shards.
 
-It writes metadata.jsonl, failures.jsonl, the data card and, last, dataset.json.
+This writes metadata.jsonl, failures.jsonl, the data card and, last, dataset.json.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ FAILURES, CARD = "failures.jsonl", "README.md"
 
 
 def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
-    """Assemble the dataset from verified shards, and return its statistics.
+    """Assemble the dataset from verified shards and return its statistics.
 
     The same shards give the same bytes.
 
     Raises:
         EyerenderError: no sample could be made, or the disk is full or not writable.
-        InputError: a shard's lines are not as this version writes them.
+        InputError: a shard's metadata differs from what this version writes.
     """
     for name in (FAILURES, METADATA, INDEX, CROISSANT, CARD, DATASET):
         remove_parts(folder / name)
@@ -89,7 +89,7 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
 
 
 def _assemble_packed(plan: Plan, folder: Path) -> dict[str, Any]:
-    """Merge what each shard says of itself: the index of images, the failures and the statistics. No line is read."""
+    """Merge the summaries of packed shards: image index, failures and statistics. No metadata is read."""
     statistics, splits, parts = Statistics(), sorted(plan.spec.splits), []
     with written(folder / FAILURES) as file:
         for shard in plan.spec.shards:
@@ -123,13 +123,13 @@ def _assemble_packed(plan: Plan, folder: Path) -> dict[str, Any]:
 
 
 def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
-    """List what is wrong with the assembled files of a dataset: dataset.json and the files whose checksums it contains.
+    """Describe each damaged file among dataset.json and the assembled files whose checksums it contains.
 
-    Where dataset.json has no checksums, as older versions wrote it, metadata.jsonl is compared with the shards.
+    If dataset.json is from an older version without checksums, metadata.jsonl is compared with the shards.
 
     Args:
         folder: the dataset.
-        digest: digest of the plan by which it must be made; None: any plan.
+        digest: digest of the plan that the dataset must have; None: any plan.
         quick: compare sizes only.
     """
     try:
@@ -151,13 +151,13 @@ def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> I
 
 
 def verify_finished(folder: Path, digest: str | None) -> Iterator[str]:
-    """List what is wrong with the finished shards of an unfinished run."""
+    """Describe each damaged file of the finished shards of an unfinished run."""
     for shard in sorted(finished(folder)):
         yield from verify(folder, shard, digest)
 
 
 def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
-    """List what is wrong with the files of a finished dataset: the results of `damage`, and of `verify` for its shards.
+    """Describe each damaged file of a finished dataset: the results of `damage`, and of `verify` for its shards.
 
     Args:
         folder: the dataset.
@@ -177,7 +177,7 @@ def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
 
 
 def shards_of(dataset: Mapping[str, Any]) -> Sequence[int] | None:
-    """Return shards that the spec in a dataset.json asks for; None where it does not say."""
+    """Return the shard numbers of the spec in a dataset.json; None if it contains none."""
     spec = dataset.get("spec")
     if isinstance(spec, dict) and (spec.get("choice") == "spread" or spec.get("layout") is not None):
         with suppress(InputError):
@@ -190,7 +190,7 @@ def shards_of(dataset: Mapping[str, Any]) -> Sequence[int] | None:
 
 
 def _lines(folder: Path, shards: Iterable[int], take: Callable[[dict[str, Any]], None]) -> Iterator[bytes]:
-    """List lines of metadata.jsonl; `take` receives each, parsed."""
+    """Yield the lines of metadata.jsonl; call `take` with each line, parsed."""
 
     def lines() -> Iterator[str]:
         for shard in shards:
@@ -228,10 +228,10 @@ class Statistics:
         self.glints = 0
 
     def take_packed(self, done: Mapping[str, Any]) -> None:
-        """Count a packed shard's done.json, except for what its rows of the index tell.
+        """Count a packed shard from its done.json, except for what `take_index` counts.
 
         Raises:
-            InputError: it is not in the format of this version.
+            InputError: done.json has another format than this version's.
         """
         self.take_shard(dict(done))
         try:
@@ -252,7 +252,7 @@ class Statistics:
                 self.splits[name], self.subjects[name] = len(own), set(np.unique(own).tolist())
 
     def take_shard(self, done: dict[str, Any]) -> None:
-        """Count a shard's done.json."""
+        """Count a shard from its done.json."""
         backend = done["backend"]
         self.backends.add(f"{backend['name']} ({backend['device']}; {done['cpu']})")
         chosen = done.get("chosen")
@@ -263,7 +263,7 @@ class Statistics:
         self.bytes += sum(entry["bytes"] for entry in done["files"].values())
 
     def take_line(self, line: dict[str, Any]) -> None:
-        """Count an image's line of metadata."""
+        """Count one image from its metadata."""
         self.images += 1
         self.splits[line["split"]] += 1
         self.subjects.setdefault(line["split"], set()).add(line["subject"])

@@ -1,4 +1,4 @@
-"""The data card: the content of a dataset, in words."""
+"""The data card: a description of a dataset in words."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _licence(spec: DatasetSpec) -> str:
 
 
 def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
-    """Make the text of README.md."""
+    """Return the text of README.md."""
     spec = plan.spec
     splits = sorted(statistics["images_by_split"])
     shown = {name: number for name, number in run_versions().items() if name not in ("python", "results")}

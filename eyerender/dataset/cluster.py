@@ -1,7 +1,7 @@
 """The Ray engine: one actor per worker, on one machine or many; one per GPU where Ray has GPUs.
 
-Every machine must see the folder under the same path. Ray restarts an actor that dies and lets it make its shard again.
-The engine puts shards in place, as the local engine does.
+Every machine must have the folder under the same path. Ray restarts an actor that dies, and the actor makes its shard
+again. As with the local engine, only the main process puts shards in place.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from .pool import RECYCLE_IMAGES, TRIES, Events, caller_hidden, end_of
 from .shard import Staged, write_shard
 from .worker import FAILURES, Job, failure
 
-# These variables locate a libLLVM or a GPU's driver on the driver's machine, and so on the others, installed alike.
+# These variables locate a libLLVM or a GPU driver on this machine, and on the other machines too, which are installed
+# alike.
 PASSED_ON = ("DRJIT_LIBLLVM_PATH", "DRJIT_LIBCUDA_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "XDG_CACHE_HOME")
 
 
@@ -46,7 +47,7 @@ class ShardActor:
         self._made = 0
 
     def render(self, shard: int, known: int) -> dict[str, Any]:
-        """Make a shard; returns a mapping with `ok`, and the summary or the kind and reason of the failure."""
+        """Make a shard; return a mapping with `ok`, and the summary or the kind and reason of the failure."""
         try:
             if self._maker is None:
                 self._maker = self._job.maker()
@@ -70,7 +71,7 @@ class RayEngine:
     """Runs shards on the actors of a Ray cluster.
 
     A separate process, the driver, talks to Ray, because Ray takes over its driver's signals: SIGTERM would end this
-    process with a stack trace. However this process ends, the driver then ends everything that Ray has started here.
+    process with a stack trace. When this process ends for any reason, the driver ends everything that Ray started here.
     """
 
     def __init__(self, job: Job, workers: int | None, *, address: str | None = None, timeout_s: float = 600.0) -> None:
@@ -80,7 +81,7 @@ class RayEngine:
         self.timeout_s = timeout_s
 
     def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
-        """Make shards, and return those that were given up, with the reasons.
+        """Make shards; return those that were given up, with the reasons.
 
         Raises:
             InputError: Ray is not installed, or the cluster cannot be reached; or as for the local engine.
@@ -119,9 +120,9 @@ class RayEngine:
 def drive(pipe: Connection, driver: _Driver, shards: list[int]) -> None:
     """Run the driver.
 
-    It sends the names and arguments of events, ("failed", error), or ("end", shards lost). When the pipe's other end
-    closes, because the engine was interrupted or its process killed, the driver ends everything that Ray has started on
-    this machine: the session of processes that it leads.
+    The driver sends events by name with their arguments, ("failed", error), or ("end", lost shards). When the other end
+    of the pipe closes, because the engine was interrupted or killed, the driver ends everything that Ray started on
+    this machine: all processes of the session that it leads.
     """
     if hasattr(os, "setsid"):
         os.setsid()  # this also protects it from Ctrl-C
@@ -146,10 +147,10 @@ def _end_with(pipe: Connection) -> None:
 
 
 def end_session(session: int, patience_s: float = 3.0) -> None:
-    """End the other processes of a session, first with SIGTERM, later with SIGKILL.
+    """End the other processes of a session, first with SIGTERM, after `patience_s` seconds with SIGKILL.
 
-    Ray's agents can be recognised by nothing else: they lose their parents, change their titles and overwrite their
-    environment. Where there is no /proc this does nothing; there a process of Ray's own watches over its driver.
+    Only the session identifies Ray's agents: they lose their parents, change their titles and overwrite their
+    environment. Without /proc this does nothing; on such systems Ray itself watches its driver.
     """
     start = time.monotonic()
     asked: set[int] = set()
@@ -163,7 +164,7 @@ def end_session(session: int, patience_s: float = 3.0) -> None:
 
 
 def _members(session: int) -> Iterator[int]:
-    """List living processes of a session except this one."""
+    """Return the living processes of a session except this one."""
     for place in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it has ended
             # After the name, which may contain anything, follow state, parent, group and session.
@@ -181,7 +182,7 @@ class _Held:
 
 @dataclass
 class _Driver:
-    """Talks to Ray, in a separate process."""
+    """Driver of a Ray cluster, in a separate process."""
 
     job: Job
     workers: int | None
@@ -189,7 +190,7 @@ class _Driver:
     timeout_s: float
 
     def run(self, pending: deque[int], send: SendEvent) -> dict[int, str]:
-        """Make shards as the engine does, with the same errors."""
+        """Make shards and send events; raise the same errors as the engine."""
         ray: Any = import_module("ray")
         variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
         try:
@@ -203,7 +204,7 @@ class _Driver:
         except (ConnectionError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"the cluster cannot be reached ({reason})", source="--address") from None
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray has set a handler
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray has replaced the handler
         try:
             return self._run(ray, pending, send)
         finally:
@@ -250,13 +251,13 @@ class _Driver:
                     idle.append(remote.remote(asdict(self.job)))
             for job in held.values():
                 if time.monotonic() - job.since > self._limit():
-                    # Ray starts it again with its task.
+                    # Ray restarts it together with its task.
                     job.since = time.monotonic()
                     ray.kill(job.actor, no_restart=False)
         return lost
 
     def _limit(self) -> float:
-        """Return the largest time for a whole shard, s; `timeout_s` is for one sample."""
+        """Return the time limit for a whole shard in seconds; `timeout_s` is for one sample."""
         return self.timeout_s * max(1, int(self.job.plan["spec"].get("shard_size", 64)) // 8)
 
     @staticmethod

@@ -1,8 +1,8 @@
-"""Order of metadata.jsonl: lines that are the first to fill a column come first, all others keep their order.
+"""Order metadata.jsonl so that the first lines fill every column.
 
-Loaders determine a column's type from the first lines of the file (Hugging Face from its first 10 MB). A column that is
-null there would get no type, and loading would fail at the first value. An example is the reason of a glint that lids
-hide once in ten thousand images.
+The first line that fills a column comes to the front; all others keep their order. Loaders determine a column's type
+from the first lines of the file (Hugging Face from its first 10 MB). A column that is null there gets no type, and
+loading fails at the first value. An example is a reason that occurs once in ten thousand images.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any
 
 
 def type_first(lines: Callable[[], Iterable[str]], take: Callable[[dict[str, Any]], None]) -> Iterator[str]:
-    """Order lines of JSON as the module describes.
+    """Order lines of JSON so that the first lines fill every column.
 
-    `lines` is called twice, and `take` receives each line once, parsed.
+    `lines` is called twice; `take` is called once with each parsed line.
     """
     seen: set[str] = set()
     first: dict[int, str] = {}
@@ -33,7 +33,7 @@ def type_first(lines: Callable[[], Iterable[str]], take: Callable[[dict[str, Any
 
 
 def _filled(node: Any, path: str) -> Iterator[str]:
-    """List paths of everything that is neither null nor an empty list."""
+    """Return the paths of all values that are neither null nor an empty list."""
     if isinstance(node, dict):
         for key, value in node.items():
             yield from _filled(value, f"{path}.{key}")

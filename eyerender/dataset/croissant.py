@@ -58,7 +58,7 @@ _CONTEXT: dict[str, Any] = {
 
 
 def croissant(plan: Plan, metadata_sha256: str) -> dict[str, Any]:
-    """Return the description as JSON-LD."""
+    """Return the Croissant description as JSON-LD."""
     spec = plan.spec
     name = "".join(c if c.isalnum() else "_" for c in spec.name)
     return {

@@ -33,18 +33,18 @@ def _are(value: object, fits: Callable[[Any], bool]) -> bool:
 
 
 def samples_of(done: Mapping[str, Any]) -> tuple[list[int], list[int] | None]:
-    """Say which samples a shard holds: first and end, and the samples where some between are left out."""
+    """Return which samples a shard holds: first and end, plus the list of samples if some in between are missing."""
     return list(done["samples"]), done.get("chosen")
 
 
 def described(samples: Sequence[int]) -> tuple[list[int], list[int] | None]:
-    """Describe the samples of a shard for `samples_of`."""
+    """Describe the samples of a shard in the form that `samples_of` reads."""
     whole = isinstance(samples, range)
     return [samples[0], samples[-1] + 1], None if whole else list(samples)
 
 
 def is_sums(value: object) -> bool:
-    """Return whether a value from a file maps names to sizes and SHA-256, as `compare_sums` requires."""
+    """Return whether a value maps file names to sizes and SHA-256, as `compare_sums` requires."""
     return isinstance(value, Mapping) and all(
         isinstance(entry, Mapping) and _is_count(entry.get("bytes")) and isinstance(entry.get("sha256"), str)
         for entry in value.values()
@@ -72,13 +72,13 @@ def read_done(folder: Path, shard: int) -> dict[str, Any]:
     """Read a finished shard's done.json and check the type of every key.
 
     Raises:
-        InputError: it is not valid.
+        InputError: the file is not valid.
     """
     return read_done_file(folder / SHARDS / shard_name(shard) / DONE)
 
 
 def read_done_file(path: Path) -> dict[str, Any]:
-    """Read a done.json or the checkpoint of a partial shard, as `read_done`."""
+    """Read a done.json or the checkpoint of a partial shard, checked as in `read_done`."""
     data = read_json(path, limit=MAX_FILE_BYTES, follow=False)
     if data.get("schema") not in (SHARD_SCHEMA, PACKED_SHARD_SCHEMA):
         raise InputError(f"must have the schema {SHARD_SCHEMA!r} or {PACKED_SHARD_SCHEMA!r}", source=str(path))
@@ -89,7 +89,7 @@ def read_done_file(path: Path) -> dict[str, Any]:
 
 
 def compare_sums(folder: Path, sums: Mapping[str, Mapping[str, Any]], *, quick: bool = False) -> Iterator[str]:
-    """List files of a folder whose sizes or SHA-256 differ from those given by name; `quick` compares sizes only."""
+    """Describe each file of a folder whose size or SHA-256 differs from `sums`; `quick` compares sizes only."""
     for name, entry in sums.items():
         try:
             path = inside(folder, name)
@@ -116,7 +116,7 @@ def sum_of(path: Path) -> dict[str, Any]:
 
 
 def run_versions() -> dict[str, str]:
-    """List versions that affect a dataset's bytes."""
+    """Return the versions that affect a dataset's bytes."""
     found = versions()
     del found["opencv-python-headless"]  # nothing here uses it
     return {**found, "pillow": package_version("pillow")}

@@ -1,11 +1,11 @@
-"""Distributions, which may replace any value of a scene template.
+"""Distributions ("draws") that may replace any value of a scene template.
 
 A draw is a mapping with the key `draw`. Its value is a pure function of the dataset's seed, the draw's dotted path in
 the template, the unit it belongs to (a sample or a subject) and the attempt:
 
     u = (m + 1/2) / 2^53,   m = the first 53 bits of SHA-256("seed/path/unit/number/attempt")
 
-Therefore it depends neither on any other draw nor on the process that makes the sample. Grids form one joint full
+It therefore depends neither on other draws nor on the process that makes the sample. Grids form one joint full
 factorial design. Sobol draws form one joint scrambled sequence (Owen 1998, as in `scipy.stats.qmc.Sobol`).
 """
 
@@ -48,7 +48,7 @@ class _RangeDraw(_Draw):
 
 
 class FixedDraw(_Draw):
-    """The value itself; this form allows `per` and comments beside it."""
+    """A constant value; unlike a plain value, it allows `per` and comments beside it."""
 
     draw: Literal["fixed"]
     value: Any
@@ -85,7 +85,7 @@ class NormalDraw(_RangeDraw):
 
 
 class GaussianDraw(_Draw):
-    """Normal distribution without limits."""
+    """Normal distribution without truncation."""
 
     draw: Literal["normal"]
     mean: Drawn
@@ -124,13 +124,13 @@ class MultivariateNormalDraw(_Draw):
         return self
 
     def at(self, numbers: Sequence[float]) -> list[float]:
-        """Return the value at one number in (0, 1) for each dimension."""
+        """Return the value for one number in (0, 1) per dimension."""
         factor = np.linalg.cholesky(np.array(self.covariance))
         return [float(v) for v in np.array(self.mean) + factor @ ndtri(np.array(numbers))]
 
 
 class MixtureDraw(_Draw):
-    """One of several draws, by weight; it is read as a choice of draws."""
+    """One of several draws, chosen by weight; it is converted to a choice of draws."""
 
     draw: Literal["mixture"]
     components: Annotated[tuple[Any, ...], Field(min_length=1)]
@@ -139,14 +139,14 @@ class MixtureDraw(_Draw):
         """Return the choice of the components.
 
         Raises:
-            InputError: a component is no draw, or has no weight.
+            InputError: a component is not a draw, or has no weight.
         """
         data: dict[str, Any] = {MARK: "choice", "values": [], "weights": []}
         for k, component in enumerate(self.components):
             if not is_draw(component) or "weight" not in component:
                 raise InputError("must be a draw with a weight", path=f"components.{k}")
             data["weights"].append(component["weight"])
-            # Where its components are drawn is theirs to say; by default with the mixture.
+            # Each component may state for what it is drawn; by default as the mixture.
             data["values"].append({"per": self.per, **{k: v for k, v in component.items() if k != "weight"}})
         for value in data["values"]:
             if value["per"] is None:
@@ -191,11 +191,11 @@ class GridDraw(_Draw):
 
     @property
     def size(self) -> int:
-        """Number of values."""
+        """Number of values of the grid."""
         return len(self.values) if self.values is not None else self.steps or 1
 
     def point(self, k: int) -> Any:
-        """Return value number k."""
+        """Return value number k of the grid."""
         if self.values is not None:
             return self.values[k]
         if self.low is None or self.high is None or self.steps is None or self.steps == 1:
@@ -240,7 +240,7 @@ def is_draw(node: object) -> bool:
 
 
 def parse_draw(node: dict[str, Any], *, source: str, path: str) -> Draw:
-    """Parse the distribution that a node describes.
+    """Parse a node of a template as a distribution.
 
     Raises:
         InputError: with the path of the wrong key.
@@ -258,13 +258,13 @@ def parse_draw(node: dict[str, Any], *, source: str, path: str) -> Draw:
 
 
 def unit_number(seed: int, path: str, unit: str, number: int, attempt: int) -> float:
-    """Draw a number u in (0, 1); see the module."""
+    """Compute the number u in (0, 1) of a draw; see the module."""
     digest = hashlib.sha256(f"{seed}/{path}/{unit}/{number}/{attempt}".encode()).digest()
     return ((int.from_bytes(digest[:8], "big") >> 11) + 0.5) / 2.0**53
 
 
 def random_value(draw: Draw, u: float) -> Any:
-    """Return the value of a random draw at u; for a choice the index of the value."""
+    """Return the value of a random draw at u; for a choice, the index of the chosen value."""
     if isinstance(draw, UniformDraw | SobolDraw):
         return draw.low + (draw.high - draw.low) * u
     if isinstance(draw, LogUniformDraw):
@@ -289,7 +289,7 @@ def random_value(draw: Draw, u: float) -> Any:
 
 
 def truncated_normal(u: float, *, mean: float, sd: float, low: float, high: float) -> float:
-    """Quantile of the truncated normal, Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), in logarithms for accurate tails."""
+    """Compute the quantile Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), in logarithms, so that tails are accurate."""
     a, b = (low - mean) / sd, (high - mean) / sd
     if a > 0:
         # The upper tail is computed by symmetry, because Phi is indistinguishable from 1 there.

@@ -1,4 +1,4 @@
-"""What a run was made with, for those who want to make it again years later: source, packages, processor, options."""
+"""Record of what produced a run, so that it can be repeated years later: source, packages, processor, options."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .options import RunOptions
 
 @cache
 def environment() -> dict[str, Any]:
-    """SHA-256 of this package's source, versions of all installed packages, and the processor."""
+    """Return the SHA-256 of this package's source, the versions of all installed packages, and the processor."""
     return {"source_sha256": source_sum(), "packages": packages(), "cpu": cpu_family()}
 
 
 def source_sum() -> str:
-    """SHA-256 over the names and contents of the package's Python files, in the order of their names."""
+    """Compute the SHA-256 over names and contents of the package's Python files, sorted by name."""
     root, digest = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
         content = path.read_bytes()
@@ -29,11 +29,11 @@ def source_sum() -> str:
 
 
 def packages() -> dict[str, str]:
-    """Versions of all installed packages by name."""
+    """Return the versions of all installed packages by name."""
     found = {str(one.metadata["Name"]): one.version for one in distributions() if one.metadata["Name"]}
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
 
 
 def flags(options: RunOptions) -> dict[str, Any]:
-    """Options of a run, as its log keeps them."""
+    """Return the options of a run as its log records them."""
     return {key: value for key, value in asdict(options).items() if value is not None}

@@ -1,4 +1,4 @@
-"""Estimated cost of a run, from the last measured rate or from a few samples made in memory."""
+"""Estimate the cost of a run, from the last measured rate or from a few samples made in memory."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def estimate(
     warn: Warn | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """Time and disk that `generate` would need: seconds = t_start + (samples t + subjects t_subject) / workers.
+    """Estimate the time and disk space of `generate`: seconds = t_start + (samples t + subjects t_subject) / workers.
 
     The rate is the last one of this spec on this machine, for any seed and number of samples.
 
@@ -51,11 +51,11 @@ def estimate(
         changes: as for `generate`.
 
     Returns:
-        Schema eyerender/estimate/2; `seconds` and `bytes` are None where no rate is known.
+        A mapping (schema eyerender/estimate/2); `seconds` and `bytes` are None if no rate is known.
 
     Raises:
         InputError: the first sample cannot be made at all.
-        BackendError: with `measure`; there is nothing to render with.
+        BackendError: with `measure`, if no backend can render.
     """
     options = replace(options, **changes)
     plan = Plan.load(spec, eye=eye, seed=seed, count=count)
@@ -95,9 +95,10 @@ def estimate(
 def measured_rate(plan: Plan, maker: Maker, *, loading_s: float = 0.0) -> Rate:
     """Measure the rate of one worker, and store it.
 
-    The first samples of a worker record kernels. What they take beyond the usual time is the worker's start, with the
-    `loading_s` of its maker. Then come the first samples of a few subjects, with the time for eyes and textures. Where
-    a run makes as few samples of a subject, all that they take is their usual time.
+    The first samples of a worker record kernels; the extra time they take counts as the worker's start, with the
+    `loading_s` of its maker. Then come the first samples of a few subjects, which include the time for eyes and
+    textures. If the run itself makes no more samples per subject than this, their whole time counts as the time per
+    sample.
     """
     samples, subjects = plan.spec.count, plan.spec.selection.subject_count
     warm = _timed(maker, range(min(_WARM + _MORE, samples)))
@@ -128,7 +129,7 @@ def measured_rate(plan: Plan, maker: Maker, *, loading_s: float = 0.0) -> Rate:
 
 @dataclass(frozen=True, slots=True)
 class _Timed:
-    """What a sample took, and what it is on disk."""
+    """Duration of a sample, and its size on disk."""
 
     seconds: float
     images: int
@@ -136,7 +137,7 @@ class _Timed:
 
 
 def _timed(maker: Maker, samples: Iterable[int]) -> list[_Timed]:
-    """Make samples in memory as a worker does, which traces one while it finishes the last."""
+    """Make samples in memory like a worker, which traces one sample while it finishes the previous one."""
     found, began = [], time.perf_counter()
     for made in maker.make_all(samples):
         size = sum(len(png_bytes(picture)) for image in made.images for picture in image.pictures.values())

@@ -1,7 +1,7 @@
-"""References to variables in a template, `{var: EXPRESSION}`: arithmetic on drawn values, and nothing else.
+"""References to variables in a template, `{var: EXPRESSION}`: arithmetic on drawn values, nothing else.
 
 An expression holds numbers, names of variables, `name.column` of a table's row, `name[k]` of a vector, + - * / **, and
-the functions in `FUNCTIONS`. It is parsed by Python's own parser and evaluated here, node by node; nothing is executed.
+the functions in `FUNCTIONS`. Python's parser reads it, and this module evaluates it node by node; nothing is executed.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def is_reference(node: object) -> bool:
 
 
 def names_of(text: str) -> set[str]:
-    """List names of the variables in an expression.
+    """Return the names of the variables in an expression.
 
     Raises:
-        InputError: it is not an expression of this kind.
+        InputError: the text is not such an expression.
     """
     tree = _parsed(text)
     functions = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
@@ -57,10 +57,10 @@ def names_of(text: str) -> set[str]:
 
 
 def evaluate(text: str, variables: Mapping[str, Any]) -> Any:
-    """Return the value of an expression: a number, or what a variable holds where the expression is its name alone.
+    """Evaluate an expression: a number, or the variable's own value if the expression is only a name.
 
     Raises:
-        InputError: the value is not a finite number or a list of such, or cannot be computed.
+        InputError: the value cannot be computed, or is neither a finite number nor a list of such.
     """
     try:
         value = _value(_parsed(text).body, variables)
@@ -86,7 +86,7 @@ def _parsed(text: str) -> ast.Expression:
 
 
 def _check(node: ast.expr, text: str) -> None:
-    """Check that an expression holds only what `_value` computes."""
+    """Check that an expression contains only what `_value` can compute."""
     match node:
         case ast.Constant(value=value) if _is_number(value):
             return

@@ -1,7 +1,7 @@
 """Files that a dataset's spec names (HDR maps, head meshes, calibrations, eye files), and their checksums.
 
-Their content affects the images as the spec does. Their checksums, by the names in the spec, are therefore part of a
-run's identity. `Plan.of` adds the eye files, which it reads itself.
+Their content affects the images, so their checksums, by the names in the spec, are part of a run's identity. `Plan.of`
+adds the eye files, which it reads itself.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from .template import possible
 
 
 def sums_of_files(scene: Mapping[str, Any], base: Path) -> dict[str, str]:
-    """Map every file that a scene of the template may name to its SHA-256, including a manifest's own files.
+    """Compute the SHA-256 of every file that a scene of the template may name, including the files of a manifest.
 
-    Names are as written; those in a manifest are relative to `base`, like all others.
+    Names are kept as written; those in a manifest are relative to `base`, like all others.
 
     Raises:
         InputError: a file is missing or cannot be read.
@@ -29,7 +29,7 @@ def sums_of_files(scene: Mapping[str, Any], base: Path) -> dict[str, str]:
 
 
 def check_files(files: Mapping[str, str], base: Path) -> None:
-    """Check that files still have their checksums; this is cheap while no file changes.
+    """Check that files still have their checksums; fast if their times and sizes are unchanged.
 
     Raises:
         InputError: a file has changed.
@@ -52,7 +52,7 @@ def _names(scene: Mapping[str, Any], base: Path) -> Iterator[str]:
 
 
 def _texts(node: Any, *keys: str) -> Iterator[str]:
-    """Return every text that may be at a place of a template, or in a list there."""
+    """Return every text that a template allows at a path, or in a list there."""
     for value in possible(node):
         if keys and isinstance(value, Mapping):
             yield from _texts(value.get(keys[0]), *keys[1:])
@@ -67,7 +67,7 @@ def _texts(node: Any, *keys: str) -> Iterator[str]:
 
 
 def sum_of_file(path: Path) -> str:
-    """Return the SHA-256 of a file, cached while the file seems unchanged.
+    """Compute the SHA-256 of a file, cached while its time and size are unchanged.
 
     Raises:
         InputError: the file cannot be read.
@@ -75,7 +75,7 @@ def sum_of_file(path: Path) -> str:
     try:
         state = path.stat()
     except OSError:
-        return file_digest(path)  # this reports what is wrong with it
+        return file_digest(path)  # the loader of this file reports what is wrong with it
     return _kept_sum(path, (state.st_mtime_ns, state.st_size, state.st_ino))
 
 

@@ -1,4 +1,4 @@
-"""What becomes part of a dataset spec when its file is read: the spec that it extends, and the rows of its tables."""
+"""Read the files that become part of a dataset spec: the spec that it extends, and its tables."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from .draws import MARK, is_draw
 
 MAX_ROWS = 10_000
 _MAX_BYTES = 4 * 2**20
-_MAX_DEPTH = 8  # of specs that extend others
+_MAX_DEPTH = 8  # depth of specs that extend others
 EXTENDS = "extends"
 
 
 def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -> dict[str, Any]:
-    """Return the mapping of a spec merged into the one that it extends; mappings are merged, anything else is replaced.
+    """Merge the mapping of a spec into the one that it extends; only mappings are merged, other values are replaced.
 
     Args:
         data: the mapping.
-        file_of: finds the file of a spec by its path or the name of a shipped one.
+        file_of: returns the file of a spec, given its path or the name of a shipped one.
         folder: folder of the spec. Names of other files in either spec are relative to it.
         depth: number of specs that extend this one.
 
@@ -47,14 +47,14 @@ def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -
 
 
 def _merged(below: Any, own: Any) -> Any:
-    # A draw is a value of its own, whose keys mean nothing to another one.
+    # A draw is replaced as a whole, because its keys mean nothing to another draw.
     if not (isinstance(below, Mapping) and isinstance(own, Mapping)) or MARK in below or MARK in own:
         return own
     return {**below, **{key: _merged(below[key], value) if key in below else value for key, value in own.items()}}
 
 
 def with_tables(node: Any, folder: Path) -> Any:
-    """Replace every `table` draw by the choice of its rows, each a mapping from column to number.
+    """Replace every `table` draw by a choice among its rows, each a mapping from column to number.
 
     Raises:
         InputError: a table cannot be read.
@@ -93,7 +93,7 @@ def _choice(node: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def aliased_draws(data: Any) -> Iterator[tuple[str, str]]:
-    """List pairs of places of a file's content in which one draw stands by a YAML alias: each is drawn on its own."""
+    """Return pairs of paths that share one draw by a YAML alias: each is drawn independently."""
     seen: dict[int, str] = {}
 
     def places(node: Any, path: str) -> Iterator[tuple[str, Any]]:

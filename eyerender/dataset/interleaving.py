@@ -1,8 +1,8 @@
-"""Order of a plan's samples in which every shard mixes subjects: short runs of a subject, one subject after another.
+"""Order of a plan's samples in which every shard mixes subjects: short runs, one subject after another.
 
-The samples of a subject are cut into runs of `run` samples. A shard takes the first run of each subject in a seeded
-order, then the second ones, and so on; what is left of the subjects comes last. So consecutive samples, which share the
-preparation of their subject, stay together, and any shard of `MIXED` runs has that many subjects if the plan has.
+The samples of a subject are cut into runs of `run` samples. The order takes the first run of each subject, with
+subjects in a seeded order, then the second runs, and so on; remaining samples come last. So consecutive samples share
+the preparation of their subject, and a shard of `MIXED` runs has as many subjects if the plan has.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 
 from ..arrays import Ints
 
-MIXED = 64  # runs of a shard
+MIXED = 64  # runs per shard
 _MULTIPLIERS = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 
 
 def scrambled(numbers: Ints, seed: int) -> Ints:
-    """Hash integers of 64 bits one to one (the finalizer of splitmix64, Steele, Lea and Flood 2014); sort by it to mix.
+    """Permute 64-bit integers by a hash (the finalizer of splitmix64, Steele, Lea, Flood 2014); sort by it to shuffle.
 
-    Unlike the generators of NumPy, it is the same for ever.
+    Unlike NumPy's generators, it never changes between versions.
     """
     step, first, second = (np.uint64(m) for m in _MULTIPLIERS)
     with np.errstate(over="ignore"):
@@ -33,7 +33,7 @@ def scrambled(numbers: Ints, seed: int) -> Ints:
 
 @dataclass(frozen=True, kw_only=True)
 class Interleaving:
-    """Order of the `planned` samples of `subjects` subjects, of which some have one sample more than others."""
+    """Order of the `planned` samples of `subjects` subjects; some have one sample more than others."""
 
     planned: int
     subjects: int
@@ -59,17 +59,17 @@ class Interleaving:
 
     @property
     def _rounds(self) -> int:
-        """Number of runs that every subject has."""
+        """Number of full runs of every subject."""
         return self.planned // self.subjects // self.run
 
     @cached_property
     def _tails(self) -> Ints:
-        """Where what is left of each subject begins, in their seeded order, (S + 1,)."""
+        """Position where the remaining samples of each subject begin, in their seeded order, (S + 1,)."""
         left = np.diff(self._first)[self._order] - self._rounds * self.run
         return np.concatenate([[0], np.cumsum(left)]) + self._rounds * self.run * self.subjects
 
     def samples_at(self, positions: Ints) -> Ints:
-        """Samples at some positions of the order."""
+        """Return the samples at positions of the order."""
         whole, (k, within) = self.run * self.subjects, np.divmod(positions % (self.run * self.subjects), self.run)
         sequence = positions // whole * self.run + within
         tail = positions >= self._rounds * whole
@@ -79,7 +79,7 @@ class Interleaving:
         return np.asarray(self._first[self._order[k]] + sequence)
 
     def positions_of(self, samples: Ints) -> Ints:
-        """Positions of some samples in the order."""
+        """Return the positions of samples in the order."""
         subject = samples * self.subjects // self.planned
         sequence = samples - self._first[subject]
         rank = self._rank[subject]

@@ -1,4 +1,4 @@
-"""Line of metadata of one image of a sample, without the names of its files, and the image's name."""
+"""Metadata of one image of a sample, without the names of its files, and the image's name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .realise import Realised
 
 
 def image_name(sample: int, frame: int, frames: int, side: str) -> str:
-    """Return the name of an image without ending; `frame` counts within the sample, which has `frames` of them."""
+    """Return the name of an image without suffix; `frame` counts within the sample, which has `frames` frames."""
     return f"{sample:08d}-{f'{frame:03d}-' if frames > 1 else ''}{side}"
 
 
@@ -25,7 +25,7 @@ def image_line(
     labels: dict[str, Any],
     record_version: int = RECORD,
 ) -> tuple[str, dict[str, Any]]:
-    """Return the name and line of observation `row` of a sample; `frames` is the number of frames of each sample."""
+    """Return name and metadata of observation `row` of a sample; `frames` is the number of frames per sample."""
     sample, scene, observations = found.sample, found.scene, found.observations
     assert sample is not None
     assert scene is not None
@@ -43,7 +43,7 @@ def image_line(
         "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
         "bit_depth": scene.spec.sensor.bit_depth,
         "gamma": scene.spec.sensor.gamma,
-        # Keys of version 4 that no scene fills yet: moments and movements of the frame, and what the eye wears.
+        # Keys of version 4 that no scene fills yet: time within the sequence, movements, and what the eye wears.
         **dict.fromkeys(("time_s", "event", "rig_pose")),
         # A frame's number is unique in the whole dataset.
         "records": [{**record, "frame": turn.sample * frames + frame}],
@@ -61,7 +61,7 @@ def image_line(
             "spectacles": None,
             "contact_lens": None,
             **_person(scene, side),
-            # They are stored as text, because their nested keys may differ between samples, which columns must not.
+            # Stored as text, because their nested keys may differ between samples, which table columns do not allow.
             "scene_json": json.dumps(sample.scene, sort_keys=True),
             "eye_json": json.dumps({k: v for k, v in eye.items() if k != "sources"}, sort_keys=True),
         },
@@ -70,7 +70,7 @@ def image_line(
 
 
 def _person(scene: Scene, side: str) -> dict[str, Any]:
-    """`person` of a line; the entrance pupil is that of the table's luminance, not of the image."""
+    """Return the metadata `person`; its entrance pupil is that at the table's luminance, not that of the image."""
     found: dict[str, Any] = scene.person_numbers(side)
     if "entrance_pupil_mm" not in found.get("person", {}):
         return found

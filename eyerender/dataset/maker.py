@@ -1,4 +1,4 @@
-"""Making of samples, with one renderer for all samples of a worker."""
+"""Make samples, with one renderer for all samples of a worker."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class MadeImage:
     """An image of a sample.
 
     Attributes:
-        name: file name without its ending.
+        name: file name without its suffix.
         pictures: pixels by kind (`LabelsSpec.pictures`).
-        line: line of metadata, without files.
+        line: metadata, without the names of files.
         saturated: whether the image is saturated (`is_saturated`).
     """
 
@@ -47,7 +47,7 @@ class MadeImage:
 
 @dataclass(frozen=True)
 class MadeSample:
-    """The images of one sample (none where it was given up), and the attempts that failed."""
+    """Images of one sample (none if it was given up), and the attempts that failed."""
 
     index: int
     images: tuple[MadeImage, ...]
@@ -55,7 +55,7 @@ class MadeSample:
 
 
 class Maker:
-    """Makes samples of one plan on one backend."""
+    """Maker of the samples of one plan on one backend."""
 
     def __init__(self, plan: Plan, frames: int, *, backend: BackendChoice = "auto", threads: int | None = None) -> None:
         self.plan = plan
@@ -75,12 +75,12 @@ class Maker:
         return next(self.make_all([index]))
 
     def make_all(self, indices: Iterable[int]) -> Iterator[MadeSample]:
-        """Make samples in order. What is left to do for one besides tracing is done while the next is traced."""
+        """Make samples in order, tracing each while the previous one is finished."""
         for begun in one_behind(self._begun(indices)):
             yield begun.result()
 
     def _begun(self, indices: Iterable[int]) -> Iterator[Future[MadeSample]]:
-        """Trace the frames of samples; a second thread makes the rest."""
+        """Trace the frames of samples in turn, while a second thread completes them."""
         waiting: deque[Realised] = deque()
 
         def frames() -> Iterator[Frames]:
@@ -101,13 +101,13 @@ class Maker:
         return self._beside.submit(lambda: MadeSample(found.index, tuple(self._images(found, begun)), found.rejections))
 
     def _exposed(self, found: Realised) -> Realised:
-        """Find the sample with the exposure of its subject; that of the scene where the subject's pictures are dark."""
+        """Set the exposure of the sample's subject; if the subject's images are dark, keep that of the scene."""
         level = self.plan.spec.auto_exposure
         if level is None or found.sample is None:
             return found
         subject = found.sample.turn.subject
         if self._settled is None or self._settled[0] != subject:
-            # Whatever sample of a subject is made, the first that can be made decides.
+            # Whichever sample of a subject comes first, its first sample that can be made decides.
             before = (realise(self.plan, k, self.frames) for k in range(self.plan.first_of(subject), found.index))
             first = next((r.scene for r in before if r.scene is not None), found.scene)
             assert first is not None

@@ -1,4 +1,4 @@
-"""Joining of parts of one run that were made in folders of their own, without a shared file system."""
+"""Join parts of one run that were made in separate folders, without a shared file system."""
 
 from __future__ import annotations
 
@@ -25,21 +25,22 @@ SCHEMA = "eyerender/merge/1"
 
 
 def merge(parts: Sequence[str | Path], out: str | Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Put the finished shards of several folders of one run into one, and assemble the dataset if none is missing.
+    """Put the finished shards of several folders of one run into one folder; assemble the dataset if none is missing.
 
     Files are linked where both folders are on one file system, and copied otherwise. A shard that several folders hold
     is taken from the first. Merging again adds what is missing.
 
     Args:
         parts: folders that `generate --shard K/N` has filled, of the same spec, options and versions.
-        out: the folder to write: a new one, or one of the same run.
+        out: the folder to write, new or of the same run.
         progress: called with shards done, shards in all, and "shards".
 
     Returns:
-        A summary: schema eyerender/merge/1.
+        A summary (schema eyerender/merge/1).
 
     Raises:
-        InputError: a folder holds no run, or that of another spec or version; a shard is damaged; `out` is taken.
+        InputError: a folder holds no run, or one of another spec or version; a shard is damaged; `out` holds something
+            else.
         EyerenderError: the disk is full or not writable.
     """
     if not parts:
@@ -74,7 +75,7 @@ _SAME = ("schema", "digest", "spec", "versions")
 
 
 def _take(folder: Path, places: Sequence[Path], plan: Plan, step: Progress) -> None:
-    """Take every shard that the folder lacks from the first part that holds it."""
+    """Copy every shard that the folder lacks from the first part that has it."""
     wanted, there = set(plan.spec.shards), finished(folder)
     sources = {shard: place for place in reversed(places) for shard in finished(place) & wanted - there}
     for k, (shard, place) in enumerate(sorted(sources.items())):
@@ -86,7 +87,7 @@ def _take(folder: Path, places: Sequence[Path], plan: Plan, step: Progress) -> N
 
 
 def _staged(folder: Path, place: Path, shard: int) -> Staged:
-    """Link or copy a shard into a temporary folder, from which `commit` takes it."""
+    """Link or copy a shard into a temporary folder, for `commit` to put in place."""
     name, done = shard_name(shard), read_done(place, shard)
     stage = folder / f"{STAGE}{name}-{uuid.uuid4().hex[:12]}"
     for kind, own in ((SHARDS, "shard"), *((kind, kind) for kind in KINDS)):
@@ -103,7 +104,7 @@ def _staged(folder: Path, place: Path, shard: int) -> Staged:
 def _copied(source: Path, place: Path) -> None:
     if source.is_symlink():
         raise InputError("is a symbolic link", source=str(source))
-    with suppress(OSError):  # other file systems, and those without links
+    with suppress(OSError):  # another file system, or one without links
         os.link(source, place)
         return
     shutil.copyfile(source, place)

@@ -1,4 +1,4 @@
-"""Options of a dataset run and of its plan, shared by Python, the command line and the engines."""
+"""Options of dataset runs and plans, shared by Python, the command line and the engines."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanOptions:
-    """Subjects, splits and size of the pictures, in place of those of the spec.
+    """Subjects, splits and image size that replace those of the spec.
 
     Attributes:
         subjects: Replace the number of subjects of the plan.
@@ -68,7 +68,7 @@ class PlanOptions:
         """Return the spec with these changes.
 
         Raises:
-            InputError: they cannot be read, or do not fit.
+            InputError: a value cannot be parsed, or does not fit.
         """
         from .picturesize import scaled
 
@@ -84,7 +84,7 @@ class PlanOptions:
 
 
 def _of_layout(spec: DatasetSpec, layout: str) -> dict[str, Any]:
-    """Values of a spec in another layout; packed shards get their default size where the spec has smaller ones."""
+    """Convert the values of a spec to another layout; too small packed shards get their default size."""
     if layout == "files":
         return {"layout": None}
     from .spec import PACKED_SHARD

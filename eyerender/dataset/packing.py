@@ -1,7 +1,7 @@
-"""Packing of a finished shard: its pictures into one tar, its lines into compressed members (`folders.packed`).
+"""Pack a finished shard: its images into one tar, its metadata into compressed members (`folders.packed`).
 
-The images of a shard stand in a seeded order, so that any stretch of a tar mixes the shard's subjects. In the tar the
-files of one image have one name with different endings, as WebDataset asks: NAME.png, NAME.mask.png, ...
+The images of a shard are in a seeded order, so that any part of a tar mixes the shard's subjects. In the tar, the files
+of one image share a name with different suffixes, as WebDataset requires: NAME.png, NAME.mask.png, ...
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ _SHARD = "shard"  # folder of the lines of a partial shard
 
 
 def pack(stage: Path, done: dict[str, Any], seed: int) -> dict[str, Any]:
-    """Pack a complete partial shard, and return the new content of its done.json.
+    """Pack a complete partial shard; return the new content of its done.json.
 
-    The old files are removed last. A shard whose packing was interrupted is packed again.
+    The old files are removed last, so that an interrupted packing can be repeated.
 
     Raises:
         OSError: the disk is full or not writable.
@@ -78,12 +78,12 @@ def pack(stage: Path, done: dict[str, Any], seed: int) -> dict[str, Any]:
 
 
 def unpack(stage: Path, done: dict[str, Any]) -> dict[str, Any]:
-    """Turn a packed shard in a stage back into a partial one, and return the content of its checkpoint.
+    """Turn a packed shard in a stage back into a partial one; return the content of its checkpoint.
 
-    The packed files are removed last. A shard whose unpacking was interrupted is unpacked again.
+    The packed files are removed last, so that an interrupted unpacking can be repeated.
 
     Raises:
-        InputError: it is damaged.
+        InputError: the shard is damaged.
         ValueError: the same.
         OSError: the disk is full or not writable.
     """
@@ -120,7 +120,7 @@ def _lines(stage: Path, done: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _write_tar(stage: Path, lines: list[dict[str, Any]], file: Any) -> None:
-    """Write the pictures of all lines, and note in each line where they stand."""
+    """Write the images of all lines, and record their offsets in each line."""
     with tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar:
         for line in lines:
             own = line[MEMBERS] = {}
@@ -137,7 +137,7 @@ def _write_tar(stage: Path, lines: list[dict[str, Any]], file: Any) -> None:
 
 
 def _counts(lines: list[dict[str, Any]]) -> dict[str, Any]:
-    """What the statistics of the dataset need of the shard's lines."""
+    """Count what the statistics of the dataset need from the shard's metadata."""
     pupils = [line["labels"]["pupil"] for line in lines]
     sizes = [pupil["amodal"]["semi_axes_px"][0] for pupil in pupils if pupil["amodal"]["semi_axes_px"] is not None]
     return {

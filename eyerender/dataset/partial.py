@@ -1,12 +1,12 @@
-"""Shards at work: samples are appended one by one, and checkpoints keep what is finished when the worker is stopped.
+"""Unfinished shards: samples are appended one by one, and checkpoints preserve them when the worker is stopped.
 
     .partial-00003-<id>/images/*.png   masks/*.png   shard/lines.jsonl   done.json
 
 `done.json` in this folder is the last checkpoint: it has the keys of a finished shard's `done.json` and lists the files
-of the samples that are finished. It is written after they are synced. What came after it is made again.
+of the samples that are finished. It is written after these files are synced; later samples are made again.
 
-The next worker takes the folder over by renaming it, and writes the lines to a new file. So a worker that hangs, and
-wakes up when its shard was given to another one, harms nothing.
+The next worker takes the folder over by renaming it, and writes metadata to a new file. So a worker that hangs and
+wakes up after its shard was given to another one does no harm.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from .packing import pack, unpack
 from .plan import Plan
 
 CHECKPOINT_S = 10.0
-"""At most so much work is lost when a worker is killed."""
+"""Time between checkpoints: the most work lost when a worker is killed."""
 _SHARD = "shard"  # folder of the lines
 
 
 class PartialShard:
-    """A shard whose samples are being made; a context manager, which resumes what an earlier worker has finished.
+    """A shard in the making; a context manager that resumes the finished samples of an earlier worker.
 
     Attributes:
-        made: samples that are finished, also those that were given up.
+        made: number of finished samples, including those that were given up.
         images: number of their images.
     """
 
@@ -49,7 +49,7 @@ class PartialShard:
         self.plan, self.shard, self.folder = plan, shard, folder
         self.made: set[int] = set()
         self.images = 0
-        self._start = self._checkpoint = self._last = time.monotonic()  # of this worker, the checkpoint, the sample
+        self._start = self._checkpoint = self._last = time.monotonic()  # of worker, checkpoint and sample
         self._before = 0.0  # seconds of earlier workers
         self._made_by = {"digest": plan.digest, "versions": run_versions(), "backend": backend, "cpu": cpu_family()}
         self._rejections: list[dict[str, Any]] = []
@@ -78,14 +78,14 @@ class PartialShard:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
-        """Keep what is finished; where there is no checkpoint, nothing is left."""
+        """Keep the checkpoint; without one, remove everything."""
         self._writer.__exit__(kind, *rest)
         self._lines.close()
         if kind is not None and not (self.stage / DONE).is_file():
             shutil.rmtree(self.stage, ignore_errors=True)
 
     def add(self, sample: MadeSample) -> None:
-        """Write a sample's images and lines; make a checkpoint when it is time.
+        """Write a sample's images and metadata; make a checkpoint if one is due.
 
         Raises:
             OSError: the disk is full or not writable.
@@ -105,14 +105,14 @@ class PartialShard:
             self._add_line(sample.index, (json.dumps(line, allow_nan=False) + "\n").encode())
             self._saturated += [sample.index] * image.saturated
         self.made.add(sample.index)
-        # The next sample is thought to take as long as this one, and would be lost, too.
+        # The next sample would take about as long as this one and be lost too.
         now, before = time.monotonic(), self._last
         self._last = now
         if now - self._checkpoint + (now - before) > CHECKPOINT_S:
             self.checkpoint()
 
     def checkpoint(self) -> dict[str, Any]:
-        """Make durable what is finished, and return the content of done.json; raises as `add`."""
+        """Make finished samples durable; return the content of done.json. Raises as `add`."""
         self.plan.check_files()  # all samples of a shard must use the same files
         self._writer.flush()
         self._lines.flush()
@@ -146,9 +146,9 @@ class PartialShard:
         return done
 
     def finish(self) -> dict[str, Any]:
-        """Order the lines by their samples, and make a last checkpoint; the shard may then be put in place.
+        """Sort the metadata by sample and make a last checkpoint; the shard is then ready to be put in place.
 
-        A packed shard is then put into its tar. Until that is complete, the checkpoint stays.
+        A packed shard is also packed into its tar; the checkpoint stays until that is complete.
         """
         if self._places != sorted(self._places):
             self._sort_lines()
@@ -157,7 +157,7 @@ class PartialShard:
 
     @property
     def seconds(self) -> float:
-        """Time that the samples took, by all workers."""
+        """Time that all workers spent on the samples, in seconds."""
         return self._before + time.monotonic() - self._start
 
     def _place(self, kind: str, file: str) -> str:
@@ -171,7 +171,7 @@ class PartialShard:
         self.images += 1
 
     def _new_lines(self) -> BinaryIO:
-        """Open a new file of lines, which replaces the old one when it is published."""
+        """Open a new metadata file, which replaces the old one at the next checkpoint."""
         path = self.stage / _SHARD / f"{LINES}.new"
         path.unlink(missing_ok=True)
         return open(path, "xb")
@@ -193,7 +193,7 @@ class PartialShard:
         self._publish_lines()
 
     def _resume(self, done: dict[str, Any]) -> None:
-        """Take over what an earlier worker has finished, as far as it is intact, of this plan and of our kind."""
+        """Take over an earlier worker's finished samples if they are intact, of this plan, and of this version."""
         try:
             if any(_comparable(done[key]) != _comparable(value) for key, value in self._made_by.items()):
                 raise InputError("was made by another plan, version or processor")
@@ -219,10 +219,10 @@ class PartialShard:
                     path.unlink()
 
     def _intact_lines(self, done: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], bytes]]:
-        """List lines of a checkpoint, whose files are compared with their checksums.
+        """Read the metadata of a checkpoint after comparing its files with their checksums.
 
         Raises:
-            InputError: something differs.
+            InputError: a file differs.
         """
         own = self._place(SHARDS, LINES)
         for name, entry in done["files"].items():
@@ -250,7 +250,7 @@ def checkpoints(folder: Path) -> dict[int, int]:
 
 
 def stages(folder: Path) -> Iterator[tuple[int, Path]]:
-    """Return shards at work in a folder, with their temporary folders."""
+    """Return the unfinished shards in a folder, with their temporary folders."""
     for stage in sorted(folder.glob(f"{STAGE}*-*")):
         number = stage.name.removeprefix(STAGE).split("-")[0]
         if number.isdigit() and stage.is_dir() and not stage.is_symlink():
@@ -258,9 +258,9 @@ def stages(folder: Path) -> Iterator[tuple[int, Path]]:
 
 
 def reopen(folder: Path, shard: int, kinds: Sequence[str]) -> None:
-    """Turn a finished shard into a partial one, which `PartialShard` can continue with more or fewer samples.
+    """Turn a finished shard back into a partial one, which `PartialShard` can continue with more or fewer samples.
 
-    After a kill between the moves, `take_back` does the rest.
+    If the process is killed between the moves, `take_back` completes them.
 
     Raises:
         OSError: a file cannot be moved.
@@ -278,7 +278,7 @@ def reopen(folder: Path, shard: int, kinds: Sequence[str]) -> None:
 
 
 def take_back(folder: Path, shards: Iterable[int]) -> None:
-    """Move what was being put in place when its run was killed back into the partial shard.
+    """Move files of shards whose run was killed while putting them in place back into the partial shard.
 
     Raises:
         OSError: a file cannot be moved.
@@ -293,7 +293,7 @@ def take_back(folder: Path, shards: Iterable[int]) -> None:
 
 
 def remove_stages(folder: Path, shards: Iterable[int], finished: set[int]) -> None:
-    """Remove what ended workers left of some shards, except what later workers can continue."""
+    """Remove temporary folders of some shards, except checkpoints that later workers can continue."""
     own = set(shards)
     for shard, stage in stages(folder):
         if shard in own and (shard in finished or not (stage / DONE).is_file()):
@@ -315,7 +315,7 @@ def _claimed(folder: Path, shard: int, stage: Path) -> dict[str, Any] | None:
 
 
 def _unpacked(stage: Path, done: dict[str, Any]) -> dict[str, Any] | None:
-    """Unpack a packed shard to continue it; what is damaged is removed, but not what a full disk keeps packed."""
+    """Unpack a packed shard to continue it; remove it if it is damaged, but keep it if only the disk is full."""
     try:
         return unpack(stage, done)
     except (InputError, KeyError, TypeError, ValueError, FileNotFoundError):
@@ -324,6 +324,6 @@ def _unpacked(stage: Path, done: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _comparable(value: Any) -> Any:
-    """Return the value of done.json without what affects no byte."""
+    """Return the content of done.json without entries that affect no byte."""
     ignored = ("threads", "python")
     return {k: v for k, v in value.items() if k not in ignored} if isinstance(value, Mapping) else value

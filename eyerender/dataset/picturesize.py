@@ -1,4 +1,4 @@
-"""Pictures of another size: the cameras of a scene template scaled, so that they see the same."""
+"""Change the image size: scale the cameras of a scene template so that they see the same."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _OPTION = "--size"
 
 
 def scaled(scene: Mapping[str, Any], size_px: tuple[int, int]) -> dict[str, Any]:
-    """Scale resolution, focal length and principal point of all cameras, and the window, to a width and height.
+    """Scale resolution, focal length and principal point of all cameras, and the window, to a new size.
 
-    The size is that of the pictures: of the window, or of the sensor where there is none. Pixels stay as large as they
-    are (`sensor.pixel_pitch_um`), as if another lens were before a sensor of more or fewer of them, so the
-    exposure stays, too.
+    The size is that of the images: of the window, or of the sensor if there is no window. The pixel pitch
+    (`sensor.pixel_pitch_um`) stays, as if another lens and a sensor with another number of pixels were used, so the
+    exposure stays too.
 
     Raises:
-        InputError: the pictures have several sizes, another shape, or the size of a camera is drawn or calibrated.
+        InputError: the images have several sizes or another aspect ratio, or a camera's size is drawn or calibrated.
     """
     image = scene.get("image")
     window = image.get("window_px") if isinstance(image, Mapping) else None
@@ -38,7 +38,7 @@ def scaled(scene: Mapping[str, Any], size_px: tuple[int, int]) -> dict[str, Any]
 
 
 def _cameras(node: Any) -> list[Mapping[str, Any]]:
-    """Return every camera of a template."""
+    """Return all cameras of a template."""
     if isinstance(node, Mapping):
         if "resolution_px" in node:
             return [node]

@@ -1,9 +1,9 @@
 """The plan of a dataset, which defines sample i as a pure function of (spec, i).
 
-Sample i belongs to subject floor(i S / N) for N planned samples and S subjects. A subject's frames are therefore
-consecutive, and their numbers differ by one at most. Beyond N the plan is continued in blocks of N samples and S new
-subjects (`Selection`). A hash of the subject determines its split (`Plan.split_of`). The
-memory of a plan does not grow with the number of samples.
+Sample i belongs to subject floor(i S / N) for N planned samples and S subjects. A subject's samples are therefore
+consecutive, and all subjects have equally many, give or take one. Beyond N the plan continues in blocks of N samples
+and S new subjects (`Selection`). A hash of the subject determines its split (`Plan.split_of`). The memory of a plan
+does not grow with the number of samples.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class Sample:
     """One sample as drawn.
 
     Attributes:
-        turn: which sample it is.
-        split: its split.
+        turn: identity of the sample: index, subject and attempt.
+        split: name of its split.
         scene: plain mapping that `SceneSpec` validates.
         eye: mapping of its eye file; empty for a drawn person, whose eyes differ.
         modified: whether the eye differs from the model's own.
-        draws: every draw of the spec by its path, None where it was not used.
+        draws: value of every draw of the spec by its path, None if it was not used.
         base: folder to which the files of the scene are relative.
     """
 
@@ -66,7 +66,7 @@ class Sample:
     base: Path
 
     def build(self) -> Scene:
-        """Build the scene, ready to be observed.
+        """Build the scene.
 
         Raises:
             InputError: the drawn values do not fit together.
@@ -96,10 +96,10 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A dataset spec with the eyes it names, and checksums of the files that it names, including eye files.
+    """A dataset spec with its eyes, and the checksums of all files that it names, including eye files.
 
-    `files` maps names, relative to the folder `base`, to SHA-256. Workers of a run find the files there, wherever they
-    run. `aliases` are pairs of places of the spec's file in which one draw stands.
+    `files` maps names, relative to the folder `base`, to SHA-256. `aliases` are pairs of paths in the spec's file that
+    share one draw.
     """
 
     spec: DatasetSpec
@@ -121,12 +121,12 @@ class Plan:
     ) -> Plan:
         """Load a plan from a file, the bare name of a shipped dataset, or a spec; a plan is returned as it is.
 
-        `eye` and `seed` replace those of the spec; parameters of other eye models are then dropped. `count` requests
-        so many samples of the plan, or of its continuation (see `DatasetSpec.first`). `changes` replaces subjects,
-        splits and the size of the pictures.
+        `eye` and `seed` replace those of the spec; parameters of other eye models are then dropped. `count` is the
+        number of samples of the plan, or of its continuation (see `DatasetSpec.first`). `changes` replaces subjects,
+        splits and the image size.
 
         Raises:
-            InputError: with one line.
+            InputError: the spec cannot be read, or a value does not fit.
         """
         if isinstance(given, Plan):
             if (eye, seed, count, changes) != (None, None, None, PlanOptions()):
@@ -151,9 +151,9 @@ class Plan:
 
     @classmethod
     def of(cls, spec: DatasetSpec, *, base: Path | None = None, source: str = "") -> Plan:
-        """Check the template, read the eyes it names and compute the checksums of its files.
+        """Check the template, read the eyes and compute the checksums of all files of a spec.
 
-        All names are relative to `base`, by default the current folder.
+        File names are relative to `base`, by default the current folder.
 
         Raises:
             InputError: a file cannot be read.
@@ -192,7 +192,7 @@ class Plan:
 
     @cached_property
     def _variables(self) -> dict[str, Unit]:
-        """Say for what each variable is drawn; a plain value is the same for every sample."""
+        """Return for what each variable is drawn; a plain value is the same for every sample."""
         draws = self.variable_template.draws
         names = self.spec.variables or {}
         return {
@@ -217,17 +217,17 @@ class Plan:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the spec and of the content of every file it names; of any number of samples of one plan."""
+        """SHA-256 of the spec and of the content of every file it names; independent of the number of samples."""
         return plan_digest(self.to_mapping())
 
     def to_mapping(self) -> dict[str, Any]:
-        """Convert to the mapping that `from_mapping` reads, without the eye files; `files` only where there are any."""
+        """Convert to the mapping that `from_mapping` reads, without the eye files; `files` only if there are any."""
         data: dict[str, Any] = {"spec": self.spec.to_mapping(), "eyes": self.eyes}
         return dict(_sorted(data | ({"files": self.files} if self.files else {})))
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any], base: Path) -> Plan:
-        """Make the plan of another process, its files relative to `base`."""
+        """Restore the plan of another process, with its files relative to `base`."""
         return cls(
             spec=DatasetSpec.from_mapping(data["spec"]), eyes=data["eyes"], files=data.get("files", {}), base=base
         )
@@ -243,7 +243,7 @@ class Plan:
             try:
                 warnings = self.draw(sample).build().warnings()
             except InputError:
-                continue  # it is drawn again, or reported when it is made
+                continue  # it is drawn again or reported when the sample is made
             for w in warnings:
                 path, reason = f"scene.{w.path}", f"{w.reason} (sample {sample})"
                 found.setdefault(
@@ -252,7 +252,7 @@ class Plan:
         return list(found.values())
 
     def spread(self, count: int) -> list[int]:
-        """At most `count` of the samples that are made, spread evenly over them."""
+        """Return at most `count` of the samples, spread evenly."""
         samples = self.spec.selection.samples
         count = min(count, len(samples))
         return [samples[k * len(samples) // count] for k in range(count)]
@@ -270,7 +270,7 @@ class Plan:
         return {}
 
     def _ranks(self, block: int) -> NDArray[np.int32]:
-        """Index of the split of each subject of a block in the order of their names, from the rank of its u."""
+        """Return the split index of each subject of a block, from the rank of its u; splits are sorted by name."""
         if block not in self._ranked:
             self._ranked[block] = self._rank(block)
         return self._ranked[block]
@@ -289,9 +289,9 @@ class Plan:
 
     @cached_property
     def _shares(self) -> tuple[float, ...]:
-        """Cumulative shares of the splits, in the order of their names.
+        """Return the cumulative shares of the splits, sorted by name.
 
-        The order of keys in a file therefore has no effect.
+        Because of the sorting, the order of keys in a file has no effect.
         """
         splits = self.spec.splits
         total, share, out = sum(splits.values()), 0.0, []
@@ -304,11 +304,11 @@ class Plan:
         return unit_number(self.spec.seed, "split", "subject", subject, 0)
 
     def split_of(self, subject: int) -> str:
-        """Split of a subject.
+        """Return the split of a subject.
 
-        It follows from a number u in (0, 1) of each subject. Up to `RANKED_SUBJECTS` subjects of a block are sorted by
-        u and cut at the cumulative shares, so counts are exact. More subjects are not sorted: u itself is compared
-        with the shares, so counts are those of a random draw.
+        The split follows from a number u in (0, 1) of each subject. Up to `RANKED_SUBJECTS` subjects of a block are
+        sorted by u and cut at the cumulative shares, so counts are exact. More subjects are not sorted: u itself is
+        compared with the shares, so counts are those of a random draw.
         """
         names = sorted(self.spec.splits)
         if len(names) == 1:
@@ -320,7 +320,7 @@ class Plan:
         return next((name for name, share in zip(names, self._shares, strict=True) if u < share), names[-1])
 
     def subject_of(self, sample: int) -> tuple[int, int]:
-        """Return the subject of a sample, and the sample's place in the subject's sequence."""
+        """Return the subject of a sample, and the position of the sample in the subject's sequence."""
         subject = self.spec.selection.subject_of(sample)
         return subject, sample - self.first_of(subject)
 
@@ -329,11 +329,11 @@ class Plan:
         return self.spec.selection.first_of(subject)
 
     def draw(self, sample: int, attempt: int = 0) -> Sample:
-        """Draw sample `sample` at an attempt.
+        """Draw the values of a sample at an attempt.
 
         Raises:
-            InputError: there is no such sample, its subject's eye cannot be made in any attempt, or what the spec draws
-                is no scene.
+            InputError: there is no such sample, its subject's eye cannot be made in any attempt, or the drawn values
+                are not a valid scene.
         """
         spec = self.spec
         if not 0 <= sample < spec.selection.end:
@@ -386,7 +386,7 @@ class Plan:
             tree = {} if self.spec.population is not None else self._scene_of(turn)[0]
             try:
                 if self.spec.population is not None:
-                    # The distance of the eyes needs both of them.
+                    # The distance between the eyes needs both of them.
                     _ = self.person_of(subject, attempt).chosen().apex_distance_mm
                 else:
                     eye, _, modified = self._eye_of(tree, turn)
@@ -401,7 +401,7 @@ class Plan:
         raise InputError(f"its eye cannot be made: {reasons[-1]}", source=self.source, path=f"subject {subject}")
 
     def person_of(self, subject: int, attempt: int) -> PersonChoice:
-        """Person of a subject at an attempt: the first has the dataset's seed, others a seed that follows from it."""
+        """Draw the person of a subject at an attempt: the first uses the dataset's seed, others a derived one."""
         assert self.spec.population is not None
         seed = self.spec.seed
         if attempt:
@@ -422,13 +422,13 @@ class Plan:
             _set(eye, path, value, f"eye_parameters.{model}", self.source)
         if mine:
             eye["name"] = f"{model} of subject {turn.subject}"
-        # Parameters of other eyes were not used.
+        # The parameters of the other eyes were not used.
         asked = {k: v if k.startswith(f"eye_parameters.{model}.") else None for k, v in drawn.items()}
         return eye, asked, bool(mine)
 
 
 def plan_digest(mapping: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a plan's mapping, whatever number of its samples is made."""
+    """Compute the SHA-256 of a plan's mapping, independent of the number of samples."""
     spec = dict(mapping["spec"])
     spec["planned"] = spec.get("planned") or spec["count"]
     del spec["count"]
@@ -437,13 +437,13 @@ def plan_digest(mapping: Mapping[str, Any]) -> str:
 
 
 def mapping_digest(mapping: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a mapping's canonical JSON."""
+    """Compute the SHA-256 of a mapping's canonical JSON."""
     text = json.dumps(mapping, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _eye_names(spec: DatasetSpec, source: str) -> list[str]:
-    """List names of the eye models that a spec may use; none where it draws people."""
+    """Return the names of the eye models that a spec may use; none if it draws people."""
     part = spec.scene.get("eye", {})
     if is_draw(part):
         raise InputError("draw single values of the eye, not the whole eye", source=source, path="scene.eye")
@@ -466,7 +466,7 @@ def _is_at(path: str, name: str) -> bool:
 
 
 def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
-    """Replace the eye model in parts of a spec."""
+    """Return the parts of a spec with another eye model."""
     part = spec.scene.get("eye", {})
     if spec.population is not None:
         raise InputError("the spec draws people with eyes of their own; take 'population' out of it", source="--eye")
@@ -481,7 +481,7 @@ def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
 
 @lru_cache(maxsize=64)
 def _eye(text: str) -> EyeSpec:
-    """Return the eye file from its JSON; the frames of a subject share it and its computed values."""
+    """Parse an eye file from its JSON; cached, so the frames of a subject share it and its computed values."""
     return EyeSpec.from_mapping(json.loads(text))
 
 

@@ -1,4 +1,4 @@
-"""The local engine: spawned, recycled and monitored workers. A shard whose worker crashes or hangs is tried again."""
+"""The local engine: spawns, recycles and monitors workers, and retries a shard whose worker crashes or hangs."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ class Events(Protocol):
     """Receiver of an engine's reports."""
 
     def ready(self, backend: dict[str, Any], worker: str) -> None:
-        """Report that a worker can render."""
+        """Handle the report that a worker can render."""
 
     def sample(self, shard: int, samples: int, images: int) -> None:
-        """Report that `samples` of a shard are made; the last one gave `images`."""
+        """Handle the report that `samples` of a shard are made; the last one has `images`."""
 
     def staged(self, staged: Staged, worker: str) -> None:
-        """Report that a shard is written and may be put in place."""
+        """Handle the report that a shard is written and may be put in place."""
 
     def retry(self, shard: int, reason: str, tries: int) -> None:
-        """Report that a shard's worker ended, and that the shard is tried again."""
+        """Handle the report that a shard's worker ended, and that the shard is tried again."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -55,7 +55,7 @@ class _Worker:
 
 
 class LocalPool:
-    """Runs shards on worker processes of this machine."""
+    """Engine that makes shards with worker processes on this machine."""
 
     def __init__(
         self, job: Job, workers: int, *, timeout_s: float = 600.0, recycle_images: int = RECYCLE_IMAGES
@@ -69,10 +69,10 @@ class LocalPool:
         self._made = 0
 
     def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
-        """Make shards, and return those that were given up, with the reasons.
+        """Make shards; return those that were given up, with the reasons.
 
         Raises:
-            BackendError: a worker has nothing to render with.
+            BackendError: a worker has no backend to render with.
             InputError: a file that the scenes name cannot be used, or has changed.
             EyerenderError: the disk is full or not writable.
         """
@@ -86,10 +86,10 @@ class LocalPool:
                     made = self._made
                     reason = self._listen(worker, events)
                     if self._made > made:
-                        del tries[NO_SHARD]  # so workers do start; only consecutive deaths end a run
+                        del tries[NO_SHARD]  # workers do start, so only consecutive deaths end a run
                     if reason is None:
                         if worker.shard is None and worker.images >= self.recycle_images:
-                            self._end(worker)  # before leaks of its libraries add up
+                            self._end(worker)  # before memory leaks of its libraries add up
                         continue
                     self._end(worker)
                     shard = NO_SHARD if worker.shard is None else worker.shard
@@ -128,7 +128,7 @@ class LocalPool:
         return sum(w.shard is not None for w in self._workers)
 
     def _hand_out(self, pending: deque[int]) -> None:
-        """Start as many workers as there is work for, and give a shard to each idle one."""
+        """Start workers as needed, and give a shard to each idle one."""
         while pending and len(self._workers) < min(self.size, self._busy() + len(pending)):
             self._start()
         for worker in self._workers:
@@ -146,7 +146,7 @@ class LocalPool:
         self._workers.append(_Worker(process=process, pipe=ours, name=f"{process.pid}", heard=time.monotonic()))
 
     def _listen(self, worker: _Worker, events: Events) -> str | None:
-        """Receive a worker's messages; return the reason why it must be ended, if there is one."""
+        """Receive a worker's messages; return the reason if the worker must be ended."""
         while True:
             try:
                 if not worker.pipe.poll():
@@ -208,9 +208,9 @@ def end_of(code: int | None, who: str = "the worker") -> str:
 
 @contextmanager
 def _environment(threads: int) -> Iterator[None]:
-    """Limit numerical libraries of a worker to its number of threads.
+    """Set the environment variables that limit a worker's numerical libraries to its number of threads.
 
-    They read these variables when they are imported.
+    The libraries read these variables when they are imported.
     """
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
@@ -227,10 +227,10 @@ def _environment(threads: int) -> Iterator[None]:
 
 @contextmanager
 def caller_hidden() -> Iterator[None]:
-    """Keep a spawned process from running the caller's script again.
+    """Prevent a spawned process from running the caller's script again.
 
     Python imports the main module in each spawned process, so a script without `if __name__ == "__main__"` would start
-    its work again there. A worker needs nothing of that module.
+    its work again there. A worker does not need that module.
     """
     main = vars(sys.modules["__main__"])
     before: dict[str, Any] = {name: main[name] for name in ("__file__", "__spec__") if name in main}

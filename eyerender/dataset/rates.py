@@ -22,7 +22,7 @@ from ..storage.files import read_json, write_json
 from .done import cpu_family
 from .plan import Plan
 
-ENOUGH_SAMPLES = 200  # more samples make a rate no more representative
+ENOUGH_SAMPLES = 200  # more samples do not make a rate more representative
 _BYTES = 2**16
 _Count = Annotated[float, Field(ge=0, le=1e15)]
 
@@ -54,9 +54,9 @@ def now() -> str:
 
 
 def keep_rate(plan: Plan, rate: Rate) -> None:
-    """Store a rate, unless a stored one of the same backend is from more than twice as many samples.
+    """Store a rate, unless the stored one of the same backend comes from more than twice as many samples.
 
-    It is dropped where the cache cannot be written.
+    If the cache cannot be written, the rate is discarded.
     """
     path = _path(plan)
     old = last_rate(plan, rate.backend)
@@ -67,7 +67,7 @@ def keep_rate(plan: Plan, rate: Rate) -> None:
 
 
 def last_rate(plan: Plan, backend: str = "auto") -> Rate | None:
-    """Return the rate that was last measured on this machine with a backend; None where none is known."""
+    """Return the rate last measured on this machine with a backend; None if there is none."""
     path = _path(plan)
     if path is None:
         return None
@@ -79,7 +79,7 @@ def last_rate(plan: Plan, backend: str = "auto") -> Rate | None:
 
 
 def _path(plan: Plan) -> Path | None:
-    """Find the path of the rate of a plan on this machine; it does not depend on the seed and the number of samples."""
+    """Return the path of a plan's rate on this machine; it does not depend on seed and number of samples."""
     folder = cache_folder()
     if folder is None:
         return None

@@ -1,8 +1,8 @@
-"""From sample i to a scene with its analytic observations; a sample that cannot be made is drawn again by a fixed rule.
+"""From sample i to a scene with its analytic observations; a failed sample is drawn again by a fixed rule.
 
 Attempt a of sample i draws every random value of the sample again. Grids and sequences stay, because they are the
-design; a Sobol draw becomes a random one; the subject's identity stays. The first attempt that can be made is the
-sample. After `attempts` of them, or at once where nothing random is left to draw, the sample is given up.
+design; a Sobol draw becomes a random one; the subject's identity stays. The first attempt that succeeds is the sample.
+After `attempts` failures, or at once if nothing random is left to draw, the sample is given up.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .spec import DatasetSpec
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """A failed attempt and its reason; it concerns the sample, or its subject's identity."""
+    """A failed attempt and its reason, which lies in the sample or in its subject's identity."""
 
     sample: int
     attempt: int
@@ -34,7 +34,7 @@ class Rejection:
 
 @dataclass(frozen=True, kw_only=True)
 class Realised:
-    """A sample with its analytic observations; `sample` is None where it was given up."""
+    """A sample with its analytic observations; `sample` is None if it was given up."""
 
     index: int
     sample: Sample | None
@@ -66,9 +66,9 @@ class Realised:
         return {"schema": "eyerender/sample/1", **drawn, "rejections": rejections}
 
     def write(self, path: str | Path) -> None:
-        """Write scene.yaml and eye.yaml of the sample into a new folder, for other commands to read.
+        """Write scene.yaml and eye.yaml of the sample into a new folder, as input of other commands.
 
-        A drawn person is in scene.yaml, from which its eyes follow; there is no eye.yaml then.
+        If a person was drawn, scene.yaml describes the person and its eyes, and there is no eye.yaml.
 
         Raises:
             InputError: the sample was given up, or the folder is not empty.
@@ -94,7 +94,7 @@ class Realised:
 def sample(
     spec: str | Path | DatasetSpec | Plan, index: int, *, eye: str | None = None, seed: int | None = None
 ) -> Realised:
-    """Make sample `index` of a dataset as `generate` does: the drawn values, the scene and the analytic observations.
+    """Draw sample `index` of a dataset as `generate` does: values, scene and analytic observations.
 
     Args:
         spec: as for `generate`.
@@ -121,9 +121,9 @@ def sample(
 
 
 def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
-    """Make sample `index` by the first attempt that succeeds.
+    """Draw sample `index` by the first attempt that succeeds.
 
-    `frames` is the number of frames that each sample must have.
+    `frames` is the number of frames required of each sample.
     """
     spec = plan.spec
     subject, sequence = plan.subject_of(index)
@@ -184,7 +184,7 @@ def frames_of(plan: Plan) -> int:
 
 
 def windows_of(scene: Scene, observations: Observations) -> list[Window]:
-    """Return the rendered window of each observation."""
+    """Return the rendered window (x0, y0, width, height) of each observation."""
     index, windows = observations.index, scene.windows()
     return [windows[int(index.camera[r]), int(index.head[r]), int(index.eye[r])] for r in range(len(observations))]
 

@@ -1,4 +1,4 @@
-"""A dataset run: claim the folder, make the missing shards, assemble the dataset."""
+"""A dataset run: claim the folder, make the missing shards, and assemble the dataset."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def generate(
     warn: Warn | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """Make a labelled dataset, or what is missing of it in a folder where a run was stopped.
+    """Make a labelled dataset, or complete one in a folder where an earlier run was stopped.
 
     The bytes of the dataset depend on the spec, `eye`, `seed` and `count` alone.
 
@@ -66,8 +66,8 @@ def generate(
         eye: replaces the eye model of the spec: a name of the catalogue or an eye file.
         seed: replaces the seed of the spec.
         count: number of samples of the spec's plan, spread over its subjects; beyond the plan it continues with new
-            subjects. In a folder that holds another number of them, those that are wanted are kept.
-        part: (k, n) makes only every n-th shard, starting with the k-th; for array jobs that write to one folder.
+            subjects. If the folder holds another number of samples, the required ones are kept.
+        part: (k, n): make only every n-th shard, starting with the k-th; for array jobs that write to one folder.
         progress: called with (images done, images in all, note).
         say: called with lines for the log.
         warn: called with warnings about the spec before the run, where it may raise to stop it, and about saturated
@@ -75,12 +75,12 @@ def generate(
         changes: fields of `RunOptions` by name, instead of those of `options`: `generate(spec, path, workers=2)`.
 
     Returns:
-        A summary: schema eyerender/generate/1.
+        A summary (schema eyerender/generate/1).
 
     Raises:
-        InputError: the folder is taken, held by another run, or of another spec or version; the spec makes no sample; a
-            file that its scenes name cannot be used, or has changed.
-        BackendError: there is nothing to render with.
+        InputError: the folder holds something else, is in use by another run, or belongs to another spec or version; no
+            sample of the spec can be made; a file that its scenes name cannot be used, or has changed.
+        BackendError: no backend can render.
         EyerenderError: the disk is full or not writable, or shards were given up after repeated tries.
     """
     plan = Plan.load(spec, eye=eye, seed=seed, count=count)
@@ -122,7 +122,7 @@ def _generate(
             except InputError:
                 if not resumed and n == 1 and not finished(folder):
                     with suppress(InputError):
-                        clear(folder)  # the folder is useless
+                        clear(folder)  # the folder cannot be used
                 raise
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
@@ -146,7 +146,7 @@ def usable_cpus() -> int:
 
 
 def worker_count(options: RunOptions, shards: int) -> tuple[int, int]:
-    """List numbers of workers and of threads of each: by default one worker per processor while memory suffices."""
+    """Return the number of workers and the threads of each; by default one worker per processor, as memory allows."""
     cpus = options.threads or usable_cpus()
     workers = options.workers
     if workers is None:
@@ -159,7 +159,7 @@ def worker_count(options: RunOptions, shards: int) -> tuple[int, int]:
 
 @dataclass(kw_only=True)
 class _Run:
-    """One run, which also receives the engine's reports."""
+    """One run; receives the engine's reports."""
 
     plan: Plan
     folder: Path
@@ -178,7 +178,7 @@ class _Run:
     total: int = 0
     samples: int = 0  # sum of `made`
     loading_s: float = 0.0  # until the first worker could render
-    first_shards: dict[str, tuple[int, float]] = field(default_factory=dict)  # of each worker: samples, seconds
+    first_shards: dict[str, tuple[int, float]] = field(default_factory=dict)  # per worker: samples, seconds
     timed: int = 0  # samples of the other shards that this run has finished
     worker_seconds: float = 0.0  # and the time that they took
     staged_images: int = 0
@@ -189,7 +189,7 @@ class _Run:
     verified: set[int] = field(default_factory=set)  # shards whose checksums this run has verified
 
     def make(self, resumed: bool) -> dict[str, Any]:
-        """Make this part's missing shards, and assemble the dataset when none is missing."""
+        """Make the missing shards of this part, and assemble the dataset if no shard is missing."""
         mine = self._mine()
         done = self._sorted_out(mine)
         # The first images of a run come from subjects that are far apart.
@@ -201,7 +201,7 @@ class _Run:
             if problem is not None and ((self.folder / DATASET).exists() or not todo):
                 self.repaired(f"the dataset is assembled again: {problem}")
         if todo:
-            remove_file(self.folder / DATASET)  # a folder that has one is complete
+            remove_file(self.folder / DATASET)  # a folder that has this file is complete
         self.total = sum(len(self.plan.spec.shard_samples(s)) for s in todo)
         if todo:
             for shard in sorted(done) if self._verifies else ():
@@ -234,12 +234,12 @@ class _Run:
         return summary
 
     def _mine(self) -> set[int]:
-        """Shards of this part."""
+        """Return the shards of this part."""
         k, n = self.part
         return set(self.plan.spec.shards[k - 1 :: n])
 
     def _sorted_out(self, mine: set[int]) -> set[int]:
-        """Finished shards, without those of this part that are damaged or hold other samples than are wanted."""
+        """Return the finished shards, without shards of this part that are damaged or hold the wrong samples."""
         spec, (k, n) = self.plan.spec, self.part
         done = finished(self.folder)
         if self._verifies:
@@ -251,9 +251,9 @@ class _Run:
         return finished(self.folder)
 
     def _assembled(self, intact: bool) -> tuple[set[int], dict[str, Any] | None]:
-        """The missing shards, and the statistics of the dataset, which is assembled unless a shard is missing.
+        """Return the missing shards and the dataset's statistics; assemble the dataset if no shard is missing.
 
-        An `intact` dataset is not assembled again.
+        A dataset that is `intact` is not assembled again.
         """
         missing = self._missing()
         if missing:
@@ -263,7 +263,7 @@ class _Run:
             return missing, found
         with final_lock(self.folder, self.say):
             if self._verifies:
-                # These are the shards of other parts; this run has verified or made its own.
+                # These are the shards of other parts; this run has verified or made its own ones.
                 self._withdraw(set(self.plan.spec.shards) - self.verified)
             if was_resized(self.folder):
                 self._reopen(set(self.plan.spec.shards))
@@ -278,14 +278,14 @@ class _Run:
 
     @property
     def _verifies(self) -> bool:
-        """Whether finished shards are compared with their checksums: with packed shards on request only."""
+        """Return whether to compare finished shards with their checksums: for packed shards only on request."""
         return self.options.repair or not self.plan.spec.is_packed
 
     def _render(self, todo: list[int], mine: set[int]) -> None:
         """Make missing shards.
 
         Raises:
-            EyerenderError: some could not be made; or as the engines.
+            EyerenderError: some shards could not be made; the engines raise further errors.
         """
         self.progress(0, self.total, "samples")
         try:
@@ -305,7 +305,7 @@ class _Run:
             )
 
     def repaired(self, what: str) -> None:
-        """Report that something was damaged and is made or written again."""
+        """Report that something damaged is made or written again."""
         self.say(f"repairing: {what}")
         self._log("repair", what=what)
 
@@ -313,14 +313,14 @@ class _Run:
         return set(self.plan.spec.shards) - finished(self.folder)
 
     def _withdraw(self, shards: set[int]) -> None:
-        """Verify finished shards, so that damaged ones are made again."""
+        """Verify finished shards, and withdraw damaged ones so that they are made again."""
         damaged = withdraw_damaged(self.folder, sorted(shards), self.plan.digest)
         for shard, problem in damaged.items():
             self.repaired(f"shard {shard} is made again: {problem}")
         self.verified |= shards - damaged.keys()
 
     def _reopen(self, shards: set[int]) -> None:
-        """Turn finished shards that hold other samples than this number of samples needs into partial ones."""
+        """Turn finished shards whose samples do not match the requested number of samples into partial ones."""
         wanted = set(self.plan.spec.shards)
         reopened, aside = 0, 0
         for shard in sorted(finished(self.folder) & shards):
@@ -346,7 +346,7 @@ class _Run:
         return LocalPool(job, min(workers, shards), timeout_s=options.timeout_s)
 
     def _keep_rate(self) -> None:
-        """Store the speed of this machine, for an estimate of the next run of this spec."""
+        """Store the speed of this machine, for estimates of later runs of this spec."""
         if self.options.engine != "local" or not self.first_shards or len(self.backends) != 1:
             return
         begun, spent = (sum(column) for column in zip(*self.first_shards.values(), strict=True))
@@ -376,7 +376,7 @@ class _Run:
         self._mixed({"backend": backend, "cpu": cpu_family() if self.options.engine == "local" else None})
 
     def sample(self, shard: int, samples: int, images: int) -> None:
-        """Record that a sample of a shard is made, or that `samples` of it are kept from an earlier worker."""
+        """Record finished samples of a shard: one that was made, or `samples` taken over from an earlier worker."""
         if shard not in self.made:
             self.kept += samples - 1 if images else samples
         self._count(shard, samples)

@@ -1,4 +1,4 @@
-"""The identity of a run in its folder: run.json, and the refusal of any other run, with the differences shown."""
+"""The identity of a run in its folder: run.json, and the refusal of another run with a list of differences."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SHOWN = 4
 def refuse_taken(folder: Path) -> None:
     """Check that a folder holds nothing but a run, before anything is written into it.
 
-    A link in the place of a run's files is refused too: making or removing shards would change what it points to.
+    Symbolic links among a run's files are refused too: making or removing shards would change their targets.
 
     Raises:
         InputError: the folder holds something else.
@@ -47,14 +47,14 @@ def refuse_taken(folder: Path) -> None:
 
 
 def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
-    """Claim a folder for a plan; returns True if it was claimed for the same plan before.
+    """Claim a folder for a plan; return True if it was claimed for the same plan before.
 
-    Where run.json is damaged or missing, the finished shards identify the folder's plan, because each names it. Where
-    nothing identifies it, and the folder holds only files of a run, the run starts over. `repaired` is called in both
-    cases. The caller holds the folder's final lock, so that two parts of a run do not repair it at the same time.
+    If run.json is damaged or missing, the finished shards identify the plan, because each names it. If nothing
+    identifies it and the folder holds only files of a run, the run starts over. `repaired` is called in both cases. The
+    caller must hold the folder's final lock, so that two parts of a run do not repair it at the same time.
 
     Raises:
-        InputError: it holds something else, or a run of another spec or other versions.
+        InputError: the folder holds something else, or a run of another spec or other versions.
         OSError: the disk is full or not writable.
     """
     path, mine = folder / RUN, _content(plan)
@@ -62,7 +62,7 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
     if found is not None:
         _refuse_another(folder, found, mine, plan.files)
         if _count_of(found) != _count_of(mine):
-            remove_file(folder / DATASET)  # it is that of another number of samples
+            remove_file(folder / DATASET)  # it belongs to another number of samples
             # Shards that were made for another number of samples are looked for until the dataset is assembled.
             write_json(path, {**mine, "resized": True})
         return True
@@ -87,10 +87,10 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
 
 
 def refuse_another_count(folder: Path, plan: Plan) -> None:
-    """Check that no other run has changed the number of samples of a folder in the meantime.
+    """Check that no other run has changed the folder's number of samples in the meantime.
 
     Raises:
-        InputError: it has.
+        InputError: another run has changed it.
     """
     found, _ = _read(folder / RUN)
     if found is not None and _count_of(found) != _count_of(plan.to_mapping()):
@@ -98,20 +98,20 @@ def refuse_another_count(folder: Path, plan: Plan) -> None:
 
 
 def _content(plan: Plan) -> dict[str, Any]:
-    """Content of run.json."""
+    """Return the content of run.json."""
     schema = PACKED_RUN_SCHEMA if plan.spec.is_packed else RUN_SCHEMA
     made_with = {"versions": run_versions(), "environment": environment()}
     return {"schema": schema, "digest": plan.digest, **plan.to_mapping(), **made_with}
 
 
 def settle(folder: Path, plan: Plan) -> None:
-    """Note that all shards are those of the plan's number of samples; the caller holds the folder's final lock."""
+    """Record that all shards match the plan's number of samples; the caller holds the folder's final lock."""
     if was_resized(folder):
         write_json(folder / RUN, _content(plan))
 
 
 def was_resized(folder: Path) -> bool:
-    """Whether a run had another number of samples, for which finished shards may have been made."""
+    """Return whether a run had another number of samples, from which finished shards may remain."""
     found, _ = _read(folder / RUN)
     return found is None or bool(found.get("resized"))
 
@@ -122,7 +122,7 @@ def _count_of(run: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _of_any_count(run: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Content of run.json without the number of samples that are made of the plan, and what affects no byte."""
+    """Return the content of run.json without the number of samples and without entries that affect no byte."""
     run = {key: value for key, value in run.items() if key not in ("resized", "environment")}
     spec = run.get("spec")
     if not isinstance(spec, Mapping):
@@ -132,10 +132,10 @@ def _of_any_count(run: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _read(path: Path) -> tuple[dict[str, Any] | None, str]:
-    """Content of run.json, or None and the reason why it cannot be used.
+    """Read run.json; if it cannot be used, return None and the reason.
 
     Raises:
-        InputError: it is not from a run of this version.
+        InputError: a run of another version wrote it.
     """
     try:
         found = read_json(path, limit=MAX_FILE_BYTES, follow=False)
@@ -147,7 +147,7 @@ def _read(path: Path) -> tuple[dict[str, Any] | None, str]:
 
 
 def _refuse_another(folder: Path, found: Mapping[str, Any], mine: Mapping[str, Any], files: Mapping[str, str]) -> None:
-    """Raise an error with the differences where a folder is of another spec or other versions."""
+    """Raise an error that lists the differences if a folder belongs to another spec or other versions."""
     # Python's own version affects no byte and may differ between machines.
     skip = ("versions.python:", "digest:", "files.", "files:")
     old_plan, plan = _of_any_count(found), _of_any_count(json.loads(json.dumps(mine)))
@@ -163,14 +163,14 @@ def _refuse_another(folder: Path, found: Mapping[str, Any], mine: Mapping[str, A
 
 
 def _readable(folder: Path) -> Iterator[dict[str, Any]]:
-    """Content of every readable done.json."""
+    """Yield the content of every readable done.json."""
     for shard in sorted(finished(folder)):
         with suppress(InputError):
             yield read_done(folder, shard)
 
 
 def _is_taken(folder: Path) -> bool:
-    """Whether a folder holds anything that is not a run's, or nothing that identifies it as a run's."""
+    """Return whether a folder holds anything foreign, or only files that do not identify a run."""
     if _read(folder / RUN)[0] is not None or any(_readable(folder)):
         return False
     names = {p.name for p in folder.iterdir() if not _is_passing(p.name)}
@@ -187,7 +187,7 @@ def _is_taken(folder: Path) -> bool:
 
 
 def _links(folder: Path) -> Iterator[str]:
-    """Symbolic links in the places of a run's files."""
+    """Return the symbolic links among a run's files."""
     for name in sorted(_OWN):
         place = folder / name
         if place.is_symlink():
@@ -198,10 +198,10 @@ def _links(folder: Path) -> Iterator[str]:
 
 
 def _is_passing(name: str) -> bool:
-    """Whether a name is that of a temporary file.
+    """Return whether a name is that of a temporary file.
 
-    These are locks, staged shards, files of ours that were not finished, and the marker that stands in a folder while
-    it is cleared.
+    Temporary files are locks, staged shards, unfinished files of this package, and the marker of a folder that is being
+    cleared.
     """
     if name == MARKER or name.startswith((LOCK, STAGE)):
         return True
@@ -209,7 +209,7 @@ def _is_passing(name: str) -> bool:
 
 
 def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
-    """Differences of two JSON values, as `path: old -> new`."""
+    """Describe the differences of two JSON values as `path: old -> new`."""
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         for key in [*old, *(k for k in new if k not in old)]:
             yield from differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))

@@ -1,10 +1,11 @@
-"""Which samples of a plan are made: all of them, the first ones, or the first ones of each subject in turn.
+"""Select the samples of a plan to make: all, the first ones, or the first ones of each subject in turn.
 
-A plan of N samples and S subjects is continued in blocks: samples b N to (b + 1) N - 1 belong to the subjects b S to
-(b + 1) S - 1, divided as in the first block. So a dataset can grow beyond its plan, and no sample changes its subject.
+A plan of N samples and S subjects is continued in blocks: samples b N to (b + 1) N - 1 belong to the subjects b S to (b
++ 1) S - 1, divided as in the first block. So a dataset can grow beyond its plan, and no sample changes its subject.
 
-Of a block that is not made as a whole, `spread` takes the samples in rounds: the first one of each subject, then the
-second ones, and so on. More samples therefore always include fewer, and each subject's sequence is begun at its start.
+If a block is not made as a whole, `spread` takes its samples in rounds: the first one of each subject, then the second
+ones, and so on. A larger selection therefore includes every smaller one, and each subject's sequence starts at its
+beginning.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _CHUNK = 2**20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joined(Sequence[int]):
-    """A range from 0, followed by larger numbers."""
+    """A sequence of integers: a range from 0, followed by larger numbers."""
 
     head: range
     tail: Ints
@@ -45,7 +46,7 @@ class Joined(Sequence[int]):
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """The `count` samples that are made of a plan of `planned` samples and `subjects` subjects, in shards of a size.
+    """The `count` samples to make of a plan with `planned` samples and `subjects` subjects, in shards of a given size.
 
     With a seed to `interleave`, every shard mixes subjects (`Interleaving`); each block of the plan has its own shards.
     """
@@ -59,7 +60,7 @@ class Selection:
 
     @property
     def _block_shards(self) -> int:
-        """Number of shards of an interleaved block."""
+        """Number of shards per interleaved block."""
         return -(-self.planned // self.shard_size)
 
     @cached_property
@@ -69,7 +70,7 @@ class Selection:
         return Interleaving(planned=self.planned, subjects=self.subjects, run=run, seed=self.interleave)
 
     def shard_of(self, sample: int) -> int:
-        """Shard of a sample."""
+        """Return the shard of a sample."""
         if self.interleave is None:
             return sample // self.shard_size
         block, k = divmod(sample, self.planned)
@@ -77,18 +78,18 @@ class Selection:
         return block * self._block_shards + at // self.shard_size
 
     def subject_of(self, sample: int) -> int:
-        """Subject of a sample."""
+        """Return the subject of a sample."""
         block, k = divmod(sample, self.planned)
         return block * self.subjects + k * self.subjects // self.planned
 
     def first_of(self, subject: int) -> int:
-        """First sample of a subject."""
+        """Return the first sample of a subject."""
         block, k = divmod(subject, self.subjects)
         return block * self.planned - (-k * self.planned // self.subjects)
 
     @property
     def subject_count(self) -> int:
-        """Number of subjects that have a sample, which are the first ones of the plan."""
+        """Number of subjects with at least one sample; they are the first ones of the plan."""
         blocks, left = divmod(self.count, self.planned)
         if self.spread:
             return blocks * self.subjects + min(left, self.subjects)
@@ -96,11 +97,11 @@ class Selection:
 
     @property
     def end(self) -> int:
-        """No sample from this one on is made."""
+        """Upper bound of the sample numbers, exclusive."""
         return -(-self.count // self.planned) * self.planned if self.spread else self.count
 
     def are_made(self, samples: Ints) -> Bools:
-        """Whether samples are made, (n,)."""
+        """Return whether samples are selected, (n,)."""
         if not self.spread:
             return np.asarray(samples < self.count)
         block, k = np.divmod(samples, self.planned)
@@ -119,7 +120,7 @@ class Selection:
 
     @cached_property
     def shards(self) -> Sequence[int]:
-        """Shards that hold a sample, in order."""
+        """Numbers of the shards that hold a sample, in order."""
         size = self.shard_size
         if self.interleave is not None:
             return self._interleaved_shards()
@@ -130,7 +131,7 @@ class Selection:
         return Joined(range(head), np.unique(np.concatenate(parts)))
 
     def shard_samples(self, shard: int) -> Sequence[int]:
-        """Samples of a shard, in order; a range where none is left out."""
+        """Return the samples of a shard, in order; as a range if they are consecutive."""
         if self.interleave is not None:
             block, k = divmod(shard, self._block_shards)
             end = min((k + 1) * self.shard_size, self.planned)
@@ -145,13 +146,13 @@ class Selection:
 
     @cached_property
     def samples(self) -> Sequence[int]:
-        """All samples, in order, with 8 bytes of memory for each one of the last block."""
+        """All selected samples, in order; takes 8 bytes per sample of the last block."""
         if not self.spread:
             return range(self.count)
         return Joined(range(self._whole), np.concatenate(list(self._chunks(self._whole))))
 
     def _interleaved_shards(self) -> Sequence[int]:
-        """Shards of the blocks that are made as a whole, and those of the last one that hold a sample."""
+        """Return the shards of complete blocks, and those of the last block that hold a sample."""
         blocks, left = divmod(self.count, self.planned)
         head = range(blocks * self._block_shards)
         if not left:
@@ -165,7 +166,7 @@ class Selection:
 
     @property
     def _whole(self) -> int:
-        """Number of samples of blocks that are made as a whole."""
+        """Number of samples in complete blocks."""
         return self.count // self.planned * self.planned
 
     def _chunks(self, first: int) -> Iterator[Ints]:
@@ -175,6 +176,6 @@ class Selection:
 
 
 def in_spread_order(items: Sequence[int]) -> list[int]:
-    """Order sorted items so that those at the front are far apart: by the reversed bits of their places."""
+    """Order sorted items so that those at the front lie far apart: by the reversed bits of their indices."""
     bits = max(len(items) - 1, 1).bit_length()
     return [items[k] for k in sorted(range(len(items)), key=lambda k: int(f"{k:0{bits}b}"[::-1], 2))]

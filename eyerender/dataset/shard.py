@@ -2,9 +2,9 @@
 
     images/00003/*.png   masks/00003/*.png   shards/00003/lines.jsonl, done.json
 
-`done.json` is put in place last, after everything else is in its place and synced. A shard that has one is therefore
-complete, even after a power cut, and its checksums show whether it still is. Of an ended run, the checkpoints of
-partial shards remain as well.
+`done.json` is put in place last, after all other files are in place and synced. A shard with this file is therefore
+complete, even after a power cut, and its checksums show later damage. Checkpoints of partial shards also remain when a
+run ends.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Stopped(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Staged:
-    """A shard that is written but not in place: its folder, and a summary for the log."""
+    """A shard that is written but not yet in place: its folder, and a summary for the log."""
 
     shard: int
     stage: str
@@ -48,17 +48,17 @@ def write_shard(
     on_sample: Callable[[int, int], None],
     stop: Callable[[], bool] = lambda: False,
 ) -> Staged:
-    """Make a shard's samples in a temporary folder, or those that an earlier worker has not finished.
+    """Make the samples of a shard in a temporary folder, continuing where an earlier worker stopped.
 
     Args:
-        maker: what makes the samples.
+        maker: the maker of the samples.
         folder: the dataset.
         shard: number of the shard.
-        on_sample: called with the number of samples that are finished and of images of the last one.
-        stop: asked before each sample; once it says so, the samples at work are finished and no other is begun.
+        on_sample: called with the number of finished samples and the number of images of the last one.
+        stop: called before each sample; if it returns true, samples in progress are finished and no new one is begun.
 
     Raises:
-        Stopped: `stop` said so.
+        Stopped: `stop` returned true.
         OSError: the disk is full or not writable.
         EyerenderError: the same.
         InputError: a file that the scenes name cannot be used, or has changed since the plan was made.
@@ -121,12 +121,12 @@ def is_finished(folder: Path, shard: int) -> bool:
 
 
 def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
-    """List what is wrong with a finished shard: its done.json, and the sizes and SHA-256 of its files.
+    """Describe each damage of a finished shard: its done.json, and the sizes and SHA-256 of its files.
 
     Args:
         folder: the dataset.
         shard: a finished shard.
-        digest: digest of the plan by which the shard must be made; None: any plan.
+        digest: digest of the plan that the shard must have; None: any plan.
         quick: compare sizes only.
     """
     name = shard_name(shard)
@@ -149,9 +149,9 @@ def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool =
 
 
 def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[int, str]:
-    """Verify finished shards, and remove the done.json of those that are damaged or of another plan.
+    """Verify finished shards, and remove the done.json of damaged ones and those of another plan.
 
-    They are then made again.
+    A run makes these shards again.
 
     Returns:
         The withdrawn shards, with the first problem of each.
@@ -169,7 +169,7 @@ def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[i
 
 
 def remove_leftovers(folder: Path, mine: set[int], done: set[int]) -> None:
-    """Remove what earlier runs left of shards that this run makes, except checkpoints of shards that are not done."""
+    """Remove remains of earlier runs in shards that this run makes, except checkpoints of unfinished shards."""
     take_back(folder, mine - done)
     remove_stages(folder, mine, done)
     for kind in (*KINDS, SHARDS):

@@ -1,4 +1,4 @@
-"""A contact sheet of sixteen images: of a dataset spec's samples, or of a scene's windows."""
+"""A contact sheet of sixteen images, from a dataset spec's samples or a scene's windows."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def preview(
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> int:
-    """Render a contact sheet of up to sixteen images into an image file; it is for looking at, not for measurements.
+    """Render a contact sheet of up to sixteen images into an image file, for viewing rather than measuring.
 
     Args:
         given: a scene or a dataset: a file, the name of a shipped one, or an object.
-        path: the image file; its ending is one of `FORMATS`.
+        path: the image file; its suffix is one of `FORMATS`.
         eye: replaces the eye model of a file: a name of the catalogue or an eye file.
         seed: replaces the seed of a file.
         backend: the render backend.
@@ -57,7 +57,7 @@ def preview(
         The number of images on the sheet.
 
     Raises:
-        InputError: the file ending is not an image's, or no sample of the spec can be made.
+        InputError: the suffix is not that of an image format, or no sample of the spec can be made.
         EyerenderError: the file cannot be written.
     """
     path = Path(path)
@@ -93,7 +93,7 @@ def _found(given: str | Path | DatasetSpec | Plan | Scene, eye: str | None, seed
 
 
 def contact_sheet(tiles: list[Tile]) -> Image.Image:
-    """Arrange tiles with their captions, four in a row."""
+    """Arrange captioned tiles, four per row."""
     shown = []
     for image, caption in tiles:
         picture = Image.fromarray(image)

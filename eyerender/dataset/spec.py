@@ -24,12 +24,12 @@ from .selection import Selection
 # Largest number of samples of a run; a Sobol sequence has no more points.
 MAX_COUNT = 10**9
 _LEAST_SHARDS = 16
-PACKED_SHARD = 1000  # samples of a packed shard by default, so that millions of images make some thousand files
+PACKED_SHARD = 1000  # samples of a packed shard by default, so that millions of images take a few thousand files
 _SPLIT = re.compile(r"[a-z][a-z0-9]*")
 
 
 class LabelsSpec(Spec):
-    """Labels in addition to those that every image has."""
+    """Optional labels, in addition to those of every image."""
 
     boundary_points: Annotated[int, Field(ge=6, le=360)] = Field(
         default=30, description="boundary points of the pupil in the record"
@@ -47,7 +47,7 @@ class LabelsSpec(Spec):
 
     @property
     def pictures(self) -> tuple[str, ...]:
-        """Kinds of images that every sample has; each kind has a separate folder."""
+        """Kinds of images that every sample has; each kind has its own folder."""
         more = {"amodal_masks": self.amodal_masks, "noiseless": self.noiseless, "highlights": self.highlights}
         return ("images", "masks", *(kind for kind, wanted in more.items() if wanted))
 
@@ -60,7 +60,7 @@ class DatasetSpec(FileSpec):
 
     FORMATS: ClassVar[tuple[int, ...]] = SceneSpec.FORMATS
 
-    kind: Literal["dataset"] = Field(description="says that the file is a dataset, not a scene")
+    kind: Literal["dataset"] = Field(description="declares that the file is a dataset, not a scene")
     name: Annotated[str, Field(min_length=1, max_length=100)] = Field(description="name of the dataset")
     description: str = Field(default="", description="what the dataset is for, in a sentence")
     licence: Annotated[str, Field(min_length=1, max_length=200)] | None = Field(
@@ -150,7 +150,7 @@ class DatasetSpec(FileSpec):
 
     @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """Return the mapping of a file in this folder, with the spec that it extends and the rows of its tables."""
+        """Merge the spec that a file extends, and the rows of its tables, into its mapping."""
         found: dict[str, Any] = with_tables(extended(data, find_dataset, folder), folder)
         return found
 
@@ -159,7 +159,7 @@ class DatasetSpec(FileSpec):
         """Check that a mapping is declared as a dataset.
 
         Raises:
-            InputError: it is not.
+            InputError: the mapping is of another kind.
         """
         if data.get("kind") != DATASET_KIND:
             if "rig" in data:
@@ -184,14 +184,14 @@ class DatasetSpec(FileSpec):
 
     @property
     def selection(self) -> Selection:
-        """Which samples are made."""
+        """Which samples are made, and in which shards."""
         spread = self.choice == "spread" and self.count % self.planned_count > 0
         sizes = self.count, self.planned_count, self.subject_count, self.shard_size
         return _selection(*sizes, spread, self.seed if self.is_packed else None)
 
     @property
     def is_packed(self) -> bool:
-        """Whether shards are packed."""
+        """Whether shards are packed into tar files."""
         return self.layout == "webdataset"
 
     @property
@@ -200,7 +200,7 @@ class DatasetSpec(FileSpec):
         return self.selection.shards
 
     def shard_samples(self, shard: int) -> Sequence[int]:
-        """Return samples of a shard."""
+        """Return the samples of a shard."""
         return self.selection.shard_samples(shard)
 
 
@@ -219,15 +219,15 @@ def _selection(
 
 
 def shipped_datasets() -> dict[str, Path]:
-    """Map the names of the dataset specs that come with the package to their files."""
+    """Return the dataset specs that come with the package, as a mapping from name to file."""
     return {name: path for name, path in shipped_files().items() if is_shipped_dataset(path)}
 
 
 def find_dataset(spec: str | Path) -> Path:
-    """Find the file of a dataset spec, by its path or by the bare name of a shipped one.
+    """Return the file of a dataset spec, given its path or the name of a shipped one.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such spec.
     """
     path, shipped = Path(spec), shipped_datasets()
     if not os.path.isfile(path):

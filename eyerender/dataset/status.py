@@ -1,4 +1,4 @@
-"""What a run is doing, from its log and the names of its shards: rates by host, time left, retries, disk.
+"""Status of a run, from its log and the names of its shards: rates by host, time left, retries, disk.
 
 Only small files are read, so this is quick for large runs, and may be called while they are at work.
 """
@@ -22,13 +22,13 @@ from .selection import Selection
 
 SCHEMA = "eyerender/status/1"
 SILENT_S = 180.0
-"""A part at work writes to the log once a minute; one that has been silent for so long has stalled or was killed."""
+"""A part at work writes to the log once a minute; after this silence it counts as stalled or killed."""
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
 
 
 @dataclass(slots=True, kw_only=True)
 class _Part:
-    """The last run of a part of the dataset on a host."""
+    """The last run of one part of the dataset on a host."""
 
     host: str
     part: str
@@ -38,10 +38,10 @@ class _Part:
     retries: int = 0
     last: str = ""
     bytes: int = 0
-    shard_images: int = 0  # of shards whose bytes are known
+    shard_images: int = 0  # images in shards whose size is known
 
     def take(self, event: dict[str, Any]) -> None:
-        """Take an event of the log."""
+        """Process an event of the log."""
         kind = event["event"]
         self.last, self.seconds = str(event["time"]), float(event["seconds"])
         if kind == "start":
@@ -57,7 +57,7 @@ class _Part:
 
     @property
     def rate(self) -> float | None:
-        """Images per second of a part that is at work."""
+        """Return the images per second of a part that is at work."""
         return self.images / self.seconds if self.state == "running" and self.images and self.seconds else None
 
     def to_mapping(self) -> dict[str, Any]:
@@ -68,10 +68,10 @@ class _Part:
 
 
 def status(path: str | Path) -> dict[str, Any]:
-    """Describe the state of a dataset's folder (schema eyerender/status/1).
+    """Return the state of a dataset's folder (schema eyerender/status/1).
 
     Raises:
-        InputError: it holds no run.
+        InputError: the folder holds no run.
     """
     folder = Path(path)
     run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
@@ -133,7 +133,7 @@ def _selection(run: dict[str, Any], source: str) -> Selection:
 
 
 def _plain(selection: Selection, shards: list[int]) -> int:
-    """Number of samples of some shards that hold all of theirs."""
+    """Count the samples of some shards, each of which has all its samples."""
     if selection.interleave is not None:
         per_block = -(-selection.planned // selection.shard_size)
         short = per_block * selection.shard_size - selection.planned
@@ -158,7 +158,7 @@ def _parts(folder: Path) -> list[_Part]:
 
 
 def _events(path: Path) -> Iterator[dict[str, Any]]:
-    """Events of a log; lines that a power cut has truncated are left out."""
+    """Yield the events of a log; lines truncated by a power cut are skipped."""
     if not path.is_file():
         return
     with opened(path, follow=False) as file:

@@ -1,4 +1,4 @@
-"""A scene template: a scene in which any value may be a draw, and the evaluation of its draws."""
+"""A scene template, in which any value may be a draw, and the evaluation of its draws."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from .draws import (
 )
 from .expressions import REFERENCE, evaluate, is_reference, names_of
 
-# Values of a subject's identity, which are drawn once per subject unless the draw says otherwise.
+# Values that identify a subject, drawn once per subject unless the draw says otherwise.
 IDENTITY = ("eye.model", "eye.margin", "look", "region", "subject.ipd_mm", "subject.eyes", "eye_parameters")
-# Exceptions, which change from frame to frame.
+# Exceptions, which change with every frame.
 PASSING = ("region.blink",)
-# Values of the eye, which never change from frame to frame, whatever the draw says.
+# Values of the eye, which never change between frames, whatever the draw says.
 FIXED_IDENTITY = ("eye.model", "eye.margin", "eye_parameters")
 _BLOCK = 256
 # Each draw becomes a column of the run, and all Sobol draws form one sequence of as many dimensions.
 MAX_DRAWS = 1000
 _CHOSEN = re.compile(r"#\d+")
-# Keys of draws that no mapping of a scene has together with a key like "draw".
+# Keys that occur beside a key like "draw" only in draws, never in a scene's mapping.
 _PARTS = frozenset(("low", "high", "mean", "sd", "weights", "steps", "covariance", "components", "value", "values"))
 
 
@@ -56,7 +56,7 @@ class PlacedDraw:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Turn:
-    """The sample that is drawn: its index, its subject and place in the subject's sequence, and both attempts."""
+    """Identity of the sample being drawn: index, subject, position in the subject's sequence, and both attempts."""
 
     sample: int
     subject: int
@@ -83,7 +83,7 @@ class Template:
         prefix: str = "",
         variables: Mapping[str, Unit] = MappingProxyType({}),
     ) -> Template:
-        """Find and check every draw, and every reference to `variables`, which are drawn per sample or subject.
+        """Collect and check all draws, and all references to `variables`, which are drawn per sample or subject.
 
         Raises:
             InputError: with the path of the draw (after `prefix`).
@@ -99,7 +99,7 @@ class Template:
     def values(
         self, turn: Turn, variables: Mapping[str, Any] = MappingProxyType({})
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the tree of plain values of one sample, and every draw's value (None where it was not used)."""
+        """Return the tree of plain values of one sample, and every draw's value (None if it was not used)."""
         drawn: dict[str, Any] = dict.fromkeys(self.draws)
         tree = self._resolve(self.tree, "", turn, drawn)
         return _with_variables(tree, variables) if variables else tree, drawn
@@ -117,7 +117,7 @@ class Template:
         return node
 
     def _value(self, placed: PlacedDraw, path: str, turn: Turn) -> tuple[Any, int]:
-        """Return the value of a draw, and its index among the draw's values (0 where it has none to choose from)."""
+        """Return the value of a draw, and its index among the draw's values (0 if it has no list of values)."""
         draw, unit = placed.draw, placed.unit
         number = turn.sample if unit == "sample" else turn.subject
         attempt = turn.attempt if unit == "sample" else turn.subject_attempt
@@ -142,7 +142,7 @@ class Template:
         return value, 0
 
     def _grid_index(self, path: str, unit: Unit, number: int) -> int:
-        """Return the index in one grid of the full product, of which the last grid (by name) varies fastest."""
+        """Return the index in one grid of the full factorial product; the last grid by name varies fastest."""
         grids = [(p, d.draw) for p, d in self.draws.items() if isinstance(d.draw, GridDraw) and d.unit == unit]
         for name, grid in reversed(grids):
             size = grid.size
@@ -153,7 +153,7 @@ class Template:
 
 
 def _with_variables(node: Any, variables: Mapping[str, Any]) -> Any:
-    """Replace references by their values."""
+    """Replace references to variables by their values."""
     if is_reference(node):
         return evaluate(str(node[REFERENCE]), variables)
     if isinstance(node, Mapping):
@@ -162,7 +162,7 @@ def _with_variables(node: Any, variables: Mapping[str, Any]) -> Any:
 
 
 def possible(node: Any) -> list[Any]:
-    """Return every value that a node of a template can take; none for numbers that are drawn at random."""
+    """Return every value that a node of a template can take; none for random numbers."""
     if not is_draw(node):
         return [node]
     values = [node.get("value")] if node.get("draw") == "fixed" else node.get("values") or []
@@ -170,7 +170,7 @@ def possible(node: Any) -> list[Any]:
 
 
 def _label(draw: Draw, value: Any, k: int) -> Any:
-    """Recorded form of a drawn value, of one type for every sample: the value, or its index among unlike ones."""
+    """Return a drawn value as recorded, of one type for every sample: the value, or its index if types differ."""
     if isinstance(draw, FixedDraw):
         every: tuple[Any, ...] = (draw.value,)
     elif isinstance(draw, GridDraw) and draw.values is None:
@@ -189,7 +189,7 @@ def _label(draw: Draw, value: Any, k: int) -> Any:
 @lru_cache(maxsize=16)
 def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
     """Return the points block * 256 .. + 255 of a scrambled Sobol sequence in (0, 1), (256, dimensions)."""
-    from scipy.stats import qmc  # which takes half a second
+    from scipy.stats import qmc  # its import takes half a second
 
     generator = np.random.default_rng([seed, 1 if unit == "subject" else 0])
     engine = qmc.Sobol(dimensions, scramble=True, rng=generator)
@@ -245,10 +245,10 @@ def _check_references(node: Any, path: str, variables: Mapping[str, Unit], probl
 
 
 def _check_reference(node: Mapping[str, Any], path: str, variables: Mapping[str, Unit]) -> None:
-    """Check that an expression can be read, and that what makes an eye does not change from frame to frame.
+    """Check that an expression can be parsed, and that eyes do not depend on variables that change per frame.
 
     Raises:
-        InputError: without a path.
+        InputError: the expression is not allowed; the error has no path yet.
     """
     if set(node) != {REFERENCE}:
         raise InputError(f"no other key may stand beside {REFERENCE!r}")
@@ -261,7 +261,7 @@ def _check_reference(node: Mapping[str, Any], path: str, variables: Mapping[str,
 
 
 def _refuse_misspelt(node: Mapping[str, Any], source: str, shown: str) -> None:
-    """Refuse a mapping that looks like a draw, but whose key `draw` is misspelt.
+    """Raise an error for a mapping that looks like a draw but misspells the key `draw`.
 
     Raises:
         InputError: naming the key.
@@ -273,7 +273,7 @@ def _refuse_misspelt(node: Mapping[str, Any], source: str, shown: str) -> None:
 
 
 def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
-    """Parse the draw at a path, which messages call `shown`."""
+    """Parse the draw at a path; messages use `shown` as its path."""
     draw = parse_draw(node, source=source, path=shown)
     bare = _CHOSEN.sub("", path)  # a place has the same meaning inside a choice
     identity = _under(bare, IDENTITY) and not _under(bare, PASSING)
@@ -290,7 +290,7 @@ def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
 
 
 def _values_of(draw: Draw) -> tuple[Any, ...]:
-    """Return values that a draw lists, which may contain draws again."""
+    """Return the values that a draw lists, which may contain further draws."""
     if isinstance(draw, FixedDraw):
         return (draw.value,)
     if isinstance(draw, ChoiceDraw | SequenceDraw | GridDraw):

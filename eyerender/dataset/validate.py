@@ -1,9 +1,9 @@
-"""Checks of a folder of images.
+"""Validation of a folder of images.
 
-Files are compared with checksums, lines with shards and plan, values with what is computed again from pose and
-parameters, and masks with the apparent outlines.
+Files are compared with checksums, metadata with shards and plan, values with those recomputed from pose and parameters,
+and masks with the apparent outlines.
 
-Memory does not grow with the folder, except for some tens of bytes an image.
+Memory grows by only some tens of bytes per image.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .validation.shards import check_run
 from .validation.truth import Again, DatasetTruth, NoTruth, SceneTruth, truth_of
 
 SAMPLE = 64
-"""So many lines are computed again where not all are; folders of no more lines are checked whole."""
+"""Number of lines that are recomputed by default; smaller folders are checked completely."""
 _BATCH = 256
 
 
@@ -39,20 +39,20 @@ def validate(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Check a folder and return a report (schema eyerender/validation/1).
+    """Validate a folder and return a report (schema eyerender/validation/1).
 
     Args:
         path: the folder.
-        quick: do not open or hash images; a changed byte and a wrong mask are then not found.
-        deep: compute all lines again, not only `SAMPLE` of them (see `sampled`).
-        render: render so many of the images of a dataset again, and compare all of their pixels.
-        backend: what renders them.
-        threads: processor threads for it; None: all.
+        quick: do not open or hash images; changed bytes and wrong masks are then not found.
+        deep: recompute all lines of metadata, not only `SAMPLE` of them (see `sampled`).
+        render: number of images of a dataset to render again and compare pixel by pixel.
+        backend: the render backend for these images.
+        threads: processor threads for rendering; None: all.
         progress: called with the amount done, the total, and the kind.
 
     Raises:
-        BackendError: there is nothing to render with.
-        InputError: it is not a folder of images.
+        BackendError: no backend can render.
+        InputError: the path is not a folder of images.
     """
     path = Path(path)
     folder = ImageFolder.load(path)
@@ -107,7 +107,7 @@ def validate(
 
 
 def _truth(folder: ImageFolder, problems: Problems, notes: list[str]) -> DatasetTruth | SceneTruth | None:
-    """What the lines of a folder can be compared with; the reason goes to the notes if they cannot be."""
+    """Return the reference for the metadata of a folder; if there is none, add the reason to the notes."""
     try:
         found = truth_of(folder, problems)
     except NoTruth as reason:
@@ -119,7 +119,7 @@ def _truth(folder: ImageFolder, problems: Problems, notes: list[str]) -> Dataset
 
 
 def _check(entry: ImageEntry, truth: DatasetTruth | SceneTruth | None, tally: Tally, *, quick: bool) -> Iterator[str]:
-    """List what is wrong with a line and its images; `truth` is None where the line is not computed again."""
+    """Describe what is wrong with an image and its metadata; with `truth` None, nothing is recomputed."""
     again = Again(()) if truth is None else truth.again(entry.line)
     yield from again.problems
     if quick:
@@ -129,19 +129,19 @@ def _check(entry: ImageEntry, truth: DatasetTruth | SceneTruth | None, tally: Ta
 
 
 def _find_files(entry: ImageEntry) -> None:
-    """Check that the files of a line exist inside the folder.
+    """Check that the files named in the metadata exist inside the folder.
 
     Raises:
-        InputError: naming the first one that does not.
+        InputError: naming the first missing file.
     """
     for key in FILE_KEYS:
         entry.check(key)
 
 
 def sampled(total: int, digest: str, count: int = SAMPLE) -> list[int]:
-    """Lines that are computed again by default: one at a hashed place in each of `count` equal parts of the file.
+    """Return the lines that are recomputed by default: a hashed one from each of `count` equal parts of the file.
 
-    They are a pure function of the folder's digest, so two checks of a folder use the same lines.
+    The choice depends only on the folder's digest, so two validations of a folder use the same lines.
     """
     if total <= count:
         return list(range(total))
@@ -154,13 +154,13 @@ def sampled(total: int, digest: str, count: int = SAMPLE) -> list[int]:
 
 
 def _batches(entries: Entries, problems: Problems) -> Iterator[tuple[int, list[ImageEntry]]]:
-    """Lines of a folder in batches, with the number of the first; a line that cannot be read is left out."""
+    """Yield the metadata of a folder in batches, with the number of the first line; unreadable lines are skipped."""
     row = 0
     while row < len(entries):
         batch: list[ImageEntry] = []
         failed = 0
         try:
-            # Lines are read one by one, so that those before a wrong line are kept.
+            # Lines are read one by one, so that those before a damaged line count.
             for entry in entries[row : row + _BATCH]:
                 batch.append(entry)
         except InputError as error:

@@ -1,4 +1,4 @@
-"""A worker process, which makes the requested shards and sends a message after each sample."""
+"""A worker process: makes the requested shards and sends a message after each sample."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from .plan import Plan
 from .shard import write_shard
 
 FAILURES: dict[str, type[EyerenderError]] = {"backend": BackendError, "input": InputError, "disk": EyerenderError}
-"""What the parent raises for each kind of failure; one of another kind may be tried again."""
+"""Error that the parent raises for each kind of failure; other kinds may be tried again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """Settings of every worker of a run.
+    """Settings shared by all workers of a run.
 
-    This is the plan and the folder of its files, the frames per sample, the folder to write, and the backend with its
+    They are the plan and the folder of its files, the frames per sample, the folder to write, and the backend with its
     threads. Folders are absolute because a worker may start in any working directory.
     """
 
@@ -40,7 +40,7 @@ class Job:
 
     @classmethod
     def of(cls, plan: Plan, frames: int, folder: Path, backend: str, threads: int) -> Job:
-        """Make the job of a plan."""
+        """Create the job of a plan."""
         return cls(
             plan=plan.to_mapping(),
             base=str(plan.base),
@@ -51,7 +51,7 @@ class Job:
         )
 
     def maker(self) -> Maker:
-        """Make the worker's maker."""
+        """Create the worker's maker."""
         plan = Plan.from_mapping(self.plan, Path(self.base))
         return Maker(plan, self.frames, backend=self.backend, threads=self.threads)  # type: ignore[arg-type]
 
@@ -62,7 +62,7 @@ def work(pipe: Connection, job: Job) -> None:
     The worker sends ("ready", backend), ("sample", shard, samples, images), ("done", summary) and ("failed", kind,
     reason), where kind is backend, input, disk or error. It receives the number of a shard, or None to end.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group, and the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group, and the parent decides
     ending = _Ending()
     threading.Thread(target=_die_with_parent, daemon=True).start()
     try:
@@ -92,14 +92,14 @@ def work(pipe: Connection, job: Job) -> None:
 
 
 class _Ending:
-    """SIGTERM ends a worker: at once where it is idle, after its samples and a checkpoint where it is at work."""
+    """Handler of SIGTERM: ends an idle worker at once, a busy one after its samples and a checkpoint."""
 
     def __init__(self) -> None:
         self.is_asked = False
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Only note SIGTERM in `is_asked` while the block runs, and end this process after it."""
+        """Inside the block, only record SIGTERM in `is_asked`; end this process after the block."""
         signal.signal(signal.SIGTERM, self._note)
         try:
             yield
@@ -113,7 +113,7 @@ class _Ending:
 
 
 def failure(error: Exception, folder: Path) -> tuple[str, str]:
-    """Return the kind and reason of an error while a shard is made: one of `FAILURES`, or `error` for a defect."""
+    """Return kind and reason of an error during a shard: one of `FAILURES`, or `error` for a defect."""
     if isinstance(error, OSError):
         return "disk", f"{folder}: cannot be written ({error.strerror or error})"
     if isinstance(error, EyerenderError):

@@ -1,1 +1,1 @@
-"""Rig design: what a rig can know about gaze (Fisher information), fits of eyes to features, eye safety."""
+"""Rig design: information about gaze (Fisher), fits of eyes to features, and eye safety."""

@@ -1,12 +1,12 @@
-"""The best k of n places for LEDs, by greedy exchange on the information that they add.
+"""Choose the best k of n positions for LEDs, by greedy exchange on the information that they add.
 
 Glints add up: with the information B_i of outline and priors in frame i and G_ik of the glint of LED k, the LEDs S have
 
     f(S) = mean over frames of log det (B_i + sum over S of G_ik)                                                  (8)
 
-which is submodular, so adding the best LED again and again loses little, and exchanges of one LED for another lose less
-still (Fedorov's exchange; Nemhauser, Wolsey and Fisher 1978). Two choices differ by the factor exp((f - f') / (2 p)) in
-the geometric mean of the standard deviations of p parameters, whatever their units.
+which is submodular, so greedily adding the best LED is near-optimal, and exchanging single LEDs improves it further
+(Fedorov's exchange; Nemhauser, Wolsey and Fisher 1978). Two choices differ by the factor exp((f - f') / (2 p)) in the
+geometric mean of the standard deviations of p parameters, whatever their units.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from .unknowns import COUNT, Unknowns
 from .varied import Slopes, slopes_of
 
 VAGUE = 1e-6
-"""Precision of what is unknown, per rad^2 or mm^2, so that frames without features have a determinant."""
+"""Precision of unknown numbers, per rad^2 or mm^2, so that frames without features have a determinant."""
 _POINTS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SiteInformation(ArrayValue):
-    """What each LED adds to what is known of i frames, on q parameters that are not known beforehand.
+    """Information that each LED adds in i frames, on q unknown parameters.
 
     Attributes:
-        base: (i, q, q) information of the outline and of priors.
+        base: (i, q, q) information of the outline and priors.
         sites: (m, i, q, q) information of each LED's glint, 0 where there is none.
     """
 
@@ -42,11 +42,11 @@ class SiteInformation(ArrayValue):
     sites: Floats
 
     def value(self, chosen: tuple[int, ...]) -> float:
-        """Mean log determinant of the information with these LEDs, equation (8)."""
+        """Compute the mean log determinant of the information with these LEDs, equation (8)."""
         return float(np.linalg.slogdet(self.base + self.sites[list(chosen)].sum(axis=0))[1].mean())
 
     def worse_by(self, chosen: tuple[int, ...], best: tuple[int, ...]) -> float:
-        """Factor between the geometric-mean standard deviations of two choices, 1 for equally good ones."""
+        """Compute the ratio of the geometric-mean standard deviations of two choices; 1 if equally good."""
         return float(np.exp((self.value(best) - self.value(chosen)) / (2.0 * self.base.shape[-1])))
 
 
@@ -57,9 +57,9 @@ def site_information(
     unknowns: Unknowns | None = None,
     noise: FeatureNoise | None = None,
 ) -> SiteInformation:
-    """Compute what each LED of a rig adds in each frame, see `er.information` for the arguments.
+    """Compute the information that each LED of a rig adds in each frame; see `er.information` for the arguments.
 
-    Each frame stands alone, with the priors of its person; all cameras of an instant count.
+    Each frame is treated separately, with the priors of its person; all cameras of an instant count.
     """
     case, _ = case_of(frames, rig)
     scene = frames.scene if rig is None else frames.seen_by(rig).scene
@@ -76,7 +76,7 @@ def site_information(
 
 
 def noise_of_some(scene: Scene, count: int) -> FeatureNoise:
-    """Noise while only `count` of a scene's LEDs are on: less light on the iris, the same glints."""
+    """Compute the feature noise with only `count` of a scene's LEDs on: less light on the iris, the same glints."""
     dimmer = [
         replace(light, intensity_mw_sr=light.intensity_mw_sr * count / len(scene.rig.lights))
         for light in scene.rig.lights
@@ -86,7 +86,7 @@ def noise_of_some(scene: Scene, count: int) -> FeatureNoise:
 
 
 def site_matrices(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
-    """Information of each of n views: (n, 23, 23) of the outline and (m, n, 23, 23) of each LED's glint."""
+    """Compute information in each of n views: (n, 23, 23) of the outline and (m, n, 23, 23) of each LED's glint."""
     normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
     size = np.sqrt(length) / noise.outline_px[camera][:, None]
     across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * size[..., None]
@@ -96,7 +96,7 @@ def site_matrices(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> tuple[Fl
 
 
 def with_priors(base: Floats, sites: Floats, unknowns: Unknowns) -> SiteInformation:
-    """Add the priors once and leave out what is known."""
+    """Add the priors once, and remove known parameters."""
     free = np.flatnonzero(unknowns.free())
     base = base + np.diag(np.maximum(unknowns.precision(), VAGUE))
     return SiteInformation(base=base[:, free[:, None], free], sites=sites[:, :, free[:, None], free])
@@ -110,17 +110,17 @@ def joined(parts: list[SiteInformation]) -> SiteInformation:
 
 
 def choose_lights(known: SiteInformation, count: int) -> tuple[int, ...]:
-    """Choose LEDs: add the best one again and again, then exchange one for another while that helps.
+    """Choose LEDs: add the best one repeatedly, then exchange single LEDs while that improves the choice.
 
     Args:
-        known: what each LED adds.
+        known: information that each LED adds.
         count: number of LEDs to choose.
 
     Returns:
         Their numbers, ascending.
 
     Raises:
-        InputError: there are fewer LEDs than that, or none is asked for.
+        InputError: `count` is below 1 or above the number of LEDs.
     """
     n = len(known.sites)
     if not 1 <= count <= n:

@@ -1,4 +1,4 @@
-"""Figures of many people on all processors, and the numbers of the industry that sum them up."""
+"""Figures of many people, computed on all processors, and the usual summary numbers of the industry."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def figures_of_people(
     """Compute the figures of the first people, in pieces that do not depend on the number of processes.
 
     Args:
-        survey: what is surveyed.
-        noise: of the features.
+        survey: rig and population.
+        noise: noise of the features.
         people: number of people.
         workers: processes; None: one for each processor.
         progress: called with (people done, people in all, what).
@@ -48,7 +48,7 @@ SHIFTS_MM = (-3.0, -1.5, 0.0, 1.5, 3.0)
 def figures_of_shifts(
     survey: Survey, noise: FeatureNoise, people: int, *, workers: int | None = None
 ) -> tuple[Floats, list[Figures]]:
-    """Compute the figures of a few people whose place is shifted: 5 x 5 to the left and up, and 5 in distance.
+    """Compute the figures of a few people at shifted positions: 5 x 5 to the left and up, and 5 in distance.
 
     Returns:
         Shifts (30, 3) in mm, those in the plane by rows from top to bottom, and the figures of each.
@@ -78,7 +78,7 @@ def users_of(values: Floats) -> dict[str, float | None]:
 
 
 def coverage_of(found: Figures) -> dict[str, float]:
-    """Compute the share of people times directions with that number of glints and `OUTLINE` of the outline."""
+    """Compute the share of people times directions with each number of glints and at least `OUTLINE` of the outline."""
     outline = found.outline >= OUTLINE
     return {
         "outline": float(outline.mean()),
@@ -87,5 +87,5 @@ def coverage_of(found: Figures) -> dict[str, float]:
 
 
 def finite_or_none(value: Any) -> float | None:
-    """A number for JSON, which has no infinities."""
+    """Convert infinities to None, because JSON has none."""
     return float(value) if np.isfinite(value) else None

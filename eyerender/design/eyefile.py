@@ -1,4 +1,4 @@
-"""Eye files with the unknowns of a person applied: the counterpart of `varied_eyes` for files."""
+"""Apply the unknowns of a person to an eye file: the counterpart of `varied_eyes` for files."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from .unknowns import (
 
 
 def changed_file(spec: EyeSpec, theta: Floats) -> EyeSpec:
-    """Eye file with what belongs to a person in `theta` (23,); the position has no place in it.
+    """Return the eye file with the person's part of `theta` (23,) applied; the position has no key in it.
 
     The pupil's ellipticity becomes the second harmonic of its contour, which is right to first order. The fovea is
     placed so that the line of sight keeps its direction in the eye, turned by kappa.
 
     Raises:
-        InputError: such an eye cannot exist.
+        InputError: the eye is physically impossible.
     """
     if not np.any(np.delete(theta, POSITION)[LOCAL:]):
         return spec

@@ -1,9 +1,9 @@
-"""Observed features against modelled ones: distances from the outline along its normal, and shifts of glints, whitened.
+"""Residuals between observed and modelled features: distances along the outline's normals, and glint shifts, whitened.
 
 An observed outline is a set of points: those of the record, or points of its ellipse. Their distances d from the
-modelled outline along its normal have the covariance that the noise gives (l px of outline have s^2 / l), or that of
-the record's ellipse. For a covariance C of the ellipse's parameters e, d = H de to first order, and the whitened
-distances are C^(-1/2) H^+ d.
+modelled outline along its normal have the covariance of the noise (s^2 / l for l px of outline), or that of the
+record's ellipse. For a covariance C of the ellipse's parameters e, d = H de to first order, and the whitened distances
+are C^(-1/2) H^+ d.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class Measured(ArrayValue):
     """Observed features of n views.
 
     Attributes:
-        outline_px: (n, k, 2) points of the outline; 0 where there are none.
-        outline_white: (n, k, k) whitening of their distances; 0 where there is no outline.
+        outline_px: (n, k, 2) points of the outline; 0 if missing.
+        outline_white: (n, k, k) whitening of their distances; 0 without an outline.
         outline_size: (n,) number of independent distances.
-        glints_px: (n, m, 2) glint of each light; 0 where there is none.
-        glint_white: (n, m, 2, 2) whitening of their shifts; 0 where there is no glint.
+        glints_px: (n, m, 2) glint of each light; 0 if missing.
+        glint_white: (n, m, 2, 2) whitening of their shifts; 0 without a glint.
     """
 
     outline_px: Floats
@@ -43,22 +43,22 @@ class Measured(ArrayValue):
     glint_white: Floats
 
     def take(self, rows: Ints) -> Measured:
-        """Return some of the views."""
+        """Select views."""
         return replace(self, **{name: getattr(self, name)[rows] for name in self.__slots__})
 
     @property
     def has_glint(self) -> Bools:
-        """Which glints were observed, (n, m)."""
+        """Whether each glint was observed, (n, m)."""
         return np.asarray(self.glint_white.any(axis=(2, 3)))
 
     @property
     def count(self) -> int:
-        """Number of independent numbers."""
+        """Number of independent values."""
         return int(self.outline_size.sum() + 2 * self.has_glint.sum())
 
 
 def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Measured:
-    """Compute features of observations with their covariances, or `noise` where they have none."""
+    """Convert observations to whitened features, with their covariances or, where these are missing, `noise`."""
     camera = np.maximum(observations.index.camera, 0)
     points, white, size = _outlines(observations, noise.outline_px[camera])
     glints, weights = np.zeros((len(camera), lights, 2)), np.zeros((len(camera), lights, 2, 2))
@@ -76,7 +76,7 @@ def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Me
 
 
 def _covariance_of(observations: Observations, light: int) -> Floats:
-    """Compute the covariance (n, 2, 2) of one light's glint; NaN where there is none."""
+    """Return the covariance (n, 2, 2) px^2 of one light's glint; NaN if there is none."""
     glints = observations.glints
     out = np.full((len(observations), 2, 2), np.nan)
     if glints.light.shape[1]:
@@ -87,7 +87,7 @@ def _covariance_of(observations: Observations, light: int) -> Floats:
 
 
 def _whitening(covariance: Floats) -> Floats:
-    """Compute inverse square roots (n, q, q) of covariances, W^T W = C^-1; directions of no weight are left out."""
+    """Compute inverse square roots (n, q, q) of covariances, W^T W = C^-1, without directions of zero weight."""
     values, vectors = np.linalg.eigh(covariance)
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.where(values > 0, 1.0 / np.sqrt(values), 0.0)
@@ -95,7 +95,7 @@ def _whitening(covariance: Floats) -> Floats:
 
 
 def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Floats, Ints]:
-    """Compute points of the outlines, the whitening of their distances, and how many of these are independent."""
+    """Compute points of the outlines, the whitening of their distances, and the number of independent distances."""
     pupil = observations.pupil
     given = pupil.points_px[:, :: max(1, -(-pupil.points_px.shape[1] // MOST_POINTS))]
     traced = np.sum(np.isfinite(given).all(axis=2), axis=1) >= 6
@@ -124,7 +124,7 @@ def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Fl
 
 
 def _of_ellipse(centre: Floats, axes: Floats, angle: float) -> tuple[Floats, Floats, Floats]:
-    """Points of an ellipse, their normal shifts by (cx, cy, a, b, angle) (k, 5), and |dp / df| for its parameter f."""
+    """Compute an ellipse's points, their normal shifts by (cx, cy, a, b, angle) (k, 5), and |dp / df|, f parameter."""
     f = 2.0 * np.pi * np.arange(ELLIPSE_POINTS) / ELLIPSE_POINTS
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     circle = np.stack([np.cos(f), np.sin(f)], axis=-1)
@@ -140,15 +140,15 @@ def _of_ellipse(centre: Floats, axes: Floats, angle: float) -> tuple[Floats, Flo
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Residuals:
-    """Whitened residuals of n views and their derivatives by the unknowns.
+    """Whitened residuals of n views, and their derivatives with respect to the unknowns.
 
     Attributes:
-        outline: (n, k).
-        glints: (n, m, 2).
-        outline_slopes: (n, k, 23); empty where not asked for.
-        glint_slopes: (n, m, 2, 23).
-        outline_size: (n,) number of independent distances that the model has, too.
-        glint_ok: (n, m) glints that are observed and that the model has.
+        outline: (n, k) residuals of outlines.
+        glints: (n, m, 2) residuals of glints.
+        outline_slopes: (n, k, 23) derivatives; empty if not requested.
+        glint_slopes: (n, m, 2, 23) derivatives.
+        outline_size: (n,) number of independent distances that the model has too.
+        glint_ok: (n, m) whether a glint is both observed and modelled.
     """
 
     outline: Floats
@@ -160,7 +160,7 @@ class Residuals:
 
 
 def residuals(seen: Measured, model: Images | Slopes) -> Residuals:
-    """Compare observed features with a model; what the model does not show has residuals 0."""
+    """Compute the residuals of observed features from a model; features that the model lacks have residuals 0."""
     images = model.images if isinstance(model, Slopes) else model
     whole = np.isfinite(images.outline_px).all(axis=(1, 2)) & (seen.outline_size > 0)
     k, m = seen.outline_px.shape[1], seen.glints_px.shape[1]
@@ -189,7 +189,7 @@ def residuals(seen: Measured, model: Images | Slopes) -> Residuals:
 
 
 def outline_distances(model_px: Floats, slopes: Floats | None, observed_px: Floats) -> tuple[Floats, Floats | None]:
-    """Find signed distances (n, k) of observed points from modelled outlines along their normals, and the derivatives.
+    """Compute signed distances (n, k) px of points from modelled outlines along their normals, and derivatives.
 
     The outline through the modelled points is their trigonometric interpolation p(f). The foot of a point o satisfies
     (p(f) - o) . p'(f) = 0 (Newton's steps from the nearest point), and its distance is n . (o - p).

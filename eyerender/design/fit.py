@@ -1,14 +1,13 @@
-"""Fit eyes to features: Gauss-Newton through the analytic observer, which is maximum likelihood for Gaussian noise.
+"""Fit eyes to features: Gauss-Newton through the analytic observer, maximum likelihood for Gaussian noise.
 
     minimise  sum_b w_b |W_b (y_b - h_b(theta))|^2 + |(theta - theta_0) / sigma|^2                                  (4)
 
 over the unknowns of all frames and of the person. The blocks b are whole outlines, single glints, and the angles
-between line of sight and known targets; W_b whitens them. The weights w_b are Huber's or those of Geman and McClure
-with a flat core: 1 while a block's root mean square t of whitened residuals (over the median of its kind, if that is
-above 1) is at most 3, then 3 / t or (18 / (9 +
-t^2))^2. While all blocks of an instant are far off, t counts relative to their median, at most 1000 times in the first
-step and half as much in each that follows. Steps are damped by Levenberg's rule. The normal equations are arrow-shaped:
-the unknowns of a frame meet those of other frames only through the person's.
+between line of sight and known targets; W_b whitens them. Let t be the rms of a block's whitened residuals, divided by
+the median of its kind if that is above 1. The weights w_b are 1 for t <= 3, and above that 3 / t (Huber) or (18 / (9 +
+t^2))^2 (Geman and McClure with a flat core). While all blocks of an instant are far off, t is taken relative to their
+median, by a factor of at most 1000 in the first step and half as much in each following one. Steps are damped by
+Levenberg's rule. The normal equations are arrow-shaped: frames are coupled only through the person's unknowns.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ from .varied import (
 
 Robust = Literal["geman-mcclure", "huber", "none"]
 CORE = 3.0
-"""Root mean square of a block's whitened residuals up to which it has its full weight."""
+"""Rms of a block's whitened residuals up to which the block has full weight."""
 _STEPS, _SETTLED = 40, 1e-10
 _POINTS = 30
 _START_AZIMUTH, _START_ELEVATION = np.radians(np.linspace(-36, 36, 9)), np.radians(np.linspace(-24, 24, 7))
@@ -65,18 +64,18 @@ DEFAULT_OUTLINE_PX, DEFAULT_GLINT_PX = 0.1, 0.05
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Problem:
-    """What is fitted: the views with their features, one eye.
+    """A fit to solve: the views of one eye with their features.
 
     Attributes:
         views: n views.
-        seen: their features.
+        seen: features of the views.
         instant: (n,) instant of each view.
-        instants: i views, one for each instant.
+        instants: one view for each of i instants.
         target_mm: (i, 3) known targets; NaN where there is none.
         fixation_rad: noise of fixation per axis.
         centre: (i, 23) means of the priors.
-        precision: (23,) of the priors.
-        free: (23,) what is fitted.
+        precision: (23,) inverse variances of the priors.
+        free: (23,) which unknowns are fitted.
         robust: the weights.
     """
 
@@ -93,18 +92,18 @@ class Problem:
 
     @property
     def shared(self) -> bool:
-        """Whether anything of the person is fitted."""
+        """Whether any unknown of the person is fitted."""
         return bool(self.free[LOCAL:].any())
 
     @property
     def has_target(self) -> Bools:
-        """Which instants have a known target, (i,)."""
+        """Whether each instant has a known target, (i,)."""
         return np.asarray(np.isfinite(self.target_mm).all(axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EyeFit(ArrayValue):
-    """One eye as fitted.
+    """Result of the fit of one eye.
 
     Attributes:
         eye: right or left.
@@ -113,13 +112,13 @@ class EyeFit(ArrayValue):
         theta: (i, 23) unknowns of each instant (`design.unknowns`), rad and mm.
         origin_mm: (i, 3) where the line of sight leaves the cornea.
         direction: (i, 3) unit direction of the line of sight.
-        known: covariances, and what is not seen.
+        known: covariances, and combinations that are not determined.
         chi2: (i,) squared whitened residuals with the weights of each instant, priors included.
         dof: degrees of freedom of the sum of `chi2`.
         outline_weight: (n,) robust weight of each outline; NaN without one.
-        glint_weight: (n, m) of each glint.
-        converged: whether the steps settled, (i,).
-        prior: the eye that the fit began with.
+        glint_weight: (n, m) robust weight of each glint.
+        converged: (i,) whether the steps settled.
+        prior: the eye at the start of the fit.
     """
 
     eye: str
@@ -138,15 +137,15 @@ class EyeFit(ArrayValue):
 
     @property
     def spec(self) -> EyeSpec:
-        """The fitted eye as a file.
+        """Convert the fitted eye to an eye file.
 
         Raises:
-            InputError: such an eye cannot exist, as with a pupil behind the front of the lens.
+            InputError: the eye is physically impossible, for instance with a pupil behind the front of the lens.
         """
         return changed_file(self.prior, self.theta[0])
 
     def to_mapping(self) -> dict[str, Any]:
-        """Convert to plain values; angles in degrees."""
+        """Convert to JSON values; angles in degrees."""
         degrees = np.where(ANGLES, np.degrees(1.0), 1.0)
         shared, spread = self.theta[0, LOCAL:] * degrees[LOCAL:], self.known.person_deviation * degrees[LOCAL:]
 
@@ -191,17 +190,17 @@ def fit_eye(
     robust: Robust = "geman-mcclure",
     start: Floats | None = None,
 ) -> tuple[EyeFit, ...]:
-    """Fit the gaze of every frame and the eye behind them to features, one fit for each observed eye.
+    """Fit the gaze of every frame, and the eye, to features; one fit for each observed eye.
 
     Args:
-        observations: of any observer, or of a table; each needs the approximate position of its eye.
-        rig: their rig.
-        unknowns: what is fitted, with which priors; default: `Unknowns.population()`.
-        prior: the eye that the fit begins with, and the mean of all priors of the person.
-        noise: of features whose covariance is null; default: 0.1 px for one px of outline, 0.05 px for a glint.
+        observations: observations of any observer, or of a table, each with the approximate position of its eye.
+        rig: the rig that observed them.
+        unknowns: the fitted unknowns and their priors; default: `Unknowns.population()`.
+        prior: start of the fit, and mean of the person's priors.
+        noise: noise of features without covariance; default: 0.1 px for one px of outline, 0.05 px for a glint.
         targets: use the known targets, with the noise of fixation.
         robust: the weights against wrong features.
-        start: (i, 23) unknowns to begin with, for one eye; default: a search.
+        start: (i, 23) start of the unknowns, for one eye; default: a search.
 
     Raises:
         InputError: there is nothing to fit, or an eye has no position.
@@ -219,7 +218,7 @@ def fit_eye(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How a fit is done, see `fit_eye`; `person` (17,) are numbers of the person that stand in place of the prior's."""
+    """Options of a fit, see `fit_eye`; `person` (17,) fixes the person's unknowns instead of the prior."""
 
     targets: bool = True
     robust: Robust = "geman-mcclure"
@@ -228,7 +227,7 @@ class Options:
 
 
 def instants_of(observations: Observations) -> Ints:
-    """Number the instants (n,) of observations of one eye: the k-th frames of all cameras of a fixation are one."""
+    """Number the instants (n,) of one eye; the k-th frames of all cameras of a fixation are one instant."""
     index = observations.index
     place = np.stack([index.head, index.fixation, index.camera], axis=-1)
     turn = np.zeros(len(index), dtype=np.int64)
@@ -299,7 +298,7 @@ def problem_of(
 
 
 def start_of(problem: Problem) -> Floats:
-    """Unknowns (i, 23) to begin with: the best of a grid of directions for the pupil's centre and the glints."""
+    """Compute the start (i, 23): the best of a grid of directions for the pupil's centre and the glints."""
     seen, n = problem.seen, len(problem.views)
     azimuth, elevation = (a.ravel() for a in np.meshgrid(_START_AZIMUTH, _START_ELEVATION))
     count = len(azimuth)
@@ -331,9 +330,9 @@ class Weights:
 
 
 def block_sizes(found: Residuals) -> tuple[Floats, Floats]:
-    """Root mean squares of the whitened residuals of outlines (n,) and glints (n, m), over their median if above 1.
+    """Compute the rms of whitened residuals of outlines (n,) and glints (n, m), over their median if above 1.
 
-    Where the eye differs from the model, all outlines or all glints are off; only those that are more so are wrong.
+    If the eye differs from the model, all outlines or all glints are off; only those that are off by more are outliers.
     """
     outline = np.sqrt(np.sum(found.outline**2, axis=1) / np.maximum(found.outline_size, 1))
     glints = np.sqrt(np.sum(found.glints**2, axis=2) / 2.0)
@@ -345,7 +344,7 @@ def block_sizes(found: Residuals) -> tuple[Floats, Floats]:
 
 
 def weights_of(problem: Problem, found: Residuals, most: float = 1.0) -> Weights:
-    """Weights of all blocks; residuals count relative to the median of their instant, at most `most` times."""
+    """Compute the weights of all blocks; residuals are relative to their instant's median, at most `most` times."""
     outline, glints = block_sizes(found)
     if problem.robust == "none":
         return Weights(outline=np.ones_like(outline), glints=np.ones_like(glints))
@@ -358,7 +357,7 @@ def weights_of(problem: Problem, found: Residuals, most: float = 1.0) -> Weights
 
 
 def _medians(group: Ints, values: Floats, count: int) -> Floats:
-    """Median (count,) of the values of each group; 0 of an empty one."""
+    """Compute the median (count,) of each group's values; 0 for an empty group."""
     order = np.lexsort((values, group))
     sizes = np.bincount(group, minlength=count)
     middle = np.cumsum(sizes) - sizes + sizes // 2
@@ -369,17 +368,17 @@ def _medians(group: Ints, values: Floats, count: int) -> Floats:
 
 
 def _huber(t: Floats) -> Floats:
-    """1 in the core, CORE / t outside."""
+    """Return Huber's weight: 1 in the core, CORE / t outside."""
     return np.asarray(CORE / np.maximum(t, CORE))
 
 
 def _geman_mcclure(t: Floats) -> Floats:
-    """1 in the core, (2 CORE^2 / (CORE^2 + t^2))^2 outside."""
+    """Return the Geman-McClure weight with a flat core: 1 inside, (2 CORE^2 / (CORE^2 + t^2))^2 outside."""
     return np.asarray((2.0 * CORE**2 / (CORE**2 + np.maximum(t, CORE) ** 2)) ** 2)
 
 
 def costs_of(problem: Problem, theta: Floats, found: Residuals, weights: Weights) -> tuple[Floats, Floats]:
-    """Equation (4): cost (i,) of each instant, and that of the person's prior."""
+    """Compute the cost (i,) of each instant, equation (4), and that of the person's prior."""
     own = weights.outline * np.sum(found.outline**2, axis=1)
     own = own + np.sum(weights.glints * np.sum(found.glints**2, axis=2), axis=1)
     cost = np.zeros(len(theta))
@@ -393,7 +392,7 @@ def costs_of(problem: Problem, theta: Floats, found: Residuals, weights: Weights
 
 
 def equations_of(problem: Problem, theta: Floats, found: Residuals, weights: Weights) -> tuple[Floats, Floats]:
-    """Information (i, 23, 23) of each instant without priors, and half of the negative gradient (i, 23)."""
+    """Compute the information (i, 23, 23) of each instant without priors, and half of the negative gradient (i, 23)."""
     n = len(problem.views)
     roots = np.sqrt(weights.outline)[:, None], np.sqrt(weights.glints)[..., None]
     slopes = np.concatenate(
@@ -415,7 +414,7 @@ def equations_of(problem: Problem, theta: Floats, found: Residuals, weights: Wei
 
 
 def arrow_step(problem: Problem, matrix: Floats, vector: Floats, theta: Floats, damping: Floats) -> Floats:
-    """Damped Gauss-Newton step (i, 23) of the arrow-shaped normal equations.
+    """Solve the arrow-shaped normal equations for the damped Gauss-Newton step (i, 23).
 
     With blocks A_i of the frames, B_i to the person and C of the person, the person's step is that of the Schur
     complement C - sum B_i^T A_i^-1 B_i, and A_i x_i = a_i - B_i y gives the frames'.
@@ -423,8 +422,8 @@ def arrow_step(problem: Problem, matrix: Floats, vector: Floats, theta: Floats, 
     Args:
         problem: the fit.
         matrix: (i, 23, 23) information without priors.
-        vector: (i, 23).
-        theta: (i, 23).
+        vector: (i, 23) half of the negative gradient.
+        theta: (i, 23) current unknowns.
         damping: (i,) Levenberg's factors.
     """
     off = (problem.centre - theta) * problem.precision
@@ -451,7 +450,7 @@ def arrow_step(problem: Problem, matrix: Floats, vector: Floats, theta: Floats, 
 
 
 def solve(problem: Problem, theta: Floats, steps: int = _STEPS) -> tuple[Floats, Bools]:
-    """Minimise equation (4) from `theta` (i, 23); returns the unknowns, and which instants settled."""
+    """Minimise equation (4) from `theta` (i, 23); return the unknowns, and which instants settled."""
     theta, settled = theta.copy(), np.zeros(len(theta), dtype=bool)
     damping = np.full(len(theta), 1e-3)
     for count in range(steps):
@@ -474,15 +473,15 @@ def solve(problem: Problem, theta: Floats, steps: int = _STEPS) -> tuple[Floats,
 
 
 def _all_in_core(weights: Weights) -> bool:
-    """Whether every block has its full weight."""
+    """Return whether every block has full weight."""
     return bool((weights.outline == 1.0).all() and (weights.glints == 1.0).all())
 
 
 def without_wrong_outlines(problem: Problem, theta: Floats) -> Floats | None:
-    """Another start, where the glints of an instant agree without its outline; None where there is no such instant.
+    """Return another start that ignores outlines in instants whose glints agree; None if there are none.
 
-    An outline has many points, so a wrong one draws the gaze along, and all glints look wrong together. Whichever
-    leaves fewer blocks unexplained is kept.
+    A wrong outline has many points, so it can pull the gaze away and make all glints look wrong. The caller keeps the
+    solution that leaves fewer blocks unexplained.
     """
     now = unexplained(problem, theta)
     if not (now > CORE**2).any():
@@ -496,7 +495,7 @@ def without_wrong_outlines(problem: Problem, theta: Floats) -> Floats | None:
 
 
 def unexplained(problem: Problem, theta: Floats) -> Floats:
-    """Sum (i,) over the blocks of each instant of their mean squared residual, at most CORE^2 each."""
+    """Sum the mean squared residuals of each instant's blocks, each at most CORE^2, (i,)."""
     found = residuals(problem.seen, images_of(problem.views, theta[problem.instant], _POINTS))
     outline, glints = block_sizes(found)
     own = np.minimum(outline**2, CORE**2) + np.minimum(glints**2, CORE**2).sum(axis=1)
@@ -506,15 +505,15 @@ def unexplained(problem: Problem, theta: Floats) -> Floats:
 
 
 def _limited(problem: Problem, step: Floats) -> Floats:
-    """The steps (i, 23), shortened where a direction would turn by more than `_MOST_RAD`."""
+    """Shorten steps (i, 23) that would turn a direction by more than `_MOST_RAD`."""
     share = np.minimum(1.0, _MOST_RAD / np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-12))
     return np.asarray(step * (share.min() if problem.shared else share[:, None]))
 
 
 def _improves(problem: Problem, now: tuple[Floats, Residuals], trial: Floats, weights: Weights) -> tuple[Bools, Bools]:
-    """Which instants (i,) get no worse by a step and keep their features, and where the gain no longer matters.
+    """Return which instants (i,) a step does not worsen without losing features, and whether the gain is negligible.
 
-    Where instants share a person, the answers are the same for all.
+    If instants share a person, the result is the same for all.
     """
     theta, found = now
     new = residuals(problem.seen, images_of(problem.views, trial[problem.instant], _POINTS))
@@ -532,7 +531,7 @@ def _improves(problem: Problem, now: tuple[Floats, Residuals], trial: Floats, we
 
 
 def _comparable(before: Residuals, after: Residuals) -> Residuals:
-    """Residuals `after` a step, where glints that only one of the two models shows count as `before`."""
+    """Return the residuals `after` a step; glints that only one of the two models has count as `before`."""
     both = (before.glint_ok & after.glint_ok)[..., None]
     return replace(after, glints=np.where(both, after.glints, before.glints))
 
@@ -540,7 +539,7 @@ def _comparable(before: Residuals, after: Residuals) -> Residuals:
 def _result(
     mine: Observations, rows: Ints, problem: Problem, state: tuple[Floats, Bools], made: tuple[EyeSpec, Unknowns]
 ) -> EyeFit:
-    """The fit with its covariances and its eye file."""
+    """Assemble the fit with its covariances and its eye file."""
     (theta, converged), (spec, unknowns) = state, made
     found = residuals(problem.seen, slopes_of(problem.views, theta[problem.instant], _POINTS, problem.free))
     weights = weights_of(problem, found)

@@ -1,4 +1,4 @@
-"""The folder of a fit: one eye file for each eye, and fit.json."""
+"""Write the folder of a fit: one eye file per eye, and fit.json."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FIT = "fit.json"
 
 
 def write_fits(output: str | Path, fits: Sequence[EyeFit], *, overwrite: bool = False) -> dict[str, Any]:
-    """Write right.yaml or left.yaml and fit.json into a folder; returns the content of the latter.
+    """Write right.yaml, left.yaml and fit.json into a folder; return the content of fit.json.
 
     Raises:
         InputError: the folder is not empty.

@@ -1,12 +1,12 @@
-"""Fisher information of what a rig observes, and the covariance of gaze and of every parameter that follows.
+"""Fisher information of a rig's observations, and the resulting covariance of gaze and of every parameter.
 
     I = sum_j (l_j / s^2) (n_j . dp_j) (n_j . dp_j)^T + sum_g dg^T dg / s_g^2 + sum_t dm^T dm / f^2 + P^-1      (3)
 
 with points p_j of the pupil's outline, their normals n_j and lengths l_j of outline, the noise s of one px of outline,
 glints g with noise s_g, the angles m between line of sight and target with the noise of fixation f for frames of a
-calibration, and the covariance P of priors. All derivatives are by the unknowns (`unknowns.py`). The inverse of I is
-the Cramer-Rao bound: no unbiased estimator on these features has less variance. It counts noise alone. What an
-estimator assumes wrongly about the eye comes on top of it.
+calibration, and the covariance P of priors. All derivatives are with respect to the unknowns (`unknowns.py`). The
+inverse of I is the Cramer-Rao bound: no unbiased estimator on these features has less variance. The bound includes
+noise only; an estimator's wrong assumptions about the eye add to it.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, NAMES, PERSON, P
 from .varied import Slopes, Views, diameters_mm, gaze_slopes, lines_of_sight, slopes_of, stacked_eyes, target_slopes
 
 UNSEEN = 1e-11
-"""Eigenvalues of the information, scaled to a unit diagonal, below which a direction counts as not seen."""
+"""Eigenvalues of the information, scaled to a unit diagonal, below which a direction is undetermined."""
 _VIRTUAL_MM = 1000.0
 _ROWS = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Case:
-    """Views with their instants: what all analyses of a rig start from.
+    """Views and their instants, the input of all analyses of a rig.
 
     Attributes:
         views: n views.
         instant: (n,) the instant of each view, 0 to i - 1.
-        instants: i views, one of each instant, for what does not depend on the camera.
+        instants: one view for each of i instants, for values that do not depend on the camera.
         theta: (i, 23) the true unknowns.
-        target_mm: (i, 3) what is looked at; NaN where nothing is.
+        target_mm: (i, 3) fixation targets; NaN without one.
     """
 
     views: Views
@@ -52,7 +52,7 @@ class Case:
 
 
 def case_of(frames: Frames, rig: RigLike | None = None) -> tuple[Case, Ints]:
-    """Make a case of frames, and the first row of each instant.
+    """Create a case from frames; also return the first row of each instant.
 
     Raises:
         InputError: the rig has another number of cameras, or a cornea has no radius.
@@ -80,10 +80,10 @@ def case_of(frames: Frames, rig: RigLike | None = None) -> tuple[Case, Ints]:
 
 
 def outline_normals(points_px: Floats, ok: Bools) -> tuple[Floats, Floats]:
-    """Unit normals (n, k, 2) and lengths (n, k) of outline at points (n, k, 2) evenly spaced in its parameter.
+    """Compute unit normals (n, k, 2) and lengths (n, k) px of outline at points (n, k, 2) evenly spaced along it.
 
-    The derivative by the parameter is (p_(j+1) - p_(j-1)) / (2 sin h) for a spacing h, which is exact for an ellipse.
-    Points without both neighbours have length 0.
+    The points are evenly spaced in the outline's parameter. The derivative by the parameter is (p_(j+1) - p_(j-1)) / (2
+    sin h) for a spacing h, which is exact for an ellipse. Points without both neighbours have length 0.
     """
     spacing = 2.0 * np.pi / points_px.shape[1]
     after, before = np.roll(points_px, -1, axis=1), np.roll(points_px, 1, axis=1)
@@ -96,7 +96,7 @@ def outline_normals(points_px: Floats, ok: Bools) -> tuple[Floats, Floats]:
 
 
 def information_of_views(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> Floats:
-    """Information (n, 23, 23) of outline and glints in each view, the first two sums of equation (3)."""
+    """Compute the information (n, 23, 23) of outline and glints in each view, the first two sums of equation (3)."""
     normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
     weight = length / noise.outline_px[camera][:, None] ** 2
     across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * np.sqrt(weight)[..., None]
@@ -107,7 +107,7 @@ def information_of_views(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> F
 
 
 def information_of_instants(case: Case, noise: FeatureNoise, boundary_points: int, free: Bools | None = None) -> Floats:
-    """Information (i, 23, 23) of all views of each instant."""
+    """Compute the information (i, 23, 23) of all views of each instant."""
     out = np.zeros((len(case.theta), COUNT, COUNT))
     for first in range(0, len(case.views), _ROWS):
         rows = np.arange(first, min(first + _ROWS, len(case.views)))
@@ -118,9 +118,9 @@ def information_of_instants(case: Case, noise: FeatureNoise, boundary_points: in
 
 
 def target_information(case: Case, noise: FeatureNoise, rows: Ints) -> Floats:
-    """Information (r, 23, 23) of the known targets of some instants, the third sum of equation (3).
+    """Compute the information (r, 23, 23) of known targets, the third sum of equation (3).
 
-    An instant without a target looks at a point one metre away on its line of sight.
+    An instant without a target is assumed to fixate a point one metre away.
     """
     views, theta = case.instants.take(rows), case.theta[rows]
     point, way = lines_of_sight(views, theta)
@@ -132,20 +132,22 @@ def target_information(case: Case, noise: FeatureNoise, rows: Ints) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EyeInformation(ArrayValue):
-    """What a rig knows about one eye in i instants.
+    """Information of a rig about one eye in i instants.
 
     Attributes:
         eye: right or left.
         fixation: (i,) fixation of each instant.
         head: (i,) head position.
-        gaze_covariance_deg2: (i, 2, 2) of the line of sight, to the subject's left and up; inf where it is not seen.
-        axis_covariance_deg2: (i, 2, 2) of the optic axis' azimuth and elevation.
-        frame_deviation: (i, 6) of what belongs to a frame (`unknowns.FRAME`), rad and mm; 0 known, inf not seen.
-        person_deviation: (17,) of what belongs to the person (`unknowns.PERSON`).
-        person_covariance: (17, 17) of these, rad and mm; inf on the diagonal of what is not seen.
-        matrix: the information on all that is not known.
-        names: what its rows are.
-        unseen: combinations that the rig does not see, in words.
+        gaze_covariance_deg2: (i, 2, 2) covariance of the line of sight, to the subject's left and up; inf if
+            undetermined.
+        axis_covariance_deg2: (i, 2, 2) covariance of the optic axis' azimuth and elevation.
+        frame_deviation: (i, 6) standard deviations of each frame's unknowns (`unknowns.FRAME`), rad and mm; 0 if known,
+            inf if undetermined.
+        person_deviation: (17,) standard deviations of the person's unknowns (`unknowns.PERSON`), rad and mm.
+        person_covariance: (17, 17) covariance of these; inf on the diagonal if undetermined.
+        matrix: information on all unknowns.
+        names: names of its rows.
+        unseen: combinations of unknowns that the rig does not determine, in words.
     """
 
     eye: str
@@ -162,18 +164,18 @@ class EyeInformation(ArrayValue):
 
     @property
     def gaze_deg(self) -> Floats:
-        """Standard deviation (i,) of the line of sight: sqrt of the sum of both variances, degrees."""
+        """Standard deviation (i,) of the line of sight in degrees: the square root of the sum of both variances."""
         return np.asarray(np.sqrt(np.trace(self.gaze_covariance_deg2, axis1=1, axis2=2)))
 
     @property
     def axis_deg(self) -> Floats:
-        """The same of the optic axis."""
+        """Standard deviation (i,) of the optic axis in degrees."""
         return np.asarray(np.sqrt(np.trace(self.axis_covariance_deg2, axis1=1, axis2=2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Information(ArrayValue):
-    """What a rig knows about each eye: `information["right"].gaze_deg`. All of it is noise alone."""
+    """Information of a rig about each eye, from noise only: `information["right"].gaze_deg`."""
 
     eyes: tuple[EyeInformation, ...]
     note: str = field(default="noise only: what an estimator assumes wrongly comes on top")
@@ -185,7 +187,7 @@ class Information(ArrayValue):
         raise InputError(f"there is no {eye} eye", path="eye")
 
     def to_mapping(self) -> dict[str, Any]:
-        """Convert to plain values: standard deviations in degrees and mm, null where nothing is seen."""
+        """Convert to JSON values: standard deviations in degrees and mm, null if undetermined."""
         return {"schema": "eyerender/information/1", "note": self.note, "eyes": [_mapping(one) for one in self.eyes]}
 
 
@@ -198,15 +200,14 @@ def information(
     calibration: Sequence[int] = (),
     boundary_points: int = 30,
 ) -> Information:
-    """Compute what a rig can know of gaze and of the eye: Fisher information and its inverse, equation (3).
+    """Compute the Fisher information of a rig about gaze and eye, and its inverse, equation (3).
 
     Args:
         frames: the frames; all cameras at one fixation and head position are one instant.
         rig: replaces the rig of the frames.
-        unknowns: what is known beforehand; default: `Unknowns()`, all but gaze and pupil.
-        noise: of the features; default: of the scene's sensor.
-        calibration: fixations whose targets are known, but for the noise of fixation. The others profit from what is
-            learned there.
+        unknowns: what is known beforehand; default: `Unknowns()`, everything except gaze and pupil.
+        noise: noise of the features; default: that of the scene's sensor.
+        calibration: fixations with known targets, up to the noise of fixation; the other frames profit from them.
         boundary_points: points of each outline.
 
     Raises:
@@ -235,11 +236,11 @@ def information(
 
 
 def joint_matrix(matrices: Floats, unknowns: Unknowns) -> tuple[Floats, Bools]:
-    """Information on the unknowns of i instants (6 each) and of their person (17), and which of them are free.
+    """Assemble the information on the unknowns of i instants (6 each) and of their person (17), and which are free.
 
     Args:
         matrices: (i, 23, 23) information of each instant, without priors.
-        unknowns: adds the priors.
+        unknowns: provides the priors.
     """
     count, own = len(matrices), LOCAL * len(matrices)
     prior, free = unknowns.precision(), unknowns.free()
@@ -256,13 +257,13 @@ def joint_matrix(matrices: Floats, unknowns: Unknowns) -> tuple[Floats, Bools]:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Inverse:
-    """Covariance of the seen combinations, and a basis (n, u) of what is not seen."""
+    """Covariance of the determined combinations, and a basis (n, u) of the undetermined ones."""
 
     covariance: Floats
     unseen: Floats
 
     def variance_of(self, slopes: Floats) -> Floats:
-        """Covariance (q, q) of q linear functions (q, n); inf on the diagonal where one depends on what is not seen."""
+        """Compute the covariance (q, q) of q linear functions (q, n); inf on the diagonal if undetermined."""
         out = slopes @ self.covariance @ slopes.T
         if self.unseen.shape[1]:
             size = np.maximum(np.linalg.norm(slopes, axis=1), 1e-300)
@@ -272,7 +273,7 @@ class Inverse:
 
 
 def inverse(matrix: Floats) -> Inverse:
-    """Invert an information, scaled to a unit diagonal; directions with a singular value below `UNSEEN` are set apart.
+    """Invert an information, scaled to a unit diagonal; directions with a singular value below `UNSEEN` are split off.
 
     The unseen basis is in the units of the unknowns, each divided by its scale.
     """
@@ -290,14 +291,14 @@ def inverse(matrix: Floats) -> Inverse:
 def eye_information(
     eye: str, at: tuple[Ints, Ints], matrices: Floats, gaze: Floats, unknowns: Unknowns
 ) -> EyeInformation:
-    """Covariances of one eye from the information of its instants."""
+    """Compute the covariances of one eye from the information of its instants."""
     count = len(matrices)
     joint, free = joint_matrix(matrices, unknowns)
     found = inverse(joint[np.ix_(free, free)])
     size, own = len(free), LOCAL * count
 
     def functions(rows: Floats) -> Floats:
-        """Covariance of linear functions (q, all unknowns)."""
+        """Compute the covariance of linear functions (q, all unknowns)."""
         return found.variance_of(rows[:, free])
 
     lines, axes = np.empty((count, 2, 2)), np.empty((count, 2, 2))
@@ -327,7 +328,7 @@ def eye_information(
 
 
 def described(unseen: Floats, names: Sequence[str]) -> tuple[str, ...]:
-    """Name the unknowns that take part in combinations that are not seen, the largest share first."""
+    """Name the unknowns that take part in undetermined combinations, the largest share first."""
     if not unseen.shape[1]:
         return ()
     share: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""Noise of features from the sensor: how well a pixel's width of outline, and a glint, can be located.
+"""Noise of features from the sensor: how accurately a pixel's width of outline, or a glint, can be located.
 
 An edge between two levels of electrons, blurred to mu(x) (slope mu'), carries the information
 
@@ -9,8 +9,8 @@ with the read noise r (quantisation included). With constant noise s, a step of 
 
     1 / sigma_g^2 = integral (d mu / dx)^2 / (mu + background + r^2) dx dy                                         (2)
 
-which for constant noise s and a peak A is pi A^2 / (2 s^2). Saturated pixels carry nothing, so a saturated glint loses
-its core.
+which for constant noise s and a peak A is pi A^2 / (2 s^2). Saturated pixels carry no information, so a saturated glint
+loses its core.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from ..rig.sensor import Sensor
 from ..scene import Scene
 
 FIXATION_DEG = 0.3
-"""Noise of fixation per axis while a target is looked at (chosen)."""
+"""Noise of fixation on a target, per axis (chosen)."""
 PUPIL_SHARE = 0.1
-"""Light of the dark pupil as a share of the iris' (chosen)."""
+"""Light of the dark pupil, as a share of the iris' (chosen)."""
 CORNEAL_RADIUS_MM, CORNEAL_INDEX = 7.8, 1.376
 _CORNEAL_TRANSMITTANCE = 0.96
 _SAMPLES, _REACH = 400, 6.0
@@ -44,9 +44,9 @@ class FeatureNoise(ArrayValue):
     """Standard deviations of features.
 
     Attributes:
-        outline_px: (cameras,) of one px of outline along its normal; l px of outline have outline_px / sqrt(l).
-        glint_px: (cameras, lights) of a glint along each axis; inf where it cannot be located.
-        fixation_deg: of fixation per axis while a target is looked at.
+        outline_px: (cameras,) of one px of outline along its normal; outline_px / sqrt(l) for l px of outline.
+        glint_px: (cameras, lights) of a glint along each axis; inf if it cannot be located.
+        fixation_deg: of fixation on a target, per axis.
     """
 
     outline_px: Floats
@@ -57,7 +57,7 @@ class FeatureNoise(ArrayValue):
     def of(
         cls, outline_px: ArrayLike, glint_px: ArrayLike, *, rig: RigGeometry, fixation_deg: float = FIXATION_DEG
     ) -> FeatureNoise:
-        """The same noise for all cameras and lights of a rig, or given for each.
+        """Create the noise for all cameras and lights of a rig, equal or given for each.
 
         Raises:
             InputError: a value is not > 0, or the shapes do not fit the rig.
@@ -76,14 +76,14 @@ class FeatureNoise(ArrayValue):
 def sensor_noise(
     scene: Scene, *, fixation_deg: float = FIXATION_DEG, lights: Sequence[Lamp] | None = None
 ) -> FeatureNoise:
-    """Noise of the features of a scene: its lamps, its sensor, the albedo of its iris, no rendering.
+    """Compute the feature noise of a scene from its lamps, sensor and iris albedo, without rendering.
 
     The levels are those of the first eye at its reference position, looking straight ahead.
 
     Args:
         scene: the scene.
         fixation_deg: noise of fixation.
-        lights: stand in place of the scene's lamps.
+        lights: replaces the scene's lamps.
     """
     rig, sensor = scene.rig, scene.spec.sensor
     lights = rig.lights if lights is None else lights
@@ -107,16 +107,16 @@ def sensor_noise(
 
 
 def read_noise_e(sensor: Sensor) -> float:
-    """Noise of a dark pixel in electrons: read-out and rounding to whole codes (1/12 of a code squared)."""
+    """Compute the noise of a dark pixel in electrons: read-out, and rounding (1/12 of a code squared)."""
     return float(np.sqrt(sensor.read_noise_e**2 + 1.0 / (12.0 * sensor.gain**2)))
 
 
 def edge_information(low_e: float, high_e: float, blur_px: float, read_e: float, well_e: float = np.inf) -> float:
-    """Information of one px of an edge on its shift along the normal, equation (1), per px^2.
+    """Compute the information of one px of an edge on its shift along the normal, equation (1), per px^2.
 
     Args:
         low_e: electrons of a pixel on the dark side.
-        high_e: on the bright side.
+        high_e: electrons of a pixel on the bright side.
         blur_px: standard deviation of the blur, the pixel's area included.
         read_e: noise of a dark pixel.
         well_e: electrons from which a pixel is saturated.
@@ -132,7 +132,7 @@ def edge_information(low_e: float, high_e: float, blur_px: float, read_e: float,
 
 
 def glint_deviation(energy_e: float, spread_px: float, background_e: float, read_e: float, well_e: float) -> float:
-    """Standard deviation (px) of a Gaussian glint along each axis, equation (2), over its unsaturated pixels.
+    """Compute the standard deviation (px) of a Gaussian glint along each axis, equation (2), without saturated pixels.
 
     Args:
         energy_e: electrons of the whole glint.
@@ -151,7 +151,7 @@ def glint_deviation(energy_e: float, spread_px: float, background_e: float, read
 
 
 def corneal_irradiance_mw_mm2(lamp: Lamp, point_mm: Floats) -> float:
-    """Irradiance (mW/mm^2) of a lamp on a surface that faces it: I / d^2."""
+    """Compute the irradiance (mW/mm^2) of a lamp on a surface that faces it: I / d^2."""
     intensity, distance = _towards(lamp, point_mm)
     return intensity / distance**2
 
@@ -159,7 +159,7 @@ def corneal_irradiance_mw_mm2(lamp: Lamp, point_mm: Floats) -> float:
 def glint_energy(
     lamp: Lamp, camera: PinholeCamera, eye_mm: Floats, sensor: Sensor, wavelength_nm: float
 ) -> tuple[float, float]:
-    """Electrons of a lamp's glint and the standard deviation (px) of its image, by the cornea as a convex mirror.
+    """Compute the electrons of a lamp's glint, and the standard deviation (px) of its image, for a convex mirror.
 
     The mirror image is m = f / (d + f) times as large (f = R / 2), so it has m^2 F of the lamp's intensity, with
     Fresnel's reflectance F.
@@ -179,7 +179,7 @@ def glint_energy(
 
 
 def _towards(lamp: Lamp, point_mm: Floats) -> tuple[float, float]:
-    """Radiant intensity (mW/sr) of a lamp towards a point, and its distance (mm)."""
+    """Compute the radiant intensity (mW/sr) of a lamp towards a point, and the distance (mm)."""
     gap = point_mm - lamp.position_mm
     distance = float(np.linalg.norm(gap))
     cosine = max(float(gap @ lamp.axis) / distance, 0.0)

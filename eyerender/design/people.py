@@ -1,12 +1,13 @@
-"""A rig in front of a population: for each person and direction of gaze the bound, and what the cameras see.
+"""A rig in front of a population: the bound for each person and direction of gaze, and the features that cameras see.
 
-Every person is calibrated at nine of the directions. What is learned there about the person,
+Every person is calibrated at nine of the directions. The information about the person from there,
 
     S = P^-1 + sum over the calibration of  C - B^T A^-1 B                                                        (7)
 
-with the blocks A (frame), B and C (person) of each frame's information and its prior, joins the information of every
-other frame alone. The bound is that of the line of sight. Points of the outline and glints count where a ray reaches
-the camera, on the sensor, and inside the projected inner margins of the lids. Lashes and frames are not considered.
+with the blocks A (frame), B and C (person) of each frame's information and its prior, is added to the information of
+every other single frame. The bound is that of the line of sight. Points of the outline and glints count if a ray
+reaches the camera, they lie on the sensor, and inside the projected inner margins of the lids. Lashes and frames are
+ignored.
 """
 
 from __future__ import annotations
@@ -42,30 +43,30 @@ GRID = 9
 CALIBRATION = (0, 4, 8)
 """Rows and columns of the 9 x 9 directions that calibrate."""
 CALIBRATION_CELLS = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
-"""Their places among the 81 directions."""
+"""Indices of the calibration directions among all 81."""
 TOGETHER = 8
 _MARGIN_COLUMNS = 44
 _VAGUE, _LOST_DEG = 1e3, 60.0
 LOST = ("ray", "sensor", "lid")
-"""Why a glint is missing: no ray (off the cornea), off the sensor, behind a lid."""
+"""Reasons for a missing glint: no ray (off the cornea), off the sensor, behind a lid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Survey:
-    """What is surveyed.
+    """A rig and the population in front of it.
 
     Attributes:
-        scene: mapping of the scene; its first eye, first head position, rig and sensor count.
+        scene: mapping of the scene; only its first eye, first head position, rig and sensor are used.
         population: mapping of the population.
         seed: seed of the people.
         azimuth_deg: half range of the optic axis' azimuth.
         elevation_deg: half range of its elevation.
-        slippage_mm: standard deviation of a person's place about the scene's, along each axis.
+        slippage_mm: standard deviation of the eye's position about the scene's, along each axis.
         luminance_cd_m2: luminance of what people see, which sets their pupils.
-        unknowns: mapping of what is known beforehand.
+        unknowns: mapping of `Unknowns`: what is known beforehand.
         lids: whether lids hide features.
-        relief_mm: standard deviation of the eye relief, the distance along x, on top of the slippage.
-        shift_mm: the same shift of everybody's place, for maps of slippage.
+        relief_mm: additional standard deviation of the eye relief, the distance along x.
+        shift_mm: common shift of all positions, for maps of slippage.
     """
 
     scene: Mapping[str, Any]
@@ -82,7 +83,7 @@ class Survey:
 
     @property
     def directions_deg(self) -> Floats:
-        """Azimuth and elevation (81, 2) of the optic axis, rows from top to bottom."""
+        """Azimuth and elevation (81, 2) of the optic axis, row by row from the top."""
         elevation = np.linspace(self.elevation_deg, -self.elevation_deg, GRID)
         azimuth = np.linspace(-self.azimuth_deg, self.azimuth_deg, GRID)
         return np.array([[a, e] for e in elevation for a in azimuth])
@@ -94,12 +95,12 @@ class Figures(ArrayValue):
 
     Attributes:
         subject: (p,) number of the person.
-        bound_deg: (p, 81) standard deviation of the line of sight after a calibration; inf where it is not seen.
-        noise_deg: (p, 81) the same with a person who is known exactly: what differs from frame to frame.
-        outline: (p, 81) share of the outline that is visible, in the camera that sees most.
+        bound_deg: (p, 81) standard deviation of the line of sight after a calibration; inf if undetermined.
+        noise_deg: (p, 81) the same for an exactly known person: the part that differs between frames.
+        outline: (p, 81) visible share of the outline, in the camera that sees most.
         glints: (p, 81) number of lights whose glint is visible in any camera.
         lost: (p, 81, 3) glints (of any camera) that are missing for the reasons `LOST`.
-        refused: numbers of people whose eye cannot exist.
+        refused: numbers of people whose eye is physically impossible.
     """
 
     subject: Ints
@@ -118,7 +119,7 @@ class Figures(ArrayValue):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Someone:
-    """A person before the rig: eye, lids, place of the apex."""
+    """A person in front of the rig: eye, lids, position of the apex."""
 
     subject: int
     eye: EyeModel
@@ -127,7 +128,7 @@ class Someone:
 
 
 def people_of(survey: Survey, first: int, count: int) -> tuple[list[Someone], list[int]]:
-    """Draw some of the people; returns those with an eye, and the numbers of those whose eye cannot exist.
+    """Draw people; return those with a possible eye, and the numbers of the others.
 
     A person depends on the seed and the number alone. The distance of the pupils moves the eye against the rig.
     """
@@ -150,9 +151,9 @@ def people_of(survey: Survey, first: int, count: int) -> tuple[list[Someone], li
 
 
 def place_of(survey: Survey, scene: Scene, person: Person) -> Floats:
-    """Compute the apex (3,) of a person's unrotated eye in the world.
+    """Compute the apex (3,) mm of a person's unrotated eye in the world.
 
-    It is the scene's, moved by half the difference in the distance of the pupils and by a draw of slippage.
+    It is that of the scene, moved by half the difference in interpupillary distance and by a random slippage.
     """
     side = scene.spec.subject.eyes[0]
     place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
@@ -179,14 +180,14 @@ def figures_of(survey: Survey, noise: FeatureNoise, first: int, count: int) -> F
 
 
 def sites_seen(survey: Survey, noises: Sequence[FeatureNoise], count: int) -> list[SiteInformation]:
-    """Compute what each LED adds for the first people with an eye, in the nine directions of the calibration.
+    """Compute the information that each LED adds for the first people with an eye, in the nine calibration directions.
 
-    Everything is traced once, for any number of `noises`; the result has one item for each of them.
+    All rays are traced once, for any number of `noises`; the result has one item for each.
     """
     rig = Scene.of(SceneSpec.from_mapping(survey.scene)).rig
     unknowns, people = Unknowns.from_mapping(survey.unknowns), people_of(survey, 0, count)[0]
     if not people:
-        raise InputError("nobody's eye can exist", path="population")
+        raise InputError("no eye of this population is physically possible", path="population")
     parts: list[list[SiteInformation]] = [[] for _ in noises]
     for one in people:
         case = _case(survey, rig, [one])
@@ -247,7 +248,7 @@ def _of_group(survey: Survey, rig: RigGeometry, noise: FeatureNoise, people: lis
 
 
 def _case(survey: Survey, rig: RigGeometry, people: list[Someone]) -> Case:
-    """Return all directions of some people, each an instant; the camera is set later."""
+    """Create a case of all directions of some people, one instant each; the camera is set later."""
     eyes = stacked_eyes([one.eye for one in people])
     cells = GRID * GRID
     person = np.repeat(np.arange(len(people)), cells)
@@ -261,9 +262,9 @@ def _case(survey: Survey, rig: RigGeometry, people: list[Someone]) -> Case:
 
 
 def _openings(survey: Survey, people: list[Someone]) -> Floats:
-    """Compute inner margins of the lids around the eye in the world, (i, columns, 3).
+    """Compute inner margins of the lids around the eye in the world, (i, columns, 3) mm.
 
-    They follow the elevation above all, so they are computed at three azimuths and interpolated between these.
+    They depend mostly on elevation, so they are computed at three azimuths and interpolated.
     """
     grid = survey.directions_deg.reshape(GRID, GRID, 2)
     poses = Poses.from_degrees(*grid[:, list(CALIBRATION)].reshape(-1, 2).T)
@@ -297,7 +298,7 @@ def _globe(eye: EyeModel, turn: Floats, shift: Floats) -> Globe:
 
 
 def visible(slopes: Slopes, camera: PinholeCamera, openings: Floats | None) -> tuple[Slopes, Ints]:
-    """Compute features that the lids leave visible, and how many glints (n, 3) are missing for which of `LOST`."""
+    """Return the features that the lids leave visible, and the numbers (n, 3) of glints lost by reason (`LOST`)."""
     traced = np.isfinite(slopes.images.glints_px).all(axis=2)
     inside = np.where(traced, slopes.glint_ok, False)
     hidden_glints = np.zeros_like(inside)
@@ -322,9 +323,9 @@ def inside_polygon(polygon_px: Floats, points_px: Floats) -> Bools:
 
 
 def bounds(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns) -> tuple[Floats, Floats]:
-    """Find the standard deviation (i,) of the line of sight in degrees, after each person's calibration, equation (7).
+    """Compute the standard deviation (i,) deg of the line of sight after each person's calibration, equation (7).
 
-    The second one is that of a person who is known exactly.
+    The second result is that of an exactly known person.
     """
     prior, free = unknowns.precision(), unknowns.free()
     prior = np.maximum(prior, _VAGUE**-2)  # so that a frame without features has an inverse
@@ -340,7 +341,7 @@ def bounds(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns
 
 
 def _learned(case: Case, matrices: Floats, noise: FeatureNoise, parts: tuple[Floats, Indices, Indices]) -> Floats:
-    """Compute the information (p, q, q) on each person after the calibration and with the prior, equation (7)."""
+    """Compute the information (p, q, q) on each person after the calibration, including the prior, equation (7)."""
     prior, local, person = parts
     rows = (GRID * GRID * np.arange(len(matrices) // GRID**2)[:, None] + CALIBRATION_CELLS).ravel()
     whole = matrices[rows] + target_information(case, noise, rows)
@@ -352,7 +353,7 @@ def _learned(case: Case, matrices: Floats, noise: FeatureNoise, parts: tuple[Flo
 
 
 def _deviation_deg(matrices: Floats, slopes: Floats) -> Floats:
-    """Standard deviation (i,) in degrees of directions with derivatives (i, 2, q); inf where it is not seen."""
+    """Compute standard deviations (i,) deg of directions with derivatives (i, 2, q); inf if undetermined."""
     scale = 1.0 / np.sqrt(np.maximum(np.einsum("iaa->ia", matrices), 1e-12))
     scaled = matrices * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(matrices.shape[1])
     slopes = slopes * scale[:, None, :]

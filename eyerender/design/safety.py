@@ -26,7 +26,7 @@ from ..rig.light import Lamp
 from ..rig.rig import RigLike
 
 BOX_MM = (3.0, 3.0, 3.0)
-"""Half sizes of the eye box about the eye's place (chosen)."""
+"""Half sizes of the box that contains the eye (chosen)."""
 LONG_S = 1000.0
 _RETINA, _LEAST_RAD, _MOST_RAD = 6000.0, 0.011, 0.1
 _MEASURED_NM = (700.0, 1400.0)
@@ -35,14 +35,14 @@ NOTE = "not a conformity test"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Exposure(ArrayValue):
-    """Exposure of an eye to the LEDs of a rig, at the nearest place of its box for each LED.
+    """Exposure of an eye to the LEDs of a rig, at the worst position in its box for each LED.
 
     Attributes:
         distance_mm: (m,) distance of each LED.
         cornea_w_m2: (m,) irradiance by each LED.
         cornea_limit_w_m2: limit of their sum.
-        retina_w_m2_sr: (m,) weighted radiance; NaN for a point source, whose radiance is not known.
-        retina_limit_w_m2_sr: (m,) its limit.
+        retina_w_m2_sr: (m,) weighted radiance; NaN for a point source, whose radiance is unknown.
+        retina_limit_w_m2_sr: (m,) limit of the radiance.
     """
 
     distance_mm: Floats
@@ -58,7 +58,7 @@ class Exposure(ArrayValue):
 
     @property
     def retina_share(self) -> Floats:
-        """Weighted radiance of each LED over its limit, (m,); NaN where it is not known."""
+        """Weighted radiance of each LED over its limit, (m,); NaN if unknown."""
         return np.asarray(self.retina_w_m2_sr / self.retina_limit_w_m2_sr)
 
     @property
@@ -67,7 +67,7 @@ class Exposure(ArrayValue):
         return np.isfinite(self.retina_w_m2_sr)
 
     def to_mapping(self) -> dict[str, Any]:
-        """Convert to plain values; an unknown retinal exposure names the key that is missing."""
+        """Convert to JSON values; an unknown retinal exposure names the missing key."""
         lights = [
             {
                 "light": k,
@@ -102,13 +102,13 @@ def eye_exposure(
 ) -> Exposure:
     """Compute the exposure of one eye, equations (5) and (6).
 
-    Intensities are those of the rig: give that of the brightest bin of an LED.
+    Intensities are taken from the rig, so give those of an LED's brightest bin.
 
     Args:
         rig: the rig, with the duty cycles of its LEDs.
         eye_mm: (3,) corneal apex.
         wavelength_nm: wavelength.
-        box_mm: (3,) half sizes of the box in which the eye may be.
+        box_mm: (3,) half sizes of the box that contains the eye.
         duration_s: exposure within a day.
 
     Raises:
@@ -134,7 +134,7 @@ def eye_exposure(
 def _of_lamp(
     lamp: Lamp, eye_mm: Floats, box_mm: Floats, wavelength_nm: float, path: str
 ) -> tuple[float, float, float, float]:
-    """Compute the distance, irradiance, weighted radiance and its limit for one LED at the nearest place of the box."""
+    """Compute distance, irradiance, weighted radiance and its limit for one LED at the nearest point of the box."""
     place = eye_mm + np.clip(lamp.position_mm - eye_mm, -box_mm, box_mm)
     gap = place - lamp.position_mm
     distance = float(np.linalg.norm(gap))

@@ -1,4 +1,4 @@
-"""The unknowns of a rig: what a frame and what a person adds, each known, unknown, or with a prior.
+"""The unknowns of a rig: numbers of a frame and of a person, each known, unknown, or with a prior.
 
 Parameters of one instant are a vector of 23 numbers in radians and millimetres. The first six belong to the frame, the
 others to the person:
@@ -9,7 +9,7 @@ others to the person:
     shift of the pupil centre with size (nasal, up)
 
 Azimuth and elevation are those of the optic axis, and the pupil is the anatomical one. All others are differences from
-the eye that the analysis begins with.
+the eye at the start of the analysis.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ TORICITY, CENTRE, ELLIPTICITY, SHIFT = slice(15, 17), slice(17, 19), slice(19, 2
 ANGLES = np.array([name in ("azimuth", "elevation", "kappa_nasal", "kappa_up") for name in NAMES])
 
 Knowledge = Literal["known", "unknown"] | Annotated[float, Field(gt=0, le=1e6)]
-"""How well a number is known beforehand: exactly, not at all, or with a standard deviation."""
+"""Prior knowledge of a number: known, unknown, or a standard deviation."""
 
 
 class Unknowns(Spec):
-    """What is known beforehand of every number: `known`, `unknown`, or a standard deviation of it (a prior).
+    """Prior knowledge of every number: `known`, `unknown`, or the standard deviation of a prior.
 
-    A prior of the three components of a position, or of two angles, holds for each of them. The priors of
-    `Unknowns.population` are rounded standard deviations of adults (docs/population.md).
+    A prior of a position or of a pair of angles holds for each component. The priors of `Unknowns.population` are
+    rounded standard deviations of adults (docs/population.md).
     """
 
     gaze_deg: Knowledge = Field(default="unknown", description="direction of the optic axis, in every frame")
@@ -74,10 +74,10 @@ class Unknowns(Spec):
 
     @classmethod
     def population(cls, **fields: Knowledge) -> Self:
-        """Every number of a person with the prior of a population, and nothing known of a frame but 3 mm of slippage.
+        """Create population priors for all numbers of a person; of a frame, only 3 mm of slippage is known.
 
         Args:
-            fields: other values of some of them.
+            fields: values that replace some of them.
         """
         priors = {
             "slippage_mm": 3.0,
@@ -91,10 +91,10 @@ class Unknowns(Spec):
 
     @classmethod
     def shaped(cls, **fields: Knowledge) -> Self:
-        """The priors of `population`, and those of the shapes of cornea and pupil: rms of adults about round ones.
+        """Create the priors of `population`, with additional ones for toric corneas and elliptic pupils: rms of adults.
 
         Args:
-            fields: other values of some of them.
+            fields: values that replace some of them.
         """
         shapes: dict[str, Knowledge] = {
             "toricity_mm": 0.065,
@@ -105,7 +105,7 @@ class Unknowns(Spec):
         return cls.population(**{**shapes, **fields})
 
     def deviations(self) -> Floats:
-        """Standard deviations (23,) in rad and mm: 0 for what is known, inf for what is unknown."""
+        """Return standard deviations (23,) in rad and mm: 0 if known, inf if unknown."""
         groups = (
             (self.gaze_deg, 2), (self.pupil_mm, 1), (self.slippage_mm, 3), (self.corneal_radius_mm, 1),
             (self.asphericity, 1), (self.pupil_depth_mm, 1), (self.kappa_deg, 2), (self.rotation_depth_mm, 1),
@@ -118,10 +118,10 @@ class Unknowns(Spec):
         return np.where(ANGLES, np.radians(out), out)
 
     def precision(self) -> Floats:
-        """Prior precision (23,): 1 / deviation^2, 0 for what is unknown and for what is known."""
+        """Return prior precisions (23,): 1 / deviation^2, 0 both for unknown and for known numbers."""
         deviation = self.deviations()
         return np.where(deviation > 0, 1.0 / np.where(deviation > 0, deviation, 1.0) ** 2, 0.0)
 
     def free(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Which of the 23 numbers are not known, (23,)."""
+        """Return which of the 23 numbers are not known, (23,)."""
         return self.deviations() > 0

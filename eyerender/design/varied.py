@@ -1,8 +1,8 @@
-"""Features of eyes as functions of the unknowns, and their derivatives, in one batch of traces.
+"""Features of eyes as functions of the unknowns, with derivatives, in one batch of traces.
 
-Derivatives are central differences of the analytic observer. Three kinds need no trace of their own: a position of the
-person acts as slippage does, the depth of the rotation centre moves the turned eye by (M - I) e_x per millimetre, and
-the pupil's shift with its size acts as its centre does.
+Derivatives are central differences of the analytic observer. Three kinds need no additional trace: a position of the
+person acts like slippage, the depth of the rotation centre moves the turned eye by (M - I) e_x per millimetre, and the
+pupil's shift with its size acts like a shift of its centre.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _RAY_STEP = 1e-5
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Views:
-    """What a rig sees: n views, each of one eye at one instant by one camera.
+    """n views, each of one eye at one instant by one camera.
 
     Attributes:
         eyes: p eyes of one structure, stacked.
@@ -71,18 +71,18 @@ class Views:
         return len(self.person)
 
     def take(self, rows: Ints | slice) -> Views:
-        """Some of the views."""
+        """Select views."""
         return replace(self, person=self.person[rows], position_mm=self.position_mm[rows], camera=self.camera[rows])
 
     @property
     def lights_mm(self) -> Floats:
-        """Places of the lights, (m, 3)."""
+        """Positions of the lights, (m, 3) mm."""
         return np.array([light.position_mm for light in self.rig.lights]).reshape(-1, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Images:
-    """Features of n views: outline (n, k, 2) px and glints (n, m, 2) px, with what there is and is on the sensor."""
+    """Features of n views: outline (n, k, 2) px and glints (n, m, 2) px, and which exist and are on the sensor."""
 
     outline_px: Floats
     outline_ok: Bools
@@ -92,14 +92,14 @@ class Images:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Slopes:
-    """Features of n views with their derivatives by the 23 unknowns.
+    """Features of n views with their derivatives with respect to the 23 unknowns.
 
     Attributes:
         images: the features.
-        outline: (n, k, 2, 23) px per rad or mm; 0 where a point does not exist.
-        glints: (n, m, 2, 23).
+        outline: (n, k, 2, 23) derivatives, px per rad or mm; 0 for a missing point.
+        glints: (n, m, 2, 23) derivatives, px per rad or mm.
         outline_ok: (n, k) whether a point is on the sensor, and its derivatives exist.
-        glint_ok: (n, m).
+        glint_ok: (n, m) the same for glints.
     """
 
     images: Images
@@ -124,7 +124,7 @@ def stacked_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
 
 
 def radius_of(surface: Surface) -> Floats:
-    """Mean apex radius (n,) of corneal surfaces.
+    """Return the mean apex radius (n,) mm of corneal surfaces.
 
     Raises:
         InputError: the surface is neither a sphere, a conic nor a biconic.
@@ -136,11 +136,11 @@ def radius_of(surface: Surface) -> Floats:
         conic = np.all(m[..., 1, 1] == 1.0) and np.all(m[..., 2, 2] == 1.0) and np.all(surface.constant == 0.0)
         if conic and np.all(v[..., 0] > 0.0) and not np.any(v[..., 1:]):
             return np.asarray(v[..., 0])
-    raise InputError("the cornea is no sphere, conic or biconic, so it has no radius to vary", path="cornea")
+    raise InputError("the cornea is not a sphere, conic or biconic, so it has no radius to vary", path="cornea")
 
 
 def _scaled(surface: Surface, factor: Floats) -> Surface:
-    """The surface with its radii multiplied by a factor (n,)."""
+    """Multiply a surface's radii by a factor (n,)."""
     if isinstance(surface, Biconic):
         return replace(surface, radii_mm=surface.radii_mm * factor[:, None])
     assert isinstance(surface, Quadric)
@@ -148,7 +148,7 @@ def _scaled(surface: Surface, factor: Floats) -> Surface:
 
 
 def _flattened(surface: Surface, change: Floats) -> Surface:
-    """The surface with its conic constants raised by (n,)."""
+    """Add (n,) to a surface's conic constants."""
     if isinstance(surface, Biconic):
         return replace(surface, conic_constants=surface.conic_constants + change[:, None])
     assert isinstance(surface, Quadric)
@@ -183,7 +183,7 @@ def _toric(surface: Surface, change: Floats, handed: Floats) -> Surface:
 
 
 def _varied_stop(stop: Stop, theta: Floats) -> Stop:
-    """The stop with its own unknowns; an ellipticity stretches its plane along one axis and shrinks it across."""
+    """Apply the stop's unknowns; an ellipticity stretches its plane along one axis and shrinks it across."""
     wanted = theta[:, PUPIL] / (2.0 * np.sqrt(np.prod(stop.semi_axes_mm, axis=-1)))
     centre = np.array(stop.centre_mm)
     centre[:, 0] -= theta[:, DEPTH]
@@ -199,15 +199,14 @@ def _varied_stop(stop: Stop, theta: Floats) -> Stop:
 
 
 def _widening(stop: Stop, theta: Floats) -> Floats:
-    """Diameter (n,) mm of the pupil beyond that of the eye that the analysis begins with."""
+    """Return the change (n,) mm of the pupil's diameter from that of the start."""
     return np.asarray(theta[:, PUPIL] - 2.0 * np.sqrt(np.prod(stop.semi_axes_mm, axis=-1)))
 
 
 def varied_eyes(eye: EyeModel, theta: Floats) -> EyeModel:
-    """Eyes (a batch of n) with the unknowns (n, 23) applied; line of sight, lens and fovea stay.
+    """Apply unknowns (n, 23) to an eye, giving a batch of n; line of sight, lens and fovea stay.
 
-    The front of the cornea gets the radius R + dR and the surfaces behind it keep their ratio to it. These keep their
-    toricity, too.
+    The front of the cornea gets the radius R + dR. The surfaces behind it keep their ratio to it, and their toricity.
     """
     radius = radius_of(eye.front[0])
     factor = (radius + theta[:, RADIUS]) / radius
@@ -229,7 +228,7 @@ def varied_eyes(eye: EyeModel, theta: Floats) -> EyeModel:
 
 
 def diameters_mm(eyes: EyeModel) -> Floats:
-    """Diameter (p,) of the circle of the pupil's area, of p eyes."""
+    """Compute the diameter (p,) mm of the circle with the pupil's area, for p eyes."""
     return np.asarray(2.0 * np.sqrt(np.prod(eyes.stop.semi_axes_mm, axis=-1)))
 
 
@@ -248,7 +247,7 @@ def images_of(views: Views, theta: Floats, boundary_points: int) -> Images:
 
 
 def _images_of_camera(views: Views, theta: Floats, number: int, k: int) -> tuple[Floats, Bools, Floats, Bools]:
-    """Outline, glints and which of them there are, of views by one camera."""
+    """Trace outline and glints, and whether they exist, for the views of one camera."""
     camera = views.rig.cameras[number]
     eye = varied_eyes(take_eyes(views.eyes, views.person), theta)
     place = views.position_mm + theta[:, SLIPPAGE] + theta[:, POSITION]
@@ -267,7 +266,7 @@ def _images_of_camera(views: Views, theta: Floats, number: int, k: int) -> tuple
 
 
 def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | None = None) -> Slopes:
-    """Features and their derivatives by the unknowns, by central differences in one batch.
+    """Trace features and their derivatives with respect to the unknowns, by central differences in one batch.
 
     Derivatives by the shapes of cornea and pupil (from `TORICITY` on) that are not `free` (23,) are 0.
     """
@@ -310,12 +309,12 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | N
 
 
 def _by_rotation(theta: Floats) -> Floats:
-    """Motion (n, 3) of a turned eye per depth of its rotation centre: x' = M (x - c) + c with c = -d e_x + ..."""
+    """Compute the motion (n, 3) of a turned eye per depth of its rotation centre, from x' = M (x - c) + c."""
     return np.asarray(turned(theta)[:, :, 0] - np.array([1.0, 0.0, 0.0]))
 
 
 def turned(theta: Floats) -> Floats:
-    """Rotations M (n, 3, 3) of the eyes by Listing's law."""
+    """Compute rotations M (n, 3, 3) of the eyes by Listing's law."""
     azimuth, elevation = theta[:, AZIMUTH], theta[:, ELEVATION]
     tau = np.array(Poses.listing(azimuth, elevation).torsion_rad)
     (ca, sa), (ce, se), (ct, st) = ((np.cos(a), np.sin(a)) for a in (azimuth, elevation, tau))
@@ -327,7 +326,7 @@ def turned(theta: Floats) -> Floats:
 
 
 def lines_of_sight(views: Views, theta: Floats) -> tuple[Floats, Floats]:
-    """Lines of sight in the world: points (n, 3) where they leave the cornea, and unit directions (n, 3)."""
+    """Compute lines of sight in the world: points (n, 3) mm where they leave the cornea, and unit directions (n, 3)."""
     eye = take_eyes(views.eyes, views.person)
     handed = eye.stop.handed
     way = eye.chief_ray.direction
@@ -341,33 +340,33 @@ def lines_of_sight(views: Views, theta: Floats) -> tuple[Floats, Floats]:
 
 
 def tangents(direction: Floats) -> Floats:
-    """Two unit vectors (n, 2, 3) across directions (n, 3): to the subject's left and up."""
+    """Return two unit vectors (n, 2, 3) across directions (n, 3): to the subject's left and up."""
     left = normalize(np.cross([0.0, 0.0, 1.0], direction))
     return np.stack([left, np.cross(direction, left)], axis=1)
 
 
 def gaze_slopes(views: Views, theta: Floats) -> Floats:
-    """Derivatives (n, 2, 23) of the line of sight's direction, left and up (rad), by the unknowns."""
+    """Compute derivatives (n, 2, 23) of the line of sight's direction, left and up (rad), by the unknowns."""
     across = tangents(lines_of_sight(views, theta)[1])
     columns = [AZIMUTH, ELEVATION, KAPPA.start, KAPPA.start + 1]
     return _differences(theta, columns, lambda t: np.einsum("nci,ni->nc", across, lines_of_sight(views, t)[1]))
 
 
 def target_misses(views: Views, theta: Floats, target_mm: Floats) -> Floats:
-    """Angles (n, 2) in rad, left and up, of the line of sight from the direction to the targets (n, 3)."""
+    """Compute angles (n, 2) in rad, left and up, from the direction of targets (n, 3) to the line of sight."""
     point, way = lines_of_sight(views, theta)
     wanted = normalize(target_mm - point)
     return np.asarray(np.einsum("nci,ni->nc", tangents(wanted), way))
 
 
 def target_slopes(views: Views, theta: Floats, target_mm: Floats) -> Floats:
-    """Derivatives (n, 2, 23) of `target_misses` by the unknowns."""
+    """Compute derivatives (n, 2, 23) of `target_misses` by the unknowns."""
     columns = [c for c in range(TORICITY.start) if c not in (PUPIL, RADIUS, ASPHERICITY, DEPTH)]
     return _differences(theta, columns, lambda t: target_misses(views, t, target_mm))
 
 
 def _differences(theta: Floats, columns: Sequence[int], function: object) -> Floats:
-    """Central differences (n, 2, 23) of a function of the unknowns with values (n, 2)."""
+    """Compute central differences (n, 2, 23) of a function of the unknowns with values (n, 2)."""
     assert callable(function)
     out = np.zeros((len(theta), 2, COUNT))
     for column in columns:

@@ -1,4 +1,4 @@
-"""The simplest common pupil finder, as a baseline: threshold, contour, ellipse."""
+"""A baseline pupil detector: threshold, contour, ellipse."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ LEVELS, FILLED = 10, 0.85
 def contour_pupil(
     image: NDArray[np.generic], *, bit_depth: int, radius_px: Sequence[float] | None = None
 ) -> RotatedRect | str:
-    """Find the pupil as OpenCV's rotated rectangle (centre, full axes, degrees); a string gives the reason for failure.
+    """Detect the pupil as OpenCV's rotated rectangle (centre, full axes, degrees), or return the reason for failure.
 
     The image is smoothed with a 5 x 5 Gaussian after glints are closed by a morphological opening. It is cut at
     `LEVELS` thresholds below Otsu's. Dark regions of a likely size are kept if they do not touch the frame and fill at
-    least `FILLED` of their hull; `cv2.fitEllipse` is applied to the hull. The one with the steepest outline for its
-    level is the pupil, because lids and shadows are softer. The contour runs through the centres of the
+    least `FILLED` of their hull; `cv2.fitEllipse` is applied to the hull. The region with the steepest outline relative
+    to its level is the pupil, because lids and shadows are softer. The contour runs through the centres of the
     outermost dark pixels, so half a pixel is added to the semi-axes.
 
     Source of the first threshold: Otsu (1979).
@@ -32,7 +32,7 @@ def contour_pupil(
     Args:
         image: (h, w) image.
         bit_depth: bits of the image.
-        radius_px: (2,) smallest and largest semi-axis to look for.
+        radius_px: (2,) smallest and largest accepted semi-axis.
     """
     full = float(2**bit_depth - 1) if image.dtype.kind in "ui" else float(image.max())
     if full <= 0.0:
@@ -64,7 +64,7 @@ def contour_pupil(
 
 
 def _likely(contour: NDArray[Any], shape: tuple[int, ...], low: float, high: float) -> bool:
-    """Return whether a contour has the size and the shape of a pupil and does not touch the frame."""
+    """Return whether a contour has the size and shape of a pupil and does not touch the frame."""
     x, y, w, h = cv2.boundingRect(contour)
     cut = x == 0 or y == 0 or x + w == shape[1] or y + h == shape[0]
     area = cv2.contourArea(contour)

@@ -1,7 +1,7 @@
-"""Memory for images that is used again.
+"""Reuse of memory for images.
 
-The system hands out memory in pages, and a fresh page costs microseconds at its first use. For a few images of a
-megabyte that is as long as the whole search for a pupil.
+The first access to a fresh memory page takes microseconds. For a few images of a megabyte this adds up to the time of a
+whole pupil search.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 from ..arrays import Bytes, Singles
 
 KEPT = 4  # buffers of a thread at most
-LEAST_BYTES = 100_000  # the C library keeps less by itself
+LEAST_BYTES = 100_000  # the C library caches less by itself
 
 
 class _Kept(threading.local):
-    """The buffers of a thread."""
+    """Buffers of a thread."""
 
     def __init__(self) -> None:
         self.buffers: list[Bytes] = []
@@ -29,7 +29,7 @@ _KEPT = _Kept()
 
 
 def image_buffer(shape: tuple[int, ...]) -> Singles:
-    """Return an uninitialised float32 array, in memory that nothing refers to any more if there is some."""
+    """Return an uninitialised float32 array, in an unused buffer if there is one."""
     size = 4 * math.prod(shape)
     if size < LEAST_BYTES:
         return np.empty(shape, dtype=np.float32)

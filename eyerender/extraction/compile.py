@@ -13,7 +13,7 @@ from .pipeline import extract
 
 
 def compile_all() -> None:
-    """Run every compiled function on drawings of a pupil, which compiles them all unless an earlier process did."""
+    """Run every compiled function on drawn pupils, which compiles them unless an earlier process did."""
     for image in (drawn_eye(), drawn_eye(lid=True), drawn_eye(edge=True)):
         extract(image)
     missing = [one.__name__ for one in functions() if not one.signatures]

@@ -1,4 +1,4 @@
-"""Pictures of what was found: the pupil's outline and centre, and the glints, drawn over the image."""
+"""Overlays of results: the pupil's outline and centre, and the glints, drawn over the image."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def overlay(image: NDArray[Any], found: Sequence[Extraction], full_scale: float)
 
     Args:
         image: (h, w) levels.
-        found: what was found in it.
+        found: the extraction to draw.
         full_scale: level that is drawn white.
 
     Returns:
@@ -55,5 +55,5 @@ def _cross(out: Bytes, centre: Floats, size: float, colour: tuple[int, int, int]
 
 
 def _fixed(points: Floats) -> NDArray[np.int32]:
-    """Compute points in OpenCV's fixed-point coordinates."""
+    """Convert points to OpenCV's fixed-point coordinates."""
     return np.rint(np.clip(points, -1e4, 1e5) * (1 << _SHIFT)).astype(np.int32)

@@ -1,4 +1,4 @@
-"""Both eyes of a frame: one search in each half of the image."""
+"""Extract both eyes of a frame, with one search in each half of the image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .pipeline import extract
 from .result import Extraction, PupilResult
 from .settings import ExtractionSettings
 
-OVERLAP = 0.1  # of the width, by which each half reaches over the middle: a head need not be in the middle
+OVERLAP = 0.1  # share of the width by which each half extends over the middle, because a head need not be centred
 LEAST_WIDTH = 32
 
 
@@ -22,9 +22,9 @@ def extract_eyes(
     settings: ExtractionSettings | None = None,
     prior: tuple[PupilResult | None, PupilResult | None] = (None, None),
 ) -> tuple[Extraction, Extraction]:
-    """Find the pupils and glints of both eyes: of the eye on the image's left, then of that on its right.
+    """Extract pupils and glints of both eyes: the eye on the image's left, then the one on its right.
 
-    The arguments are those of `extract`, `prior` for each eye. Places are relative to the whole image.
+    The arguments are those of `extract`, with one `prior` per eye. Positions are relative to the whole image.
     """
     array = np.asarray(image)
     if array.ndim < 2 or array.shape[1] < LEAST_WIDTH:
@@ -44,7 +44,7 @@ def extract_eyes(
     first, second = left.pupil.ellipse, right.pupil.ellipse
     if first is None or second is None or np.hypot(*(first.centre_px - second.centre_px)) > 2.0 * first.semi_axes_px[0]:
         return left, right
-    # Both halves show the same eye. It is that of the side on which it lies.
+    # Both halves show the same eye. It belongs to the side on which it lies.
     other = PupilResult.missing("coarse search", "only one eye was found, on the other side of the image")
     if first.centre_px[0] < 0.5 * width:
         return left, replace(right, pupil=other, glints=(), rejected=())
@@ -52,7 +52,7 @@ def extract_eyes(
 
 
 def _moved(found: Extraction, x0: int, shape: tuple[int, int]) -> Extraction:
-    """Return a result of a part of the image that begins at column x0, in the whole image."""
+    """Shift the result of a part that begins at column x0 to coordinates of the whole image."""
     shift = np.array([float(x0), 0.0])
     glints, rejected = (
         tuple(replace(one, xy_px=one.xy_px + shift) for one in several) for several in (found.glints, found.rejected)

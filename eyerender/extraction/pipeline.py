@@ -1,4 +1,4 @@
-"""The extraction of pupil and glints from an image, step by step."""
+"""Extraction of pupil and glints from an image, step by step."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from .statistics import median
 
 # Distance of a tenth of the edge points from a refined boundary that contradicts it: in their own scatter, and in px.
 APART, APART_PX = 4.0, 0.5
-SAME_LIGHT = 0.5  # in noise standard deviations; a smaller change of the spots' light does not move the boundary
+SAME_LIGHT = 0.5  # noise standard deviations; a smaller change of the spots' light does not move the boundary
 
 
 def extract(
@@ -47,22 +47,22 @@ def extract(
     settings: ExtractionSettings | None = None,
     prior: PupilResult | None = None,
 ) -> Extraction:
-    """Find the pupil ellipse and the glints of an image.
+    """Extract the pupil ellipse and the glints from an image.
 
     Args:
-        image: (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats. Of a
-            colour image (h, w, 3 or 4; red first) the luminance is taken, with a warning.
+        image: (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats. A colour
+            image (h, w, 3 or 4; red first) is converted to luminance, with a warning.
         bit_depth: bits of an integer image; None: those of its type.
         gamma: the image stores intensity^(1 / gamma); 1 for linear data.
         settings: settings of the extractor.
-        prior: the pupil of the previous frame. It is looked for there first, and elsewhere too unless it is certain
-            there. A missing pupil is no prior.
+        prior: the pupil of the previous frame. The search starts there, and continues elsewhere unless the result is
+            certain. A missing pupil is ignored.
 
     Returns:
-        What was found. Whatever an image shows, even nothing, gives a result with a status and a reason.
+        Pupil and glints. If something is not found, the result has a status and a reason.
 
     Raises:
-        InputError: it is not a single-channel image, or it contradicts bit_depth.
+        InputError: the array is not an image, or contradicts bit_depth.
     """
     ensure_compiled()
     settings = settings or ExtractionSettings()
@@ -79,12 +79,12 @@ def extract(
 
 
 def _nothing(pupil: PupilResult, noise: float, shape: tuple[int, int]) -> Extraction:
-    """Report a pupil that is missing, without glints."""
+    """Return the result for a missing pupil, without glints."""
     return Extraction(pupil=pupil, glints=(), rejected=(), noise=noise, shape=shape)
 
 
 def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionSettings) -> Extraction:
-    """Complete a boundary to a result: the pupil, with the glints around it."""
+    """Complete a boundary to a result: the pupil with the glints around it."""
     size = (int(prepared.linear.shape[0]), int(prepared.linear.shape[1]))
     noise, found = prepared.noise_dn / DN, scored.candidate
     model = found.model
@@ -112,10 +112,10 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
 
 
 def _better(pixels: PupilResult, edges: PupilResult) -> bool:
-    """Return whether the pupil by the pixels is as certain as that by the edges.
+    """Return whether the pupil from the pixel model is as certain as the one from the edges.
 
-    Where a lid cuts the outline, it must also be closer to the truth by the covariances: the lid's shadow reaches the
-    pixels beside the edges.
+    If a lid cuts the outline, its covariance must also be smaller: the lid's shadow reaches the pixels beside the
+    edges.
     """
     if pixels.goodness is None or edges.goodness is None:
         return pixels.ok
@@ -131,14 +131,14 @@ def _deviation(pupil: PupilResult) -> float:
 
 
 def _iris_level(prepared: Prepared, found: PupilCandidate, model: EdgeModel) -> float:
-    """Compute the level just outside the seen parts of the boundary, in the image as it is."""
+    """Compute the level just outside the visible parts of the boundary, in the unmodified image."""
     away = 1.5 * model.sigma_px + 1.0
     levels = levels_beside(model.ellipse.numbers(), away, prepared.linear, (0, 0), NO_PATCH)
     return median(levels[found.sectors])
 
 
 def pixel_fit(prepared: Prepared, found: PupilCandidate, settings: ExtractionSettings) -> PixelFit | None:
-    """Fit the pixel model to a boundary; None where it contradicts the edges."""
+    """Fit the pixel model to a boundary; None if it contradicts the edges."""
     model = found.model
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     return _refined(prepared, found, *_fit_spots(prepared, found, spots))[0]
@@ -148,7 +148,7 @@ def _refined(prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotF
     """Fit the pixel model to the image without the spots.
 
     Returns:
-        The fit, None where it contradicts the edges, and the spots.
+        The fit, None if it contradicts the edges, and the spots.
     """
     part = part_about(found.image.linear, found.boundary.ellipse)
     cleaned = _without_spots(prepared, part, found, spots, fit)
@@ -167,7 +167,7 @@ def _refined(prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotF
 def _without_spots(
     prepared: Prepared, part: Part, found: PupilCandidate, spots: Spots, fit: SpotFit
 ) -> tuple[Part, Bools]:
-    """A part of the image without the light of well-fitted spots, and mask of the pixels that other spots affect."""
+    """Subtract well-fitted spots from a part of the image; also return the mask of pixels that other spots affect."""
     if found.image.inverted:
         upright = part_about(prepared.linear, found.boundary.ellipse)
         return part, affected_pixels(prepared, upright, spots)
@@ -188,7 +188,7 @@ def _boundary_fit(
 
 
 def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> Bools | None:
-    """Compute spots (n,) whose window reaches the boundary, or None."""
+    """Return which spots (n,) have windows that reach the boundary; None if none does."""
     apart = np.abs(signed_distance(model.ellipse, spots.xy_px))
     on_boundary = fit.converged & (apart < window_radius(spots.width_px) + 3.0 * model.sigma_px)
     return np.asarray(on_boundary) if on_boundary.any() else None
@@ -197,7 +197,7 @@ def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> Bools | None:
 def _fitted_again(
     prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotFit, on_boundary: Bools, model: EdgeModel
 ) -> SpotFit:
-    """Fit the spots on the boundary again with the refined boundary, and use these fits where they are no worse."""
+    """Refit the spots on the boundary with the refined boundary, and use these fits if they are no worse."""
     part = part_about(prepared.linear, found.boundary.ellipse)
     part, _ = subtract_spots(part, prepared.noise_dn, fit, fit.converged & ~on_boundary, model.ellipse)
     corner = np.array(part.corner)
@@ -210,10 +210,10 @@ def _fitted_again(
 
 
 def _agrees(fit: PixelFit, found: PupilCandidate) -> bool:
-    """Return whether the refined boundary agrees with the edges everywhere, not on average only.
+    """Return whether the refined boundary agrees with the edges everywhere, not only on average.
 
-    Noise and texture leave a tenth of the points farther from it than 1.6 standard deviations, light that the model
-    mistakes for iris (a ring of glints) an arc of them much farther.
+    Noise and texture leave a tenth of the points farther than 1.6 standard deviations from it. Light that the model
+    mistakes for iris (a ring of glints) leaves a whole arc of points much farther.
     """
     boundary = found.boundary
     points = found.edges.points_px[boundary.inliers]
@@ -222,7 +222,7 @@ def _agrees(fit: PixelFit, found: PupilCandidate) -> bool:
 
 
 def _fit_spots(prepared: Prepared, found: PupilCandidate, spots: Spots) -> tuple[Spots, SpotFit]:
-    """Fit the spots on top of the boundary from the edges.
+    """Fit the spots on the background of the boundary from the edges.
 
     Blends are replaced by the spots into which they split.
     """
@@ -238,7 +238,7 @@ def _fit_spots(prepared: Prepared, found: PupilCandidate, spots: Spots) -> tuple
 
 
 def _background(work: Prepared, model: EdgeModel) -> Callable[[Floats, Floats], Floats]:
-    """Compute the level without spots at pixels (x, y), up to a constant, which the spots' fit contains."""
+    """Return a function of pixels (x, y): the level without spots, up to a constant that the spots' fit contains."""
     return (lambda x, y: -model.level(x, y)) if work.inverted else model.level
 
 

@@ -25,13 +25,13 @@ DN = 255.0  # grey levels of full scale; every level inside the extractor is in 
 
 
 def as_image(array: NDArray[np.generic]) -> Image:
-    """Convert to float32, without a copy where possible (OpenCV's types are less precise than what it returns)."""
+    """Convert to float32, without a copy if possible; for OpenCV's results, whose declared types are imprecise."""
     return np.asarray(array, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Prepared:
-    """An image made ready for extraction.
+    """An image prepared for extraction.
 
     Attributes:
         linear: (h, w) float32 linear intensity, full scale 255.
@@ -48,7 +48,7 @@ class Prepared:
     scale: int = 1
 
     def reduced(self, scale: int) -> Prepared:
-        """Return the image at 1 / scale of the size, with the noise that it has there."""
+        """Return the image reduced by the factor `scale`, with its noise at that size."""
         if scale == 1:
             return self
         height, width = (scale * (side // scale) for side in self.linear.shape)
@@ -71,7 +71,7 @@ class Part:
 
 
 def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | str:
-    """Prepare an image, or give the reason why nothing can be found in it.
+    """Prepare an image, or return the reason why nothing can be found in it.
 
     Args:
         image: (h, w) integers (full scale 2^bit_depth - 1; without bit_depth, that of the type) or floats (any linear
@@ -80,7 +80,7 @@ def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | st
         gamma: the image stores intensity^(1 / gamma).
 
     Raises:
-        InputError: it is not a single-channel image.
+        InputError: the array is not a single-channel image.
     """
     array = _checked(image)
     if not (np.isfinite(gamma) and 0.1 <= gamma <= 10.0):
@@ -126,9 +126,9 @@ def _checked(image: object) -> NDArray[np.generic]:
 
 
 def luminance(colour: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Luminance (h, w) of an image (h, w, 3 or more; red first), of the same type; equal channels stay as they are.
+    """Compute the luminance (h, w) of an image (h, w, 3 or more; red first), of the same type.
 
-    Source of the weights: ITU-R BT.601.
+    Equal channels give exactly their level. Source of the weights: ITU-R BT.601.
     """
     grey = np.asarray(colour[..., :3], dtype=np.float64) @ np.array([0.299, 0.587, 0.114])
     return np.asarray(grey if colour.dtype.kind == "f" else np.rint(grey), dtype=colour.dtype)
@@ -152,15 +152,15 @@ def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: flo
         return out, DN, DN / full
     table = (DN * (np.arange(full + 1) / full) ** gamma).astype(np.float32)
     linear = table[array.astype(np.intp, copy=False)]
-    # This is the decoded step at the image's own middle level.
+    # This is the decoded step at the median level of the image.
     middle = max(int(median(array[::4, ::4].ravel())), 1)
     return linear, DN, float(table[middle] - table[middle - 1])
 
 
 def _white_level(linear: Image, clip: float) -> float:
-    """Level at which a camera clips that does not use all levels: its brightest one, if glints are flat there.
+    """Return the clip level of a camera that does not use all levels: the brightest level, if glints are flat there.
 
-    More than half of the pixels within 3 % of that level have it, and they are few.
+    Flat means that more than half of the pixels within 3 % of that level have it; they must be few in the image.
     """
     top = float(linear.max())
     if not WHITEST * clip <= top < clip:
@@ -191,7 +191,7 @@ def _from_float(array: NDArray[np.generic], gamma: float) -> Image | str:
 
 
 def estimate_noise(linear: Image) -> float:
-    """Estimate the noise at about 10,000 places.
+    """Estimate the noise's standard deviation (DN) from about 10,000 pixels.
 
     sigma = 1.4826 median|d| / 2, d = I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1)
 
@@ -199,7 +199,7 @@ def estimate_noise(linear: Image) -> float:
     mean.
     """
     difference = _differences(linear, max(1, int(np.sqrt(linear.size / 10_000))))
-    # Flat areas that clipping made constant contain no information on the noise.
+    # Flat clipped areas contain no information about the noise.
     moving = np.count_nonzero(difference)
     if moving < 0.05 * difference.size:
         return 0.0
@@ -207,7 +207,7 @@ def estimate_noise(linear: Image) -> float:
 
 
 def _differences(linear: Image, step: int) -> Image:
-    """|I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1, y+1)| of every `step`-th pixel of every `step`-th row, in one row."""
+    """Compute the differences of `estimate_noise`, absolute and flattened, at every `step`-th pixel and row."""
     a, b = linear[:-1:step, :-1:step], linear[:-1:step, 1::step]
     c, d = linear[1::step, :-1:step], linear[1::step, 1::step]
     return as_image(np.abs(a - b - c + d).ravel())
@@ -216,8 +216,8 @@ def _differences(linear: Image, step: int) -> Image:
 def invert(prepared: Prepared) -> Prepared:
     """Invert an image for bright pupils: level -> ceiling - level, with the ceiling above the pupil.
 
-    Glints, which are brighter than the pupil, become dark specks. They are cut at the ceiling, the 99th percentile of
-    the smoothed image, so that a bright pupil's own level differs from them.
+    Glints, which are brighter than the pupil, become dark specks. The ceiling, the 99th percentile of the smoothed
+    image, clips them, so that they differ from a bright pupil.
     """
     smooth = cv2.medianBlur(prepared.linear, 5)
     ceiling = quantile(smooth[::2, ::2].ravel(), 0.999) + 3.0 * prepared.noise_dn
@@ -226,5 +226,5 @@ def invert(prepared: Prepared) -> Prepared:
 
 
 def single_threaded() -> None:
-    """Let OpenCV use one thread, where several processes share the work."""
+    """Limit OpenCV to one thread, for processes that share the processors."""
     cv2.setNumThreads(1)

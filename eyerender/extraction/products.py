@@ -1,6 +1,6 @@
-"""Sums of products, which normal equations are made of, their solution, and other loops of compiled functions.
+"""Compiled loops: sums of products for normal equations, their solution, and selections.
 
-numba takes several times as long to compile NumPy's expressions of whole arrays as it takes for these loops.
+numba compiles these loops several times faster than NumPy expressions of whole arrays.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ..jit import inlined, summing
 
 @summing
 def add_products(rows: Floats, begin: int, end: int, out: Floats) -> None:
-    """Add the products of rows (k, n), over the columns from `begin` to `end`, to the lower half of out (k, k)."""
+    """Add the products of rows (k, n), summed over columns from `begin` to `end`, to the lower half of out (k, k)."""
     for j in range(rows.shape[0]):
         for m in range(j + 1):
             total = 0.0
@@ -26,9 +26,9 @@ def add_products(rows: Floats, begin: int, end: int, out: Floats) -> None:
 
 @inlined
 def solve(matrix: Floats, right: Floats) -> None:
-    """Solve n equations whose matrix (n, n) is positive definite: `right` (n,) becomes the solution.
+    """Solve n linear equations with a positive definite matrix (n, n); `right` (n,) becomes the solution.
 
-    The matrix is changed, too. numba takes seconds to compile `np.linalg.solve`.
+    The matrix is overwritten too. numba takes seconds to compile `np.linalg.solve`.
     """
     for k in range(right.size):
         for i in range(k + 1, right.size):
@@ -79,6 +79,6 @@ def selected(values: Floats, which: Bools) -> Floats:
 
 @inlined
 def copy(values: Floats, out: Floats) -> None:
-    """Copy values (n,). numba takes a second to compile the assignment of an array to a slice."""
+    """Copy values (n,); numba takes a second to compile the assignment of an array to a slice."""
     for i in range(values.size):
         out[i] = values[i]

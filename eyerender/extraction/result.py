@@ -1,4 +1,4 @@
-"""Results of the extractor: a pupil and glints, each with a status and, where it is missing, a reason."""
+"""Results of the extractor: a pupil and glints, each with a status and, if it is missing, a reason."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Goodness:
         explained: share of the outline whose pixels the refined model explains; `support` if it was not fitted.
         contrast: step from pupil to iris as a share of full scale.
         contrast_to_noise: the same step divided by the noise of a pixel.
-        residual_px: root mean square distance of the edge points from the ellipse.
-        reduced_chi2: of the pixel model. 1 means that noise alone explains the residual; 0 that it was not fitted.
+        residual_px: rms distance of the edge points from the ellipse.
+        reduced_chi2: reduced chi^2 of the pixel model: 1 if noise alone explains the residual, 0 if it was not fitted.
         blur_px: standard deviation of the edge's blur.
         unevenness: how much darker the pupil's middle is than its outer part, as a share of the step.
         spread: scatter of the grey levels inside the pupil beyond the noise, as a share of the step.
@@ -34,11 +34,11 @@ class Goodness:
         refined: whether the ellipse comes from the pixel model.
         leverage: standard deviation of the boundary, averaged along it, if every sixteenth of the visible outline were
             displaced independently by 1 px: 0.5 to 0.6 for a whole outline, 5 and more for a short arc.
-        open: share of the outline without edge points that is dark on both sides, as no boundary is.
+        open: share of the outline without edge points that is dark on both sides, unlike a boundary.
         beyond: edge points outside the ellipse, per point that it fits.
         within: edge points inside it, per point that it fits.
-        shaded: share of the outline that has an edge point with less than the iris' light outside.
-        pale: share of the outline that has an edge point with more than the pupil's light inside.
+        shaded: share of the outline with edge points whose outside is darker than the iris.
+        pale: share of the outline with edge points whose inside is brighter than the pupil.
         mirrored: share of the outline without edge points where a bright inside meets a brighter outside, as below a
             reflection that covers both.
     """
@@ -71,7 +71,7 @@ class PupilResult:
 
     Attributes:
         status: OK, or NOT_FOUND.
-        stage: the stage that failed; None for a pupil.
+        stage: the stage that failed; None if the pupil was found.
         reason: why it failed.
         ellipse: the ellipse.
         covariance: (5, 5) of (cx, cy, a, b, angle), px and rad.
@@ -98,7 +98,7 @@ class PupilResult:
 
     @staticmethod
     def missing(stage: Stage, reason: str) -> PupilResult:
-        """Make a missing pupil from the stage that failed and the reason."""
+        """Create a missing pupil from the stage that failed and the reason."""
         return PupilResult(status=Status.NOT_FOUND, stage=stage, reason=f"{stage}: {reason}")
 
 
@@ -109,8 +109,8 @@ class GlintResult:
     Attributes:
         status: OK, or REJECTED for a reflection that is not a glint of the cornea.
         reason: why it was rejected.
-        xy_px: (2,) centre.
-        covariance: (2, 2) px^2.
+        xy_px: (2,) centre, px.
+        covariance: (2, 2) of the centre, px^2.
         amplitude: fitted peak over the background as a share of full scale; above 1 for a clipped spot.
         sigma_px: standard deviation of the spot.
         saturated: whether it is clipped.
@@ -132,7 +132,7 @@ class GlintResult:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Extraction:
-    """Everything that was found in one image; coordinates are relative to it, pixel centres at integers.
+    """Pupil and glints of one image; coordinates are relative to it, with pixel centres at integers.
 
     Full scale is the largest code of the stated bit depth. A float image's full scale is 1.7 times its 99.5th
     percentile.

@@ -17,7 +17,7 @@ LEAST_PX, MOST_OF_SIDE = 3.0, 0.4
 class ExtractionSettings(Spec):
     """Settings of `extract`.
 
-    Nothing here is tuned to a data set: thresholds adapt to the image's own noise and contrast.
+    No setting is tuned to a data set: thresholds adapt to the noise and contrast of the image.
     """
 
     method: Literal["fast", "refined"] = Field(
@@ -52,7 +52,7 @@ class ExtractionSettings(Spec):
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Sizes and shapes of a pupil that a search accepts.
+    """Accepted sizes and shapes of a pupil.
 
     Attributes:
         least_px: smallest semi-axis b.
@@ -68,7 +68,7 @@ class Shape:
 
     @staticmethod
     def of(settings: ExtractionSettings, shape: tuple[int, int]) -> Shape:
-        """Derive the sizes from the settings and the (h, w) of the image."""
+        """Compute the limits from the settings and the (h, w) of the image."""
         low, high = settings.radius_min_px, settings.radius_max_px
         least = LEAST_PX if low is None else low
         most = max(MOST_OF_SIDE * min(shape), 2.0 * least) if high is None else high

@@ -18,13 +18,13 @@ def median(values: NDArray[Any]) -> float:
 
 
 def quantile(values: NDArray[Any], share: float) -> float:
-    """Compute the value below which `share` of (n,) values of any type lie, by linear interpolation; NaN for none."""
+    """Compute the `share` quantile of values (n,) of any type, by linear interpolation; NaN for none."""
     return quantile_of(np.asarray(values, dtype=np.float64), share)
 
 
 @compiled("f8[::1], f8")
 def quantile_of(values: Floats, share: float) -> float:
-    """Compute the value below which `share` of (n,) values lie, by linear interpolation; NaN for none."""
+    """Compute the `share` quantile of values (n,), by linear interpolation; NaN for none."""
     if values.size == 0:
         return math.nan
     at = share * (values.size - 1)
@@ -41,7 +41,7 @@ def quantile_of(values: Floats, share: float) -> float:
 
 @inlined
 def select(values: Floats, rank: int) -> float:
-    """Order values (n,) so far that the one of this rank is in its place, and return it, as `np.partition` does.
+    """Partially sort values (n,) so that the one of this rank is in its place, and return it, like `np.partition`.
 
     numba takes several seconds to compile `np.partition`. Source: Hoare (1961).
     """

@@ -1,6 +1,6 @@
-"""Videos: grey frames of a file one by one, the pupil followed from frame to frame, and videos of what was found.
+"""Videos: read grey frames one by one, follow the pupil from frame to frame, and write overlay videos.
 
-OpenCV's FFmpeg decodes and encodes. A frame is grey where the file has no colour, else its luminance.
+OpenCV's FFmpeg decodes and encodes. Frames of colour videos are converted to luminance.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .settings import ExtractionSettings
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
 MAX_VIDEO_BYTES = 1 << 40
-# FFmpeg's reader of each kind of file that is accepted, by its first bytes. FFmpeg itself would also choose readers of
+# FFmpeg's demuxer for each accepted kind of file, by its first bytes. FFmpeg itself would also choose demuxers of
 # scripts and playlists, which open other files.
 _READERS = (
     (re.compile(rb".{4}(ftyp|moov|mdat|wide|free|skip|pnot)", re.DOTALL), "mov"),  # MP4 and QuickTime
@@ -41,17 +41,17 @@ _READERS = (
 )
 _HEAD_BYTES = 512
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
-# Codec of each kind of file that is written: one that OpenCV's own FFmpeg can encode.
+# Codec of each kind of file that is written: one that OpenCV's bundled FFmpeg can encode.
 CODECS = {".mp4": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
-# What is wrong with a file is said in one line of ours, without those of OpenCV and FFmpeg.
+# Errors are reported in one line of this package, without the messages of OpenCV and FFmpeg.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-_TINT = 8  # codes between channels that lossy codecs leave in grey pictures
+_TINT = 8  # levels between channels that lossy codecs leave in grey images
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """A frame: its number, its time in s (NaN where there is none), the grey image (h, w), whether it has colour."""
+    """A video frame: number, time in s (NaN if unknown), grey image (h, w), and whether the file has colour."""
 
     number: int
     time_s: float
@@ -60,19 +60,19 @@ class Frame:
 
 
 def is_video(path: str | Path) -> bool:
-    """Return whether a name is that of a video."""
+    """Return whether a file name has the suffix of a video."""
     return Path(path).suffix.lower() in SUFFIXES
 
 
 class VideoReader:
-    """The frames of a video file, once from first to last.
+    """Frames of a video file, read once from first to last.
 
     Attributes:
-        frames_per_s: as the file states it, else 25.
-        count: number of frames as the file states it, 0 where it does not.
+        frames_per_s: frame rate that the file states, else 25.
+        count: number of frames that the file states, else 0.
 
     Raises:
-        InputError: it is missing, not a regular file, not a video, or its frames are too large.
+        InputError: the file is missing, not a regular file or not a video, or its frames are too large.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -114,9 +114,9 @@ class VideoReader:
 
 
 def _capture(path: str, reader: str) -> cv2.VideoCapture:
-    """Open a video with one of FFmpeg's readers, which may open nothing but files.
+    """Open a video with one of FFmpeg's demuxers, which may open only files.
 
-    OpenCV takes these options from the environment alone. The path is absolute, so that it cannot be taken for the
+    OpenCV reads these options only from the environment. The path is absolute, so that it cannot be mistaken for the
     address of a stream.
     """
     before = os.environ.get(_OPTIONS)
@@ -137,10 +137,10 @@ def follow(
     settings: ExtractionSettings | None = None,
     eyes: int = 1,
 ) -> Iterator[tuple[Frame, tuple[Extraction, ...]]]:
-    """Extract the features of each frame; where a pupil was found, it is looked for first in the next frame.
+    """Extract the features of each frame; the search starts at the pupil of the previous frame.
 
     Args:
-        frames: frames in the order of time.
+        frames: frames in temporal order.
         gamma: encoding gamma of the levels.
         settings: settings of the extractor.
         eyes: 1, or 2 for frames with both eyes: that on the image's left, then that on its right.
@@ -156,7 +156,7 @@ def follow(
 
 
 class VideoWriter:
-    """A video of colour pictures (h, w, 3) of one size; the name's ending chooses the format (.mp4, .avi, .mkv)."""
+    """Writer of colour frames (h, w, 3) of one size; the file's suffix chooses the format (.mp4, .avi, .mkv)."""
 
     def __init__(self, path: str | Path, width: int, height: int, frames_per_s: float) -> None:
         self.path = Path(path)
@@ -166,7 +166,7 @@ class VideoWriter:
         even = (width + width % 2, height + height % 2)  # OpenCV cuts off the last row or column of odd sizes
         code = cv2.VideoWriter.fourcc(*CODECS[name])
         with ExitStack() as stack:
-            # OpenCV opens the file by its name, which nobody can guess and which is ours already.
+            # OpenCV opens the file by name; nobody else can guess this name, and the file exists already.
             file = stack.enter_context(written(self.path, ending=name))
             self._writer = cv2.VideoWriter(file.name, cv2.CAP_FFMPEG, code, frames_per_s, even)
             if not self._writer.isOpened():
@@ -174,7 +174,7 @@ class VideoWriter:
             self._publish = stack.pop_all()
 
     def add(self, picture: Bytes) -> None:
-        """Add a picture."""
+        """Add a frame."""
         height, width = picture.shape[:2]
         self._writer.write(np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
 

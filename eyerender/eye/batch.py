@@ -1,4 +1,4 @@
-"""Batches of eyes: one eye model whose numbers have a leading axis."""
+"""Batches of eyes: an eye model whose numbers have a leading axis."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _NUMBERS = tuple(f.name for f in fields(EyeModel) if f.name not in ("name", "sid
 _RECORDS = (LineOfSight, RotationCentres, Sphere, Stop)
 
 CHUNK_POINTS = 30000
-"""Points refracted at once: fewer leave the time to the interpreter, more leave the cache."""
+"""Points refracted at once: with fewer the interpreter's overhead dominates, more do not fit the cache."""
 FEW_EYES = 4
-"""Largest number of different eyes that are traced one after the other with plain numbers; more are stacked."""
+"""Largest number of different eyes that are traced one after the other; more are stacked."""
 
 
 def structure_of(eye: EyeModel) -> Structure:
-    """Compute the structure that eyes must share to be stacked: kinds and numbers of surfaces."""
+    """Return the structure that eyes must share to be stacked: kinds and numbers of surfaces."""
     front, back = (tuple(s.kind for s in surfaces) for surfaces in (eye.front, eye.back))
     return front, back, eye.back_passing, eye.lens_gradient is not None, eye.retina.kind
 
 
 def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
-    """Stack n eyes of one structure into a batch; name and side are those of the first."""
+    """Stack n eyes of one structure into a batch with the name and side of the first."""
     first = eyes[0]
     structure = structure_of(first)
     if any(structure_of(eye) != structure for eye in eyes):
@@ -44,14 +44,14 @@ def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
 
 
 def take_eyes(eye: EyeModel, index: Indices) -> EyeModel:
-    """Compute eyes of a batch at `index`; a single eye is returned as it is."""
+    """Select eyes of a batch by `index`; a single eye is returned unchanged."""
     if eye.fovea_mm.ndim == 1:
         return eye
     return replace(eye, **{name: _taken(getattr(eye, name), index) for name in _NUMBERS})
 
 
 def _stacked(values: tuple[Any, ...]) -> Any:
-    """Stack a part of n eyes: arrays or numbers, tuples, records of arrays, surfaces and media."""
+    """Stack one part of n eyes: arrays or numbers, tuples, records of arrays, surfaces or media."""
     first = values[0]
     if isinstance(first, np.ndarray):
         return read_only(stacked(values))
@@ -65,7 +65,7 @@ def _stacked(values: tuple[Any, ...]) -> Any:
 
 
 def _taken(value: Any, index: Indices) -> Any:
-    """Return parts of a batch of eyes at `index`."""
+    """Select `index` from one part of a batch of eyes."""
     if isinstance(value, np.ndarray):
         return value[index]
     if isinstance(value, tuple):
@@ -76,7 +76,7 @@ def _taken(value: Any, index: Indices) -> Any:
 
 
 def groups(eyes: Sequence[EyeModel], which: Indices) -> list[tuple[tuple[EyeModel, Indices | None], Indices]]:
-    """List rows whose eyes can be traced together: ((eye or stacked eyes, row -> eye of the stack), rows)."""
+    """Group rows whose eyes can be traced together: ((one eye or a stack, row -> eye of the stack), rows)."""
     kinds: dict[object, list[int]] = {}
     for k in np.unique(which):
         kinds.setdefault(structure_of(eyes[k]), []).append(int(k))
@@ -93,13 +93,13 @@ def groups(eyes: Sequence[EyeModel], which: Indices) -> list[tuple[tuple[EyeMode
 
 
 class _Last:
-    """The eyes that were stacked last, and their stack."""
+    """The most recently stacked eyes and their stack."""
 
     held: tuple[tuple[EyeModel, ...], EyeModel] | None = None
 
 
 def _stacked_once(eyes: tuple[EyeModel, ...]) -> EyeModel:
-    """Stack of eyes; fixation and features of the same eyes share one, because stacking takes a third of either."""
+    """Return the stack of eyes, cached for the last eyes because stacking takes a third of a fixation or a trace."""
     held = _Last.held
     if held is None or len(held[0]) != len(eyes) or not all(map(is_, held[0], eyes)):
         held = _Last.held = eyes, stack_eyes(eyes)
@@ -107,16 +107,16 @@ def _stacked_once(eyes: tuple[EyeModel, ...]) -> EyeModel:
 
 
 def chunks(group: tuple[EyeModel, Indices | None], rows: Indices, size: int) -> list[tuple[Indices, EyeModel]]:
-    """Cut the rows of a group into (rows, their eyes) of at most `size` rows each."""
+    """Split the rows of a group into (rows, their eyes) of at most `size` rows each."""
     eye, place = group
     parts = [rows[part] for part in slices(len(rows), size)]
     return [(part, eye if place is None else take_eyes(eye, place[part])) for part in parts]
 
 
 def slices(count: int, size: int) -> list[slice]:
-    """Divide into equal pieces of at most `size`.
+    """Divide `count` into equal pieces of at most `size`.
 
-    A short last piece would cost the interpreter as much as a full one.
+    Equal pieces avoid a short last one, which would cost nearly as much as a full one.
     """
     pieces = max(1, -(-count // size))
     edges = [count * k // pieces for k in range(pieces + 1)]

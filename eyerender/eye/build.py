@@ -1,6 +1,6 @@
-"""Eye file -> model, in four steps: the surfaces, the landmarks that they have, the stop, and the ray through it.
+"""Build the model from an eye file, in four steps: surfaces, landmarks, stop, and the chief ray.
 
-Surfaces and their landmarks are computed once for all pupils of an eye.
+Surfaces and their landmarks are computed once for all pupil sizes of an eye.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def build_eye(spec: EyeParts, side: Side, wavelength_nm: float, pupil_diameter_m
         spec: the eye file.
         side: right or left.
         wavelength_nm: wavelength in vacuum.
-        pupil_diameter_mm: diameter of the pupil; None: the file's own.
+        pupil_diameter_mm: diameter of the anatomical pupil; None: that of the file.
 
     Raises:
         InputError: the pupil does not fit, or an index is below 1 at this wavelength.
@@ -45,7 +45,7 @@ def build_eye(spec: EyeParts, side: Side, wavelength_nm: float, pupil_diameter_m
 
 
 def fitting_stop(spec: EyeParts, pupil_diameter_mm: float | None) -> Stop:
-    """Stop of the right eye at a diameter (the file's own if None).
+    """Return the stop of the right eye at a diameter (that of the file if None), checked to fit the eye.
 
     Raises:
         InputError: the pupil does not fit.
@@ -65,7 +65,7 @@ def fitting_stop(spec: EyeParts, pupil_diameter_mm: float | None) -> Stop:
 
 
 def bare_eye(spec: EyeParts, wavelength_nm: float, stop: Stop) -> EyeModel:
-    """Return the right eye without its landmarks (fovea and chief ray are zeros), which is enough for tracing."""
+    """Build the right eye without its landmarks (fovea and chief ray are zeros), which is enough for tracing."""
     front = tuple(surface_of(s) for s in spec.cornea)
     front_indices = tuple(index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(spec.cornea))
     back: tuple[Surface, ...] = ()
@@ -110,7 +110,7 @@ def bare_eye(spec: EyeParts, wavelength_nm: float, stop: Stop) -> EyeModel:
 
 
 class _Key:
-    """A spec that equals every other spec with the same surfaces and fovea: all that a key of the caches depends on."""
+    """Cache key: a spec that equals every other spec with the same surfaces and fovea."""
 
     __slots__ = ("spec", "text")
 
@@ -127,7 +127,7 @@ class _Key:
 
 @lru_cache(maxsize=64)
 def _with_surfaces(spec: _Key, wavelength_nm: float) -> EyeModel:
-    """Return the right eye with its fovea, which does not depend on the stop; its stop is the file's own."""
+    """Build the right eye with its fovea, which does not depend on the stop; its stop is that of the file."""
     parts = spec.spec
     bare = bare_eye(parts, wavelength_nm, stop_of(parts, parts.stop.diameter_mm))
     if parts.fovea.position_mm is not None:
@@ -140,7 +140,7 @@ def _with_surfaces(spec: _Key, wavelength_nm: float) -> EyeModel:
 
 @lru_cache(maxsize=256)
 def _with_landmarks(spec: _Key, wavelength_nm: float, stop_centre_mm: tuple[float, float, float]) -> EyeModel:
-    """Return the right eye with all landmarks, of which the chief ray depends on the stop's centre only."""
+    """Build the right eye with all landmarks; only the chief ray depends on the stop's centre."""
     eye = replace(_with_surfaces(spec, wavelength_nm), name=spec.spec.name)
     eye = replace(eye, stop=replace(eye.stop, centre_mm=np.array(stop_centre_mm)))
     return replace(eye, chief_ray=chief_ray_in_air(eye, eye.fovea_mm))

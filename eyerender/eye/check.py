@@ -1,4 +1,4 @@
-"""Checks of an eye file that pydantic cannot make: whether the geometry can be an eye."""
+"""Geometric checks of an eye file: whether it describes a possible eye."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _TOUCH_MM = 1e-6
 _BULGE_MM = 0.5
 _FAR_MM = 60.0
 _SMALLEST_RADIUS_MM, _SMALLEST_HALF_MM = 2.0, 1.0
-# The corneas of severe keratoconus are within a tenth of this.
+# Corneas with severe keratoconus come within a tenth of this limit.
 _MISFIT_MM = 0.5
 
 
@@ -142,7 +142,7 @@ def _stop_depth(centre: Floats, normal: Floats, grid: Floats) -> Floats:
 
 
 def _disc(radius_mm: float, centre: Floats) -> Floats:
-    """Compute points (y, z) that fill a disc."""
+    """Return points (y, z) that fill a disc."""
     radius, angle = np.meshgrid(np.linspace(0.0, radius_mm, 25), np.linspace(0.0, 2 * np.pi, 32, endpoint=False))
     return centre + np.column_stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()])
 
@@ -189,7 +189,7 @@ def _shape_problem(placed: PlacedSpec) -> tuple[str, str] | None:
 
 
 def _continued(surface: Measured) -> tuple[str, str] | None:
-    """Return the problem of a measured surface that its outer biconic does not continue."""
+    """Describe the problem of a measured surface that its outer biconic fails to continue; None if there is none."""
     away = misfit_mm(surface)
     if away < _MISFIT_MM:
         return None

@@ -1,4 +1,4 @@
-"""Measured shapes of an eye file as surfaces: the outer biconic is fitted here, once for each shape."""
+"""Build surfaces from the measured shapes of an eye file; the outer biconic is fitted once per shape."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ANY = np.array([8.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 @lru_cache(maxsize=4096)
 def zernike_surface(shape: ZernikeSpec) -> ZernikeSurface:
-    """Return the surface of Zernike terms at the eye's origin."""
+    """Build the surface of Zernike terms, with its apex at the eye's origin."""
     coefficients = np.zeros(terms(max(order_of(len(shape.coefficients_mm)), 1)))
     coefficients[: len(shape.coefficients_mm)] = shape.coefficients_mm
     base = np.array([0.0 if shape.base_radius_mm is None else 1.0 / shape.base_radius_mm, shape.base_conic_constant])
@@ -38,7 +38,7 @@ def zernike_surface(shape: ZernikeSpec) -> ZernikeSurface:
 
 @lru_cache(maxsize=256)
 def grid_surface(shape: GridSpec) -> GridSurface:
-    """Return the bicubic surface of a grid of heights at the eye's origin."""
+    """Build the bicubic surface of a grid of heights, with its apex at the eye's origin."""
     heights, spacing = np.array(shape.heights_mm).T, np.array(shape.spacing_mm)
     half = 0.5 * (len(heights) - 1) * float(spacing)
     zone = half / WINDOW[1] if shape.zone_radius_mm is None else shape.zone_radius_mm
@@ -57,7 +57,7 @@ def grid_surface(shape: GridSpec) -> GridSurface:
             table=coefficients,
         )
 
-    # On a plane first (a biconic of no curvature), only to find the biconic.
+    # First on a plane (a biconic without curvature), only to fit the biconic.
     flat = np.array([np.inf, np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     raw = on_biconic(flat, heights)
     outer = outer_biconic(lambda y, z: raw.measured(y, z, False)[0], _ring(zone))
@@ -65,14 +65,14 @@ def grid_surface(shape: GridSpec) -> GridSurface:
     y, z = np.meshgrid(place, place, indexing="ij")
     biconic = raw.with_outer(outer)
     base = biconic.outer_slopes(y, z)
-    # Beyond the reach of the biconic there is no rest; those nodes lie far beyond the window.
+    # Beyond the reach of the biconic there is no residual; those nodes lie far outside the measured zone.
     surface = on_biconic(outer, np.where(base.inside, heights - base.x, 0.0))
     apex = surface.measured(np.zeros(1), np.zeros(1), False)[0][0]
     return surface.with_outer(outer - apex * np.eye(8)[5])
 
 
 def misfit_mm(surface: Measured) -> float:
-    """Compute the root mean square of the deviation from the outer biconic, on a circle in the middle of the window."""
+    """Compute the rms deviation from the outer biconic (mm), on a circle in the middle of the transition."""
     angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
     radius = float(np.mean(surface.window_mm))
     y, z = radius * np.cos(angle), radius * np.sin(angle)

@@ -1,9 +1,9 @@
-"""The entrance pupil: the image of the stop that the cornea shows to a distant observer on the optic axis.
+"""The entrance pupil: the image of the stop through the cornea, for a distant observer on the optic axis.
 
-Rays from the margin's points leave the cornea parallel to the axis. Their feet (y, z) outline the entrance pupil, whose
-diameter is that of the circle of equal area. With the outline's Fourier series y + i z = sum_m c_m exp(i m f) in the
-margin's parameter f, its area is pi |sum_m m |c_m|^2|, which is exact for an ellipse and converges with the number of
-points faster than any power.
+Rays from the margin's points leave the cornea parallel to the axis. Their positions (y, z) outline the entrance pupil,
+whose diameter is that of the circle of equal area. With the outline's Fourier series y + i z = sum_m c_m exp(i m f) in
+the margin's parameter f, its area is pi |sum_m m |c_m|^2|, which is exact for an ellipse and converges with the number
+of points faster than any power.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SETTLED_MM = 1e-10
 
 
 def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS, distance_mm: float = FAR_MM) -> float:
-    """Compute the diameter of the entrance pupil of a single eye, for the circle of equal area.
+    """Compute the diameter (mm) of the entrance pupil of a single eye: that of the circle of equal area.
 
     Args:
         eye: the eye.
@@ -67,17 +67,17 @@ def stop_for_entrance(
     *,
     points: int = POINTS,
 ) -> float:
-    """Compute the diameter of the stop that has an entrance pupil of `entrance_mm`.
+    """Compute the diameter (mm) of the stop whose entrance pupil has the diameter `entrance_mm`.
 
     Args:
         front: refracting surfaces before the stop, outside in.
         indices: index behind each.
-        stop_of: stop of a diameter; its place and shape may depend on the diameter.
+        stop_of: returns the stop of a diameter; its position and shape may depend on it.
         entrance_mm: wanted diameter of the entrance pupil.
         points: number of points of the margin.
 
     Raises:
-        InputError: the search does not end, or a ray does not leave the eye.
+        InputError: the search does not converge, or a ray does not leave the eye.
     """
 
     def miss(diameter: float) -> float:
@@ -85,7 +85,7 @@ def stop_for_entrance(
 
     low = entrance_mm / 1.13
     f_low = miss(low)
-    # The cornea enlarges stops of all diameters almost alike.
+    # The cornea magnifies stops of all diameters almost equally.
     high = low * entrance_mm / (entrance_mm + f_low)
     f_high = miss(high)
     for _ in range(_STEPS):

@@ -56,7 +56,7 @@ class Fixations(ArrayValue):
         residual_mm: (n,) miss distance of the line of sight (chief ray: from the target; entrance window: from the
             fovea).
         status: (n,) of `Status`.
-        line_of_sight_mm: (n, 3) point of the unturned eye where the line of sight meets the cornea.
+        line_of_sight_mm: (n, 3) point where the line of sight meets the cornea, in the eye-fixed frame.
         line_of_sight_direction: (n, 3) unit vectors from there to the target, in the eye-fixed frame.
     """
 
@@ -67,7 +67,7 @@ class Fixations(ArrayValue):
     line_of_sight_direction: Floats
 
     def reason(self, item: int) -> str | None:
-        """Compute the reason why fixation `item` failed; None if it did not."""
+        """Return the reason why fixation `item` failed; None if it did not."""
         return Status(int(self.status[item])).reason
 
     def __len__(self) -> int:
@@ -81,9 +81,10 @@ def fixations(
     position_mm: npt.ArrayLike,
     line_of_sight: LineOfSightKind = "chief_ray",
 ) -> Fixations:
-    """Find the poses of n eyes that fixate targets.
+    """Compute the poses with which n eyes fixate targets.
 
-    The eyes are `eyes[eye_index]`, with apexes at `position_mm` in the world, head included.
+    The eyes are `eyes[eye_index]`. Their apexes at rest lie at `position_mm` (n, 3) in the world, head position
+    included.
     """
     which = np.asarray(eye_index, dtype=np.intp)
     seen = np.asarray(target_mm, dtype=np.float64) - np.asarray(position_mm, dtype=np.float64)
@@ -109,12 +110,12 @@ def fixations(
 
 
 def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKind = "chief_ray") -> Fixations:
-    """Find the poses that fixate targets.
+    """Compute the poses with which an eye fixates targets.
 
     Args:
         eye: one eye, or a batch of n.
         target_mm: (n, 3) in the eye frame, i.e. the world's target minus the eye's position minus the head's.
-        line_of_sight: its definition, see the module.
+        line_of_sight: "chief_ray" or "entrance_window", see the module.
 
     Raises:
         InputError: a target is not a finite point, or the definition is unknown.
@@ -130,10 +131,10 @@ def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKi
 
 
 def far_sight_mm(eye: EyeModel) -> Floats:
-    """Place (y, z) in mm, in the eye frame, of the line of sight of an eye that looks along +x into the distance.
+    """Compute the position (y, z) mm of the line of sight, in the eye frame, for an eye that looks far along +x.
 
-    The line of sight by the chief ray has a direction d in the eye. The torsion-free rotation that turns d to +x is
-    that of Listing's law for the gaze (d_x, -d_y, -d_z).
+    The chief ray to the fovea has a direction d in the eye. The torsion-free rotation that turns d to +x is that of
+    Listing's law for the gaze (d_x, -d_y, -d_z).
     """
     x, y, z = eye.chief_ray.direction
     pose = Poses.listing(np.arctan2(-y, x), np.arcsin(-z))
@@ -160,7 +161,7 @@ def _by_chief_ray(eye: EyeModel, target_mm: Floats) -> Fixations:
 
 
 def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
-    """Solve for the pose by Broyden from the chief ray's pose.
+    """Solve for the pose by Broyden's method, starting from the pose by chief ray.
 
     The error is the miss at the fovea, across the line of sight.
     """
@@ -184,7 +185,7 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
         new, entry, way, lost = _window_miss(eye, target_mm, angles)
         square = np.maximum(np.sum(step * step, -1), 1e-300)
         surprise = new - miss - np.einsum("nij,nj->ni", slope, step)
-        # Tiny steps contain only rounding and would spoil the slope.
+        # Tiny steps consist of rounding errors and would spoil the slope.
         learn = (square > 1e-22)[:, None, None]
         slope = slope + np.where(learn, surprise[:, :, None] * step[:, None, :] / square[:, None, None], 0.0)
         miss = new
@@ -203,7 +204,7 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
 
 
 def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floats, Floats, Floats, Bools]:
-    """Miss at the fovea (n, 2), point on the cornea, direction to the target, and whether there is no such ray."""
+    """Compute the miss at the fovea (n, 2), point on the cornea, direction to the target, and where no ray exists."""
     poses = Poses.listing(angles[:, 0], angles[:, 1])
     seen = join(into_eye(Turning.of(poses), eye, components(target_mm)))
     centre, lost = entrance_window_centre(eye, seen)
@@ -217,7 +218,7 @@ def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floa
 
 
 def entrance_window_centre(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Bools]:
-    """Compute the centre of the entrance window seen from viewpoints, and where there is none.
+    """Compute the centre of the entrance window seen from viewpoints, and where it does not exist.
 
     c = mean(p_i) - t mean(u_i) with exit points p_i and directions u_i, where t makes c come closest to the optic axis.
     Where the mean ray runs along the optic axis, t is not determined. The window is then that of a viewpoint 1e-4 rad
@@ -241,7 +242,7 @@ def entrance_window_centre(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats,
 
 
 def _mean_ray(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Floats, Bools]:
-    """Mean exit point and mean direction (n, 3) of the rays from the stop's margin, and where a ray does not exist."""
+    """Average exit points and directions (n, 3) of the rays from the stop's margin; return where one is missing."""
     margin = eye.stop.boundary(WINDOW_POINTS)
     found = apparent_points(eye.front, eye.front_indices, margin, viewpoint_mm[:, None, :])
     lost = (found.status != Status.OK).any(axis=1)
@@ -249,7 +250,7 @@ def _mean_ray(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Floats, Bool
 
 
 def _to_the_axis(point: Floats, way: Floats) -> Floats:
-    """Compute the parameter t (n,) for which point - t way comes closest to the x axis."""
+    """Compute the parameter t (n,) at which point - t way comes closest to the x axis."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.sum(way[:, 1:] * point[:, 1:], axis=-1) / np.sum(way[:, 1:] ** 2, axis=-1))
 
@@ -264,7 +265,7 @@ def _status(target_mm: Floats, *, azimuth: Floats, elevation: Floats, residual: 
 
 
 def _tangents(direction: Xyz) -> tuple[Xyz, Xyz]:
-    """Make two unit vectors orthogonal to a direction that points roughly along +x."""
+    """Compute two unit vectors orthogonal to a direction that points roughly along +x."""
     x, y, z = direction
     scale = 1.0 / np.sqrt(x * x + y * y)
     e1 = (-y * scale, x * scale, 0.0 * x)
@@ -273,6 +274,6 @@ def _tangents(direction: Xyz) -> tuple[Xyz, Xyz]:
 
 _ON_AXIS_RAD = 5e-5
 _ON_AXIS_MM = 1e-3
-"""A mean ray this close to the optic axis, in direction and in place, runs along it."""
+"""A mean ray this close to the optic axis, in direction and position, counts as lying on it."""
 _NUDGE_RAD = 1e-5
 _START_RAD = float(np.radians(85.0))

@@ -1,4 +1,4 @@
-"""Eye files of format 1, whose keys format 2 replaces.
+"""Conversion of eye files of format 1, whose keys format 2 replaces.
 
 | format 1 | format 2 |
 |---|---|
@@ -6,7 +6,7 @@
 | `tilt_order: xyz` (Rx Ry Rz) | `tilt_deg` of the same rotation as Rz Ry Rx |
 | `index_rate: 2` of a lens with `shells` | `layers`, one by one |
 
-The eye that is built is the same.
+Both describe the same eye.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:
     Wrong values are left as they are, and the check of format 2 names them.
 
     Raises:
-        InputError: one of the three keys has a value that format 1 did not have, or that does not fit.
+        InputError: one of the three keys has a value that format 1 did not allow.
     """
     out = {**data, "format": 2}
     if isinstance(out.get("cornea"), list):
@@ -47,7 +47,7 @@ def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _placed(value: Any, path: str) -> Any:
-    """Convert a placed surface: its apex, and its tilt as Rz Ry Rx."""
+    """Convert the position and tilt of a shape: to its apex, and to Rz Ry Rx."""
     if not isinstance(value, Mapping):
         return value
     out = {**value}
@@ -69,7 +69,7 @@ def _placed(value: Any, path: str) -> Any:
 
 
 def _apex_from_centre(shape: Any, path: str) -> float | None:
-    """Compute the distance of the apex from the centre along the axis (mm); None where the shape itself is wrong."""
+    """Compute the distance of the apex from the centre along the axis (mm); None if the shape itself is wrong."""
     kind = shape.get("kind") if isinstance(shape, Mapping) else None
     if kind == "ellipsoid":
         semi_axes = _numbers(shape.get("semi_axes_mm"), 3)
@@ -96,7 +96,7 @@ def _tilt_deg(rotation: Floats) -> Floats:
 
 
 def _count_layers(lens: dict[str, Any]) -> None:
-    """Replace, in place, the doubled rate of the index by the layers that it stood for.
+    """Replace, in place, the doubled index rate by the layers that it stood for.
 
     Shell k stood at k / (2 shells) of the way from edge to core and had (k + 1) / shells inside. The lens' own surfaces
     were the first shell.
@@ -115,7 +115,7 @@ def _count_layers(lens: dict[str, Any]) -> None:
 
 
 def _choice(data: dict[str, Any], key: str, known: tuple[Any, Any], path: str) -> Any:
-    """Remove a key of format 1; its default is the first of its two values."""
+    """Remove a key of format 1 and return its value; the default is the first known value."""
     value = data.pop(key, known[0])
     if isinstance(value, bool) or not isinstance(value, type(known[0])) or value not in known:
         raise InputError(f"must be {known[0]!r} or {known[1]!r}, not {shown(value)}", path=f"{path}.{key}")
@@ -123,7 +123,7 @@ def _choice(data: dict[str, Any], key: str, known: tuple[Any, Any], path: str) -
 
 
 def _numbers(value: Any, count: int) -> Floats | None:
-    """Read a list of finite numbers within the limits of a spec as an array; None for anything else."""
+    """Convert a list of finite numbers within the limits of a spec to an array; None for anything else."""
     if not isinstance(value, list | tuple) or len(value) != count:
         return None
     if any(isinstance(v, bool) or not isinstance(v, int | float) or not abs(v) <= LARGEST for v in value):

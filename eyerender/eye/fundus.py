@@ -1,19 +1,19 @@
-"""Light that the fundus returns through the pupil: bright near the lamp's own direction, dark elsewhere.
+"""Light that the fundus returns through the pupil: bright near the direction of the lamp, dark elsewhere.
 
 A lamp sends a pencil of rays through each point q of the pupil. On the retina the pencil arrives at the direction
 
     theta_L(q) = u_L + (F - V_L) q
 
-in object space, where u_L is the direction of the lamp, V_L = 1/d_L its vergence and F the vergence at which the eye
-is focused. The fundus spreads the light with a kernel K (1/sr) about that direction and returns a share rho of it. A
+in object space, where u_L is the direction of the lamp, V_L = 1/d_L its vergence and F the vergence at which the eye is
+focused. The fundus spreads the light with a kernel K (1/sr) about that direction and returns a share rho of it. A
 camera that looks through the pupil's point p sees the direction theta_C(p), so the radiance in air is
 
     L(p) = T_L T_C rho / (pi n'^2 f^2) * integral E(q) K(theta_C(p) - theta_L(q)) dA_q
 
 with E the irradiance of the stop, n' the index of the vitreous, f the height on the retina per angle in air, and T the
 transmittances of the cornea. The optics is paraxial about the camera's ray. The spread is a Gaussian core (aberrations
-and diffraction) and an exponential halo: choroid and retina carry infrared light sideways before it returns. What is
-left, after several reflections in the globe, is even.
+and diffraction) and an exponential halo: choroid and retina carry infrared light sideways before it returns. The
+remaining light, after several reflections in the globe, is uniform.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CELLS = 24
 _DISC_DEG, _DISC_RADIUS_DEG = (15.5, -1.5), 2.9
 # Delori and Pflibsen 1989, table I, at 805 nm: 10.37 % at the fovea, 11.27 % beside it, 12.52 % nasally.
 _FOVEA_SHARE, _FOVEA_DEG = 0.92, 2.5
-_NODES = 169  # points of the pupil
+_NODES = 169  # sample points of the pupil
 _UP = frozen([0.0, 0.0, 1.0])
 _VANISHED = 210.0  # squared gap, in sigma^2, beyond which a Gaussian is 0 in single precision
 _REACH = 12.0  # halo widths, beyond which a lamp returns less than a hundred-thousandth of its halo's peak
@@ -42,7 +42,7 @@ _REACH = 12.0  # halo widths, beyond which a lamp returns less than a hundred-th
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FundusLight(ArrayValue):
-    """Return factors over the stop for each lamp.
+    """Radiance factors over the stop, for each lamp.
 
     Attributes:
         factors: (m, CELLS, CELLS) radiance in air towards the camera per irradiance of the stop (1/sr), before the
@@ -65,7 +65,7 @@ class FundusLight(ArrayValue):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """How the fundus returns light.
+    """Reflectance and scatter of the fundus.
 
     Attributes:
         reflectance: share of the light that returns, away from fovea and optic disc.
@@ -83,15 +83,15 @@ class Spread:
 
 
 def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: float, spread: Spread) -> FundusLight:
-    """Compute the light of lamps that the fundus returns to a camera.
+    """Compute the light of lamps that the fundus returns through the pupil to a camera.
 
     Args:
         eye: the eye.
-        lamps_mm: (m, 3) places of the lamps in the eye frame.
-        camera_mm: (3,) place of the camera's pinhole in the eye frame.
-        focus_dpt: vergence of the place for which the eye is focused, 1 / distance in metres from the pupil; negative
-            for a hyperope who does not accommodate.
-        spread: how the fundus returns light.
+        lamps_mm: (m, 3) positions of the lamps in the eye frame.
+        camera_mm: (3,) position of the camera's pinhole in the eye frame.
+        focus_dpt: vergence (D) of the point in focus, 1 / its distance in metres from the pupil; negative for a
+            hyperope who does not accommodate.
+        spread: reflectance and scatter of the fundus.
     """
     centre, scale = entrance_pupil(eye)
     lamps, camera = np.asarray(lamps_mm, float) - centre, np.asarray(camera_mm, float) - centre
@@ -117,7 +117,7 @@ def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: 
         aside = _direction(lamp / distance, out_of_pupil, plane)
         if np.linalg.norm(aside) > reach + np.abs(blur * q).max() * 1e-3:
             continue
-        # The light of a node comes from all over its cell.
+        # The light of a node is spread over its cell.
         sigma = np.hypot(spread.blur_rad, abs(blur) * cell_mm * 1e-3 / np.sqrt(12))
         core, halo = _sums(theta_c, aside + blur * q * 1e-3, sigma, spread.halo_rad)
         core *= (1 - spread.halo_share) / (2 * np.pi * sigma**2)
@@ -130,9 +130,9 @@ def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: 
 
 
 def _sums(seen: Floats, lit: Floats, sigma: float, fall: float) -> tuple[Floats, Floats]:
-    """Sums over places `lit` (n, 2) of exp(-g^2 / 2 sigma^2) and exp(-g / fall), g their gap to places `seen` (..., 2).
+    """Sum exp(-g^2 / 2 sigma^2) and exp(-g / fall) over points `lit` (n, 2); g is the distance to `seen` (..., 2).
 
-    In single precision, in which exponentials take a tenth of the time; sums of hundreds of them are good to 1e-6.
+    Computed in single precision, which takes a tenth of the time; sums of hundreds of terms are accurate to 1e-6.
     """
     x, y = (np.subtract.outer(seen[..., k].astype(np.float32), lit[:, k].astype(np.float32)) for k in (0, 1))
     x *= x
@@ -150,7 +150,7 @@ def _sums(seen: Floats, lit: Floats, sigma: float, fall: float) -> tuple[Floats,
 
 @remembered
 def retinal_scale_mm(eye: EyeModel) -> float:
-    """Compute the height on the retina per angle (rad) in air about the entrance pupil, mm.
+    """Compute the height on the retina per angle (mm/rad) in air about the entrance pupil.
 
     Without a lens it is D w / u, with D the distance of the stop from the fovea, and u = n w / m by Lagrange's
     invariant. An eye with a lens is nearly in focus; then it is the distance of the nodes from the fovea.
@@ -166,13 +166,13 @@ def _inner_index(eye: EyeModel) -> float:
 
 
 def _retina_area_mm2(eye: EyeModel) -> float:
-    """Compute the area of the inside of the globe, that of the sclera's sphere less its wall of about 1 mm."""
+    """Compute the inner area of the globe (mm^2): a sphere 1 mm, the thickness of the wall, inside the sclera's."""
     return float(4 * np.pi * (float(eye.sclera.radius_mm) - 1.0) ** 2)
 
 
 @remembered
 def _pupil_nodes(eye: EyeModel) -> tuple[Floats, float]:
-    """Points (n, 2) of the stop in units of its semi-axes, and the area (mm^2) of the stop for which each stands."""
+    """Return points (n, 2) of the stop in units of its semi-axes, and the stop area (mm^2) per point."""
     k = np.arange(_NODES)
     radius, angle = np.sqrt((k + 0.5) / _NODES), k * np.pi * (3 - np.sqrt(5))  # Vogel's spiral, even by area
     f = np.arange(360) * np.pi / 180
@@ -184,14 +184,14 @@ def _pupil_nodes(eye: EyeModel) -> tuple[Floats, float]:
 
 
 def _direction(way: Floats, axis: Floats, plane: Floats) -> Floats:
-    """Compute the angle (2,) rad between a unit vector and an axis, along the axes of a plane across it."""
+    """Compute the angles (2,) rad of a unit vector from an axis, along the axes of a plane across it."""
     across = plane @ way
     sine = np.linalg.norm(across)
     return np.asarray(across * (np.arctan2(sine, way @ axis) / sine) if sine > 0 else across)
 
 
 def _relative_reflectance(eye: EyeModel, axis: Floats, plane: Floats, theta: Floats, disc_gain: float) -> Floats:
-    """Reflectance at directions `theta` from the camera's axis, over that of the fundus away from fovea and disc."""
+    """Compute the reflectance at `theta` from the camera's axis, relative to the fundus off fovea and disc."""
     way = axis + theta @ plane
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
     sight = eye.chief_ray.direction

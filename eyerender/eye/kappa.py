@@ -1,9 +1,9 @@
 """Angle kappa: from the pupillary axis to the line of sight, by tracing.
 
-The pupillary axis meets the front cornea at a right angle and leads, refracted on, through the centre of the stop: a
-camera with a lamp at its nodal point sees the glint at the centre of the pupil from there. What instruments call kappa
-is the direction of the line of sight from that axis (Le Grand called it lambda). Alpha, which eye files hold as
-`fovea.field_deg`, counts from the optic axis instead.
+The pupillary axis is perpendicular to the front cornea and, refracted, passes through the centre of the stop. A coaxial
+camera and lamp on this axis see the glint at the centre of the pupil. Instruments report as kappa the angle from this
+axis to the line of sight (Le Grand's lambda). Alpha, which eye files hold as `fovea.field_deg`, counts from the optic
+axis instead.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
 
 
 def kappa_deg(eye: EyeModel) -> tuple[float, float]:
-    """Compute angles (horizontal, vertical) of the line of sight from the pupillary axis, nasal and up, in degrees.
+    """Compute the angles (horizontal, vertical) from the pupillary axis to the line of sight, nasal and up, in degrees.
 
     Raises:
         InputError: the cornea has no pupillary axis.
@@ -50,10 +50,10 @@ def kappa_deg(eye: EyeModel) -> tuple[float, float]:
 
 
 def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
-    """Find where the fovea (3,) must lie for an angle kappa: the retina's point on that line of sight.
+    """Compute the fovea (3,) mm that gives an eye an angle kappa: the retinal point on that line of sight.
 
     Args:
-        eye: the eye, whose own fovea does not matter.
+        eye: the eye; its own fovea is ignored.
         wanted_deg: kappa (horizontal, vertical), nasal and up.
 
     Raises:
@@ -71,15 +71,15 @@ def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
 
 
 def with_kappa(spec: EyeSpec, wanted_deg: tuple[float, float], *, wavelength_nm: float = 850.0) -> EyeSpec:
-    """Copy of an eye whose fovea lies so that the eye has the angle kappa (see `kappa_deg`).
+    """Copy an eye file with the fovea moved so that the eye has a given angle kappa (see `kappa_deg`).
 
     Args:
         spec: the eye.
         wanted_deg: kappa (horizontal, vertical), nasal and up.
-        wavelength_nm: wavelength at which it is traced.
+        wavelength_nm: wavelength of the traced rays.
 
     Raises:
-        InputError: no place of the fovea gives this angle.
+        InputError: no position of the fovea gives this angle.
     """
     eye = spec.build(wavelength_nm=wavelength_nm)
     alpha = alpha_deg(eye, fovea_of_kappa(eye, wanted_deg), distance_mm=spec.fovea.distance_mm)
@@ -88,11 +88,11 @@ def with_kappa(spec: EyeSpec, wanted_deg: tuple[float, float], *, wavelength_nm:
 
 
 def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: float = 1500.0) -> tuple[float, float]:
-    """Compute angles (horizontal, vertical) of the nodal ray that ends on the fovea, nasal and up, in degrees.
+    """Compute angles (horizontal, vertical) from the optic axis to the nodal ray of the fovea, nasal and up, degrees.
 
     Args:
         eye: the eye.
-        fovea_mm: (3,) a fovea; default: the eye's own.
+        fovea_mm: (3,) position of the fovea; default: that of the eye.
         distance_mm: distance of the nodal ray's object from the corneal apex.
 
     Raises:
@@ -116,12 +116,12 @@ def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: flo
 
 
 def _through_stop(eye: EyeModel, way: Callable[[Floats], Floats], reason: str) -> tuple[Floats, Floats]:
-    """Point of the cornea and outward direction of the ray that leads, refracted, through the centre of the stop.
+    """Trace the ray that passes, refracted, through the centre of the stop: its corneal point and outward direction.
 
     Args:
         eye: the eye.
-        way: outward unit direction (3,) of the ray that meets the cornea at a point (3,).
-        reason: what an error says.
+        way: returns the outward unit direction (3,) of the ray at a corneal point (3,).
+        reason: message of the error.
 
     Raises:
         InputError: there is no such ray.
@@ -149,10 +149,10 @@ def _through_stop(eye: EyeModel, way: Callable[[Floats], Floats], reason: str) -
 
 
 def angles_of(eye: EyeModel, way: Floats) -> Floats:
-    """Compute angles (2,) rad of a direction from the optic axis, nasal and up: it is along (1, tan h, tan v)."""
+    """Compute the angles (2,) rad, nasal and up, of a direction from the optic axis: it is along (1, tan h, tan v)."""
     return np.asarray(np.arctan2([_handed(eye) * way[1], way[2]], way[0]))
 
 
 def _handed(eye: EyeModel) -> float:
-    """1 for a right eye, whose +y is nasal, and -1 for a left one."""
+    """Return 1 for a right eye, whose +y is nasal, and -1 for a left one."""
     return 1.0 if eye.side == "right" else -1.0

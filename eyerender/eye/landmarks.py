@@ -1,4 +1,4 @@
-"""Landmarks found by tracing: the incident node, the fovea, the chief ray to the fovea."""
+"""Landmarks of the eye, found by ray tracing: incident node, fovea, and chief ray to the fovea."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NODE_DISTANCE_MM = 1500.0
 
 
 def path_to_retina(eye: EyeModel) -> tuple[Crossing, ...]:
-    """Return all crossings from air to the retina; the last one does not bend the light, which ends there."""
+    """Return all surfaces on the path from air to the retina, where the light ends without refraction."""
     last = eye.back_indices[-1] if eye.back else eye.front_indices[-1]
     lens = zip(eye.back, eye.back_indices, eye.back_rims_mm, eye.back_passing, _through(eye, 1), strict=True)
     return (
@@ -38,12 +38,12 @@ def path_to_retina(eye: EyeModel) -> tuple[Crossing, ...]:
 
 
 def _through(eye: EyeModel, last: int) -> list[GradientMedium | None]:
-    """Find the medium before each surface of the lens, on a path that leaves a gradient lens at its surface `last`."""
+    """Return the medium in front of each lens surface on a path that leaves a gradient lens at its surface `last`."""
     return [eye.lens_gradient if k == last else None for k in range(len(eye.back))]
 
 
 def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Floats, Floats]:
-    """Compute rays from objects that reach the retina parallel to themselves.
+    """Compute nodal rays from objects: they reach the retina parallel to their direction in air.
 
     Args:
         eye: the eye.
@@ -60,8 +60,8 @@ def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Flo
     direction, error, retina = _parallel_rays(path, objects_mm, normalize(guess_mm - objects_mm))
     for k in np.flatnonzero(~(error < _PARALLEL)):
         row = slice(k, k + 1)
-        # The ray meets the edge of a shell, where the index jumps. It is solved with the shells that it meets next to
-        # the edge.
+        # The ray meets the edge of a shell, where the index jumps. Solve it with the shells that it meets next to the
+        # edge.
         met = crossed(path, trace(path, 1.0, objects_mm[row], direction[row]))
         direction[row], error[row], retina[row] = _parallel_rays(met, objects_mm[row], direction[row])
     if not (error < _PARALLEL).all():
@@ -70,7 +70,7 @@ def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Flo
 
 
 def _parallel_rays(path: Sequence[Crossing], objects_mm: Floats, direction: Floats) -> tuple[Floats, Floats, Floats]:
-    """Run Newton on the change of direction, with differences over 1e-5 rad: directions, |change|, retina points."""
+    """Solve for nodal rays by Newton's method: directions, |change of direction|, and retina points."""
     for _ in range(30):
         first, second = _tangents(direction)
         bundle = np.stack([direction, direction + _STEP * first, direction + _STEP * second])
@@ -91,7 +91,7 @@ def _parallel_rays(path: Sequence[Crossing], objects_mm: Floats, direction: Floa
 
 
 def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
-    """Compute crossings that one traced ray (leading shape (1,)) really met, without their rims."""
+    """Return the surfaces that one traced ray (leading shape (1,)) met, without their rims."""
     moved = np.linalg.norm(np.diff(traced.points_mm[:, 0], axis=0), axis=-1) > 0.0
     return tuple(replace(c, rim_mm=np.inf, beyond_rim=Status.MISSED) for c, met in zip(path, moved, strict=True) if met)
 
@@ -137,9 +137,9 @@ def fovea_by_nodal_ray(eye: EyeModel, node_mm: Floats, field_rad: Floats, distan
 
 
 def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
-    """Compute the ray that leaves the fovea, passes the stop's centre and goes out into the air.
+    """Compute the ray in air from the fovea through the stop's centre.
 
-    It is fixed in the eye, so fixation by chief ray only has to turn the eye until it meets the target.
+    This ray is fixed in the eye, so fixation by chief ray only has to turn it onto the target.
 
     Raises:
         InputError: there is no such ray.
@@ -181,7 +181,7 @@ def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
 
 
 def field_direction(field_rad: Floats) -> Floats:
-    """Compute unit vectors along (1, tan h, tan v); field angles (..., 2) -> (..., 3)."""
+    """Compute unit vectors (..., 3) along (1, tan h, tan v) from field angles (h, v) (..., 2) in radians."""
     field = np.asarray(field_rad, dtype=np.float64)
     return normalize(np.stack([np.ones(field.shape[:-1]), np.tan(field[..., 0]), np.tan(field[..., 1])], axis=-1))
 

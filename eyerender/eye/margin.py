@@ -1,4 +1,4 @@
-"""A pupil margin for any eye model: slightly irregular, and moving as the pupil changes size.
+"""An irregular pupil margin for any eye model, which also shifts as the pupil changes size.
 
 r(f) = 1 + sum_k A_k cos(k (f - F_k)), k = 2 .. 6, is the margin's radius over its mean. Its noncircularity is the rms
 of r - 1, sqrt(sum_k A_k^2 / 2). In a drawn margin A_k cos(k F_k) and A_k sin(k F_k) are independent normal numbers
@@ -8,9 +8,8 @@ pupil.)
 Sources: Wyatt (1995), "The form of the human pupil", Vision Res. 35, 2021-2036: noncircularity 0.0166 on average,
 mostly in the first 4 or 5 harmonics, about half of it (47.7 % in light, 59.6 % in the dark) an ellipse's; here 46 % go
 with k = 2. Yang, Thompson and Burns (2002), "Pupil location under mesopic, photopic, and pharmacologically dilated
-conditions", Invest. Ophthalmol. Vis. Sci. 43, 2508-2512: .133 mm towards the temple from 4.1 to 6.3 mm.
-Chosen without a source: the power law, one outline at every diameter, no vertical shift, and two eyes that are mirror
-images.
+conditions", Invest. Ophthalmol. Vis. Sci. 43, 2508-2512: .133 mm towards the temple from 4.1 to 6.3 mm. Chosen without
+a source: the power law, one outline at every diameter, no vertical shift, and two eyes that are mirror images.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ Shift = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
 class PupilMargin(Spec):
-    """Margin of the pupil and its shift, in place of those of the eye file; a left eye has the mirror image.
+    """Margin of the pupil and its shift, replacing those of the eye file; a left eye has the mirror image.
 
-    With a `seed` or a `contour` the outline is that about a circle, else it stays the eye file's.
+    With a `seed` or a `contour`, the outline is a deformed circle; otherwise that of the eye file is kept.
     """
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(default=None, description="selects the drawn outline")
@@ -72,7 +71,7 @@ class PupilMargin(Spec):
         return self
 
     def outline(self) -> ContourSpec | None:
-        """Compute the outline that is drawn or given; None where that of the eye file is kept."""
+        """Return the drawn or given outline; None if that of the eye file is kept."""
         if self.seed is None:
             return self.contour
         return drawn_contour(self.seed, NONCIRCULARITY if self.noncircularity is None else self.noncircularity)
@@ -87,7 +86,7 @@ class PupilMargin(Spec):
 
 
 def drawn_contour(seed: int, noncircularity: float) -> ContourSpec:
-    """Draw the outline of a seed; the directions and shares of its harmonics do not depend on its noncircularity."""
+    """Draw a random outline; the directions and shares of its harmonics depend on the seed only."""
     order = np.array(HARMONICS, dtype=np.float64)
     u, v = np.random.default_rng((0x9099, seed)).random((2, len(order)))
     # Box and Muller's transform: with the phase this gives two normal numbers from uniform ones.

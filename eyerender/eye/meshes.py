@@ -37,12 +37,12 @@ class Patch:
     """A piece of surface.
 
     Attributes:
-        name: what it is.
+        name: name of the patch.
         vertices: (n, 3) mm.
         normals: (n, 3) unit normals.
         faces: (m, 3) indices of vertices.
-        exterior: index of refraction on the side of the normal; None where opaque.
-        interior: index of refraction behind; None where opaque.
+        exterior: refractive index on the side of the normal; None if opaque.
+        interior: refractive index behind the surface; None if opaque.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Patch:
 
     @property
     def mesh(self) -> Any:
-        """Convert to a trimesh."""
+        """Convert to a `trimesh.Trimesh`."""
         return _trimesh(self.vertices, self.faces, self.normals)
 
 
@@ -67,7 +67,7 @@ class EyeMeshes:
 
 
 def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
-    """Make all meshes of an eye, in the eye frame (mm); a gradient lens is made of shells."""
+    """Compute all meshes of an eye, in the eye frame (mm); a gradient lens is approximated by shells."""
     eye = shelled(eye)
     angle = 2 * np.pi * np.arange(sectors) / sectors
     cornea = cornea_patches(eye, rings, sectors)
@@ -113,7 +113,7 @@ def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
 
 
 def cornea_patches(eye: EyeModel, rings: int, sectors: int) -> tuple[Patch, ...]:
-    """Compute patches of the cornea's refracting surfaces, from outside: the front, and the back if there is one."""
+    """Compute the patches of the cornea's refracting surfaces, outside in: the front, and the back if there is one."""
     limbus = np.full(sectors, float(eye.limbus_radius_mm))
     indices = [1.0, *(float(n) for n in eye.front_indices)]
     patches = [_cap("cornea_front", eye.front[0], limbus, rings, indices[0], indices[1])]
@@ -147,7 +147,7 @@ def _fan(sectors: int) -> Ints:
 
 
 def _strips(first: int, rings: int, sectors: int) -> Ints:
-    """Compute quads between consecutive rings of `sectors` vertices; the innermost ring starts at vertex `first`."""
+    """Return quads between consecutive rings of `sectors` vertices; the innermost ring starts at vertex `first`."""
     i, j = np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij")
     a, k = first + i * sectors, (j + 1) % sectors
     upper = np.stack([a + j, a + sectors + j, a + sectors + k], axis=-1)
@@ -156,12 +156,12 @@ def _strips(first: int, rings: int, sectors: int) -> Ints:
 
 
 def _rim(patch: Patch, sectors: int) -> Floats:
-    """Compute the last ring of a patch."""
+    """Return the outermost ring of a patch."""
     return patch.vertices[-sectors:]
 
 
 def _trimesh(vertices: Floats, faces: Ints, normals: Floats | None = None) -> Any:
-    import trimesh  # which takes a quarter of a second, and few processes need it
+    import trimesh  # its import takes a quarter of a second, and few processes need it
 
     return trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
 
@@ -178,7 +178,7 @@ def _band(
 
 
 def chamber_rim(surface: Surface, centre: Floats, normal: Floats, limbus_mm: float, angle: Floats) -> Floats:
-    """Radius (sectors,) mm at which the posterior cornea meets the plane of the iris, less than that of the limbus."""
+    """Compute the radius (sectors,) mm where the posterior cornea meets the iris plane, at most that of the limbus."""
     low, high = np.zeros_like(angle), np.full_like(angle, limbus_mm * 0.995)
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -275,7 +275,7 @@ def _iris(eye: EyeModel, sectors: int) -> Patch:
 
 
 def _closed(*parts: tuple[Patch, int]) -> Any:
-    """Join patches (sign -1: turned around) into one body with their common rims merged."""
+    """Join patches into one closed body with their common rims merged; sign -1 turns a patch around."""
     vertices, faces, count = [], [], 0
     for patch, sign in parts:
         vertices.append(patch.vertices)

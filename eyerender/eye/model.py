@@ -50,7 +50,7 @@ class Stop(ArrayValue):
     def relative_radius(self, angle_rad: npt.ArrayLike) -> Floats:
         """Compute the relative radius r at the parameter f of the ellipse.
 
-        f is counted from the first semi-axis of the right eye's stop towards up; it is mirrored for a left eye.
+        f runs from the first semi-axis of the right eye's stop towards up; for a left eye it is mirrored.
 
         Args:
             angle_rad: () or (m,); (n, ...) for a batch of n stops.
@@ -64,7 +64,7 @@ class Stop(ArrayValue):
         return out
 
     def boundary(self, count: int) -> Floats:
-        """Compute points of the margin, evenly spaced in the ellipse's parameter, (..., count, 3).
+        """Compute points (..., count, 3) mm of the margin, evenly spaced in the ellipse's parameter.
 
         The first lies on the first semi-axis (nasal where it is not turned), and the next follow towards up. Those of a
         left eye are the mirror images of the right eye's.
@@ -90,7 +90,7 @@ class Stop(ArrayValue):
         return np.asarray(first * first + second * second <= limit * limit)
 
     def height_mm(self, point: Xyz) -> Floats:
-        """Compute the height of points above the stop's plane, towards the cornea."""
+        """Compute the height (mm) of points above the stop's plane, towards the cornea."""
         ndim = point[0].ndim
         gap = shift(point, self.centre_mm, -1.0)
         return np.asarray(sum(gap[i] * fit(self.rotation[..., i, 0], ndim) for i in range(3)))
@@ -145,8 +145,8 @@ class LineOfSight(ArrayValue):
 class EyeModel(ArrayValue):
     """An eye in the eye frame, at one wavelength and with one pupil.
 
-    A gradient lens has two surfaces, with the index of its edge behind the front and `lens_gradient` between them, or
-    many shells.
+    A gradient lens has two surfaces with `lens_gradient` between them (the index listed behind the front is that of its
+    edge), or many shells.
 
     Attributes:
         name: name of the model.
@@ -164,9 +164,9 @@ class EyeModel(ArrayValue):
         iris_root_radius_mm: radius of the iris' root.
         sclera: sphere of the sclera.
         rotation: centres of rotation.
-        fovea_mm: (3,).
+        fovea_mm: (3,) position of the fovea.
         chief_ray: the fixed ray in air that reaches the fovea through the stop's centre.
-        lens_gradient: medium of a gradient lens that is not made of shells.
+        lens_gradient: medium of a gradient lens; None without one, or if it is made of shells.
     """
 
     name: str
@@ -190,7 +190,7 @@ class EyeModel(ArrayValue):
 
     @property
     def purkinje_orders(self) -> tuple[int, ...]:
-        """Purkinje images of this eye: 1 front cornea, 2 back cornea, 3 lens front, 4 lens back."""
+        """Purkinje images that this eye has: 1 front cornea, 2 back cornea, 3 lens front, 4 lens back."""
         orders = [1]
         if len(self.front) > 1:
             orders.append(2)

@@ -17,10 +17,10 @@ from ..spec import ByKind, FileSpec, Number, Positive, Spec, Vec2, Vec3
 MAX_SURFACES = 400
 # Zernike terms of radial order 14, and nodes of a grid in a row: a grid of 201 x 201 takes some seconds to fit.
 MAX_TERMS, MAX_NODES = 120, 201
-# Discs and zones of measured corneas, and their depths: any eye's are well within.
+# Radii of discs and zones of measured corneas, and their depths: every real eye is well within.
 Reach = Annotated[float, Field(ge=0.5, le=20.0)]
 Depth = Annotated[float, Field(ge=-30.0, le=30.0)]
-# Germanium has the highest index of all materials that are transparent somewhere in the infrared: 4.
+# Germanium has the highest index, 4, of all materials that are transparent somewhere in the infrared.
 LARGEST_INDEX = 5.0
 # Cauchy's coefficients grow with the sixth power of nanometres.
 Coefficient = Annotated[float, Field(ge=-1e20, le=1e20)]
@@ -322,7 +322,7 @@ class EyeParts(FileSpec):
 
     format: int = Field(default=3, description="version of this file format")
     name: str = Field(description="name of the model")
-    description: str = Field(default="", description="what the model is, in a sentence")
+    description: str = Field(default="", description="description of the model, in a sentence")
     cornea: tuple[SurfaceSpec, ...] = Field(
         min_length=1, max_length=MAX_SURFACES, description="surfaces between air and the stop"
     )

@@ -38,14 +38,14 @@ class Poses(ArrayValue):
 
     @classmethod
     def listing(cls, azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Poses:
-        """Make poses whose torsion follows Listing's law."""
+        """Create poses whose torsion follows Listing's law."""
         azimuth = np.asarray(azimuth_rad, dtype=np.float64)
         elevation = np.asarray(elevation_rad, dtype=np.float64)
         return cls(azimuth, elevation, listing_torsion(azimuth, elevation))
 
     @classmethod
     def from_degrees(cls, azimuth_deg: npt.ArrayLike, elevation_deg: npt.ArrayLike) -> Poses:
-        """Make poses by Listing's law from degrees."""
+        """Create poses by Listing's law from angles in degrees."""
         return cls.listing(np.radians(azimuth_deg), np.radians(elevation_deg))
 
     def __len__(self) -> int:
@@ -61,7 +61,7 @@ def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) ->
 def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
     """Compute the rigid motion of the eye: x_turned = M x + t in the eye frame.
 
-    The world's point is x_turned + the eye's position + the head's position.
+    The point in the world is x_turned + the eye's position + the head's position.
 
     Args:
         poses: n poses.
@@ -77,14 +77,14 @@ def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
 
 
 def centres_of(eye: EyeModel) -> Floats:
-    """Compute centres of azimuth, elevation and torsion, (1, 9), or (n, 9) for a batch."""
+    """Return the centres of azimuth, elevation and torsion, (1, 9) mm, or (n, 9) for a batch."""
     r = eye.rotation
     centres = np.concatenate([r.azimuth_centre_mm, r.elevation_centre_mm, r.torsion_centre_mm], axis=-1)
     return np.array(np.atleast_2d(centres))
 
 
 class Turning(NamedTuple):
-    """Sines and cosines of poses, one array per angle, to transform points into the turned eye cheaply."""
+    """Sines and cosines of poses, one array per angle, for fast transforms into the turned eye."""
 
     azimuth: tuple[Floats, Floats]
     elevation: tuple[Floats, Floats]
@@ -92,7 +92,7 @@ class Turning(NamedTuple):
 
     @classmethod
     def of(cls, poses: Poses) -> Turning:
-        """Compute them from poses."""
+        """Compute the sines and cosines of poses."""
         return cls(
             (np.cos(poses.azimuth_rad), np.sin(poses.azimuth_rad)),
             (np.cos(poses.elevation_rad), np.sin(poses.elevation_rad)),
@@ -115,5 +115,5 @@ def into_eye(turning: Turning, eye: EyeModel, point: Xyz) -> Xyz:
 
 
 def split(vector: Floats) -> Xyz:
-    """Compute components of vectors (..., 3), as views."""
+    """Return the components of vectors (..., 3), as views."""
     return vector[..., 0], vector[..., 1], vector[..., 2]

@@ -1,4 +1,4 @@
-"""Poses, compiled: the rigid motion of turned eyes, and the poses that turn a line through a target."""
+"""Compiled functions for poses: the rigid motion of turned eyes, and the poses that turn a line through a target."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def move_all(angles: Floats, centres: Floats, turn: Floats, shift: Floats) -> No
 
 @inlined
 def seen(c, target, azimuth, elevation):  # type: ignore[no-untyped-def]
-    """Return the target in the frame of the turned eye, with its derivatives by azimuth and elevation.
+    """Transform the target into the frame of the turned eye, with its derivatives by azimuth and elevation.
 
     Listing's torsion is included. `c` are the centres of azimuth, elevation and torsion.
     """
@@ -76,9 +76,9 @@ def dot(a, b):  # type: ignore[no-untyped-def]
 
 @compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8, f8[:,::1]")
 def turn_all(centres: Floats, lines: Floats, target: Floats, largest_start_rad: float, out: Floats) -> None:
-    """Turn lines that are fixed to eyes through targets, by Newton with Listing's law.
+    """Solve for the poses that turn lines fixed to eyes through targets, by Newton's method with Listing's law.
 
-    The equations are e1.(q - p) = e2.(q - p) = 0, where q is the target as the turned eye sees it.
+    The equations are e1.(q - p) = e2.(q - p) = 0, where q is the target in the frame of the turned eye.
 
     Args:
         centres: (1 or n, 9) centres of azimuth, elevation and torsion, mm.
@@ -113,5 +113,5 @@ def turn_all(centres: Floats, lines: Floats, target: Floats, largest_start_rad: 
             turn = min(max(turn, -LARGEST_STEP_RAD), LARGEST_STEP_RAD) if turn == turn else 0.0
             lift = min(max(lift, -LARGEST_STEP_RAD), LARGEST_STEP_RAD) if lift == lift else 0.0
             azimuth, elevation = azimuth - turn, elevation - lift
-            # Newton converges quadratically, so the remaining error is below rounding. It is measured then.
+            # Newton converges quadratically, so the remaining error is below rounding. Measure it now.
             last = max(abs(turn), abs(lift)) < SETTLED_RAD

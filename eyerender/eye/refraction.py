@@ -1,4 +1,4 @@
-"""The refraction of an eye about its optic axis, by tracing.
+"""Refraction of an eye about its optic axis, by tracing.
 
 A ray that meets the cornea at the small height h with the small slope u reaches the retina at A h + B u + c. Light of
 the vergence K (a power matrix, 1/mm) has u = -K h, so it comes to a focus where A = B K. Spectacles of power F at the
@@ -22,7 +22,7 @@ _SLOPE = 1e-4
 
 
 def at_cornea_d(spectacles_d: float, vertex_mm: float = VERTEX_MM) -> float:
-    """Compute the refraction at the cornea of eyes that need spectacles of a power: F / (1 - d F)."""
+    """Convert a spectacle power (D) to the refraction at the cornea (D): F / (1 - d F)."""
     return spectacles_d / (1.0 - vertex_mm * spectacles_d / 1000.0)
 
 

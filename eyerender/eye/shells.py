@@ -12,15 +12,15 @@ from ..geometry.surfaces import Surface
 from .model import EyeModel
 
 SHELLS = 21
-"""Shells a half where a lens has to be made of bodies: in meshes and drawings."""
+"""Shells per half where a lens has to be made of bodies: in meshes and drawings."""
 
 
 class Layers(NamedTuple):
     """Layers of a lens from outside in, (k,) each.
 
     Attributes:
-        sizes: size of each shell.
-        index_shares: how far the index inside each shell has changed from edge to core.
+        sizes: scale of each shell about the lens' centre.
+        index_shares: index inside each shell, as a share of the way from edge to core.
     """
 
     sizes: Floats
@@ -43,11 +43,11 @@ def lens_shells(
     rim_mm: float,
     layers: Layers,
 ) -> Shells:
-    """Make the shells of the lens between two single surfaces.
+    """Compute the shells of the lens between two surfaces.
 
     Args:
-        front: front of the lens.
-        back: back of the lens.
+        front: front surface of the lens.
+        back: back surface of the lens.
         centre_mm: (3,) centre of the scaling.
         indices: index of the edge, of the core, and behind the lens.
         rim_mm: rim radius of the outermost shell.
@@ -64,13 +64,13 @@ def lens_shells(
 
 
 def even_layers(count: int) -> Layers:
-    """Layers with equal steps of the index, which is taken in the middle of each; `count` as in `GradientLensSpec`."""
+    """Return layers with equal index steps, each with the index at its middle; `count` as in `GradientLensSpec`."""
     steps = np.arange(count)
     return Layers(np.sqrt(1.0 - steps / count), (steps + 0.5) / count)
 
 
 def shelled(eye: EyeModel, count: int = SHELLS) -> EyeModel:
-    """Replace the gradient lens of a single eye by shells; any other eye is returned as it is."""
+    """Replace the gradient lens of a single eye by shells; any other eye is returned unchanged."""
     gradient = eye.lens_gradient
     if gradient is None:
         return eye

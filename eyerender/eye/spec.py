@@ -1,4 +1,4 @@
-"""The eye file: a right eye as the user writes it, checked and built."""
+"""The eye file: a right eye as the user writes it, validated and built."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from .topography import with_topographies
 
 
 class EyeSpec(EyeParts):
-    """A right eye that can exist."""
+    """A right eye whose geometry is possible."""
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Bring a mapping of an older format to the present one, which describes the same eye."""
+        """Convert a mapping of an older format to the current one, which describes the same eye."""
         if data.get("format") == 1:
             data = upgraded(data)
-        # Format 3 added the shapes of measured corneas, and changed nothing else.
+        # Format 3 only added the shapes of measured corneas.
         return {**data, "format": 3} if data.get("format") == 2 else data
 
     @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """Read the measured points that the shapes name, and put the grids fitted to them in their place."""
+        """Read the files of measured points that the shapes name, and replace them by fitted grids."""
         return with_topographies(data, folder)
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""The stop of an eye file."""
+"""Build the stop of an eye file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .parts import EyeParts
 
 
 def stop_of(spec: EyeParts, diameter_mm: float) -> Stop:
-    """Stop of the right eye at a diameter."""
+    """Build the stop of the right eye at a diameter (mm)."""
     stop = spec.stop
     change = diameter_mm - stop.diameter_mm
     rotation = tilt_rotation(np.radians(stop.tilt_deg)) @ rotation_x(np.radians(stop.axis_deg))

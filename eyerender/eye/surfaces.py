@@ -1,4 +1,4 @@
-"""Surfaces and media of an eye file."""
+"""Build the surfaces and media of an eye file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from .shells import SHELLS, Layers, even_layers, lens_shells
 
 @lru_cache(maxsize=64)
 def surface_of(placed: PlacedSpec) -> Surface:
-    """Build a placed shape as a surface of the eye frame; equal shapes are the same object."""
+    """Build a shape as a surface in the eye frame; equal shapes give the same object."""
     shape = placed.shape
     rotation = tilt_rotation(np.radians(placed.tilt_deg))
     position = np.array(placed.position_mm)
@@ -67,7 +67,7 @@ def surface_of(placed: PlacedSpec) -> Surface:
 
 def _general_quadric(shape: QuadricSpec, position: Floats, rotation: Floats) -> Quadric:
     a, b, c, d, e, f, g, h, i, k = shape.coefficients
-    # The scale makes the size of rounding depend on distances, not on the unit of the coefficients.
+    # The scale ties the size of rounding errors to distances, not to the unit of the coefficients.
     scale = max(abs(v) for v in (a, b, c, d, e, f)) or max(abs(v) for v in (g, h, i))
     if b == c and d == e == f == 0.0 and b != 0.0:
         scale = abs(b)
@@ -77,14 +77,14 @@ def _general_quadric(shape: QuadricSpec, position: Floats, rotation: Floats) -> 
 
 
 def medium_of(spec: MediumSpec) -> Medium:
-    """Build the medium that a spec describes."""
+    """Build the medium of a spec."""
     if spec.cauchy is not None:
         return CauchyMedium(*spec.cauchy)
     return ConstantMedium(1.0 if spec.index is None else spec.index)
 
 
 def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
-    """Compute the index at a wavelength.
+    """Compute the refractive index at a wavelength (nm).
 
     Raises:
         InputError: the index is below 1.
@@ -98,7 +98,7 @@ def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
 
 
 def sclera_of(spec: EyeParts, cornea: Surface) -> Sphere:
-    """Sclera: the sphere through the limbus circle, centred on the cornea's axis unless the file gives the centre."""
+    """Build the sclera: the sphere through the limbus circle, centred on the cornea's axis unless given otherwise."""
     radius = spec.sclera.radius_mm
     if spec.sclera.centre_mm is not None:
         return Sphere(read_only(spec.sclera.centre_mm), radius)
@@ -110,7 +110,7 @@ def sclera_of(spec: EyeParts, cornea: Surface) -> Sphere:
 
 
 def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]:
-    """Compute the geometry of a gradient lens: (front, back, centre (3,)).
+    """Return the geometry of a gradient lens: (front, back, centre (3,)).
 
     Raises:
         InputError: the surfaces cannot be those of a gradient lens.
@@ -138,7 +138,7 @@ def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]
 def gradient_lens(
     lens: GradientLensSpec, wavelength_nm: float
 ) -> tuple[tuple[Surface, ...], tuple[FloatLike, ...], tuple[FloatLike, ...], GradientMedium | None]:
-    """Surfaces of a gradient lens outside in, the index behind each, their rims, and the medium (None for shells)."""
+    """Build a gradient lens: surfaces outside in, index behind each, their rims, and the medium (None for shells)."""
     front, back, centre = gradient_geometry(lens)
     edge, core, vitreous = (
         index_at(medium, wavelength_nm, f"lens.{name}")

@@ -1,6 +1,6 @@
-"""Measured points of a cornea: tables of topographers and OCT, and meshes, as the grid that an eye file holds.
+"""Read measured points of a cornea (tables of topographers and OCT, and meshes) and fit the grid of an eye file.
 
-Files are not trusted: their size, the number of points and the numbers are limited, and each problem is one line.
+Files are not trusted: file size, number of points and magnitudes are limited, and each problem is one line.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..storage.files import read_bytes, read_text, shown
 from .parts import MAX_NODES, GridSpec, TopographySpec
 
 MAX_FILE_BYTES, MAX_POINTS, MIN_POINTS = 64 * 2**20, 200_000, 50
-"""The fit holds sixteen numbers per point."""
+"""Limits of a file; the fit needs sixteen numbers per point."""
 _MM = {"mm": 1.0, "um": 1e-3, "m": 1e3}
 _FARTHEST_MM = 30.0
 _SECTORS = 36
@@ -37,7 +37,7 @@ def read_topography(spec: TopographySpec, folder: str | Path = ".") -> GridSpec:
 
     Args:
         spec: the file, its axes and units.
-        folder: what the file's path is relative to.
+        folder: folder to which the file's path is relative.
 
     Raises:
         InputError: the file cannot be read, or its points are no surface about the axis.
@@ -71,7 +71,7 @@ def read_topography(spec: TopographySpec, folder: str | Path = ".") -> GridSpec:
         reason = f"needs a grid of more than {MAX_NODES} nodes in a row; give a larger 'spacing_mm'"
         raise InputError(reason, source=source)
     half = count * spec.spacing_mm
-    # Points outside the square cannot bear on it.
+    # Points outside the square have no influence.
     inside = near & (np.maximum(np.abs(y), np.abs(z)) <= half)
     if np.count_nonzero(inside) < MIN_POINTS:
         raise InputError(f"has fewer than {MIN_POINTS} points within {half:.3g} mm of the axis", source=source)
@@ -85,7 +85,7 @@ def read_topography(spec: TopographySpec, folder: str | Path = ".") -> GridSpec:
 
 
 def topography_files(path: str | Path) -> tuple[str, ...]:
-    """Compute paths of the measured points that an eye file names, relative to its folder.
+    """Return the paths of measured points that an eye file names, relative to its folder.
 
     Raises:
         InputError: the eye file cannot be read.
@@ -108,10 +108,10 @@ def topography_files(path: str | Path) -> tuple[str, ...]:
 
 
 def with_topographies(data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Put fitted grids in the place of the files that the shapes of an eye file name.
+    """Replace the files that the shapes of an eye file name by fitted grids.
 
     Raises:
-        InputError: naming the key, or the file that is wrong.
+        InputError: naming the key or the wrong file.
     """
 
     def walk(node: Any, path: str) -> Any:
@@ -143,7 +143,7 @@ def _fitted(node: Mapping[str, Any], path: str, folder: Path) -> dict[str, Any]:
 
 
 def _rows(path: Path) -> list[list[str]]:
-    """Return cells of a table, row by row."""
+    """Yield the cells of a table, row by row."""
     text = read_text(path, limit=MAX_FILE_BYTES).lstrip("\ufeff")
     delimiter = max(",;\t", key=text.split("\n", 1)[0].count)
     rows: list[list[str]] = []
@@ -161,7 +161,7 @@ def _rows(path: Path) -> list[list[str]]:
 
 
 def _columns(rows: list[list[str]], spec: TopographySpec, source: str) -> Floats:
-    """Return three columns of a table as points (n, 3); rows with an empty cell are left out."""
+    """Read three columns of a table as points (n, 3); rows with an empty cell are left out."""
     wanted = (0, 1, 2) if spec.columns is None else spec.columns
     header = rows[0] if any(isinstance(name, str) for name in wanted) else None
     places = []
@@ -183,7 +183,7 @@ def _columns(rows: list[list[str]], spec: TopographySpec, source: str) -> Floats
 
 
 def _matrix(rows: list[list[str]], source: str) -> Floats:
-    """Return a table of z with x in its first row and y in its first column as points (n, 3)."""
+    """Read a matrix of z, with x in its first row and y in its first column, as points (n, 3)."""
     across = [_number(cell, source, 1) for cell in rows[0][1:]]
     out = []
     for number, row in enumerate(rows[1:], start=2):
@@ -209,8 +209,8 @@ def _number(cell: str, source: str, row: int) -> float:
 
 
 def _mesh(path: Path) -> Floats:
-    """Compute vertices of a PLY file, (n, 3)."""
-    import trimesh  # which takes a quarter of a second
+    """Read the vertices of a PLY file, (n, 3)."""
+    import trimesh  # its import takes a quarter of a second
 
     data = plain_ply(read_bytes(path, limit=MAX_FILE_BYTES), source=str(path))
     try:

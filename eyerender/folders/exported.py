@@ -1,4 +1,4 @@
-"""Folders that `export-dataset` has written: how their images are encoded."""
+"""Read the image encoding of folders that `export-dataset` wrote."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ EXPORT = "export.json"
 
 
 def exported_gamma(folder: Path) -> float | None:
-    """Return the encoding gamma that an export states (1 for linear images); None where the folder states none.
+    """Return the encoding gamma that an export states (1 for linear images); None if it states none.
 
     Raises:
         InputError: export.json cannot be read.

@@ -1,6 +1,6 @@
-"""Reading and writing image files: 16- and 8-bit greyscale PNG; greyscale of the usual formats is read.
+"""Read and write image files: 16- and 8-bit greyscale PNG; other common greyscale formats can be read.
 
-Pixel values are linear sensor counts. Nothing here scales them, except `preview`, which is for people.
+Pixel values are linear sensor counts. Only `preview`, which is for viewing, scales them.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from ..arrays import Bytes
 from ..errors import InputError
 from ..storage.files import opened, written
 
-ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")  # of images in a folder
+ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")  # suffixes of images
 MAX_FILES = 1_000_000
 
 # Size of the largest window that can be rendered; it limits the memory that a hostile file can make us allocate.
 MAX_PIXELS = 8192 * 8192
-# More than such an image takes in any of the formats, in addition to the file's descriptive data.
+# Larger than any such image in any of the formats, plus the file's metadata.
 MAX_IMAGE_BYTES = 2**30
 # Pillow supports many more formats, some of which start other programs.
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
@@ -38,7 +38,7 @@ _WAITING = 8  # images of a `Writer`
 
 
 def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> None:
-    """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour, completely or not at all.
+    """Write (h, w) uint8 or uint16 as greyscale, or (h, w, 3) uint8 as colour; on an error, nothing is left.
 
     Images are mostly written into a folder that is synced as a whole before it is published; `sync` makes a single one
     durable.
@@ -50,8 +50,8 @@ def write_png(path: str | Path, image: NDArray[Any], *, sync: bool = False) -> N
 def png_bytes(image: NDArray[Any]) -> bytes:
     """Encode (h, w) uint8 or uint16 as a greyscale PNG, or (h, w, 3) uint8 as a colour one (ISO/IEC 15948).
 
-    Noise does not compress, and writing must not cost more than rendering. So every row has the same filter, and the
-    encoder searches only for runs, which masks have.
+    Noise does not compress, and writing must not take longer than rendering. So every row has the same filter, and the
+    encoder searches only for runs, which occur in masks.
     """
     import cv2
 
@@ -64,7 +64,7 @@ def png_bytes(image: NDArray[Any]) -> bytes:
 
 
 class Writer:
-    """Writes PNG files in a second thread, while the next image is rendered; a context manager.
+    """Writes PNG files in a second thread while the next image is rendered; a context manager.
 
     At most a few images wait. An error of a write is raised by the next call, or at the end of the block.
     """
@@ -84,12 +84,12 @@ class Writer:
             self._thread.shutdown(wait=True, cancel_futures=True)
 
     def flush(self) -> None:
-        """Wait until every image is written; raises the error of a write."""
+        """Wait until every image is written; raise the error of a failed write."""
         while self._waiting:
             self._waiting.popleft().result()
 
     def png(self, path: Path, image: NDArray[Any]) -> None:
-        """Write an image like `write_png`, later."""
+        """Queue an image for writing, as in `write_png`."""
         while len(self._waiting) >= _WAITING:
             self._waiting.popleft().result()
         self._waiting.append(self._thread.submit(write_png, path, image))
@@ -103,7 +103,7 @@ def compressed(image: Bytes, quality: int) -> Bytes:
 
 
 def image_files(folder: str | Path) -> list[str]:
-    """List the image files in a folder and below it, relative to it and sorted; links are not followed.
+    """Return the image files in a folder and below it, relative to it and sorted; links are not followed.
 
     Raises:
         InputError: there are none, or too many files.
@@ -136,13 +136,13 @@ def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
 
 
 def image_of(data: bytes, source: str) -> tuple[NDArray[Any], int]:
-    """Read the content of an image file, like `read_image`."""
+    """Decode the content of an image file, like `read_image`."""
     image, depth, _ = _image(io.BytesIO(data), len(data), source, colour=False)
     return image, depth
 
 
 def read_any_image(path: str | Path) -> tuple[NDArray[Any], int, bool]:
-    """Read an image like `read_image`, but take the luminance (ITU-R BT.601) where it has real colour.
+    """Read an image like `read_image`, but convert real colour to luminance (ITU-R BT.601).
 
     Returns:
         The image and its bit depth as of `read_image`, and whether it has colour.
@@ -162,7 +162,7 @@ def _image(data: BinaryIO, size: int, source: str, *, colour: bool) -> tuple[NDA
     try:
         if size == 0:
             raise InputError("is empty", source=source)
-        # Where Pillow warns, it either reads the image nevertheless or fails with an error.
+        # If Pillow warns, it either reads the image anyway or fails with an error.
         with warnings.catch_warnings(action="ignore"), Image.open(data, formats=FORMATS) as file:
             return _decoded(file, source, colour)
     except InputError:
@@ -170,7 +170,7 @@ def _image(data: BinaryIO, size: int, source: str, *, colour: bool) -> tuple[NDA
     except MemoryError:
         raise InputError("needs more memory than is available", source=source) from None
     except Exception:
-        # For a damaged file Pillow's decoders may raise any exception.
+        # Pillow's decoders may raise any exception for a damaged file.
         raise InputError("is not a readable image", source=source) from None
 
 
@@ -196,7 +196,7 @@ def _decoded(file: Image.Image, source: str, colour: bool) -> tuple[NDArray[Any]
 
 
 def _from_colour(file: Image.Image, source: str, colour: bool) -> tuple[Bytes, int, bool]:
-    """Convert a file with colour channels to grey levels; real colour only where it is allowed."""
+    """Convert a file with colour channels to grey levels; real colour only if it is allowed."""
     if file.has_transparency_data and np.asarray(file.convert("RGBA"))[..., 3].min() < 255:
         raise InputError("has transparent pixels", source=source)
     grey = _same_channels(file)
@@ -215,5 +215,5 @@ def _same_channels(file: Image.Image) -> Bytes | None:
 
 
 def preview(image: NDArray[Any], full_scale: float) -> Bytes:
-    """Make an 8-bit copy for viewing. The codes are shown unchanged, as is usual for near-infrared cameras."""
+    """Convert an image to 8 bits for viewing. Codes are scaled linearly, as is usual for near-infrared cameras."""
     return np.asarray(np.round(255 * np.clip(np.asarray(image, dtype=float) / full_scale, 0, 1)), dtype=np.uint8)

@@ -46,7 +46,7 @@ IMAGE_SCHEMAS = (IMAGE_SCHEMA, RENDERED_SCHEMA, "eyerender/image/2", "eyerender/
 DATASET_SCHEMA, PACKED_SCHEMA = "eyerender/dataset/1", "eyerender/dataset/2"
 """Schemas of dataset.json where each picture is a file, and where shards are packed."""
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
-RUN = "run.json"  # in a folder that `generate` fills, from its start
+RUN = "run.json"  # present from the start in a folder that `generate` fills
 RUN_SCHEMA, PACKED_RUN_SCHEMA = "eyerender/run/1", "eyerender/run/2"
 LOG = "log.jsonl"
 # Files of a finished shard. LINES is not called metadata.jsonl, because loaders of image folders would read it, too.
@@ -78,10 +78,10 @@ FILE_KEYS = (
 
 @dataclass(frozen=True, slots=True)
 class ImageEntry:
-    """One image of a folder: its files, its window (x0, y0, width, height) and its line of metadata.
+    """One image of a folder: its files, its window (x0, y0, width, height) and its metadata.
 
-    `number` counts the lines of the file `listed` from 1; it is 0 where it is unknown. `listed` is metadata.jsonl by
-    default; in an unfinished run and in a packed folder it is the file of a shard.
+    `number` is the line number in the file `listed`, from 1; 0 if unknown. `listed` is metadata.jsonl by default; in an
+    unfinished run and in a packed folder it is the file of a shard.
     """
 
     folder: Path
@@ -91,7 +91,7 @@ class ImageEntry:
 
     @property
     def source(self) -> Path:
-        """File that holds the line."""
+        """File that contains the line."""
         return self.listed or self.folder / METADATA
 
     @property
@@ -101,7 +101,7 @@ class ImageEntry:
 
     @property
     def path(self) -> Path:
-        """Path of the image file; raises `InputError` as `file` does."""
+        """Path of the image file; raises `InputError` like `file`."""
         found = self.file("file_name")
         if found is None:
             raise InputError("missing", source=str(self.source), path=self._where("file_name"))
@@ -109,14 +109,15 @@ class ImageEntry:
 
     @property
     def mask_path(self) -> Path | None:
-        """Path of the mask file, if there is one; raises `InputError` as `file` does."""
+        """Path of the mask file, if there is one; raises `InputError` like `file`."""
         return self.file("mask_file_name")
 
     def file(self, key: str) -> Path | None:
-        """Find the file that one of `FILE_KEYS` names; None where the line names none.
+        """Return the path of the file that one of `FILE_KEYS` names; None if the metadata names none.
 
         Raises:
-            InputError: it leads out of the folder, is missing, or is not a regular file (a link, a pipe, a folder).
+            InputError: the path leads out of the folder, or the file is missing or not regular (a link, a pipe, a
+                folder).
         """
         name = self.line.get(key)
         if name is None:
@@ -124,16 +125,16 @@ class ImageEntry:
         return inside(self.folder, name, source=str(self.source), path=self._where(key))
 
     def check(self, key: str) -> None:
-        """Check that the file that one of `FILE_KEYS` names is there; raises as `file`."""
+        """Check that the file that one of `FILE_KEYS` names exists; raise like `file`."""
         self.file(key)
 
     def data(self, key: str) -> bytes | None:
-        """Content of the file that one of `FILE_KEYS` names, None where the line names none; raises as `file`."""
+        """Read the file that one of `FILE_KEYS` names; None if the metadata names none. Raises like `file`."""
         path = self.file(key)
         return None if path is None else read_bytes(path, limit=MAX_IMAGE_BYTES, follow=False)
 
     def picture(self, key: str) -> tuple[NDArray[Any], int] | None:
-        """Pixels and bit depth of the file that one of `FILE_KEYS` names, None where the line names none.
+        """Read pixels and bit depth of the file that one of `FILE_KEYS` names; None if the metadata names none.
 
         Raises:
             InputError: as for `file`; the file is not a greyscale image.
@@ -143,7 +144,7 @@ class ImageEntry:
 
     @property
     def gamma(self) -> float:
-        """The image stores linear intensity^(1 / gamma)."""
+        """Encoding gamma: the image stores linear intensity^(1 / gamma)."""
         return float(self.line.get("gamma") or 1.0)
 
     @property
@@ -153,7 +154,7 @@ class ImageEntry:
         return w["x0"], w["y0"], w["width"], w["height"]
 
     def image(self) -> NDArray[Any]:
-        """Read the sensor's counts in the window, (h, w) uint8 or uint16; float32 where the file holds floats.
+        """Read the sensor's counts in the window, (h, w) uint8 or uint16; float32 if the file holds floats.
 
         Raises:
             InputError: as for `file`; the file is not a greyscale image, or its size differs from the window's.
@@ -163,10 +164,10 @@ class ImageEntry:
         return image
 
     def mask(self) -> Bytes | None:
-        """Read what each pixel shows, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 a frame.
+        """Read the class of each pixel, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 a frame.
 
         Returns:
-            The mask, None where the line names none.
+            The mask; None if the metadata names none.
 
         Raises:
             InputError: as for `image`; the file does not have 8 bits.
@@ -178,11 +179,11 @@ class ImageEntry:
         return self._parts("amodal_mask_file_name")
 
     def highlight_mask(self) -> Bytes | None:
-        """Read where wet and oily surfaces mirror a lamp (1, else 0); like `mask`."""
+        """Read the mask of lamp highlights on wet and oily surfaces (1, else 0); like `mask`."""
         return self._parts("highlight_mask_file_name")
 
     def noiseless(self) -> NDArray[Any] | None:
-        """Read the counts without the sensor's noise, like `image`; None where the line names no such file."""
+        """Read the counts without the sensor's noise, like `image`; None if the metadata names no such file."""
         return self._picture("noiseless_file_name")
 
     @property
@@ -193,10 +194,10 @@ class ImageEntry:
 
     @property
     def labels(self) -> dict[str, Any]:
-        """Labels of the image (docs/formats.md), empty where it has none.
+        """Labels of the image (docs/formats.md), empty if it has none.
 
         Raises:
-            InputError: they are not a mapping.
+            InputError: the labels are not a mapping.
         """
         found = self.line.get("labels")
         if found is None:
@@ -240,12 +241,12 @@ class ImageEntry:
 
 @dataclass(frozen=True, slots=True)
 class PackedEntry(ImageEntry):
-    """One image of a packed shard; `members` are the places of its files in the tar, by the keys of their names."""
+    """One image of a packed shard; `members` are the positions of its files in the tar, by the keys of their names."""
 
     members: Mapping[str, Any] = field(default_factory=dict)
 
     def file(self, key: str) -> Path | None:
-        """Like `ImageEntry.file`: the picture is copied to a temporary file, which goes when this process ends."""
+        """Copy the file to a temporary one, removed when this process ends; otherwise like `ImageEntry.file`."""
         data = self.data(key)
         if data is None:
             return None
@@ -270,7 +271,7 @@ class PackedEntry(ImageEntry):
 
 @dataclass(frozen=True, slots=True)
 class Entries(Sequence[ImageEntry]):
-    """The images of a folder. Each line of metadata is read and checked when its entry is requested, and not kept.
+    """Images of a folder. Each line of metadata is read and checked when its entry is requested, and not kept.
 
     Iteration is faster than access by index. A slice is another such sequence.
 
@@ -312,8 +313,8 @@ class Entries(Sequence[ImageEntry]):
 class ImageFolder:
     """A folder of images; iteration yields an `ImageEntry` for each.
 
-    The lines of metadata are read when their entries are requested, and never all kept. Of an unfinished run, the
-    images of the finished shards are there; `unfinished` then says how many, and is empty otherwise.
+    Metadata is read when an entry is requested. In an unfinished run, only the images of finished shards are included;
+    `unfinished` then describes how many, and is empty otherwise.
     """
 
     path: Path
@@ -323,13 +324,13 @@ class ImageFolder:
 
     @classmethod
     def load(cls, path: str | Path) -> ImageFolder:
-        """Open a folder: read dataset.json, find the lines of metadata.jsonl and check the first one.
+        """Open a folder: read dataset.json, index metadata.jsonl and check its first line.
 
         A folder of an unfinished run gives an `UnfinishedRunWarning`.
 
         Raises:
-            InputError: naming the file, and the line and key where there is one. A later wrong line is reported when it
-                is read.
+            InputError: naming the file and, if possible, line and key. Other wrong lines are reported when they are
+                read.
         """
         folder = Path(path)
         if not os.path.isdir(folder):
@@ -377,7 +378,7 @@ class ImageFolder:
 
     @classmethod
     def _of_run(cls, folder: Path) -> ImageFolder:
-        """Open the folder of an unfinished run, whose finished shards hold the lines."""
+        """Open the folder of an unfinished run, whose finished shards contain the metadata."""
         run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
         if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
             raise InputError("does not describe a run of this version", source=str(folder / RUN))
@@ -411,7 +412,7 @@ class ImageFolder:
         return iter(self.entries)
 
     def rows_of(self, split: str) -> tuple[Ints, list[str]]:
-        """Rows of the entries of a split, and the names of all splits; the index of packed shards tells both at once.
+        """Return the rows of a split's entries, and the names of all splits.
 
         Raises:
             InputError: a line or the index is wrong.
@@ -435,7 +436,7 @@ class ImageFolder:
                 parts.append(Observations.from_records([r for entry in batch for r in entry.records], complete=True))
             except InputError:
                 for entry in batch:
-                    entry.truth()  # this names the wrong line
+                    entry.truth()  # the error message names the wrong line
                 raise
         found = concatenate(parts)
         # Head positions are counted over all images.
@@ -443,21 +444,21 @@ class ImageFolder:
 
 
 def shard_name(shard: int) -> str:
-    """Make the name of a shard's folders."""
+    """Return the name of a shard's folders."""
     return f"{shard:05d}"
 
 
 def finished(folder: Path) -> set[int]:
-    """List the shards that have a done.json."""
+    """Return the shards that have a done.json."""
     place = folder / SHARDS
     if not place.is_dir():
         return set()
-    # There may be ten thousands of shards, for which paths as text are three times as fast.
+    # There may be tens of thousands of shards, for which paths as text are three times as fast.
     return {int(name) for name in os.listdir(place) if name.isdigit() and os.path.isfile(f"{place}/{name}/{DONE}")}
 
 
 def packed_index(done: Mapping[str, Any], shard: int, splits: Sequence[str], source: str) -> NDArray[Any]:
-    """Rows of the index of one packed shard, from the columns in its done.json; `splits` are those of the whole index.
+    """Return the index rows of one packed shard from its done.json; `splits` are those of the whole index.
 
     Raises:
         InputError: the columns are not in the format of this version.
@@ -477,7 +478,7 @@ def packed_index(done: Mapping[str, Any], shard: int, splits: Sequence[str], sou
 
 
 def packed_lines(folder: Path, shards: Sequence[int]) -> PackedLines:
-    """Lines of some packed shards, by what their done.json say."""
+    """Return the metadata of some packed shards, located by their done.json."""
     dones = []
     for shard in shards:
         dones.append(read_json(folder / SHARDS / shard_name(shard) / DONE, limit=MAX_FILE_BYTES, follow=False))
@@ -492,7 +493,7 @@ def packed_lines(folder: Path, shards: Sequence[int]) -> PackedLines:
 
 @cache
 def _scratch() -> str:
-    """Folder of this process for pictures that are needed as files."""
+    """Return this process's temporary folder for images that are needed as files."""
     folder = tempfile.mkdtemp(prefix="eyerender-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
@@ -504,10 +505,10 @@ def _entries(folder: Path, files: list[Path]) -> Entries:
 
 
 def _check_line(line: dict[str, Any], source: str, where: str) -> None:
-    """Check the files, names and window of a line; the rest of it is not checked.
+    """Check the files, names and window of a line; other keys are not checked.
 
     Raises:
-        InputError: they cannot be used.
+        InputError: a value cannot be used.
     """
 
     def refuse(key: str, reason: str) -> NoReturn:
@@ -565,7 +566,7 @@ def _is_whole(value: object) -> TypeGuard[int]:
 
 
 def same_run(path: str | Path, digest: str) -> bool:
-    """Return whether a folder already holds the complete result of the same spec made by the same versions."""
+    """Return whether a folder already holds the complete result of the same spec and versions."""
     try:
         found = read_json(Path(path) / DATASET)
     except InputError:
@@ -600,7 +601,7 @@ A change of the code that changes them raises it. A run that was begun with anot
 
 
 def versions() -> dict[str, str]:
-    """List the versions on which a result depends."""
+    """Return the versions on which a result depends."""
     packages = ("eyerender", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless")
     found = {name: package_version(name) for name in packages}
     return {"python": platform.python_version(), "results": str(RESULTS), **found}

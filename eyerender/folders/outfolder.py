@@ -1,11 +1,11 @@
-"""Folders that a command fills: who writes, what may be replaced, and how a result is published.
+"""Output folders of commands: who writes, what may be replaced, and how a result is published.
 
-A folder is staged and put in place when it is complete, so a run that is interrupted or runs out of disk leaves nothing
-that looks like a result.
+A folder is staged and moved into place when complete, so an interrupted run, or one that runs out of disk space, leaves
+nothing that looks like a result.
 
 `--overwrite` replaces what this package made and nothing else. A folder is recognised by dataset.json, run.json,
 study.json, sweep.json or results.json with our schema, or by the marker file, which lists what was written. Files that
-neither have a known name nor are in that list belong to somebody else; then nothing is replaced at all.
+neither have a known name nor are listed belong to somebody else; then nothing is replaced.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _SIGN_BYTES = 2**30
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp", ".exr", ".hdr")
 _FOLDERS = re.compile(r"(images/)?((images|masks|amodal_masks|noiseless|highlights|shards)(/[0-9]+)?)|images|layouts")
 _FILES = re.compile(
-    r"(images/)?("  # a study's images are a dataset of their own
+    r"(images/)?("  # a study's images are a dataset in their own folder
     r"(dataset|run|croissant)\.json|(metadata|failures|log)\.jsonl|README\.md|report\.html|"
     r"(images|masks|amodal_masks|noiseless|highlights)/([0-9]+/)?[^/]+\.(png|exr)|"
     r"shards/[0-9]+/(lines\.jsonl|lines\.jsonl\.gz|images\.tar|done\.json)|index\.npy)"
@@ -55,7 +55,7 @@ def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
     With `overwrite`, a folder is refused if this package did not make it or if it contains anything else.
 
     Raises:
-        InputError: it holds something that must not be replaced.
+        InputError: the folder holds something that must not be replaced.
     """
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
@@ -87,14 +87,14 @@ def has_own_name(folder: Path, file: Path) -> bool:
 
 
 def clear(folder: Path, *, known: bool = False) -> None:
-    """Remove what this package made in a folder, and what killed runs left; locks stay.
+    """Remove everything that this package made in a folder, and remains of killed runs; locks stay.
 
-    dataset.json is removed first, so that no half of a dataset looks complete. The marker is removed last, so that an
-    interrupted removal can be repeated. Nothing is removed if something else is found.
+    dataset.json is removed first, so that a partial dataset does not look complete. The marker is removed last, so that
+    an interrupted removal can be repeated. Nothing is removed if something else is found.
 
     Args:
         folder: the folder.
-        known: the caller knows that the folder is a run's, even if the files that should identify it are damaged.
+        known: whether the caller knows that the folder belongs to a run, even if its identifying files are damaged.
 
     Raises:
         InputError: as `refuse_non_empty` with `overwrite`.
@@ -112,14 +112,13 @@ def clear(folder: Path, *, known: bool = False) -> None:
 
 @contextmanager
 def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """Yield a folder to write into, inside `path`; its content takes its place only if the block succeeds.
+    """Yield a temporary folder inside `path`; its content is moved into place only if the block succeeds.
 
     `dataset.json` moves last, so a folder that has one is complete, even after a power cut: everything is synced before
-    it moves. A folder that no other file identifies as ours gets the marker. What an earlier, killed run left is
-    removed.
+    it moves. A folder that no other file identifies gets the marker. Remains of an earlier, killed run are removed.
 
     Raises:
-        InputError: the place is taken, or another writer uses it.
+        InputError: the folder is not empty, or another writer uses it.
         EyerenderError: the disk is full or not writable; nothing is left behind.
     """
     final = Path(path)
@@ -139,7 +138,7 @@ def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
                 shutil.rmtree(stage, ignore_errors=True)
     except InputError:
         raise
-    except EyerenderError as error:  # the user knows the folder, but not the stage in it
+    except EyerenderError as error:  # the user knows the folder, but not the temporary one inside
         raise type(error)(str(error).replace(str(stage), str(final))) from None
     except OSError as error:
         raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
@@ -152,7 +151,7 @@ def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
 def _publish(stage: Path, final: Path) -> None:
     """Replace the content of a folder by that of a staged folder.
 
-    If that fails, nothing is left that could be taken for a result: what has moved is removed again. The old content
+    If that fails, files that were already moved are removed again, so that nothing looks like a result. The old content
     stays as long as none of it has been removed.
     """
     sync_tree(stage)
@@ -160,7 +159,7 @@ def _publish(stage: Path, final: Path) -> None:
     old = _listed(final) or set()
     is_whole = any(True for _ in _made_here(final, old, strict=False))  # the old content, if there is any
     try:
-        # From here on the folder can be recognised at every moment.
+        # From here on the folder is identifiable at every moment.
         _mark(final, old | new)
         is_whole = False
         _empty(final, old, keep=stage.name)
@@ -186,7 +185,7 @@ def _mark(folder: Path, names: Set[str]) -> None:
 
 
 def _listed(folder: Path) -> set[str] | None:
-    """Read a folder's marker: empty where another file identifies the folder as ours, None where none does.
+    """Read a folder's marker: empty if another file identifies the folder as made here, None if nothing does.
 
     Names of folders end with a slash.
     """
@@ -209,9 +208,9 @@ def _read_sign(path: Path, schema: str) -> dict[str, Any] | None:
 
 
 def _made_here(folder: Path, listed: Set[str], *, strict: bool) -> Iterator[tuple[str, bool]]:
-    """Yield what this package made, by name, and whether it is a folder; a folder comes after its content.
+    """Yield each file and folder that this package made, by name; a folder comes after its content.
 
-    With `strict` anything else raises `InputError`; otherwise it is left out.
+    With `strict`, anything else raises `InputError`; otherwise it is skipped.
     """
 
     def walk(prefix: str) -> Iterator[tuple[str, bool]]:
@@ -255,13 +254,13 @@ def _refuse_others(folder: Path, listed: Set[str]) -> None:
 
 
 def _empty(folder: Path, listed: Set[str], keep: str = "") -> None:
-    """Remove what this package made, except the marker; also remove stages, except `keep`."""
+    """Remove what this package made, except the marker, and temporary folders, except `keep`."""
     remove_file(folder / DATASET)
     for name, is_folder in _made_here(folder, listed, strict=False):
         if is_folder:
             _remove_stages(folder / name)
             with suppress(OSError):
-                (folder / name).rmdir()  # something else may be in it by now
+                (folder / name).rmdir()  # something else may have been put in it by now
         elif name != MARKER:
             (folder / name).unlink(missing_ok=True)
     _remove_stages(folder, keep)
@@ -274,7 +273,7 @@ def _remove_stages(folder: Path, keep: str = "") -> None:
 
 
 def _names(folder: Path) -> set[str]:
-    """List everything in a folder, relative to it; names of folders end with a slash."""
+    """Yield everything in a folder, relative to it; names of folders end with a slash."""
     out = set()
     for place, folders, files in os.walk(folder):
         prefix = "" if Path(place) == folder else f"{Path(place).relative_to(folder).as_posix()}/"

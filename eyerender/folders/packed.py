@@ -1,11 +1,11 @@
-"""Reading of packed shards (docs/formats.md, version 2 of a dataset's folder).
+"""Read and write packed shards (docs/formats.md, version 2 of a dataset's folder).
 
     shards/00003/images.tar       all pictures of the shard
     shards/00003/lines.jsonl.gz   lines of metadata in gzip members: the tables first, then 32 lines in each member
     index.npy                     one row per image of the finished dataset
 
-A line is what its image holds beyond the tables: what all lines of the shard share, and those of one eye of a subject.
-Its values stand in a list, whose keys are a shape in the first member.
+The tables hold the values shared by all lines of the shard, and by the lines of one eye of a subject. A line holds the
+remaining values as a list; its keys are one of the shapes in the first member.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ the shard, and the first byte of the gzip member that holds its line."""
 
 
 def rounded(node: Any) -> Any:
-    """A JSON value whose numbers have `DIGITS` significant digits; to round twice changes nothing."""
+    """Round the numbers of a JSON value to `DIGITS` significant digits; idempotent."""
     if isinstance(node, float):
         return float(f"{node:.{DIGITS}g}")
     if isinstance(node, dict):
@@ -55,9 +55,9 @@ def rounded(node: Any) -> Any:
 
 
 def pack_lines(lines: Sequence[Mapping[str, Any]]) -> tuple[bytes, list[int]]:
-    """File of a shard's lines, and the first byte of the gzip member of each line.
+    """Pack a shard's metadata: the file's content, and the first byte of the gzip member of each line.
 
-    The same lines, also with other numbers of digits or orders of keys, give the same bytes.
+    The bytes do not depend on the order of keys, nor on digits beyond `DIGITS`.
     """
     opened_lines = [_opened(line) for line in lines]
     groups: dict[str, list[dict[str, Any]]] = {}
@@ -91,7 +91,7 @@ def pack_lines(lines: Sequence[Mapping[str, Any]]) -> tuple[bytes, list[int]]:
 
 
 def _leaves(node: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Values of a tree of mappings, with the keys that lead to them."""
+    """Yield the values of a tree of mappings, with the keys that lead to them."""
     for key, value in node.items():
         if isinstance(value, dict) and value:
             yield from _leaves(value, (*path, key))
@@ -100,7 +100,7 @@ def _leaves(node: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tuple[tu
 
 
 def _tree(paths: Sequence[Sequence[str]], values: Sequence[Any]) -> dict[str, Any]:
-    """The tree whose leaves these are."""
+    """Rebuild a tree of mappings from its leaves."""
     out: dict[str, Any] = {}
     for path, value in zip(paths, values, strict=True):
         node = out
@@ -125,7 +125,7 @@ def _closed(node: dict[str, Any]) -> dict[str, Any]:
 
 
 def _group(line: Mapping[str, Any]) -> str:
-    """Whose table a line has: a subject's eyes differ in more than their images do."""
+    """Return the group whose table a line uses: the eye of a subject."""
     return f"{line['subject']} {line['records']['[0]']['eye']}"
 
 
@@ -139,7 +139,7 @@ def _member(texts: Sequence[bytes]) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class _Head:
-    """What the lines of each group of a shard share, and the paths of the values in each shape of a rest."""
+    """Values shared by the lines of each group of a shard, and the paths of the values in each shape."""
 
     tables: dict[str, dict[str, Any]]
     shapes: list[list[list[str]]]
@@ -147,7 +147,7 @@ class _Head:
 
 @lru_cache(maxsize=128)
 def _head(path: str, state: tuple[int, ...]) -> _Head:
-    del state  # of the file, so that another one in its place is read again
+    del state  # of the file, so that a replaced file is read again
     (text,) = _inflated(path, 0)
     head = parse_json(text, source=path)
     if not isinstance(head, dict) or head.get("schema") != LINES_SCHEMA:
@@ -164,10 +164,10 @@ def _block(path: str, first: int, state: tuple[int, ...]) -> list[bytes]:
 
 
 def _inflated(path: str, first: int) -> list[bytes]:
-    """Lines of the gzip member that begins at a byte.
+    """Read the lines of the gzip member that begins at a byte.
 
     Raises:
-        InputError: there is none, or it is too large.
+        InputError: there is no member, or it is too large.
     """
     try:
         with opened(path, follow=False) as file:
@@ -186,7 +186,7 @@ def _inflated(path: str, first: int) -> list[bytes]:
 
 
 def read_line(path: Path, row: int, block: int) -> dict[str, Any]:
-    """Line of metadata in a row of a shard, whose gzip member begins at byte `block`.
+    """Read the metadata in a row of a shard, whose gzip member begins at byte `block`.
 
     Raises:
         InputError: the file or the line is wrong.
@@ -204,7 +204,7 @@ def read_line(path: Path, row: int, block: int) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", source=name) from None
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
-        raise InputError(f"is no packed line ({type(error).__name__}: {error})", source=name, path=where) from None
+        raise InputError(f"is not a packed line ({type(error).__name__}: {error})", source=name, path=where) from None
 
 
 def _state(path: Path) -> tuple[int, ...]:
@@ -213,7 +213,7 @@ def _state(path: Path) -> tuple[int, ...]:
 
 
 def read_member(folder: Path, shard: str, place: object, *, source: str, path: str) -> bytes:
-    """A file of a shard's tar; `place` is its first byte and its size, from a line.
+    """Read a file of a shard's tar; `place` is its first byte and its size, from the metadata.
 
     Raises:
         InputError: there is no such file.
@@ -233,7 +233,7 @@ def read_member(folder: Path, shard: str, place: object, *, source: str, path: s
 
 @dataclass(frozen=True, kw_only=True)
 class PackedLines:
-    """Lines of packed shards, in the order of an index; with the methods of `LineFiles`.
+    """Metadata of packed shards, in the order of an index; with the methods of `LineFiles`.
 
     The index is either a file, which is not kept in memory, or the rows of the finished shards of an unfinished run.
     """
@@ -245,10 +245,10 @@ class PackedLines:
 
     @cached_property
     def rows(self) -> NDArray[Any]:
-        """Rows of the index, (n,) of `INDEX_TYPE`.
+        """Return the rows of the index, (n,) of `INDEX_TYPE`.
 
         Raises:
-            InputError: the file is no such index.
+            InputError: the file is not such an index.
         """
         if self.given is not None:
             return self.given
@@ -257,9 +257,9 @@ class PackedLines:
         try:
             rows: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
         except (ValueError, OSError, EOFError) as error:
-            raise InputError(f"is no index of images ({error})", source=str(path)) from None
+            raise InputError(f"is not an index of images ({error})", source=str(path)) from None
         if rows.dtype != INDEX_TYPE or rows.ndim != 1:
-            raise InputError("is no index of images", source=str(path))
+            raise InputError("is not an index of images", source=str(path))
         return rows
 
     def __getstate__(self) -> dict[str, Any]:
@@ -269,13 +269,13 @@ class PackedLines:
         return len(self.rows)
 
     def of_split(self, split: str) -> Ints:
-        """Rows of one split."""
+        """Return the rows of one split."""
         if split not in self.splits:
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(self.rows["split"] == self.splits.index(split))
 
     def read(self, rows: range) -> Iterator[tuple[Path, int, dict[str, Any]]]:
-        """Read some lines: the file, the number in it from 1, and the object.
+        """Read some lines: the file, the line number in it from 1, and the object.
 
         Raises:
             InputError: as `read_line`.

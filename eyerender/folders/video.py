@@ -1,4 +1,4 @@
-"""Frames of a recorded video as files."""
+"""Unpack the frames of a recorded video as files."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ MAX_IMAGES = 100_000
 
 
 def unpacked(video: Path) -> list[Path]:
-    """Frames of a video as PNG files in the cache, unpacked once per content.
+    """Unpack the frames of a video as PNG files into the cache, once per content.
 
     Raises:
-        InputError: it cannot be read, or there is no cache to unpack it into.
+        InputError: the video cannot be read, or there is no cache folder.
     """
     home = cache_folder()
     if home is None:

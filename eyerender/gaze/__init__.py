@@ -2,8 +2,8 @@
 
     gaze = er.gaze.Regression("R3").fit(truth, rig).predict(found, rig)
 
-Every estimator follows the protocol `GazeEstimator`, and so may a class of your own. The names in `__init__.pyi` load
-their modules on first use.
+Every estimator implements the protocol `GazeEstimator`; a class of your own may do so too. The names in `__init__.pyi`
+load their modules on first use.
 """
 
 import lazy_loader

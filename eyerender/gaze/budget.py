@@ -1,4 +1,4 @@
-"""The error budget of gaze: what the eye model, the features, the image, the noise and the estimator each cost.
+"""The error budget of gaze: the error added by eye model, features, image, noise and estimator, one by one.
 
 A chain of observations of the same frames, each with one cause of error more than the one before, gives a chain of gaze
 estimates. With e the error of an estimate as a vector (horizontal, vertical) in degrees, a cause moves gaze by
@@ -40,11 +40,11 @@ Steps = Mapping[str, Observations | Sequence[Observations]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cause:
-    """What one cause adds to the error of gaze, in degrees.
+    """Gaze error added by one cause, in degrees.
 
     Attributes:
-        name: the cause.
-        frames: number of frames (of each eye, unless both are averaged) with an estimate before and after.
+        name: name of the cause.
+        frames: number of frames with an estimate before and after (each eye counts, unless both are averaged).
         seeds: number of repetitions with other noise, 1 where nothing is random.
         rms_deg: rms angle between the paired estimates.
         shift_deg: the part common to all frames of an eye; rms over the eyes.
@@ -97,10 +97,10 @@ class ErrorBudget:
     frames_missing: int
 
     def cause(self, name: str, *, transferred: bool = False) -> Cause:
-        """Find a cause by its name.
+        """Return a cause by its name.
 
         Raises:
-            InputError: there is none.
+            InputError: there is no such cause.
         """
         for cause in self.transferred if transferred else self.causes:
             if cause.name == name:
@@ -108,11 +108,11 @@ class ErrorBudget:
         raise InputError(f"has no cause {name!r}", path="causes")
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return JSON values (schema eyerender/gaze-budget/1)."""
+        """Convert to a mapping for JSON (schema eyerender/gaze-budget/1)."""
         return {"schema": BUDGET_SCHEMA, **asdict(self)}
 
     def __str__(self) -> str:
-        """Make two tables, degrees."""
+        """Format both tables as text, in degrees."""
         lines = _table("calibrated anew on each step's features", self.causes, self.total_deg, self.mean_deg)
         if self.transferred and self.transferred_total_deg is not None and self.transferred_mean_deg is not None:
             title = f"calibrated on the features of '{self.calibrated_on}', tested on the images"
@@ -130,7 +130,7 @@ def budget(
     transfer_from: str | None = None,
     binocular: bool = False,
 ) -> ErrorBudget:
-    """Split the error of gaze by cause.
+    """Split the gaze error by cause.
 
     Args:
         steps: cause -> observations of the same frames with this cause and all earlier ones, or several observations
@@ -184,7 +184,7 @@ IMAGE_CAUSES = ("extraction", "image formation", "image", "noise")
 
 
 def error_vectors_deg(direction: Floats, wanted: Floats) -> Floats:
-    """Compute errors (n, 2) of directions (n, 3) from those wanted (n, 3), to the subject's right and up, in degrees.
+    """Compute error vectors (n, 2), to the subject's right and up in degrees, from directions (n, 3) and true ones.
 
     The length is the angle between the two; the direction is that of the great circle from `wanted`.
     """
@@ -199,14 +199,14 @@ def error_vectors_deg(direction: Floats, wanted: Floats) -> Floats:
 
 
 def mean_interval(values: Floats) -> tuple[float, float, float]:
-    """Compute the mean of values (n,), n >= 2, such as paired differences, and its 95 % interval."""
+    """Compute the mean of values (n,), n >= 2, such as paired differences, and its 95 % confidence interval."""
     n, mean = len(values), float(values.mean())
     half = float(student.ppf(0.975, n - 1) * values.std(ddof=1) / np.sqrt(n))
     return mean, mean - half, mean + half
 
 
 def displacement(before: Floats, after: Floats, eye: Ints) -> tuple[float, dict[int, Floats], float, float]:
-    """Split displacements of gaze into rms, shift (2,) by eye, pattern and scatter (degrees).
+    """Split gaze displacements into rms, shift (2,) by eye, pattern and scatter, all in degrees.
 
     Args:
         before: (s, n, 2) error vectors of n frames; s is 1, or the number of seeds of `after`.
@@ -226,7 +226,7 @@ def displacement(before: Floats, after: Floats, eye: Ints) -> tuple[float, dict[
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """How error vectors are made of observations."""
+    """Calibration of an estimator and error vectors of its estimates, per row or per frame."""
 
     rig: RigGeometry
     estimator: GazeEstimator
@@ -234,7 +234,7 @@ class _Task:
     binocular: bool
 
     def fits(self, learnt: Observations) -> list[tuple[Bools, GazeEstimator]]:
-        """Compute calibrations, each with the rows that it is tested on."""
+        """Calibrate on observations; return each calibration with the rows to test it on."""
         fixation = learnt.index.fixation
         if self.calibration is not None:
             tests = [~np.isin(fixation, self.calibration)]
@@ -243,7 +243,7 @@ class _Task:
         return [(np.asarray(test), self.estimator.fit(learnt.take(~test), self.rig)) for test in tests]
 
     def errors(self, fits: Sequence[tuple[Bools, GazeEstimator]], seen: Observations) -> Floats:
-        """Compute error vectors (n, 2) of what is `seen`; NaN where there is no estimate."""
+        """Compute error vectors (n, 2) of observations; NaN where there is no estimate."""
         out = np.full((len(seen), 2), np.nan)
         for test, fitted in fits:
             out[test] = self._predicted(fitted, seen.take(test))
@@ -258,7 +258,7 @@ class _Task:
         return np.asarray(rows)
 
     def eyes(self, seen: Observations) -> Ints:
-        """Compute the eye of each row, or `_BOTH` of each frame."""
+        """Return the eye of each row, or `_BOTH` for each frame."""
         if self.binocular:
             return np.full(len(np.unique(seen.index.frame)), _BOTH)
         return np.asarray(seen.index.eye)
@@ -274,7 +274,7 @@ class _Task:
 
     @staticmethod
     def _of_frames(seen: Observations, errors: Floats) -> Floats:
-        """Compute the mean of both eyes' error vectors of each frame, as of points on a screen."""
+        """Average both eyes' error vectors of each frame, as points on a screen."""
         points = GazePoints.of(np.concatenate([errors, np.where(np.isnan(errors[:, :1]), np.nan, 0.0)], axis=1))
         return np.asarray(binocular_average(seen, points)[1].point_mm[:, :2])
 

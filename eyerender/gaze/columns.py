@@ -1,4 +1,4 @@
-"""Which column of a table means what: as a person says, or as the columns' names say."""
+"""The meaning of a table's columns: given by the user or recognised from their names."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ColumnPair = tuple[ColumnName, ColumnName]
 
 
 class EyeColumns(Spec):
-    """The columns of one eye."""
+    """Column names of one eye."""
 
     pupil: ColumnPair | None = Field(default=None, description="x and y of the pupil's centre, px")
     pupil_axes: ColumnPair | None = Field(default=None, description="lengths of the ellipse's axes, px")
@@ -35,7 +35,7 @@ class EyeColumns(Spec):
 
 
 class CsvColumns(FileSpec, EyeColumns):
-    """The names of a table's columns that are not recognised automatically, and their units."""
+    """Names and units of columns that are not recognised automatically."""
 
     time: ColumnName | None = Field(
         default=None, description="rows with the same time are one frame, if there is no `frame`"
@@ -71,7 +71,7 @@ class CsvColumns(FileSpec, EyeColumns):
     delimiter: Literal[",", ";", "\t", "|", " "] | None = Field(default=None, description="default: as the header says")
 
 
-# The names that are found, without their units, in lower case and with _ in place of everything else.
+# Recognised names, without units, in lower case and with _ in place of everything else.
 _PLAIN_NAMES = {
     "time": (
         "time",
@@ -103,10 +103,10 @@ _SIDES = re.compile(r"^(right|left|r|l)_(.*)$|^(.*)_(right|left|r|l)$")
 
 
 def completed(given: CsvColumns, header: list[str], told: str, problems: Problems) -> CsvColumns:
-    """Return the columns as given, completed by those that are found by their names.
+    """Complete the given columns by those recognised from their names.
 
     Raises:
-        InputError: a given column does not exist, or two could be meant.
+        InputError: a given column does not exist, or a name is ambiguous.
     """
     data = given.to_mapping()
     named = {name for name in _names_in(data) if name is not None}
@@ -127,7 +127,7 @@ def completed(given: CsvColumns, header: list[str], told: str, problems: Problem
 
 
 def _names_in(data: Mapping[str, Any]) -> set[str | None]:
-    """List names of columns in a mapping of columns."""
+    """Return the column names in a mapping of columns."""
     keys = {*EyeColumns.model_fields, "time", "frame", "fixation", "camera", "eye", "light", "target"}
     out: set[str | None] = set()
     for key, value in data.items():
@@ -140,7 +140,7 @@ def _names_in(data: Mapping[str, Any]) -> set[str | None]:
 
 
 class _Names:
-    """The columns of a table by their bare names: lower case, without units."""
+    """Columns of a table by their bare names: lower case, without units."""
 
     def __init__(self, problems: Problems) -> None:
         self.columns: dict[str, list[str]] = {}
@@ -150,7 +150,7 @@ class _Names:
         self.columns.setdefault(_UNIT.sub("", bare), []).append(column)
 
     def all_of(self, *bare: str) -> list[str] | None:
-        """Return columns of names that belong together; None where one is missing."""
+        """Return the columns of names that belong together; None if one is missing."""
         if not all(name in self.columns for name in bare):
             return None
         for name in bare:
@@ -160,16 +160,16 @@ class _Names:
         return [self.columns[name][0] for name in bare]
 
     def first(self, choices: Iterable[tuple[str, ...]]) -> list[str] | None:
-        """Return columns of the first choice that is there."""
+        """Return the columns of the first choice that the table has."""
         return next((found for choice in choices if (found := self.all_of(*choice))), None)
 
     def one(self, choices: Iterable[str]) -> str | None:
-        """Return the column of the first name that is there."""
+        """Return the column of the first name that the table has."""
         found = self.first((name,) for name in choices)
         return found[0] if found else None
 
     def glints(self) -> list[list[str] | None] | None:
-        """Return columns of the glint of each light; without a light 0, the numbers in the names begin with 1."""
+        """Return the glint columns of each light; if no name has the number 0, lights are counted from 1."""
         named = {(int(m[1]), m[2]): name for name in self.columns if (m := _GLINT.fullmatch(name))}
         if not named:
             single = self.first((f"{glint}_x", f"{glint}_y") for glint in ("glint", "cr"))
@@ -180,7 +180,7 @@ class _Names:
         return [self.all_of(x, y) if x and y else None for x, y in pairs]
 
     def eye(self) -> dict[str, Any]:
-        """Return the keys of `EyeColumns` that are found."""
+        """Return the `EyeColumns` that are recognised, by key."""
         axes = self.first(_AXES)
         found = {
             "pupil": self.first((f"{name}_x", f"{name}_y") for name in _CENTRES),
@@ -195,12 +195,12 @@ class _Names:
 
 
 def _found(header: list[str], problems: Problems) -> dict[str, Any]:
-    """Return the columns whose names say what they are."""
+    """Return the columns that are recognised from their names."""
     whole, sides = _Names(problems), {side: _Names(problems) for side in EYES}
     for column in header:
         bare = re.sub(r"[^a-z0-9]+", "_", column.lower()).strip("_")
         if bare.endswith("diameter_mm"):
-            continue  # a size in mm is no size in the image
+            continue  # a size in mm is not a size in the image
         whole.add(bare, column)
         split = _SIDES.match(_UNIT.sub("", bare)) or _SIDES.match(bare)
         if split:

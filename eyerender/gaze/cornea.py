@@ -44,11 +44,11 @@ class CorneaCentres(ArrayValue):
 
 
 def from_all_glints(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats) -> CorneaCentres:
-    """Compute the method A: the k that minimise sum_{i<j} |c_i(k_i) - c_j(k_j)|^2; the centre is the mean of the c_i.
+    """Compute the centre by method A: minimise sum_{i<j} |c_i(k_i) - c_j(k_j)|^2 over k; return the mean of the c_i.
 
-    Damped Gauss-Newton on the m distances of every row at once, from the best of a coarse search. The cost is that of
-    the deviations from the mean, which is the same up to the factor m:
-    sum_{i<j} |c_i - c_j|^2 = m sum_i |c_i - mean|^2.
+    Damped Gauss-Newton on the m distances of all rows at once, starting from the best of a coarse search. It minimises
+    the deviations from the mean, which is the same cost up to the factor m: sum_{i<j} |c_i - c_j|^2 = m sum_i |c_i -
+    mean|^2.
 
     Args:
         origin_mm: (..., 3) nodal points.
@@ -84,7 +84,7 @@ def from_all_glints(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radi
         c, slope = np.where(pick, c_new, c), np.where(pick, slope_new, slope)
         deviation, cost = np.where(pick, deviation_new, deviation), np.where(better, cost_new, cost)
         damping = np.where(better, np.maximum(damping * 0.1, 1e-14), np.maximum(damping * 30, 1e-10))
-        # Newton's steps square the error: after one of 1e-9 only rounding is left. A row that no step improves is
+        # Newton's steps square the error: after a step of 1e-9 only rounding is left. A row that no step improves is
         # finished.
         if bool(np.all((settled <= 1e-9) | (damping > 1.0) | ~np.isfinite(settled))):
             break
@@ -94,11 +94,12 @@ def from_all_glints(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radi
 
 
 def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple[Floats, Bools]:
-    """Unit direction (..., 3) from the camera to the cornea's centre, without any eye parameter, and whether it exists.
+    """Compute the unit direction (..., 3) from the camera to the cornea's centre, and whether it is defined.
 
-    Each plane of camera, light and glint contains the centre: b is normal to all (L_i - O) x u_i. With two lights b =
-    unit[((L_1 - O) x u_1) x ((L_2 - O) x u_2)] (Guestrin & Eizenman 2006; Shih, Wu & Liu 2000); with more it is the
-    right singular vector of the smallest singular value. There is none where camera, lights and centre are coplanar.
+    No eye parameter is needed. Each plane of camera, light and glint contains the centre: b is normal to all (L_i - O)
+    x u_i. With two lights b = unit[((L_1 - O) x u_1) x ((L_2 - O) x u_2)] (Guestrin & Eizenman 2006; Shih, Wu & Liu
+    2000); with more it is the right singular vector of the smallest singular value. It is undefined where camera,
+    lights and centre are coplanar.
     """
     normals = unit(np.cross(light_mm - origin_mm[..., None, :], glints))
     if glints.shape[-2] == 2:
@@ -115,7 +116,7 @@ def line_to_centre(origin_mm: Floats, glints: Floats, light_mm: Floats) -> tuple
 
 
 def from_plane(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats) -> CorneaCentres:
-    """Compute the method B: c = O + k_c b, with k_c from the mirror condition of the first glint.
+    """Compute the centre by method B: c = O + k_c b, with k_c from the mirror condition of the first glint.
 
     In the plane of camera, light and glint, with e the unit vector normal to b: (c(k) - O) . e = k u.e - R n(k).e = 0.
     Newton's method solves it for the distance k of the mirror point.
@@ -157,7 +158,7 @@ def from_plane(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm
 def optic_axis(
     origin_mm: Floats, *, pupil: Floats, centre_mm: Floats, radius_mm: Floats, distance_mm: Floats, index: Floats
 ) -> tuple[Floats, Bools, Bools]:
-    """Return the optic axis w (..., 3): from the cornea's centre through the pupil centre.
+    """Compute the optic axis w (..., 3), from the cornea's centre through the pupil centre.
 
     r = near intersection of the pupil ray with sphere(c, R), refracted (1 -> n) into t; p = r + k_p t on sphere(c, K);
     w = unit(p - c)                                                               (Guestrin & Eizenman 2006, section II)
@@ -191,7 +192,7 @@ def _radii(radius_mm: Floats, shape: tuple[int, ...]) -> Floats:
 
 
 def _near_intersection(origin: Floats, *, ray: Floats, centre: Floats, radius: Floats) -> tuple[Floats, Bools]:
-    """Find where unit rays first meet spheres, and whether they do; the nearest point of the ray where they do not."""
+    """Intersect unit rays with spheres at the near side; return the nearest point of the ray and False if it misses."""
     m = origin - centre
     b = (m * ray).sum(axis=-1, keepdims=True)
     square = b * b - (m * m).sum(axis=-1, keepdims=True) + radius * radius
@@ -216,7 +217,7 @@ def _mirror_centres(
 
 
 def _coarse(origin: Floats, *, glints: Floats, light_mm: Floats, radius: Floats) -> Floats:
-    """Compute starting distances (..., m): all equal, with the value of a coarse grid whose centres disagree least."""
+    """Compute starting distances (..., m), all equal: the value on a coarse grid where the centres disagree least."""
     m = glints.shape[-2]
     k = _START.reshape(-1, *([1] * radius.ndim)) * radius
     c, _ = _mirror_centres(
@@ -232,7 +233,7 @@ def _coarse(origin: Floats, *, glints: Floats, light_mm: Floats, radius: Floats)
 
 
 def _solved(system: Floats, right: Floats) -> Floats:
-    """Solve small symmetric systems (..., m, m), by Cramer's rule for two, which most rigs have."""
+    """Solve small symmetric systems (..., m, m), with Cramer's rule for the common case of two unknowns."""
     if system.shape[-1] == 2:
         a, b, d = system[..., 0, 0], system[..., 0, 1], system[..., 1, 1]
         first, second = d * right[..., 0] - b * right[..., 1], a * right[..., 1] - b * right[..., 0]

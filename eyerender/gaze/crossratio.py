@@ -41,7 +41,7 @@ class CrossRatio:
     alphas: Mapping[int, Floats] = field(default_factory=dict)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate alpha_i of each eye on its fixations of the four corner lights; repeated ones are averaged.
+        """Calibrate alpha_i of each eye on fixations of the four corner lights; average repeated fixations.
 
         Raises:
             InputError: no usable observation of an eye looks at one of the corner lights.

@@ -1,9 +1,9 @@
-"""How well calibration targets determine a polynomial, with a warning where they do not.
+"""Check how well calibration targets determine a polynomial, and warn if they do not.
 
-The functions that the terms span are scaled to a mean square of 1 over the area of the features. The singular values of
-their design at the calibration's features are then the shares of a function's size that the calibration sees: 1 for a
-function seen as well as the whole area, and 0 for one that vanishes at every feature, such as x^3 - x on three columns.
-An error in the features of the calibration grows by the inverse of the smallest share.
+The functions that the terms span are scaled to a mean square of 1 over the area of the features. A singular value of
+the design matrix at the calibration's features is then the visible share of a function: 1 if the features see as much
+of it as the whole area would, and 0 if it vanishes at every feature, such as x^3 - x on three columns. An error in the
+features of the calibration grows by the inverse of the smallest share.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from ..errors import InputWarning, Warn
 Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
 
 LEAST_SHARE = 0.2
-"""Share of a function's size below which the calibration does not determine it: errors grow fivefold."""
-_STEPS = 15  # a side of the grid that stands for the area; more than twice the highest power of Table 2
+"""Visible share of a function below which the calibration does not determine it: errors grow fivefold."""
+_STEPS = 15  # points per side of the grid that stands for the area; more than twice the highest power of Table 2
 
 
 class UndeterminedWarning(UserWarning):
-    """The targets of a calibration determine fewer terms than the estimator has."""
+    """The calibration targets determine fewer terms than the estimator has."""
 
 
 def monomials(v: Floats, terms: Terms) -> Floats:
@@ -34,7 +34,7 @@ def monomials(v: Floats, terms: Terms) -> Floats:
 
 
 def seen_shares(vectors: Floats, terms: Terms) -> Floats:
-    """Compute the visible shares (m,) of functions of m terms at vectors (n, 2), in falling order."""
+    """Compute how much vectors (n, 2) see of the functions that m terms span: shares (m,), in descending order."""
     low, high = vectors.min(axis=0), vectors.max(axis=0)
     shares = np.zeros(len(terms))
     if not (high > low).all():
@@ -50,12 +50,12 @@ def seen_shares(vectors: Floats, terms: Terms) -> Floats:
 
 
 def is_determined(vectors: Floats, terms: Iterable[Terms]) -> bool:
-    """Return whether vectors (n, 2) of a calibration determine polynomials of these terms."""
+    """Return whether calibration vectors (n, 2) determine polynomials of these terms."""
     return all(seen_shares(vectors, part)[-1] >= LEAST_SHARE for part in terms)
 
 
 def shortfall(vectors: Floats, terms: Iterable[Terms], what: str) -> str | None:
-    """Say why features (n, 2) of a calibration do not determine the polynomials of `what`; None where they do."""
+    """Return why features (n, 2) of a calibration do not determine the polynomials of `what`; None if they do."""
     for part in terms:
         shares = seen_shares(vectors, part)
         if shares[-1] < LEAST_SHARE:
@@ -67,7 +67,7 @@ def shortfall(vectors: Floats, terms: Iterable[Terms], what: str) -> str | None:
 
 @contextmanager
 def undetermined_to(warn: Warn | None, source: str) -> Iterator[None]:
-    """Pass the `UndeterminedWarning`s of the block to `warn`, one of each text, after the block; None drops them."""
+    """Collect each distinct `UndeterminedWarning` of the block and pass it to `warn` afterwards; None discards them."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UndeterminedWarning)
         yield

@@ -36,7 +36,7 @@ class DirectionRegression:
     Args:
         function: R1 to R12 of Table 2, or the terms of azimuth and of elevation.
         feature: "pupil-glint", the vector from the mean of the glints to the pupil, or "pupil", its centre alone.
-        lights: lights of the glints; None: all of the rig's. An observation that lacks one of them has no vector.
+        lights: lights of the glints; None: all of the rig's. An observation without one of these glints has no vector.
         fits: by eye (0 right, 1 left), set by `fit`.
     """
 
@@ -52,7 +52,7 @@ class DirectionRegression:
 
     @property
     def _polynomial(self) -> Regression:
-        # A feature in pixels may lie far from 0, so the polynomial is about its mean.
+        # A feature in pixels may lie far from 0, so the polynomial is centred on its mean.
         return Regression(self.function, normalised=False, centred=True)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
@@ -107,7 +107,7 @@ class DirectionRegression:
         return self.predict_rays(observations, rig).on_screen(screen)
 
     def features(self, observations: Observations, rig: RigLike) -> tuple[Floats, Objects]:
-        """Compute features (n, 2) px, and the reasons why there are none (n,), None where there are."""
+        """Compute features (n, 2) px, and the reasons (n,) where there are none; None elsewhere."""
         built = rig.build()
         _, unknown = camera_of(observations, built)
         lights = () if self.feature == "pupil" else chosen_lights(built, self.lights, 1)

@@ -33,9 +33,9 @@ class GazePoints(ArrayValue):
 
     @classmethod
     def of(cls, point_mm: ArrayLike, reason: Objects | None = None) -> GazePoints:
-        """Make gaze points (n, 3) mm whose status follows from the reasons (n,), None where there is an estimate.
+        """Create gaze points (n, 3) mm from reasons (n,), which are None where there is an estimate.
 
-        A point that is not finite is missing, whatever its reason.
+        A point that is not finite counts as missing, even without a reason.
         """
         points = np.asarray(point_mm, dtype=float)
         reasons = np.full(len(points), None, dtype=object) if reason is None else reason.copy()
@@ -68,14 +68,14 @@ class GazeRays(ArrayValue):
 
     @classmethod
     def of(cls, origin_mm: Floats, direction: Floats, reason: Objects) -> GazeRays:
-        """Make rays that are NaN wherever there is a reason."""
+        """Create rays, set to NaN wherever there is a reason."""
         ok = np.array([r is None for r in reason], dtype=bool)[:, None]
         return cls(
             frozen(np.where(ok, origin_mm, np.nan)), frozen(np.where(ok, direction, np.nan)), frozen(reason, object)
         )
 
     def on_screen(self, screen: ScreenPlane, name: str = "the gaze ray") -> GazePoints:
-        """Compute points where the rays meet the screen's plane; `name` says in reasons what the rays are."""
+        """Intersect the rays with the screen's plane; `name` describes the rays in reasons."""
         points, hits = screen.intersect(self.origin_mm, self.direction)
         reason = self.reason.copy()
         reason[(reason == None) & ~hits] = f"{name} does not meet the screen"  # noqa: E711
@@ -84,7 +84,7 @@ class GazeRays(ArrayValue):
 
 @runtime_checkable
 class GazeEstimator(Protocol):
-    """Interface of gaze estimators. A user's own class with this interface can be used like the package's own.
+    """Interface of gaze estimators. Your own class with this interface can be used like the package's own.
 
     An estimator is a value: `fit` does not change it and returns a fitted copy. The rig may be an authored `Rig` or a
     computed `RigGeometry`; `rig.build()` converts both to the latter.
@@ -105,16 +105,16 @@ class GazeEstimator(Protocol):
 
 @runtime_checkable
 class RayEstimator(GazeEstimator, Protocol):
-    """An estimator of rays. It can be calibrated and used without a screen, as head-mounted rigs have none."""
+    """Interface of estimators that return rays. They work without a screen, which head-mounted rigs lack."""
 
     def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
-        """Estimate rays of gaze of observations, one row each."""
+        """Estimate a gaze ray for each observation."""
         ...
 
 
 @runtime_checkable
 class StoredEstimator(GazeEstimator, Protocol):
-    """A user's own estimator whose calibration can be written to a file and read back.
+    """Interface of your own estimators whose calibration can be written to a file and read back.
 
     `from_mapping(to_mapping())` predicts the same.
     """
@@ -125,12 +125,12 @@ class StoredEstimator(GazeEstimator, Protocol):
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any]) -> Self:
-        """Make the calibrated estimator; raises `InputError` or `ValueError` for data that it did not write."""
+        """Create the calibrated estimator; raise `InputError` or `ValueError` for data that it did not write."""
         ...
 
 
 def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Observations, GazePoints]:
-    """Compute the mean of both eyes' gaze points of each frame, and the frames' first observations.
+    """Average both eyes' gaze points of each frame; also return the row of each frame's first observation.
 
     A frame in which either eye is missing has no binocular estimate: the mean of one eye would be biased towards it.
     """
@@ -147,12 +147,12 @@ def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Obs
 
 
 def ray_errors_deg(observations: Observations, rays: GazeRays) -> Floats:
-    """Angle (n,) between each ray and the line from its origin to the target, in degrees; NaN where one is missing."""
+    """Compute the angle (n,), degrees, between each ray and the line from its origin to the target; NaN if unknown."""
     return angular_error_deg(rays.origin_mm + rays.direction, observations.index.target_mm, rays.origin_mm)
 
 
 def angular_error_deg(point_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> Floats:
-    """Angle at `from_mm` between the directions to estimate and target, (n,) degrees; arguments (n, 3) or (3,) mm.
+    """Compute the angle (n,) in degrees, seen from `from_mm`, between estimate and target; arguments (n, 3) or (3,) mm.
 
     It uses atan2 of cross and dot product, which is accurate at small angles where arccos is not.
     """

@@ -31,7 +31,7 @@ from .search import Misses, calibrate
 
 # Chebyshev degree of the centre as a function of sqrt(R); its last terms are below 1e-6 mm over 3 to 20 mm.
 _DEGREE = 14
-_OFF_SCREEN_MM = 1e4  # miss, in a search, of a visual axis that never meets the screen's plane
+_OFF_SCREEN_MM = 1e4  # miss assigned, in a search, to a visual axis that never meets the screen's plane
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class GuestrinEizenman:
     calibrations: Mapping[int, Calibration] = field(default_factory=dict)
 
     def with_parameters(self, parameters: Mapping[int, EyeParameters]) -> Self:
-        """Make an estimator with given parameters by eye (0 right, 1 left), without a calibration."""
+        """Create an estimator with known parameters by eye (0 right, 1 left), without a calibration."""
         known = {
             k: Calibration(
                 parameters=p,
@@ -78,9 +78,8 @@ class GuestrinEizenman:
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate R, K, alpha, beta (and n) of each eye by bounded nonlinear least squares.
 
-        With a screen, the misses are those of gaze points on it, in mm. Without one, each target is missed on the plane
-        through it that is perpendicular to the line from the eye, in units of an angle, so that near and far targets
-        count alike.
+        With a screen, the misses are measured on it, in mm. Without one, each miss is measured on the plane through the
+        target perpendicular to the line from the eye, and scaled to an angle, so that near and far targets count alike.
 
         Raises:
             InputError: there are too few usable targets to determine the parameters.
@@ -91,7 +90,7 @@ class GuestrinEizenman:
     def restarts(
         self, observations: Observations, rig: RigLike, starts: Sequence[EyeParameters]
     ) -> dict[int, list[Calibration]]:
-        """Calibrate each eye from several starts, to see whether the search finds a single minimum."""
+        """Calibrate each eye from several starts, to check that the search finds a single minimum."""
         models = self._models(observations, rig.build())
         return {eye: [model.calibrate(start) for start in starts] for eye, model in models.items()}
 
@@ -106,7 +105,7 @@ class GuestrinEizenman:
         return self.visual_axes(observations, rig.build())
 
     def visual_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
-        """Compute visual axes from the centre of corneal curvature, in the direction of gaze."""
+        """Compute visual axes: rays from the centre of corneal curvature in the direction of gaze."""
         optic = self.optic_axes(observations, rig)
         direction = np.full((len(observations), 3), np.nan)
         for eye, calibration in self.calibrations.items():
@@ -117,7 +116,7 @@ class GuestrinEizenman:
         return GazeRays.of(optic.origin_mm, direction, optic.reason)
 
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
-        """Compute optic axes from the centre of corneal curvature through the pupil centre."""
+        """Compute optic axes: rays from the centre of corneal curvature through the pupil centre."""
         if not self.calibrations:
             raise InputError("the estimator is not calibrated; call fit first")
         rays = feature_rays(observations, rig, self.lights, least=2)
@@ -149,13 +148,13 @@ class GuestrinEizenman:
         return find(rays.origin_mm[rows], glints=rays.glints[rows], light_mm=rays.light_mm, radius_mm=radius)
 
     def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
-        """Compute visual axes (..., 3) of optic axes w (..., 3); alpha towards +y and beta upwards, in radians."""
+        """Turn optic axes w (..., 3) to visual axes (..., 3): by alpha towards +y and by beta upwards, in radians."""
         theta = np.arctan2(w[..., 1], w[..., 0]) + alpha
         phi = np.arcsin(np.clip(w[..., 2], -1.0, 1.0)) + beta
         return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
 
     def search(self, misses: Misses, start: EyeParameters) -> Calibration:
-        """Find one eye's parameters with the least sum of squared misses, from `start`."""
+        """Minimise the sum of squared misses over one eye's parameters, from `start`."""
         return calibrate(misses, start, self.bounds, self.free, self.tolerance)
 
     @property
@@ -185,7 +184,7 @@ class GuestrinEizenman:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Goals:
-    """Targets (n) as points of planes.
+    """Targets (n) as points on planes.
 
     Attributes:
         origin_mm: a point of the plane, (3,) for a screen, else (n, 3).
@@ -203,13 +202,13 @@ class _Goals:
 
     @classmethod
     def of(cls, observations: Observations, screen: ScreenPlane | None) -> _Goals:
-        """Return targets on the screen, or on planes of their own."""
+        """Express targets on the screen's plane, or each on its own plane if there is no screen."""
         index, targets = observations.index, observations.index.target_mm
         if screen is not None:
             axes = np.stack([screen.right, screen.up, screen.normal], axis=-1)
             off = -((targets - screen.centre_mm) @ screen.normal)
             wanted = targets_on_screen(observations, screen)
-            # Targets that are farther off have been projected.
+            # Targets farther from the screen than this have been projected onto it.
             off = np.where(np.abs(off) <= OFF_PLANE_MM * (1 + 1e-9), off, 0.0 * off)
             return cls(origin_mm=screen.centre_mm, axes=axes, wanted=wanted, off_plane=off, weight=None)
         line = targets - index.eye_position_mm - index.head_mm
@@ -228,7 +227,7 @@ class _Goals:
 
     @property
     def known(self) -> Bools:
-        """Whether there is a target, and its plane is known, (n,)."""
+        """Whether the target and its plane are known, (n,)."""
         return np.asarray(np.isfinite(self.wanted).all(axis=1) & np.isfinite(self.off_plane))
 
     def take(self, rows: Ints) -> _Goals:
@@ -243,7 +242,7 @@ class _Goals:
         )
 
     def local(self, vectors: Floats) -> Floats:
-        """Compute vectors (P, n, 3) in the planes' axes."""
+        """Rotate vectors (P, n, 3) into the planes' axes."""
         return vectors @ self.axes if self.axes.ndim == 2 else np.einsum("pni,nij->pnj", vectors, self.axes)
 
 
@@ -261,7 +260,7 @@ class _Model:
         self.estimator, self.goals, self.sign = estimator, goals, sign
         self.origin, self.pupil = rays.origin_mm[rows], rays.pupil[rows]
         low, high = estimator.bounds.lower.cornea_radius_mm, estimator.bounds.upper.cornea_radius_mm
-        # The centre depends on R alone, and smoothly, so one batch of solutions serves every step of every search. Its
+        # The centre depends smoothly on R alone, so one batch of solutions serves every step of every search. Its
         # distance is nearly proportional to sqrt(R), because the glints' separation is proportional to R over the
         # distance squared.
         self.middle, self.half = 0.5 * (np.sqrt(low) + np.sqrt(high)), 0.5 * (np.sqrt(high) - np.sqrt(low))
@@ -296,7 +295,7 @@ class _Model:
 
 
 def _why(found: CorneaCentres, meets: Bools, inside: Bools) -> Objects:
-    """Compute the reason why an observation has no optic axis; None where it has one."""
+    """Return why an observation has no optic axis; None if it has one."""
     out = np.full(len(meets), None, dtype=object)
     out[~inside] = "the refracted pupil ray misses the sphere that holds the pupil"
     out[~meets] = "the pupil ray misses the cornea"

@@ -60,6 +60,6 @@ class Hennessey:
         return correction.apply_to_rays(observations, self.optic_axes(observations, rig), rig)
 
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
-        """Compute optic axes of the assumed eye, from the centre of corneal curvature."""
+        """Compute optic axes of the assumed eye: rays from the centre of corneal curvature."""
         eyes = {int(e): self.parameters for e in np.unique(observations.index.eye)}
         return GuestrinEizenman(lights=self.lights).with_parameters(eyes).optic_axes(observations, rig)

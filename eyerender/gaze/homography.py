@@ -31,7 +31,7 @@ _DEGENERATE = 1e-10  # ratio of singular values below which points determine no 
 
 @dataclass(frozen=True, slots=True)
 class Homography:
-    """Pupil centre normalised by four glints, mapped to the screen.
+    """Map the pupil centre to the screen after normalising it by four glints.
 
     Args:
         lights: the four lights in the order top left, top right, bottom right, bottom left.
@@ -87,7 +87,7 @@ class Homography:
         return GazePoints.of(screen.world(on_screen), reason)
 
     def normalised(self, observations: Observations, rig: RigGeometry) -> tuple[Floats, Objects]:
-        """Compute the pupil centre in the unit square of the glints (n, 2), and the reason why there is none (n,)."""
+        """Compute the pupil centre in the unit square of the glints (n, 2), and why there is none (n,)."""
         chosen_lights(rig, self.lights, 4)
         glints, reason = glints_of(observations, self.lights)
         H, ok = homography(glints, np.broadcast_to(SQUARE, glints.shape))
@@ -99,7 +99,7 @@ class Homography:
 
 
 def homography(source: ArrayLike, target: ArrayLike, *, conditioned: bool = False) -> tuple[Floats, Bools]:
-    """Homographies (..., 3, 3) of unit norm from points (..., k, 2) to (..., k, 2), k >= 4, and whether they exist.
+    """Compute homographies (..., 3, 3) of unit norm between points (..., k, 2), k >= 4, and whether they exist.
 
     Four points determine it exactly; for more it is the least-squares solution of the algebraic error. It does not
     exist where the points do not determine it (NaN among them, three of four on a line).
@@ -119,7 +119,7 @@ def homography(source: ArrayLike, target: ArrayLike, *, conditioned: bool = Fals
     design = np.concatenate([first, second], axis=-2)
     finite = np.isfinite(design).all(axis=(-1, -2))
     _, values, vt = np.linalg.svd(np.where(finite[..., None, None], design, 0.0))
-    # Without these scales the columns' units, px against 1, would decide what counts as degenerate.
+    # Without these scales, the units of the columns (px against 1) would decide what counts as degenerate.
     ok = finite & (_spread(p) > 1e-6) & (_spread(q) > 1e-6)
     with np.errstate(invalid="ignore", divide="ignore"):
         ok &= values[..., 7] / values[..., 0] > _DEGENERATE**2
@@ -128,7 +128,7 @@ def homography(source: ArrayLike, target: ArrayLike, *, conditioned: bool = Fals
 
 
 def transformed(H: Floats, points: ArrayLike) -> tuple[Floats, Bools]:
-    """Apply H (..., 3, 3) to points (..., 2) or (..., k, 2); also returns whether the result is finite."""
+    """Apply H (..., 3, 3) to points (..., 2) or (..., k, 2); also return whether the result is finite."""
     p = np.asarray(points, dtype=float)
     many = p.ndim > H.ndim - 1 or H.ndim == 2
     h = np.concatenate([p, np.ones((*p.shape[:-1], 1))], axis=-1)
@@ -155,7 +155,7 @@ def _conditioning(points: Floats) -> Floats:
 
 
 def _spread(points: Floats) -> Floats:
-    """Compute the relative measure of how well k >= 4 points (..., k, 2) are in general position; 0 if they are not.
+    """Measure how well k >= 4 points (..., k, 2) are in general position; 0 if they are degenerate.
 
     With four points it is the smallest triangle's area over the square of their extent. With more it is the smaller
     extent over the larger one.

@@ -1,4 +1,4 @@
-"""Maximum likelihood: gaze by fits of a traced eye model to outlines and glints.
+"""Maximum-likelihood gaze: fit a traced eye model to pupil outlines and glints.
 
 A calibration fits the person (corneal radius, asphericity and toricity, pupil depth, centre, ellipticity and shift with
 size, kappa, centre of rotation) with the priors of a population, together with gaze, pupil and slippage of every frame.
@@ -31,10 +31,10 @@ OUTLINE_PX, GLINT_PX = 0.2, 0.1
 
 @dataclass(frozen=True, slots=True)
 class MaximumLikelihood:
-    """Fits of an eye model to the features of every frame.
+    """Estimate gaze by fitting an eye model to the features of every frame.
 
     Args:
-        eye: name of the eye model that the fits begin with.
+        eye: name of the eye model from which the fits start.
         slippage_mm: standard deviation of the eye's position in a frame about the one in the record; 0: it is exact.
         persons: numbers of the person (17,) by eye (0 right, 1 left), set by `fit`.
     """
@@ -87,7 +87,7 @@ class MaximumLikelihood:
         return self.slippage_mm if self.slippage_mm > 0 else "known"
 
     def _fits(self, observations: Observations, rig: RigLike, unknowns: object, *, targets: bool) -> dict[int, EyeFit]:
-        """Compute fits by eye; of known persons where the estimator has them and no targets are used."""
+        """Fit each eye's frames; the person's numbers are fixed if they are known and no targets are used."""
         from ..design.fit import Options, fit_one
         from ..design.noise import FeatureNoise
         from ..design.unknowns import Unknowns

@@ -1,4 +1,4 @@
-"""A user's own estimator class, given as `module:Class`, with one-line errors for its mistakes."""
+"""Load a user's own estimator class, given as `module:Class`, and turn its mistakes into one-line errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .estimate import GazeEstimator, GazePoints, StoredEstimator
 
 @dataclass(frozen=True, slots=True)
 class OwnEstimator:
-    """An estimator of a user's own class with the interface `GazeEstimator`.
+    """Wrapper of a user's own class with the interface `GazeEstimator`.
 
     Every exception of its methods becomes an `InputError` that names the class. Their results are checked.
     """
@@ -27,7 +27,7 @@ class OwnEstimator:
 
     @classmethod
     def load(cls, reference: str, *, source: str = "") -> Self:
-        """Import `module:Class` and make an object of it without arguments.
+        """Import `module:Class` and create an object without arguments.
 
         Raises:
             InputError: there is no such class, it needs arguments, or it has no `fit` and `predict`.
@@ -37,7 +37,7 @@ class OwnEstimator:
             return cls(reference, kind())
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the name of the class, as in calibration files."""
+        """Return the name of the class, as stored in calibration files."""
         return {"reference": self.reference}
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
@@ -60,10 +60,10 @@ class OwnEstimator:
         return gaze
 
     def check_storable(self) -> None:
-        """Check, before a calibration, that it could be written to a file.
+        """Check before a calibration that it can be written to a file.
 
         Raises:
-            InputError: it could not.
+            InputError: it cannot.
         """
         if not isinstance(self.estimator, StoredEstimator):
             reason = (
@@ -87,15 +87,15 @@ class OwnEstimator:
         return state
 
     def restored(self, state: Any) -> Self:
-        """Restore the estimator from the calibration of a file.
+        """Restore the estimator from the calibration in a file.
 
         Raises:
-            InputError: the class refuses it.
+            InputError: the class raises an error.
         """
         self.check_storable()
         assert isinstance(self.estimator, StoredEstimator)
         if not isinstance(state, dict):
-            raise InputError("must hold what to_mapping gave", path="state")
+            raise InputError("must hold the result of to_mapping", path="state")
         try:
             with _calling(self.reference, "from_mapping"):
                 estimator = type(self.estimator).from_mapping(state)
@@ -107,7 +107,7 @@ class OwnEstimator:
 def _class(reference: str, source: str) -> type[Any]:
     found = load_reference(reference, source=source)
     if not isinstance(found, type):
-        raise InputError(f"{reference} is no class", source=source)
+        raise InputError(f"{reference} is not a class", source=source)
     missing = [name for name in ("fit", "predict") if not callable(getattr(found, name, None))]
     if missing:
         reason = f"{reference} has no method {' and no method '.join(missing)} (see er.gaze.GazeEstimator)"

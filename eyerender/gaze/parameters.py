@@ -21,7 +21,7 @@ class EyeParameters:
     Attributes:
         cornea_radius_mm: corneal radius R.
         pupil_distance_mm: distance K from the centre of corneal curvature to the pupil.
-        index: index n of what lies behind the cornea.
+        index: refractive index n behind the corneal surface.
         alpha_deg: angle from the optic to the visual axis, horizontally towards the nose.
         beta_deg: the same angle upwards.
     """
@@ -38,7 +38,7 @@ class EyeParameters:
 
     @classmethod
     def of(cls, values: Sequence[float] | Floats) -> EyeParameters:
-        """Make parameters from five numbers in the order of the fields."""
+        """Create parameters from five numbers in the order of the fields."""
         return cls(**{f.name: float(v) for f, v in zip(fields(cls), values, strict=True)})
 
     def to_mapping(self) -> dict[str, float]:
@@ -71,7 +71,7 @@ class ParameterBounds:
             raise InputError("radii must be > 0 and the index >= 1")
 
     def draw(self, count: int, seed: int) -> list[EyeParameters]:
-        """Draw `count` seeded random parameters, uniform between the bounds."""
+        """Draw `count` random parameters, uniform between the bounds; equal seeds give equal draws."""
         low, high = self.lower.vector(), self.upper.vector()
         return [EyeParameters.of(v) for v in np.random.default_rng(seed).uniform(low, high, (count, len(low)))]
 

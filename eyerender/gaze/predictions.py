@@ -1,9 +1,9 @@
-"""Gaze of observations with its errors, as `gaze predict` reports it.
+"""Gaze estimates and their errors, as `gaze predict` reports them.
 
-Errors are distances on the screen's plane in mm and px, and angles at the eye in degrees. The place of the eye is the
-observations' own where they have one. Otherwise it is estimated: as the origin of the estimator's gaze ray, or as the
-centre of corneal curvature that two glints give with an average cornea. A centre is 8 mm behind the apex, which changes
-an angle at 600 mm by 1 %.
+Errors are distances on the screen's plane in mm and px, and angles at the eye in degrees. The eye's position is taken
+from the observations if they state it. Otherwise it is estimated: the origin of the estimator's gaze ray, or the centre
+of corneal curvature from two glints and an average cornea. This centre is 8 mm behind the apex, which changes an angle
+at 600 mm by 1 %.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ POINTS_SCHEMA, RAYS_SCHEMA = "eyerender/gaze/3", "eyerender/gaze/4"
 """Schemas of gaze points on a screen, and of gaze rays of a rig without one."""
 
 GIVEN, RAYS, GLINTS = "given", "rays", "glints"
-"""Where the place of an eye is from: the observations, the estimator's gaze rays, or the glints."""
+"""Sources of the eye's position: the observations, the estimator's gaze rays, or the glints."""
 
 
 def predictions(
@@ -36,17 +36,16 @@ def predictions(
     rig: RigGeometry,
     screen_px: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
-    """Estimate gaze of every observation and of every frame with two eyes.
+    """Estimate the gaze of every observation, and of every frame with both eyes.
 
-    Schema eyerender/gaze/3 holds gaze points. Errors are null without a target, those in px also without the screen's
-    size in px, and those in degrees without a place of the eye. For a rig without a screen, schema eyerender/gaze/4
-    holds the rays of an estimator of rays. Their errors are angles at their origins, and there are no binocular
-    estimates.
+    Schema eyerender/gaze/3 holds gaze points. Errors are null without a target; errors in px also without the screen's
+    size in px, and errors in degrees without the eye's position. For a rig without a screen, schema eyerender/gaze/4
+    holds gaze rays. Their errors are angles at the rays' origins, and there are no binocular estimates.
 
     Args:
         estimator: a calibrated estimator.
-        observations: what is seen.
-        rig: what saw it.
+        observations: features, with targets where they are known.
+        rig: the rig that observed them.
         screen_px: width and height of the rig's screen in px.
     """
     if rig.screen is None and isinstance(estimator, RayEstimator):
@@ -120,20 +119,20 @@ def _ray_predictions(estimator: RayEstimator, observations: Observations, rig: R
 def _screen_errors(
     observations: Observations, point_mm: Floats, screen: ScreenPlane | None, screen_px: tuple[float, float] | None
 ) -> dict[str, Floats]:
-    """Find distances (n,) on the screen's plane between gaze points (n, 3) and targets, by unit; NaN where unknown."""
+    """Compute distances (n,) on the screen's plane from gaze points (n, 3) to targets, by unit; NaN where unknown."""
     unknown = np.full(len(observations), np.nan)
     if screen is None:
         return {"mm": unknown, "px": unknown}
     try:
         miss = screen.flat(point_mm) - targets_on_screen(observations, screen)
-    except InputError:  # a target off the plane, of an eye without a place
+    except InputError:  # a target off the plane, for an eye whose position is unknown
         return {"mm": unknown, "px": unknown}
     pixels = np.full(2, np.nan) if screen_px is None else np.array(screen_px) / screen.size_mm
     return {"mm": np.linalg.norm(miss, axis=1), "px": np.linalg.norm(miss * pixels, axis=1)}
 
 
 def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGeometry) -> tuple[Floats, Objects]:
-    """Compute the place of each eye (n, 3) mm in the world, NaN where it is unknown, and where it is from (n,)."""
+    """Compute the position of each eye (n, 3) mm in the world, NaN where unknown, and its source (n,)."""
     index = observations.index
     place = np.array(index.eye_position_mm + index.head_mm)
     source = np.array([GIVEN if np.isfinite(one).all() else None for one in place], dtype=object)
@@ -154,7 +153,7 @@ def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGe
 
 
 def _corneal_centres(observations: Observations, rig: RigGeometry) -> Floats:
-    """Compute centres of corneal curvature (n, 3) from the glints and an average radius; NaN where there are none."""
+    """Compute centres of corneal curvature (n, 3) mm from the glints and an average radius; NaN where this fails."""
     centre = np.full((len(observations), 3), np.nan)
     if len(rig.lights) < 2:
         return centre
@@ -169,7 +168,7 @@ def _corneal_centres(observations: Observations, rig: RigGeometry) -> Floats:
 
 
 def _middles(observations: Observations, place: Floats, frames: Observations) -> Floats:
-    """Point (f, 3) from which the binocular error of each frame is seen: the head's, or the middle of its eyes."""
+    """Compute the vertex (f, 3) of each frame's binocular error: the head, or the point midway between the eyes."""
     _, which = np.unique(observations.index.frame, return_inverse=True)
     total = np.zeros((len(frames), 3))
     np.add.at(total, which, place)
@@ -179,7 +178,7 @@ def _middles(observations: Observations, place: Floats, frames: Observations) ->
 
 
 def _by_eye(observations: Observations, ok: Bools, errors: dict[str, Floats], source: Objects) -> list[dict[str, Any]]:
-    """Compute the summary of each eye."""
+    """Summarise the errors of each eye."""
     out = []
     for eye in np.unique(observations.index.eye):
         rows = observations.index.eye == eye
@@ -189,7 +188,7 @@ def _by_eye(observations: Observations, ok: Bools, errors: dict[str, Floats], so
 
 
 def _summary(ok: Bools, errors: dict[str, Floats], source: Objects) -> dict[str, Any]:
-    """Compute the mean, median and 95th percentile of errors, and the share of samples without an estimate."""
+    """Compute mean, median and 95th percentile of errors, and the share of samples without an estimate."""
     units = ("mm", "px", "deg")
     found = {unit: values[np.isfinite(values)] for unit, values in errors.items()}
     return {
@@ -214,7 +213,7 @@ def _errors_of(errors: dict[str, Floats], i: int) -> dict[str, float | None]:
 
 
 def _identity(observations: Observations, i: int) -> dict[str, Any]:
-    """List keys that say which observation row `i` is."""
+    """Return the keys that identify the observation of row `i`."""
     index = observations.index
     return {
         "frame": int(index.frame[i]),

@@ -27,12 +27,12 @@ class Quality(ArrayValue):
 
 
 def quality(samples_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> Quality:
-    """Compute the quality of repeated estimates.
+    """Compute accuracy and precision of repeated estimates.
 
     Args:
         samples_mm: (s, n, 3) s >= 2 samples of n fixations, in time order.
         target_mm: (n, 3) targets.
-        from_mm: (n, 3) or (3,) point from which the angles are seen.
+        from_mm: (n, 3) or (3,) vertex of the angles, usually the eye.
     """
     samples = np.asarray(samples_mm, dtype=float)
     if samples.ndim != 3 or len(samples) < 2:

@@ -1,4 +1,4 @@
-"""Rays of features, the input of the model-based estimators.
+"""Rays through image features, the input of the model-based estimators.
 
 u = direction in which the camera sees a feature;  O = its nodal point;  L = a light.
 """
@@ -19,7 +19,7 @@ from ..rig.screen import ScreenPlane
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FeatureRays(ArrayValue):
-    """Rays of observations.
+    """Rays through the features of n observations.
 
     Attributes:
         origin_mm: (n, 3) nodal points.
@@ -39,11 +39,11 @@ class FeatureRays(ArrayValue):
 def feature_rays(
     observations: Observations, rig: RigGeometry, lights: Sequence[int] | None, *, least: int
 ) -> FeatureRays:
-    """Compute rays to the pupil centre and to the glints.
+    """Compute rays through the pupil centre and the glints.
 
     Args:
         observations: n observations.
-        rig: their rig.
+        rig: the rig that observed them.
         lights: lights of the glints; None: all of the rig's.
         least: smallest number of lights that is accepted.
 
@@ -72,7 +72,7 @@ def feature_rays(
 
 
 def glints_of(observations: Observations, lights: tuple[int, ...]) -> tuple[Floats, Objects]:
-    """Compute glints (n, m, 2) px of the lights in their order, and why an observation lacks pupil or glint (n,)."""
+    """Return glints (n, m, 2) px of the lights in their order, and why an observation lacks pupil or glint (n,)."""
     reason = np.full(len(observations), None, dtype=object)
     reason[~observations.pupil.ok] = "no pupil"
     places = np.full((len(observations), len(lights), 2), np.nan)
@@ -83,10 +83,10 @@ def glints_of(observations: Observations, lights: tuple[int, ...]) -> tuple[Floa
 
 
 def chosen_lights(rig: RigGeometry, lights: Sequence[int] | None, least: int) -> tuple[int, ...]:
-    """Choose the lights to use, at least `least` different ones of the rig's.
+    """Return the lights to use: at least `least` different lights of the rig.
 
     Raises:
-        InputError: they are not different lights of the rig, or too few.
+        InputError: there are too few, or they are not different lights of the rig.
     """
     wanted = tuple(range(len(rig.lights))) if lights is None else tuple(lights)
     if len(set(wanted)) != len(wanted) or any(not 0 <= k < len(rig.lights) for k in wanted):
@@ -97,7 +97,7 @@ def chosen_lights(rig: RigGeometry, lights: Sequence[int] | None, least: int) ->
 
 
 def camera_of(observations: Observations, rig: RigGeometry) -> tuple[Ints, Objects]:
-    """Camera of each observation (n,), -1 with a reason (n,) where it is unknown; a single camera is always known."""
+    """Return each observation's camera (n,), -1 with a reason (n,) where unknown; a single camera is always known."""
     camera = np.array(observations.index.camera, dtype=np.int64)
     if len(rig.cameras) == 1:
         camera[camera < 0] = 0
@@ -109,11 +109,11 @@ def camera_of(observations: Observations, rig: RigGeometry) -> tuple[Ints, Objec
 
 
 OFF_PLANE_MM = 1.0
-"""Largest distance of a target from the screen's plane at which it counts as a point of the screen."""
+"""Largest distance from the screen's plane at which a target counts as a point of the screen."""
 
 
 def screen_of(rig: RigGeometry, instead: str = "") -> ScreenPlane:
-    """Compute the screen of the rig; `instead` says what works without one.
+    """Return the screen of the rig; `instead` names the method that works without one.
 
     Raises:
         InputError: there is none.
@@ -124,12 +124,12 @@ def screen_of(rig: RigGeometry, instead: str = "") -> ScreenPlane:
 
 
 def targets_on_screen(observations: Observations, screen: ScreenPlane) -> Floats:
-    """Compute screen points (n, 2) mm of the targets of observations; NaN without a target.
+    """Compute screen coordinates (n, 2) mm of the observations' targets; NaN without a target.
 
     A target off the plane is projected along the line from the eye, because that is where the eye looks through it.
 
     Raises:
-        InputError: a target is off the plane and the place of its eye is unknown, or the line does not meet the plane.
+        InputError: a target is off the plane, and its eye's position is unknown or the line misses the plane.
     """
     index = observations.index
     targets = index.target_mm
@@ -148,18 +148,18 @@ def targets_on_screen(observations: Observations, screen: ScreenPlane) -> Floats
 
 
 def target_directions(observations: Observations) -> Floats:
-    """Compute unit directions (n, 3) from each eye's place to its target; NaN where one is unknown."""
+    """Compute unit directions (n, 3) from each eye's position to its target; NaN where one is unknown."""
     index = observations.index
     return unit(index.target_mm - index.eye_position_mm - index.head_mm)
 
 
 def unit(v: Floats) -> Floats:
-    """Compute the unit vectors v / |v| along the last axis; NaN for a zero vector."""
+    """Normalise vectors along the last axis; NaN for a zero vector."""
     length = np.sqrt((v * v).sum(axis=-1, keepdims=True))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(v / np.where(length > 0, length, np.nan))
 
 
 def nasal_sign(eye: Ints) -> Floats:
-    """Find the sign of the nasal direction along y: +1 for a right eye and eyes of unknown side, -1 for a left eye."""
+    """Return the sign of the nasal direction along y: +1 for a right eye or an unknown side, -1 for a left eye."""
     return np.where(np.asarray(eye) == 1, -1.0, 1.0)

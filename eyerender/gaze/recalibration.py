@@ -31,7 +31,7 @@ _ANGLE = "use recalibration='angle' without one"
 
 @dataclass(frozen=True, slots=True)
 class Recalibration:
-    """A correction of gaze rays; `coefficients` (2, 6) by eye are empty before the calibration."""
+    """Polynomial correction of gaze rays; `coefficients` (2, 6) by eye are empty before the calibration."""
 
     kind: RecalibrationKind = "angle"
     coefficients: Mapping[int, Floats] = field(default_factory=dict)
@@ -95,7 +95,7 @@ class Recalibration:
         return GazeRays.of(rays.origin_mm, unit(points.point_mm - rays.origin_mm), points.reason)
 
     def _on_angles(self, observations: Observations, rays: GazeRays) -> GazeRays:
-        """Compute rays whose angles are corrected, if the correction acts on angles."""
+        """Return the rays with corrected angles; unchanged if the correction acts on the screen."""
         if self.kind == "none":
             return rays
         if not self.coefficients:
@@ -127,6 +127,6 @@ def direction_of(angles: Floats) -> Floats:
 
 
 def monomials(v: Floats) -> Floats:
-    """Compute monomials (1, a, b, ab, a^2, b^2) of (..., 2)."""
+    """Compute the monomials 1, a, b, ab, a^2, b^2 of (a, b) along the last axis, (..., 2) to (..., 6)."""
     a, b = v[..., 0], v[..., 1]
     return np.stack([np.ones_like(a), a, b, a * b, a * a, b * b], axis=-1)

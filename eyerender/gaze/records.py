@@ -1,4 +1,4 @@
-"""Records of features and their rig, read for `gaze fit` and `gaze predict`."""
+"""Read records of features and their rig, for `gaze fit` and `gaze predict`."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from .columns import CsvColumns
 from .table import observations_from_csv
 
 ReadArray = Callable[[Any, tuple[int, ...], str], Floats]
-"""Turns a value into an array of a shape; raises `InputError` with the path."""
+"""Function that converts a value to an array of a shape; raises `InputError` with the path."""
 
 TABLES = (".csv", ".tsv")
-"""Names of files that are read as tables end with one of these."""
+"""Suffixes of files that are read as tables."""
 
-# This is about 40,000 observations. All of them are held in memory at once.
+# About 40,000 observations. All of them are held in memory at once.
 MAX_RECORDS_BYTES = 128 * 2**20
 
 
@@ -45,9 +45,9 @@ def load_observations(
     Args:
         path: JSON as `features` writes it, which includes the rig; JSONL with one record a line; or a table (.csv or
             .tsv, see `observations_from_csv`).
-        scene: provides the rig, if the file does not.
-        rig: provides the rig instead: a rig, or a file that `load_rig` reads.
-        columns: what the columns of a table are.
+        scene: scene whose rig is used if the file has none.
+        rig: the rig to use instead, or a file that `load_rig` reads.
+        columns: meaning of a table's columns.
 
     Raises:
         InputError: naming the file and the key.
@@ -92,9 +92,9 @@ def load_rig(path: str | Path) -> RigGeometry:
 
 
 def _read(text: str, source: str) -> tuple[list[Any], Any]:
-    """Read records and rig (None: there is none) from the text of a file."""
+    """Parse records and rig (None if there is none) from the text of a file."""
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
-    # With one record a line, the first line is a whole object and not the last line.
+    # In a file with one record per line, the first line is a complete object and more lines follow.
     if len(lines) > 1 and lines[0][1].rstrip().endswith("}"):
         problems = Problems(source)
         objects = [problems.attempt(partial(parse_json, line, source=source, path=f"line {k}")) for k, line in lines]

@@ -79,14 +79,14 @@ class EyeFit:
 
 @dataclass(frozen=True, slots=True)
 class Regression:
-    """Polynomial regression on the pupil-glint vector of one light's glint.
+    """Polynomial regression on the vector from one light's glint to the pupil.
 
     Args:
         function: R1 to R12 of Table 2, or the terms of x and y, as ("x + y + 1", "x + y2 + 1").
-        light: the light whose glint is the start of the vector.
+        light: the light whose glint is used.
         normalised: divide by the distance of the two pupils; False uses the vector in pixels, of one eye alone.
-        centred: define the polynomial about the calibration vectors' mean. That is a different function wherever the
-            terms are not closed under a shift, as in R4 and R6 to R12.
+        centred: expand the polynomial about the mean of the calibration vectors. This changes the result if the terms
+            are not closed under a shift, as in R4 and R6 to R12.
         fits: by eye (0 right, 1 left), set by `fit`.
     """
 
@@ -129,10 +129,10 @@ class Regression:
         return replace(self, fits=fits)
 
     def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> EyeFit:
-        """Fit the coefficients of one eye: vectors (n, 2) to points on the screen (n, 2) mm.
+        """Fit the coefficients of one eye, from vectors (n, 2) to points on the screen (n, 2) mm.
 
-        The polynomial is of scaled vectors, which does not change the function. A subclass may solve differently.
-        Warns with `UndeterminedWarning` where there are enough vectors, but too few distinct columns or rows of them.
+        The vectors are scaled first, which does not change the function. A subclass may solve differently. Warns with
+        `UndeterminedWarning` if there are enough vectors, but in too few distinct columns or rows.
 
         Raises:
             InputError: as for `fit`.
@@ -178,7 +178,7 @@ class Regression:
 
 
 def highest_determined(vectors: Floats) -> str | None:
-    """The function of Table 2 with the most terms that calibration vectors (n, 2) determine; None if there is none."""
+    """Return the function of Table 2 with the most terms that vectors (n, 2) determine; None if there is none."""
     if not len(vectors):
         return None
     by_terms = sorted(_TABLE, key=lambda name: sum(map(len, _TABLE[name])), reverse=True)
@@ -191,7 +191,7 @@ def _instead(vectors: Floats) -> str:
 
 
 def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: bool = True) -> tuple[Floats, Objects]:
-    """Compute pupil-glint vectors (n, 2), and the reasons why there are none (n,), None where there are.
+    """Compute pupil-glint vectors (n, 2), and the reasons (n,) where there are none; None elsewhere.
 
     Normalised vectors need both eyes of a frame: the distance of their pupils is the unit. Otherwise the unit is
     pixels.
@@ -216,7 +216,8 @@ def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: 
 
 def _partners(frame: Ints, eye: Ints) -> Ints:
     """Return the row of the other eye of the same frame, -1 where there is none."""
-    # This is one number for each (frame, eye), next to that of its partner. Eyes of unknown side have no partner.
+    # The interpupillary distance of each (frame, eye), next to that of its partner. Eyes of unknown side have no
+    # partner.
     key = 2 * frame + eye
     order = np.argsort(key, kind="stable")
     at = np.minimum(np.searchsorted(key[order], key ^ 1), len(key) - 1)

@@ -1,4 +1,4 @@
-"""The search for eye parameters, which is bounded and deterministic and reports how it ended.
+"""Bounded, deterministic search for eye parameters.
 
     min sum |miss|^2     trust region reflective (Branch, Coleman & Li 1999; scipy `least_squares`)
 
@@ -22,7 +22,7 @@ _SCALE = np.array([1.0, 1.0, 0.05, 1.0, 1.0])
 MOST_ITERATIONS = 400
 
 Misses = Callable[[Floats], Floats]
-"""The misses (P, n, 3) mm of n targets at P sets of the five parameters (P, 5)."""
+"""Function that computes the misses (P, n, 3) mm of n targets at P sets of the five parameters (P, 5)."""
 
 
 class FreeParameters:
@@ -37,7 +37,7 @@ class FreeParameters:
     """
 
     def __init__(self, start: EyeParameters, bounds: ParameterBounds, free: Bools) -> None:
-        """Choose the free parameters.
+        """Select the free parameters.
 
         Raises:
             InputError: the start lies outside the bounds.
@@ -50,14 +50,17 @@ class FreeParameters:
             raise InputError("the start of the calibration lies outside the bounds")
 
     def full(self, x: Floats) -> Floats:
-        """Return all five parameters (m, 5) for free ones (m, k)."""
+        """Insert free parameters (m, k) into full vectors of five (m, 5)."""
         self.evaluations += 1
         out = np.repeat(self.first[None], len(x), axis=0)
         out[:, self.free] = x
         return out
 
     def derivative(self, values: Callable[[Floats], Floats], x: Floats) -> Floats:
-        """Central differences (k, ...) of `values`, which takes (P, 5) to (P, ...), at x (k,), inside the bounds."""
+        """Compute central differences (k, ...) of `values` at x (k,), within the bounds.
+
+        `values` maps parameter sets (P, 5) to (P, ...).
+        """
         step, k = 1e-5 * self.scale, len(x)
         up, down = np.minimum(x + step, self.high), np.maximum(x - step, self.low)
         points = np.repeat(x[None], 2 * k, axis=0)
@@ -67,7 +70,7 @@ class FreeParameters:
         return np.asarray((r[:k] - r[k:]) / (up - down)[:, None])
 
     def calibration(self, done: Any, total: Callable[[Floats], Floats], objective: str) -> Calibration:
-        """Make the calibration from scipy's result and the objective `total` (P,) of parameter sets (P, 5)."""
+        """Convert scipy's result to a `Calibration`; `total` computes the objective (P,) of parameter sets (P, 5)."""
         values, free = self.first.copy(), self.free
         values[free] = np.clip(done.x, self.low, self.high)
         reach = 1e-4 * (self.high - self.low)
@@ -87,7 +90,7 @@ class FreeParameters:
 def calibrate(
     misses: Misses, start: EyeParameters, bounds: ParameterBounds, free: Bools, tolerance: float
 ) -> Calibration:
-    """Find the parameters within `bounds` with the least sum of squared misses; those not `free` stay as in `start`.
+    """Minimise the sum of squared misses over the free parameters within `bounds`; the others stay as in `start`.
 
     Raises:
         InputError: the start lies outside the bounds.

@@ -1,4 +1,4 @@
-"""Estimators by name, and their calibrations as files, for `gaze fit` and `gaze predict`."""
+"""Estimators by name, and their calibrations in files, for `gaze fit` and `gaze predict`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ from .regression import EyeFit, Regression
 from .twocamera import ShihWuLiu
 
 CALIBRATION_SCHEMA = "eyerender/gaze-calibration/4"
-# Still read: 1 to 3 have no regression of directions, 1 has no rig, 1 and 2 have no user's own estimators.
+# Older versions are still read: 1 to 3 have no regression of directions, 1 has no rig, and 1 and 2 have no user's own
+# estimators.
 _SCHEMAS = (CALIBRATION_SCHEMA, *(f"eyerender/gaze-calibration/{version}" for version in (3, 2, 1)))
 FIT_SCHEMA = "eyerender/gaze-fit/2"
 
@@ -54,7 +55,7 @@ BuiltIn = (
 
 
 class EstimatorSpec(Spec):
-    """Name and options of an estimator; options of other estimators are ignored."""
+    """Name and options of an estimator. Options that belong to other estimators are ignored."""
 
     name: EstimatorName
     function: str = "R3"
@@ -73,7 +74,7 @@ class EstimatorSpec(Spec):
         """Return the name and options of one of the package's estimators, calibrated or not.
 
         Raises:
-            InputError: it is not an estimator of the package, or has options that a file cannot store.
+            InputError: the estimator is not one of the package's, or has options that a file cannot store.
         """
         options: dict[str, Any] = {}
         if type(estimator) is Regression:
@@ -103,7 +104,7 @@ class EstimatorSpec(Spec):
                 options |= {"name": "hennessey", "index": index}
             bare = replace(estimator, correction=None)
         else:
-            raise InputError(f"a {type(estimator).__name__} is no estimator of this package")
+            raise InputError(f"a {type(estimator).__name__} is not an estimator of this package")
         spec = cls.from_mapping(options)
         if spec.build() != bare:
             raise InputError(f"a {type(estimator).__name__} with these options cannot be written to a file")
@@ -114,7 +115,7 @@ class EstimatorSpec(Spec):
         eye = MEAN_EYE if self.index is None else EyeParameters(index=self.index)
         if self.name == "regression":
             regression = Regression(self.terms or self.function, normalised=self.normalised)
-            _ = regression.terms  # a wrong function is an error here, not at the first fit
+            _ = regression.terms  # a wrong function is an error here, not only at the first fit
             return regression
         if self.name == "direction-regression":
             directions = DirectionRegression(self.terms or self.function, self.feature)
@@ -135,7 +136,7 @@ class EstimatorSpec(Spec):
 
 
 def choose_estimator(given: str, *, source: str = "--estimator", **options: Any) -> GazeEstimator:
-    """Make an uncalibrated estimator from its name (see `NAMES`) and options, or from a class by `module:Class`.
+    """Create an uncalibrated estimator from its name (see `NAMES`) and options, or from a class `module:Class`.
 
     Raises:
         InputError: there is no such estimator, or an option is wrong.
@@ -148,7 +149,7 @@ def choose_estimator(given: str, *, source: str = "--estimator", **options: Any)
 
 
 def _described(estimator: GazeEstimator) -> dict[str, Any]:
-    """Return the name and options of an estimator, as in files."""
+    """Return the name and options of an estimator, as stored in files."""
     return estimator.to_mapping() if isinstance(estimator, OwnEstimator) else EstimatorSpec.of(estimator).to_mapping()
 
 
@@ -161,18 +162,18 @@ def fit_estimator(
     source: str = "",
     warn: Warn | None = None,
 ) -> tuple[GazeEstimator, dict[str, Any]]:
-    """Calibrate an estimator and summarise it (schema eyerender/gaze-fit/2).
+    """Calibrate an estimator and summarise the result (schema eyerender/gaze-fit/2).
 
     Args:
         estimator: the estimator, not calibrated.
         observations: observations of known targets.
-        rig: their rig.
+        rig: the rig that observed them.
         fixations: fixations for the calibration, counted from 0; None: all.
         source: name of the observations in messages.
-        warn: called for targets off the screen and for an estimator that the targets do not determine; it may raise.
+        warn: called for targets off the screen and if the targets do not determine the estimator; it may raise.
 
     Raises:
-        InputError: there are no targets, a fixation is unknown, or the estimator itself refuses.
+        InputError: there are no targets, a fixation does not exist, or the estimator cannot be calibrated.
     """
     index = observations.index
     rows = np.isfinite(index.target_mm).all(axis=1)
@@ -207,7 +208,7 @@ def fit_estimator(
 
 
 def _mean_and_max(gaze: list[dict[str, Any]], unit: str) -> dict[str, Any]:
-    """Compute the mean and largest error of the entries of `predictions`."""
+    """Compute the mean and largest error of entries that `predictions` returned."""
     errors = [one[f"error_{unit}"] for one in gaze if one.get(f"error_{unit}") is not None]
     return {
         f"mean_{unit}": float(np.mean(errors)) if errors else None,
@@ -217,7 +218,7 @@ def _mean_and_max(gaze: list[dict[str, Any]], unit: str) -> dict[str, Any]:
 
 
 def save_estimator(path: str | Path, estimator: GazeEstimator, rig: RigLike | None = None) -> None:
-    """Write a calibrated estimator as JSON, with the rig of its calibration where that is known.
+    """Write a calibrated estimator as JSON, with the rig of its calibration if known.
 
     A user's own class must follow `StoredEstimator` and be importable, because the file names it as `module:Class`.
 
@@ -243,15 +244,15 @@ def save_estimator(path: str | Path, estimator: GazeEstimator, rig: RigLike | No
 
 
 def load_estimator(path: str | Path, own: str | None = None) -> GazeEstimator:
-    """Load the estimator of a calibration; see `load_calibration`."""
+    """Read a calibration file and return its estimator; see `load_calibration`."""
     return load_calibration(path, own)[0]
 
 
 def load_calibration(path: str | Path, own: str | None = None) -> tuple[GazeEstimator, RigGeometry | None]:
-    """Read a calibration: the estimator, and the rig of the calibration (None where the file has none).
+    """Read a calibration file: the estimator, and the rig of the calibration (None if the file has none).
 
-    The calibration of a user's own class is read only where `own` names that class again, as `module:Class`, because a
-    file must never cause code to be loaded.
+    The calibration of a user's own class is read only if `own` names that class as `module:Class`, because a file must
+    never cause code to be loaded.
 
     Raises:
         InputError: naming the file and the key.
@@ -317,7 +318,7 @@ class _CrossRatioState(Spec):
 
 
 class _PersonState(Spec):
-    # Nine numbers are those without the shapes of cornea and pupil, which are 0 then.
+    # Nine numbers come from older files, which lack the shapes of cornea and pupil; these are then 0.
     person: Annotated[tuple[float, ...], Field(min_length=9, max_length=PERSON_NUMBERS)]
 
 
@@ -360,7 +361,7 @@ _STATES: dict[type[BuiltIn], type[Spec]] = {
 
 
 def _checked(estimator: BuiltIn, state: object) -> Spec:
-    """Validate one eye's part of a calibration's file.
+    """Validate the calibration of one eye in a file.
 
     Raises:
         InputError: with the path of the key.
@@ -374,7 +375,7 @@ def _checked(estimator: BuiltIn, state: object) -> Spec:
 
 
 def _state(estimator: BuiltIn) -> dict[str, Any]:
-    """Return calibrated values by eye."""
+    """Return the calibrated values of each eye."""
     found: dict[int, Any]
     if isinstance(estimator, Regression | DirectionRegression):
         found = {
@@ -396,7 +397,7 @@ def _state(estimator: BuiltIn) -> dict[str, Any]:
 
 
 def _restored(estimator: BuiltIn, eyes: dict[int, Any]) -> BuiltIn:
-    """Restore an estimator with the calibrations of a file by eye, as `_checked` returns them."""
+    """Restore an estimator from calibrations by eye, as `_checked` returns them."""
 
     def arrays(key: str) -> dict[int, Floats]:
         return {e: frozen(getattr(state, key)) for e, state in eyes.items()}

@@ -1,7 +1,7 @@
-"""Tables of pupils, glints and targets (CSV) as observations.
+"""Read tables (CSV) of pupils, glints and targets as observations.
 
 A row is one eye in one frame, or both eyes of a frame (with columns of the right and of the left eye), or one glint
-(with a column `light`). `CsvColumns` says which column is what.
+(with a column `light`). `CsvColumns` states the meaning of the columns.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from ..status import Status
 from ..storage.files import read_bytes, shown
 from .columns import CsvColumns, EyeColumns, completed
 
-# A table is held in memory as text and as numbers, which takes some 20 times its size. A million rows are half an hour
-# at 600 Hz.
+# A table in memory, as text and numbers, takes some 20 times its size in the file. A million rows are half an hour at
+# 600 Hz.
 MAX_TABLE_BYTES, MAX_COLUMNS, MAX_ROWS = 64 * 2**20, 1000, 1_000_000
-# Numbers that can still be squared.
+# Larger numbers could not be squared.
 _LARGEST = 1e30
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-"))
 _EYE_WORDS = {
@@ -56,14 +56,15 @@ def observations_from_csv(
 
     Args:
         path: the table (CSV with a header; commas, semicolons or tabs). An empty cell is a missing value.
-        columns: `CsvColumns`, a mapping of its keys or its YAML file; for columns with names of their own.
+        columns: meaning of columns that are not recognised by name: `CsvColumns`, a mapping of its keys or its YAML
+            file.
         rig: the rig; needed for targets on its screen.
 
     Returns:
         The observations in frame order, the right eye first.
 
     Raises:
-        InputError: naming the lines and columns that are wrong.
+        InputError: naming the wrong lines and columns.
     """
     if columns is None:
         given = CsvColumns()
@@ -80,7 +81,7 @@ def observations_from_csv(
 
 @dataclass
 class _Table:
-    """The cells of a table, by the name of the column; and what is wrong with it."""
+    """Cells of a table by column name, with the problems found so far."""
 
     source: str
     header: list[str]
@@ -130,7 +131,7 @@ class _Table:
         self.problems.add(reason, f"line {self.lines[row]}.{column}")
 
     def numbers(self, column: str | None) -> Floats:
-        """Return a column as numbers (n,), NaN where a cell is empty or there is no column."""
+        """Return a column as numbers (n,), NaN where a cell is empty or the column is missing."""
         out = np.full(len(self), np.nan)
         for k, cell in enumerate(self.cells[column] if column else ()):
             word = cell.strip()
@@ -147,7 +148,7 @@ class _Table:
         return out
 
     def several(self, columns: tuple[str, ...] | None, count: int) -> Floats:
-        """Return columns that belong together as (n, count): all of them are given in a row, or none."""
+        """Return columns that belong together as (n, count); each row must give all of them or none."""
         if columns is None:
             return np.full((len(self), count), np.nan)
         known = len(self.problems)
@@ -160,7 +161,7 @@ class _Table:
         return out
 
     def counts(self, column: str | None, unknown: int, limit: int = 2**31 - 1) -> Ints:
-        """Return a column of whole numbers (n,), `unknown` where a cell is empty or there is no column."""
+        """Return a column of whole numbers (n,), `unknown` where a cell is empty or the column is missing."""
         found = self.numbers(column)
         empty = np.isnan(found)
         bad = ~empty & ~((found >= 0) & (found <= limit) & (found == np.floor(found)))
@@ -169,7 +170,7 @@ class _Table:
         return np.where(empty | bad, unknown, np.where(bad, 0, found)).astype(np.int64)
 
     def eyes(self, column: str | None, words: Mapping[str, str]) -> Ints:
-        """Return a column of eyes: 0 right, 1 left, -1 where a cell is empty or there is no column."""
+        """Return a column of eyes (n,): 0 right, 1 left, -1 where a cell is empty or the column is missing."""
         out = np.full(len(self), -1, np.int64)
         meanings = {**_EYE_WORDS, **{word.strip().lower(): side for word, side in words.items()}}
         for k, cell in enumerate(self.cells[column] if column else ()):
@@ -263,7 +264,7 @@ def _parts(table: _Table, columns: CsvColumns) -> list[tuple[EyeColumns, Ints]]:
 
 
 def _frames(table: _Table, columns: CsvColumns, eye: Ints) -> Ints:
-    """Compute the frame of each row."""
+    """Return the frame number of each row."""
     named = columns.frame or columns.time
     for k, cell in enumerate(table.cells[named] if named else ()):
         if cell.strip().lower() in _MISSING:
@@ -280,7 +281,7 @@ def _frames(table: _Table, columns: CsvColumns, eye: Ints) -> Ints:
 
 
 def _features(table: _Table, part: EyeColumns, columns: CsvColumns, width: int) -> dict[str, Floats]:
-    """The numbers of one eye in each row: its pupil (n, 2), semi-axes and angle (n, 3), glints (n, width, 2), ..."""
+    """Return one eye's numbers in each row: pupil centre (n, 2), axes and angle (n, 3), glints (n, width, 2), ..."""
     shape = np.full((len(table), 3), np.nan)
     if part.pupil_axes is not None:
         semi = columns.axes == "semi" or (columns.axes is None and "semi" in part.pupil_axes[0].lower())
@@ -309,7 +310,7 @@ def _features(table: _Table, part: EyeColumns, columns: CsvColumns, width: int) 
 
 
 def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> Floats:
-    """Compute the target of each row (n, 3) mm in the world, NaN where there is none."""
+    """Return the target of each row (n, 3) mm in the world, NaN where there is none."""
     names = columns.target
     if names is None:
         return np.full((len(table), 3), np.nan)
@@ -342,7 +343,7 @@ def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> 
 def _listed_glints(
     table: _Table, column: str, glints: Floats, light: Ints, which: Ints, count: int
 ) -> tuple[Floats, Ints]:
-    """Compute glints (count, lights, 2) and their lights of rows that hold one glint each."""
+    """Return glints (count, lights, 2) and their lights, from rows that hold one glint each."""
     here = np.isfinite(glints[:, 0]).all(axis=1) if glints.shape[1] else np.zeros(len(light), bool)
     for k in np.flatnonzero(here & (light < 0)).tolist():
         table.refuse(k, column, "is empty, but the row holds a glint")
@@ -359,10 +360,10 @@ def _listed_glints(
 
 
 def _merged(table: _Table, key: str, values: Floats, which: Ints, count: int) -> Floats:
-    """Return values of rows that are one observation: those of the first row that has them; later rows must agree."""
+    """Merge the rows of each observation: use the first row that has values; later rows must agree."""
     out = np.full((count, *values.shape[1:]), np.nan)
     there = np.nonzero(np.isfinite(values))
-    backwards = tuple(axis[::-1] for axis in there)  # the first one is written last
+    backwards = tuple(axis[::-1] for axis in there)  # assigned in reverse order, so that the first row wins
     out[(which[backwards[0]], *backwards[1:])] = values[backwards]
     other = np.isfinite(values) & (values != out[which])
     for k in np.flatnonzero(other.reshape(len(values), -1).any(axis=1)).tolist():
@@ -371,7 +372,7 @@ def _merged(table: _Table, key: str, values: Floats, which: Ints, count: int) ->
 
 
 def _places(position: Floats, frame: Ints, eye: Ints, columns: CsvColumns) -> tuple[Floats, Floats]:
-    """Place of each eye without its head's, and the head's: the middle of both eyes where both are known, else 0."""
+    """Return the eye's position relative to its head, and the head's: midway between the eyes if known, else 0."""
     position = position.copy()
     for side, place in columns.eye_position_mm.items():
         position[(eye == EYES.index(side)) & np.isnan(position).any(axis=1)] = place
@@ -389,7 +390,7 @@ def _places(position: Floats, frame: Ints, eye: Ints, columns: CsvColumns) -> tu
 
 
 def _reasons(found: Bools) -> Objects:
-    """Say why features are missing; None where they were found."""
+    """Return why features are missing; None where they were found."""
     reason = np.full(found.shape, None, dtype=object)
     reason[~found] = Status.NOT_FOUND.reason
     return reason

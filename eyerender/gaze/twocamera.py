@@ -93,7 +93,7 @@ class ShihWuLiu:
         return GazeRays.of(centre, axis, reason)
 
     def _pairs(self, observations: Observations) -> tuple[Ints, Ints]:
-        """List rows of the first and of the second camera that show the same fixation of the same eye."""
+        """Return the rows of the first and of the second camera that show the same fixation of the same eye."""
         index = observations.index
         key = np.stack([index.head, index.fixation, index.eye], axis=1)
         known = index.fixation >= 0
@@ -107,7 +107,7 @@ class ShihWuLiu:
 
 
 def _closest(o1: Floats, *, b1: Floats, o2: Floats, b2: Floats) -> tuple[Floats, Bools]:
-    """Compute the middle of the closest approach of two lines (n, 3), and whether they are not parallel (n,)."""
+    """Compute the midpoint of the closest approach of two lines (n, 3), and whether they are not parallel (n,)."""
     w = o2 - o1
     cosine = (b1 * b2).sum(axis=-1)
     cross = np.cross(b1, b2)

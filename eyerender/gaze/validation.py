@@ -40,19 +40,19 @@ class GazeErrors(ArrayValue):
 
     @property
     def mean_deg(self) -> float | None:
-        """Mean over the frames with an estimate; None if there are none."""
+        """Mean over the frames with an estimate, in degrees; None if there are none."""
         return float(self.error_deg[self.ok].mean()) if self.ok.any() else None
 
     @property
     def max_deg(self) -> float | None:
-        """Largest error; None if there are none."""
+        """Largest error in degrees; None if there are none."""
         return float(self.error_deg[self.ok].max()) if self.ok.any() else None
 
 
 def leave_one_target_out(estimator: GazeEstimator, observations: Observations, rig: RigLike) -> GazeErrors:
-    """Estimate each target by a calibration on all other targets.
+    """Estimate each target with a calibration on all other targets.
 
-    A residual at the calibration targets themselves would flatter every estimator with many terms.
+    Residuals at the calibration targets themselves would favour estimators with many terms.
 
     Raises:
         InputError: there are no targets, or too few to calibrate on.

@@ -1,4 +1,4 @@
-"""Heights of a biconic with their derivatives: formulas for arrays, which compiled code uses too."""
+"""Heights of a biconic with derivatives: formulas for arrays, also used by compiled code."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def biconic_slopes(constants: tuple[FloatLike, ...], y: Floats, z: Floats) -> Sl
 
     Args:
         constants: (c_y, c_z, k_y, k_z), c = 1/R and k = (1 + Q) c^2 in the meridians of y and z.
-        y: places.
-        z: places.
+        y: local coordinates, mm.
+        z: local coordinates, mm.
     """
     cy, cz, ky, kz = constants
     y_square, z_square = y * y, z * z

@@ -1,4 +1,4 @@
-"""The ellipse, its float64 direct fit, the pixel convention, and the conversions between its forms.
+"""The ellipse, its direct fit in float64, the pixel convention, and conversions between its forms.
 
 Pixel centres are at integers; x points to the right, y down. An ellipse has a centre, semi-axes a >= b, and the angle
 of a, measured from +x toward +y, in [0, pi):
@@ -89,7 +89,7 @@ class Ellipse:
 
     @staticmethod
     def of(numbers: Sequence[float] | Floats) -> Ellipse:
-        """Make an ellipse from the result of `numbers`."""
+        """Create an ellipse from the result of `numbers`."""
         return Ellipse(np.array(numbers[:2]), np.array(numbers[2:4]), float(numbers[4]))
 
     def conic(self) -> Floats:
@@ -120,8 +120,8 @@ class Ellipse:
 class EllipseFit(NamedTuple):
     """A batch of fitted ellipses.
 
-    Where no ellipse fits (collinear points, a number that is not finite) the residual is infinite and the parameters
-    are NaN. `ok` marks the valid ones.
+    If no ellipse fits (collinear points, values that are not finite), the residual is infinite and the parameters are
+    NaN. `ok` marks the valid ones.
 
     Attributes:
         centre_px: (..., 2) px.
@@ -166,7 +166,7 @@ def fit_ellipse_direct(points: ArrayLike) -> EllipseFit:
     Raises:
         InputError: the shape is wrong.
     """
-    from .ellipse_kernels import fit_all  # which loads numba
+    from .ellipse_kernels import fit_all  # its import loads numba
 
     array = np.asarray(points, dtype=np.float64)
     if array.ndim < 2 or array.shape[-1] != 2 or array.shape[-2] < 5:
@@ -270,7 +270,7 @@ def _vertical_span(ellipse: Ellipse) -> tuple[float, float]:
 
 
 def _chord(ellipse: Ellipse, y: Floats) -> tuple[Floats, Floats]:
-    """Find both ends of the horizontal chord at each y; they are equal where the line misses the ellipse."""
+    """Compute both ends of the horizontal chord at each y; they are equal where the line misses the ellipse."""
     a, b, c, d, e, f = ellipse.conic()
     linear = b * y + d
     root = np.sqrt(np.maximum(linear * linear - 4.0 * a * (c * y * y + e * y + f), 0.0))

@@ -1,4 +1,4 @@
-"""Direct least-squares ellipses, compiled (see `ellipse.fit_ellipse_direct`)."""
+"""Compiled direct least-squares fits of ellipses (see `ellipse.fit_ellipse_direct`)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def means(x, y):  # type: ignore[no-untyped-def]
 
 @summed
 def lean(basis, u, v):  # type: ignore[no-untyped-def]
-    """Take the part along u and v out of a basis function, and return it."""
+    """Remove the part along u and v from a basis function, in place; return its coefficients."""
     a, b = 0.0, 0.0
     for k in range(len(u)):
         a, b = a + basis[k] * u[k], b + basis[k] * v[k]
@@ -65,7 +65,7 @@ def null_vector(pq, pr, qq, qr, rr, value):  # type: ignore[no-untyped-def]
 
 @inlined
 def positive_eigenvector(pp, pq, pr, qq, qr, rr):  # type: ignore[no-untyped-def]
-    """Find the vector w of M w = lambda diag(1, -1, -1) w for the largest lambda; M is symmetric."""
+    """Compute the vector w of M w = lambda diag(1, -1, -1) w for the largest lambda; M is symmetric."""
     # Eigenvalues of diag(1, -1, -1) M, whose characteristic polynomial is x^3 - t x^2 + s x - det = 0.
     t = pp - qq - rr
     s = pq * pq + pr * pr - pp * (qq + rr) + qq * rr - qr * qr
@@ -101,7 +101,7 @@ def sampson_rms(work, w, quadratic, linear, factor):  # type: ignore[no-untyped-
 
 @inlined
 def fit_one(x, y, work, out):  # type: ignore[no-untyped-def]
-    """Fit an ellipse to points, with room `work` (5, k) for their coordinates and basis functions."""
+    """Fit an ellipse to points, with memory `work` (5, k) for their coordinates and basis functions."""
     mean_x, mean_y = means(x, y)
     sxx, sxy, syy = moments(x, y, mean_x, mean_y)
     # Cholesky factor L of the covariance: (x, y) = L (u, v).

@@ -1,4 +1,4 @@
-"""Surfaces as graphs x = h(y, z) over one plane, compiled: heights with their first and second derivatives.
+"""Compiled heights x = h(y, z) of surfaces over one plane, with first and second derivatives.
 
 The surfaces of an eye are rows of numbers, `numbers` (eyes, surfaces, `COLUMNS`), one row for all eyes or one per eye;
 `kinds` holds the kind of each surface, and `table` the coefficients of measured surfaces one after the other.
@@ -114,7 +114,7 @@ def measured_jet(kind, numbers, table, i, s, y, z, outer):  # type: ignore[no-un
 
 @inlined
 def _inner_jet(kind, numbers, table, i, s, y, z, outer):  # type: ignore[no-untyped-def]
-    """Evaluate the measured surface itself, at a place relative to its origin."""
+    """Evaluate the measured surface itself, at a position relative to its origin."""
     c, t, x = numbers[i, s, TURN], numbers[i, s, TURN + 1], numbers[i, s, ORIGIN]
     own_y, own_z = c * y + t * z, c * z - t * y
     if kind == ZERNIKE:
@@ -189,9 +189,9 @@ def _grid_jet(numbers, table, i, s, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def _knot(place, size):  # type: ignore[no-untyped-def]
-    """Find the knot interval of a place: the place in it, and the first of its four coefficients."""
+    """Return the knot interval of a position: the position in it, and the first of its four coefficients."""
     place += 0.5 * (size - 1)
-    # A place that is not a number is in the first interval, where its height is not a number either.
+    # NaN falls into the first interval, where its height is NaN too.
     first = min(max(np.floor(place), 1.0), size - 3.0) if place == place else 1.0
     return place - first, int(first) - 1
 
@@ -209,7 +209,7 @@ def _splines(t):  # type: ignore[no-untyped-def]
 
 @compiled("i8[::1], f8[:,:,::1], f8[::1], f8[::1], f8[::1], f8[:,:,::1]")
 def jets(kinds: Ints, numbers: Floats, table: Floats, y: Floats, z: Floats, out: Floats) -> None:
-    """Write `jet` of every surface of the first eye at places (k,) to `out` (surfaces, 6, k)."""
+    """Write `jet` of every surface of the first eye at positions (k,) to `out` (surfaces, 6, k)."""
     for s in range(len(kinds)):
         for k in range(len(y)):
             found = jet(kinds, numbers, table, 0, s, y[k], z[k])
@@ -219,7 +219,7 @@ def jets(kinds: Ints, numbers: Floats, table: Floats, y: Floats, z: Floats, out:
 
 @compiled("i8[::1], f8[:,:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1]")
 def heights(kinds: Ints, numbers: Floats, table: Floats, y: Floats, z: Floats, out: Floats) -> None:
-    """Write the height of every surface of the first eye at places (k,) to `out` (surfaces, k)."""
+    """Write the height of every surface of the first eye at positions (k,) to `out` (surfaces, k)."""
     for s in range(len(kinds)):
         for k in range(len(y)):
             out[s, k] = jet(kinds, numbers, table, 0, s, y[k], z[k])[0]

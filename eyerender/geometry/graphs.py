@@ -1,4 +1,4 @@
-"""Surfaces as graphs x = h(y, z) over one plane, as numbers for compiled code (`graph_kernels`)."""
+"""Express surfaces as graphs x = h(y, z) over one plane, as numbers for compiled code (`graph_kernels`)."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ class Graphs:
         return not np.any(self.origin_mm) and bool(np.all(self.rotation == np.eye(3)))
 
     def jets(self, y: Floats, z: Floats) -> list[Jet]:
-        """Compute heights and derivatives of the surfaces of the first eye at places (k,)."""
+        """Compute heights and derivatives of the surfaces of the first eye at positions (k,)."""
         out = np.empty((len(self.kinds), 6, len(y)))
         jets(self.kinds, self.numbers, self.table, np.array(y, dtype=float), np.array(z, dtype=float), out)
         return [Jet(*rows) for rows in out]
 
     def heights(self, y: Floats, z: Floats) -> Floats:
-        """Compute heights (s, k) of the surfaces of the first eye at places (k,); NaN where they do not reach."""
+        """Compute heights (s, k) of the surfaces of the first eye at positions (k,); NaN where they do not reach."""
         out = np.empty((len(self.kinds), len(y)))
         heights(self.kinds, self.numbers, self.table, np.array(y, dtype=float), np.array(z, dtype=float), out)
         return out
@@ -74,7 +74,7 @@ class Graphs:
 
 @remembered
 def graphs_of(*surfaces: Surface) -> Graphs | None:
-    """Express surfaces as graphs over one plane (see `express`), cached for the same objects."""
+    """Express surfaces as graphs over one plane (see `express`); cached for the same objects."""
     return express(*surfaces)
 
 
@@ -85,7 +85,7 @@ def express(*surfaces: Surface) -> Graphs | None:
     that of the first graph surface.
 
     Returns:
-        None where the surfaces have no common plane.
+        The graphs; None if the surfaces have no common plane.
     """
     ensure_compiled(RAYS)
     frame = next((surface for surface in surfaces if isinstance(surface, GraphSurface)), None)
@@ -102,7 +102,7 @@ def express(*surfaces: Surface) -> Graphs | None:
         row[:, ORIGIN : ORIGIN + 3], row[:, AXIS : AXIS + 3] = place, turn[..., :, 0]
         row[:, X0] = place[..., 0]
         if isinstance(surface, Quadric):
-            # From a point beside its own origin, so that no digits cancel.
+            # Measured from a point beside its origin, so that no digits cancel.
             seen = surface.seen_from(origin + rotation[..., :, 0] * place[..., :1], rotation)
             if not np.all(seen.rotation[..., 0, 0] > 0.5):
                 return None

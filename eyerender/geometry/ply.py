@@ -1,4 +1,4 @@
-"""PLY files made by others: their header is checked and stripped of comments before a library reads them."""
+"""Read PLY files made by others: check their header and strip comments before a library reads them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from ..storage.files import shown
 MAX_HEADER_BYTES = 65536
 _WORDS = (b"format", b"element", b"property")
 
-# Trimesh logs what it leaves out; here a mesh is either read or refused with one line.
+# Trimesh logs what it ignores; here a mesh is either read or refused with one line.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def plain_ply(data: bytes, *, source: str = "") -> bytes:
-    """Read a PLY file whose header must hold formats, elements and properties alone; comments may name other files.
+    """Read a PLY file whose header holds only formats, elements and properties; comments may name other files.
 
     Raises:
-        InputError: it has no such header, or the header counts elements that the file cannot hold.
+        InputError: the file has no such header, or the header counts more elements than the file can hold.
     """
     head: list[bytes] = []
     start = 0

@@ -26,12 +26,12 @@ Xyz = tuple[Floats, Floats, Floats]
 
 
 class Hit(NamedTuple):
-    """Where rays meet a surface.
+    """Intersections of rays with a surface.
 
     Attributes:
-        distance: along the unit direction, mm.
+        distance: distance along the unit direction, mm.
         point: the intersections.
-        gradient: half gradient there.
+        gradient: half gradients there.
         ok: whether the ray meets the surface.
     """
 
@@ -102,7 +102,7 @@ class Surface(ABC):
 
     @abstractmethod
     def gradient_at(self, point: Xyz) -> Xyz:
-        """Compute the half gradient g, not normalized."""
+        """Compute the half gradient g, not normalised."""
 
     @abstractmethod
     def hessian_at(self, point: Xyz) -> SymmetricMatrix:
@@ -113,7 +113,7 @@ class Surface(ABC):
         """Compute the depth x of the sheet over the local (y, z); NaN where the sheet does not reach."""
 
     def take(self, index: Indices) -> Self:
-        """Select surfaces of the batch by `index`; a single surface is returned as it is."""
+        """Select surfaces of the batch by `index`; a single surface is returned unchanged."""
         return type(self)(*(part[index] for part in self._parts())) if self.batch_shape else self
 
     @classmethod
@@ -152,11 +152,11 @@ class Surface(ABC):
         return hash((type(self), *((a + 0.0).tobytes() for a in self._key())))
 
     def _parts(self) -> tuple[Any, ...]:
-        """List the arrays from which the surface is made."""
+        """Return the arrays from which the surface is made."""
         return tuple([getattr(self, name) for name in _names(type(self))])
 
     def _key(self) -> tuple[Floats, ...]:
-        """List the arrays that define the surface, for comparison."""
+        """Return the arrays that define the surface, for comparison."""
         return self._parts()
 
     # -- points (..., 3) ----------------------------------------------------------------------------------------------
@@ -180,14 +180,14 @@ class Surface(ABC):
         return self.local_sag(np.asarray(y_mm, dtype=np.float64), np.asarray(z_mm, dtype=np.float64))
 
     def intersect(self, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Floats, Bools]:
-        """Find the nearest crossing ahead.
+        """Compute the nearest crossing ahead.
 
         Args:
             origins_mm: (..., 3) origins.
             directions: (..., 3) unit vectors.
 
         Returns:
-            Distance (...,) in mm, infinite where the ray misses the surface, and whether there is a crossing (...,).
+            Distance (...,) in mm, infinite if the ray misses the surface, and whether there is a crossing (...,).
         """
         origin, direction = components(origins_mm), components(directions)
         hits = [self.hit(origin, direction, inward) for inward in (True, False)]
@@ -213,7 +213,7 @@ class Surface(ABC):
 
 @cache
 def _names(kind: type) -> tuple[str, ...]:
-    """List the names of the arrays from which surfaces of a kind are made."""
+    """Return the names of the arrays from which surfaces of a kind are made."""
     return tuple(f.name for f in fields(kind) if f.init)
 
 

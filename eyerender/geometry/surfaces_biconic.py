@@ -44,7 +44,7 @@ class Biconic(GraphSurface):
         return biconic_jet(self._constants(max(y.ndim, z.ndim)), y, z)
 
     def likeness(self) -> tuple[Floats, Floats]:
-        """Return the conic of mean curvature and mean 1 + Q."""
+        """Return curvature and 1 + Q of the conic with the mean curvature."""
         return np.mean(1.0 / self.radii_mm, axis=-1), 1.0 + np.mean(self.conic_constants, axis=-1)
 
     def _scaled_shape(self, factor: float) -> dict[str, Floats]:

@@ -1,4 +1,4 @@
-"""Surfaces that are graphs x = h(y, z) of their own frame: rays meet them by safeguarded Newton steps."""
+"""Surfaces that are graphs x = h(y, z) in their own frame; ray hits by safeguarded Newton steps."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ class GraphSurface(Surface):
 
     @abstractmethod
     def likeness(self) -> tuple[Floats, Floats]:
-        """Return curvature and 1 + Q, (...,), of the conic from whose hit the search starts."""
+        """Return curvature and 1 + Q, (...,), of the approximating conic at which the search starts."""
 
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
-        """Solve x - h(y, z) = 0 along the ray by Newton, from the hit on a conic that is like the surface.
+        """Solve x - h(y, z) = 0 along the ray by Newton's method, starting at the hit on the approximating conic.
 
-        Rays for which the steps do not settle are searched by bisection about that hit. The residual of every hit is
+        Rays for which the steps do not converge are searched by bisection around that hit. The residual of every hit is
         checked.
         """
         start = self.local_point(origin)
@@ -101,7 +101,7 @@ class GraphSurface(Surface):
     def _searched(
         self, start: Xyz, way: Xyz, guess: Floats, t: Floats, error: Floats, lost: Bools, inward: bool
     ) -> tuple[Floats, Floats]:
-        """Search `lost` rays: the first change of sign within some mm of the guess, halved, and Newton from there."""
+        """Search `lost` rays: bisect the first change of sign near the guess, then apply Newton's method."""
         rows = np.nonzero(lost) if lost.ndim else (np.zeros(1, dtype=np.intp),)
         shape = lost.shape or (1,)
         few = self.take(rows[0])
@@ -109,7 +109,7 @@ class GraphSurface(Surface):
         near = np.broadcast_to(guess, shape)[rows]
 
         def side(s: Floats) -> Floats:
-            """Return a positive number before the crossing that is sought, a negative one behind it, else NaN."""
+            """Return a positive number before the crossing, a negative one behind it, else NaN."""
             value = ox + s * dx - few.local_sag(oy + s * dy, oz + s * dz)
             return value if inward else -value
 
@@ -165,9 +165,9 @@ class GraphSurface(Surface):
         return self.local_vector(shift(point, self.origin_mm, -1.0))
 
     def local_vector(self, vector: Xyz) -> Xyz:
-        """Turn directions of the eye frame to the local frame."""
+        """Rotate directions of the eye frame to the local frame."""
         return vector if self.untilted else turn_back(self.rotation, vector)
 
     def eye_vector(self, vector: Xyz) -> Xyz:
-        """Turn directions of the local frame to the eye frame."""
+        """Rotate directions of the local frame to the eye frame."""
         return vector if self.untilted else turn(self.rotation, vector)

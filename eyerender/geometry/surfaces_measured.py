@@ -1,7 +1,7 @@
 """Measured corneas: a Zernike expansion on a conic, or a grid of heights, continued outside the measured zone.
 
-Inside, the surface is the measured one, M. Outside it is the outer biconic B, turned about its axis and on a plane that
-may lean. Between the squared radii q_i and q_o of the window the height is
+Inside, the surface is the measured one, M. Outside it is the outer biconic B, rotated about its axis and added to a
+plane that may be tilted. Between the squared radii q_i and q_o of the window the height is
 
     h = B + w (M - B),  w = 1 - s^3 (10 - 15 s + 6 s^2),  s = (y^2 + z^2 - q_i) / (q_o - q_i)
 
@@ -33,7 +33,7 @@ class Measured(GraphSurface):
     Attributes:
         outer: (..., 8) the outer biconic: R_u, R_v, Q_u, Q_v, the angle of u from y (rad), the height at the axis (mm),
             and the slopes along y and z of the plane on which it stands.
-        window_mm: (..., 2) radii at which the window begins and ends.
+        window_mm: (..., 2) radii at which the transition begins and ends.
     """
 
     __slots__ = ()
@@ -46,10 +46,10 @@ class Measured(GraphSurface):
         """Compute height, slopes and (if `second`) second derivatives of the measured surface, as in a `Jet`.
 
         Args:
-            y: places within the window's end.
-            z: places, of the same shape.
-            second: whether second derivatives are wanted.
-            outer: the same numbers of the outer biconic, if they are known.
+            y: positions inside the end of the transition.
+            z: positions, of the same shape.
+            second: whether to compute second derivatives.
+            outer: the same numbers of the outer biconic, if known.
         """
 
     def slopes(self, y: Floats, z: Floats) -> Slopes:
@@ -108,11 +108,11 @@ class Measured(GraphSurface):
         )
 
     def likeness(self) -> tuple[Floats, Floats]:
-        """Return the conic of mean curvature and mean 1 + Q of the outer biconic."""
+        """Return curvature and 1 + Q of the conic with the outer biconic's means."""
         return np.mean(1.0 / self.outer[..., :2], axis=-1), 1.0 + np.mean(self.outer[..., 2:4], axis=-1)
 
     def _share(self, y: Floats, z: Floats) -> tuple[Floats, FloatLike]:
-        """Compute the place in the window, from 0 where it begins to 1 where it ends, and the width q_o - q_i."""
+        """Compute the position in the transition, 0 where it begins and 1 where it ends, and the width q_o - q_i."""
         begin, end = (fit(self.window_mm[..., k], y.ndim) for k in (0, 1))
         width = end * end - begin * begin
         return np.asarray((y * y + z * z - begin * begin) / width), width
@@ -134,7 +134,7 @@ class Measured(GraphSurface):
 
 
 def _window(share: Floats, width: FloatLike) -> tuple[Floats, Floats, Floats]:
-    """Compute the window w over its share s, and its first and second derivatives by the squared radius."""
+    """Compute the weight w over its share s, and its first and second derivatives by the squared radius."""
     s = np.clip(share, 0.0, 1.0)
     rest = 1.0 - s
     w = rest**3 * (1.0 + s * (3.0 + 6.0 * s))
@@ -190,7 +190,8 @@ class ZernikeSurface(Measured):
         count = 6 if second else 3
         radius = fit(self.radius_mm, y.ndim)
         p, q = y / radius, z / radius
-        # One small matrix product for each row: large ones would be spread over cores, which costs more than it saves.
+        # A small matrix product for each row: large products would be spread over cores, which costs more than it
+        # saves.
         batch = min(max(p.ndim - 1, len(self.batch_shape)), 1)
         basis = product_basis(self.order, p, q, batch)
         flat = basis.reshape(*basis.shape[: batch + 1], -1)
@@ -245,7 +246,7 @@ class GridSurface(Measured):
         rotation: (..., 3, 3) local to eye frame.
         outer: see `Measured`.
         window_mm: see `Measured`.
-        centre_mm: (..., 2) place (y, z) of the middle of the grid.
+        centre_mm: (..., 2) position (y, z) of the middle of the grid.
         spacing_mm: (...,) spacing of the grid.
         row: (...,) the surface's grid in the table.
         table: (e, n, n) coefficients c_ij (mm) of e grids, i along y and j along z; n is odd.
@@ -296,12 +297,12 @@ class GridSurface(Measured):
         )
 
     def take(self, index: Indices) -> Self:
-        """Select surfaces of the batch by `index`, with the same table; a single surface is returned as it is."""
+        """Select surfaces of the batch by `index`, with the same table; a single surface is returned unchanged."""
         *parts, table = self._parts()
         return type(self)(*(*(part[index] for part in parts), table)) if self.batch_shape else self
 
     def with_outer(self, outer: Floats) -> Self:
-        """Move the same bicubic heights to another biconic."""
+        """Replace the outer biconic, keeping the bicubic heights."""
         return replace(self, outer=outer)
 
     def _scaled_shape(self, factor: float) -> dict[str, Floats]:
@@ -346,9 +347,9 @@ def splines(share: Floats, spacing: FloatLike, second: bool) -> tuple[Floats, ..
     """Evaluate the four cubic B-splines over a knot interval, (..., 4), with first and (on request) second derivatives.
 
     Args:
-        share: place in the interval, from 0 to 1; outside, the cubics are continued.
+        share: position in the interval, from 0 to 1; outside, the cubics are continued.
         spacing: length of the interval, mm.
-        second: whether second derivatives are wanted.
+        second: whether to compute second derivatives.
     """
     t, r = share, 1.0 - share
     h = np.asarray(spacing)

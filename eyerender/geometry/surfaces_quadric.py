@@ -58,7 +58,7 @@ class Quadric(Surface):
         origin_mm: npt.ArrayLike = (0.0, 0.0, 0.0),
         rotation: npt.ArrayLike | None = None,
     ) -> Quadric:
-        """Make the conic y^2 + z^2 + 2 R x + (1 + Q) x^2 = 0 with its apex at the origin; R > 0 opens to -x."""
+        """Create the conic y^2 + z^2 + 2 R x + (1 + Q) x^2 = 0 with its apex at the origin; R > 0 opens to -x."""
         radius = np.asarray(radius_mm, dtype=np.float64)
         shape = np.broadcast_shapes(radius.shape, np.shape(conic_constant), np.shape(origin_mm)[:-1])
         sign = np.broadcast_to(np.sign(radius), shape)
@@ -77,7 +77,7 @@ class Quadric(Surface):
         rotation: npt.ArrayLike | None = None,
         front: bool = True,
     ) -> Quadric:
-        """Make half of the ellipsoid (x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about `centre_mm`, towards +x (`front`) or -x."""
+        """Create half of (x/a)^2 + (y/b)^2 + (z/c)^2 = 1 about `centre_mm`, towards +x (`front`) or -x."""
         axes = np.asarray(semi_axes_mm, dtype=np.float64)
         matrix = np.zeros((*axes.shape[:-1], 3, 3))
         scale = axes[..., 1] * axes[..., 2]
@@ -87,7 +87,7 @@ class Quadric(Surface):
 
     @classmethod
     def plane(cls, origin_mm: npt.ArrayLike, rotation: npt.ArrayLike | None = None) -> Quadric:
-        """Make the plane x = 0 of the local frame."""
+        """Create the plane x = 0 of the local frame."""
         return cls.oriented(np.zeros((3, 3)), np.array([1.0, 0.0, 0.0]), np.array(0.0), 1.0, origin_mm, rotation)
 
     @classmethod
@@ -100,7 +100,7 @@ class Quadric(Surface):
         origin_mm: npt.ArrayLike = (0.0, 0.0, 0.0),
         rotation: npt.ArrayLike | None = None,
     ) -> Quadric:
-        """Choose a sheet of F = 0: the one where the half gradient of F has the sign `sign` along x."""
+        """Create the sheet of F = 0 on which the half gradient of F has the sign `sign` along x."""
         factor = np.asarray(sign, dtype=np.float64)
         full = factor[..., None, None] * np.asarray(matrix)
         shape = full.shape[:-2]
@@ -116,12 +116,12 @@ class Quadric(Surface):
 
     @property
     def coefficients(self) -> tuple[Floats | float, ...]:
-        """Coefficients (A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c), eye frame; numbers or (n,) arrays."""
+        """Return (A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c) in the eye frame; numbers or (n,) arrays."""
         return self._eye
 
     @property
     def axial_coefficients(self) -> tuple[Floats | float, Floats | float, Floats | float] | None:
-        """Coefficients (A_xx, b_x, c) of y^2 + z^2 + A_xx x^2 + 2 b_x x + c = 0 in the eye frame; None for others."""
+        """Return (A_xx, b_x, c) of y^2 + z^2 + A_xx x^2 + 2 b_x x + c = 0 in the eye frame; None for others."""
         return (self._eye[0], self._eye[6], self._eye[9]) if self._axial else None
 
     def seen_from(self, origin_mm: Floats, rotation: Floats) -> Quadric:

@@ -1,4 +1,4 @@
-"""Fits to measured heights: the biconic that continues them, the spline through a grid, the grid of scattered points.
+"""Fits to measured heights: the continuing biconic, splines through a grid, and a grid from scattered points.
 
 Heights are depths x of a surface over (y, z), negative behind the apex of a cornea.
 """
@@ -30,7 +30,7 @@ def outer_biconic(height: Callable[[Floats, Floats], Floats], ring_mm: tuple[flo
 
     Args:
         height: depth of the surface over (y, z).
-        ring_mm: radii between which the biconic is fitted; points lie evenly by area.
+        ring_mm: radii between which the biconic is fitted, to points that are uniform by area.
     """
     inner, end = ring_mm
     radius = np.sqrt(np.linspace(inner**2, end**2, _RINGS))[:, None]
@@ -41,7 +41,7 @@ def outer_biconic(height: Callable[[Floats, Floats], Floats], ring_mm: tuple[flo
 
 def biconic_through(y: Floats, z: Floats, x: Floats) -> Floats:
     """Fit a biconic to points, (n,) each, by least squares in x (see `Measured.outer`), (8,)."""
-    # Start: the paraboloid x = a + b y + c z - (d y^2 + 2 e y z + f z^2) / 2, turned to its own meridians.
+    # Start: the paraboloid x = a + b y + c z - (d y^2 + 2 e y z + f z^2) / 2, rotated to its own meridians.
     table = np.column_stack([np.ones_like(y), y, z, -0.5 * y * y, -y * z, -0.5 * z * z])
     a, b, c, d, e, f = np.linalg.lstsq(table, x, rcond=None)[0]
     sign = 1.0 if d + f > 0.0 else -1.0
@@ -57,7 +57,7 @@ def biconic_through(y: Floats, z: Floats, x: Floats) -> Floats:
         beyond = (1.0 + v[2:4]) * (REACH_MM / v[:2]) ** 2 - 0.95
         return np.asarray(np.concatenate([gap, 10.0 * np.maximum(beyond, 0.0)]))
 
-    # The angle means nothing for a sphere, so it is kept near its start.
+    # The angle is undefined for a sphere, so it is kept near its start.
     free = np.array([np.inf, np.inf, np.inf])
     bounds = (np.concatenate([low, [turn - 1.6], -free]), np.concatenate([high, [turn + 1.6], free]))
     first, fine = [*start, turn, a, b, c], 1e-14
@@ -93,13 +93,13 @@ def smooth_heights(
     smoothing with B-splines and penalties").
 
     Args:
-        y: (k,) places, mm.
-        z: (k,) places, mm.
+        y: (k,) positions, mm.
+        z: (k,) positions, mm.
         x: (k,) heights, mm.
         half_mm: half of the grid's width; a multiple of the spacing.
         spacing_mm: spacing of the grid.
-        smoothing: weight of the penalty on differences in units of the spacing; 0 passes through the points as far as
-            the splines can.
+        smoothing: weight of the penalty on differences in units of the spacing; 0 interpolates the points as far as the
+            splines allow.
     """
     base = biconic_through(y, z, x)
     x = x - _biconic_height(base, y, z)

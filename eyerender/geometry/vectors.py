@@ -1,4 +1,4 @@
-"""Lengths and products of many short vectors. NumPy's own functions loop over the three numbers of each vector."""
+"""Lengths and products of many short vectors; NumPy's functions would loop over the three numbers of each vector."""
 
 from __future__ import annotations
 

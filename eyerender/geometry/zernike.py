@@ -5,8 +5,8 @@ Term j has the radial order n and the azimuthal order m, j = (n (n + 2) + m) / 2
     Z = sqrt((2 - delta_m0) (n + 1)) R_n^|m|(rho) cos(m theta), sin(|m| theta) for m < 0,
     R_n^m(rho) = (-1)^k rho^m P_k^(m, 0)(1 - 2 rho^2), k = (n - m) / 2, with Jacobi's polynomials P
 
-(Thibos et al. 2002, "Standards for reporting the optical aberrations of eyes"; Abramowitz & Stegun 22.5). theta counts
-from the first axis to the second. A sum of terms is evaluated as a sum of products of Chebyshev polynomials T_i(p)
+(Thibos et al. 2002, "Standards for reporting the optical aberrations of eyes"; Abramowitz & Stegun 22.5). theta runs
+from the first axis towards the second. A sum of terms is evaluated as a sum of products of Chebyshev polynomials T_i(p)
 T_j(q): its coefficients are no larger than those of the Zernike terms, so no digits cancel, as they do in powers of p
 and q. Derivatives are sums of the same products.
 """
@@ -25,12 +25,12 @@ MAX_ORDER = 14
 
 
 def terms(order: int) -> int:
-    """Count the terms up to a radial order."""
+    """Return the number of terms up to a radial order."""
     return (order + 1) * (order + 2) // 2
 
 
 def order_of(count: int) -> int:
-    """Find the smallest radial order with at least `count` terms."""
+    """Return the smallest radial order with at least `count` terms."""
     order = 0
     while terms(order) < count:
         order += 1
@@ -38,12 +38,12 @@ def order_of(count: int) -> int:
 
 
 def orders(order: int) -> list[tuple[int, int]]:
-    """List (n, m) of all terms up to a radial order, in the standard order."""
+    """Return (n, m) of all terms up to a radial order, in the standard order."""
     return [(n, m) for n in range(order + 1) for m in range(-n, n + 1, 2)]
 
 
 def zernike(order: int, p: Floats, q: Floats) -> Floats:
-    """Evaluate all terms up to a radial order at places (p, q) of the unit disc, (terms, ...)."""
+    """Evaluate all terms up to a radial order at points (p, q) of the unit disc, (terms, ...)."""
     square, angle = p * p + q * q, np.arctan2(q, p)
     rho = np.sqrt(square)
     out = np.empty((terms(order), *np.shape(square)))
@@ -66,7 +66,7 @@ def mirrored(coefficients: Floats) -> Floats:
 def products(order: int) -> Floats:
     """Compute the matrices from Zernike coefficients to those of Chebyshev products, (6, terms, terms).
 
-    The first axis holds the value and its derivatives by p, q, pp, pq and qq. A product T_i(p) T_j(q) has the place of
+    The first axis holds the value and its derivatives by p, q, pp, pq and qq. A product T_i(p) T_j(q) has the index of
     the pair (i, j) in `pairs`.
     """
     count = order + 1
@@ -91,12 +91,12 @@ def products(order: int) -> Floats:
 
 @lru_cache(maxsize=MAX_ORDER + 1)
 def pairs(order: int) -> tuple[tuple[int, int], ...]:
-    """List the pairs (i, j) with i + j <= order."""
+    """Return the pairs (i, j) with i + j <= order."""
     return tuple((i, j) for i in range(order + 1) for j in range(order + 1 - i))
 
 
 def product_basis(order: int, p: Floats, q: Floats, axis: int) -> Floats:
-    """Evaluate the products T_i(p) T_j(q) of `pairs` at places of one shape, along a new axis."""
+    """Evaluate the products T_i(p) T_j(q) of `pairs` at points of one shape, along a new axis."""
     first, second = _chebyshev(order, p), _chebyshev(order, q)
     out = np.empty((*p.shape[:axis], terms(order), *p.shape[axis:]))
     view = np.moveaxis(out, axis, 0)
@@ -115,5 +115,5 @@ def _chebyshev(order: int, x: Floats) -> list[Floats]:
 
 
 def fitted(order: int, p: Floats, q: Floats, values: Floats) -> Floats:
-    """Fit coefficients (terms,) to values (n,) at places (n,) by least squares."""
+    """Fit coefficients (terms,) to values (n,) at points (n,) by least squares."""
     return np.asarray(np.linalg.lstsq(zernike(order, p, q).T, values, rcond=None)[0], dtype=np.float64)

@@ -1,1 +1,1 @@
-"""From frames to images and back: capture, the image observer, labels, and comparison of the observers."""
+"""From frames to images and back: rendering, the image observer, labels, and comparison of the observers."""

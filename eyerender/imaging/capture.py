@@ -1,4 +1,4 @@
-"""Rendering of frames in memory, with a window of the sensor for each eye."""
+"""Render frames in memory, with a window of the sensor for each eye."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..rendering.records.job import RenderJob
     from ..rendering.renderer import RenderedWindow, Renderer
 
-# For one image, this is a day's work of a fast processor.
+# For one image, this is a day's work for a fast processor.
 MAX_SAMPLES = 10**12
 
 
@@ -36,12 +36,12 @@ class EyeImage:
     """A rendered image of one eye: a window of a camera's sensor.
 
     Attributes:
-        frame: the one row of `Frames` that it shows.
+        frame: the row of `Frames` that it shows.
         row: index of that row among the rendered frames.
         window: (x0, y0, width, height) of the window in full-sensor pixels.
-        counts: what the sensor stores, (height, width) uint8 or uint16 DN.
-        irradiance: on the sensor before noise and quantisation, (height, width) W/m^2.
-        parts: part of the picture at each pixel's centre, (height, width) uint8 (docs/formats.md).
+        counts: counts stored by the sensor, (height, width) uint8 or uint16 DN.
+        irradiance: irradiance of the sensor before noise and quantisation, (height, width) W/m^2.
+        parts: part of the eye at each pixel's centre, (height, width) uint8 (docs/formats.md).
         eye: the eye's model, placed in the world by x_world = M x + t.
         M: (3, 3) rotation of that motion.
         t: (3,) translation of that motion, mm.
@@ -107,7 +107,7 @@ def render_windows(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BegunImage:
-    """The image of a traced row of `frames`, which a second thread makes."""
+    """Image in progress of a traced row of `frames`; a second thread completes it."""
 
     frames: Frames
     row: int
@@ -133,15 +133,15 @@ class BegunImage:
 
 
 def begin_each(many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False) -> Iterator[BegunImage]:
-    """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
+    """Trace the rows of many frames in order; a second thread completes each image while the next row is traced.
 
-    The next frames are fetched before the last ones are traced, so that a second thread can prepare them meanwhile.
-    Where fetching fails, the frames at hand are traced first.
+    The next frames are fetched before the last ones are traced, so that a second thread can prepare them. If fetching
+    fails, the frames at hand are traced first.
 
     Args:
         many: the frames, one scene after the other.
-        renderer: what traces them.
-        highlights: whether to find the highlights of wet and oily surfaces.
+        renderer: the renderer.
+        highlights: whether to label the highlights of wet and oily surfaces.
 
     Raises:
         InputError: a scene's windows cannot be rendered.
@@ -173,7 +173,7 @@ class _Step:
 
 
 def _steps(many: Iterable[Frames], highlights: bool) -> Iterator[_Step]:
-    """Make the jobs to trace, one after the other."""
+    """Yield the jobs to trace, one after the other."""
     for frames in many:
         check_windows(frames.scene)
         for row in range(len(frames)):
@@ -182,7 +182,7 @@ def _steps(many: Iterable[Frames], highlights: bool) -> Iterator[_Step]:
 
 
 def render_job(frames: Frames, row: int) -> RenderJob:
-    """Make the renderer's job for one row: the eye in its pose, the rig, the window, the seed."""
+    """Create the renderer's job for one row: the eye in its pose, the rig, the window, the seed."""
     from ..rendering.records.job import RenderJob
 
     scene, index = frames.scene, frames.index
@@ -213,10 +213,10 @@ def render_job(frames: Frames, row: int) -> RenderJob:
 
 
 def focus_dpt(frames: Frames, row: int) -> float:
-    """Compute the vergence at which the eye of one row is focused.
+    """Compute the vergence (D) at which the eye of one row is focused.
 
-    Where the scene states how far the lens accommodates, as for drawn people, the eye is focused that much nearer than
-    its far point. Otherwise it is focused on its target, or far away without one, unless it is too short-sighted.
+    If the scene states the accommodation, as for drawn people, the eye is focused that much nearer than its far point.
+    Otherwise it is focused on its target, or far away without one, unless it is too short-sighted.
     """
     scene, index = frames.scene, frames.index
     far = -at_cornea_d(scene.refraction_d(EYES[index.eye[row]]))
@@ -228,7 +228,7 @@ def focus_dpt(frames: Frames, row: int) -> float:
 
 
 def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:
-    """Place the job at evenly spaced moments of the exposure, with moving eye and head; empty where nothing moves."""
+    """Return the job at evenly spaced moments of the exposure, with moving eye and head; empty if nothing moves."""
     scene, pose = frames.scene, frames.pose
     motion = scene.spec.motion
     if motion is None:
@@ -277,10 +277,10 @@ def check_windows(scene: Scene) -> None:
 
 
 def make_renderer(backend: BackendChoice = "auto", threads: int | None = None) -> Renderer:
-    """Make a renderer on a backend that works.
+    """Create a renderer on a backend that works.
 
     Raises:
-        BackendError: there is none; the message says how to fix it.
+        BackendError: no backend renders; the message says how to fix it.
     """
     chosen = choose_backend(backend, threads)
     # Importing the renderer imports mitsuba, which requires a backend that is set up.
@@ -301,7 +301,7 @@ def noiseless(image: EyeImage) -> NDArray[Any]:
 
 
 def stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
-    """Convert counts to the type in which they are written, through the sensor's compression."""
+    """Convert counts to the stored type, through the sensor's compression."""
     sensor = scene.spec.sensor
     if sensor.bit_depth != 8:
         return dn

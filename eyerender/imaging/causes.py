@@ -1,13 +1,13 @@
-"""Observations of a scene with one cause of error after the other, for the error budget of gaze (`gaze/budget.py`).
+"""Observe a scene with one cause of error after the other, for the error budget of gaze (`gaze/budget.py`).
 
     estimator        exact features of the reference eye; the pupil is the image of the stop's centre
-    eye model        the same of the scene's own eye
-    optics           the centre of the apparent pupil's ellipse instead: refraction and perspective of its outline
-    extraction       features found in an ideal image: bare eye, lamps alone, lens without faults, no noise
-    image formation  features found in the scene's image without the sensor's noise: lids, lashes, blur, motion, ...
-    noise            features found in the same image with noise, once for each seed
+    eye model        the same for the scene's own eye
+    optics           the centre of the apparent pupil's ellipse: refraction and perspective of its outline
+    extraction       features extracted from an ideal image: bare eye, lamps only, ideal lens, no noise
+    image formation  features extracted from the scene's image without noise: lids, lashes, blur, motion, ...
+    noise            features extracted from the same image with noise, once for each seed
 
-Where the scene's image without noise is the ideal one already, extraction and image formation are one step, `image`.
+If the scene's image without noise is already ideal, extraction and image formation are one step, `image`.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ def budget_steps(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, list[Observations]]:
-    """Observe the frames of a scene with one cause of error after the other; the argument of `er.gaze.budget`.
+    """Observe the frames of a scene with one cause of error after the other; the input of `er.gaze.budget`.
 
     Every image is rendered once and exposed again for each seed.
 
     Args:
         frames: frames with targets.
-        reference: eye model whose features give the estimator's own error.
+        reference: eye model with whose features the estimator's own error is computed.
         images: whether to render images; without them the steps end with `optics`.
         seeds: number of exposures of each image with other noise.
         backend: backend that renders.
@@ -62,7 +62,7 @@ def budget_steps(
 
     Raises:
         InputError: the frames have no targets, or seeds < 1.
-        BackendError: there is nothing to render with.
+        BackendError: no backend can render.
     """
     if seeds < 1:
         raise InputError(f"must be >= 1, not {seeds}", path="seeds")
@@ -84,7 +84,7 @@ def budget_steps(
 def _image_steps(
     frames: Frames, seeds: int, renderer: Renderer, progress: Progress | None
 ) -> dict[str, list[Observations]]:
-    """Observe the steps that need images; each image is developed, observed and dropped before the next."""
+    """Observe the steps that need images; each image is exposed, observed and dropped before the next."""
     observer, sensor = ImageObserver(), frames.scene.spec.sensor
     ideal, own = ideal_scene(frames.scene), _noiseless_scene(frames.scene)
     apart = ideal.spec != own.spec
@@ -115,7 +115,7 @@ def with_stop_centre(observations: Observations) -> Observations:
 
 
 def ideal_scene(scene: Scene) -> Scene:
-    """Replace the scene's camera by an ideal one: bare eyes, lamps alone, a lens and a sensor without faults."""
+    """Replace the scene's camera by an ideal one, and use bare eyes and lamps only."""
     spec, own = scene.spec, scene.spec.sensor
     sensor = own.model_copy(
         update={
@@ -129,7 +129,7 @@ def ideal_scene(scene: Scene) -> Scene:
 
 
 def exposed_again(image: EyeImage, sensor: Sensor, seed: int) -> EyeImage:
-    """Expose a rendered image with a sensor and other noise; the fixed pattern stays, as it is the sensor's."""
+    """Expose a rendered image with another sensor and other noise; the sensor's fixed pattern stays."""
     spec, index = image.scene.spec, image.frame.index
     scene = image.scene.replaced(spec.model_copy(update={"sensor": sensor}))
     camera = scene.rig.cameras[image.camera]
@@ -147,7 +147,7 @@ def _noiseless_scene(scene: Scene) -> Scene:
 
 
 def _with_eye(frames: Frames, model: str) -> Frames:
-    """Let eyes of another model fixate the same targets, with the scene's pupil diameter where it sets one."""
+    """Let eyes of another model fixate the same targets, with the scene's pupil diameter if it sets one."""
     scene = frames.scene
     other = Scene.of(scene.spec, base=scene.base, eye=model, source=scene.source)
     found = other.frames()

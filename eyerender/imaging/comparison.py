@@ -1,4 +1,4 @@
-"""Comparison of the two observers: errors of image-derived features against the analytic ones, and the gaze of both."""
+"""Compare the two observers: errors of image-derived features against analytic ones, and the gaze of both."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ SCHEMA = "eyerender/compare/2"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FeatureErrors(ArrayValue):
-    """Image-derived minus analytic features, NaN where one of the two has none.
+    """Image-derived minus analytic features, NaN if one of the two is missing.
 
     Attributes:
-        centre_px: (n, 2).
-        semi_axes_px: (n, 2).
-        glint_px: (n, m, 2), in the order of the analytic glints.
+        centre_px: (n, 2) errors of the pupil's centre.
+        semi_axes_px: (n, 2) errors of the semi-axes.
+        glint_px: (n, m, 2) errors of glints, in the order of the analytic glints.
         pupil_expected: (n,) whether the analytic observer sees the pupil on the sensor.
-        pupil_found: (n,) whether it was also found in the image.
+        pupil_found: (n,) whether it was also detected in the image.
         glint_expected: (n, m) the same for glints.
-        glint_found: (n, m).
+        glint_found: (n, m) the same for glints.
     """
 
     centre_px: Floats
@@ -42,7 +42,7 @@ class FeatureErrors(ArrayValue):
     glint_found: Bools
 
     def summary(self) -> dict[str, Any]:
-        """Summarise medians, 95th percentiles, maxima and mean vectors in px, and the counts."""
+        """Return medians, 95th percentiles, maxima and mean vectors in px, and the counts."""
         return {
             "pupils": {"expected": int(self.pupil_expected.sum()), "found": int(self.pupil_found.sum())},
             "glints": {"expected": int(self.glint_expected.sum()), "found": int(self.glint_found.sum())},
@@ -56,9 +56,9 @@ class FeatureErrors(ArrayValue):
 class Comparison:
     """Analytic and image-derived observations of the same frames, with feature errors and gaze errors of both.
 
-    The gaze errors are None where the scene allows none; `gaze_reason` is then the reason. With several subjects, each
-    is calibrated on its own: `subjects` are their numbers, `subject_errors` the errors of each, by observer as above,
-    and `gaze_truth` and `gaze_found` those of all who can be calibrated.
+    The gaze errors are None if the scene allows none, for the reason `gaze_reason`. With several subjects, each is
+    calibrated separately: `subjects` are their numbers, `subject_errors` the errors of each, by observer, and
+    `gaze_truth` and `gaze_found` those of all who can be calibrated.
     """
 
     truth: Observations
@@ -152,7 +152,7 @@ def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
     """Compute the errors of `found` against `truth`, row by row.
 
     Raises:
-        InputError: the two are not of the same frames and eyes.
+        InputError: the frames and eyes of the two differ.
     """
     same = len(truth) == len(found) and np.array_equal(truth.index.frame, found.index.frame)
     if not same or not np.array_equal(truth.index.eye, found.index.eye):
@@ -186,22 +186,22 @@ def compare(
     *,
     subjects: Ints | None = None,
 ) -> Comparison:
-    """Compare two observers' reports of the same frames, in features and in gaze.
+    """Compare two observers on the same frames, in features and in gaze.
 
     Args:
-        truth: the reference, such as the analytic observer's report.
-        found: report of the same frames and eyes, row by row, such as that of the image observer.
+        truth: the reference, such as observations of the analytic observer.
+        found: observations of the same frames and eyes, row by row, such as those of the image observer.
         rig: the rig of both.
         estimator: gaze estimator for both; every target is estimated by a calibration on the others.
         name: name of the estimator in the result; default: its class, and a regression's function.
-        subjects: (n,) whom each row shows, if they are several or their targets are drawn: each subject is then
-            calibrated on its own, and each of its targets counts as a fixation.
+        subjects: (n,) subject of each row, if there are several or targets are drawn: each subject is then calibrated
+            separately, and each of its targets counts as a fixation.
 
     Returns:
-        The comparison. Where gaze cannot be estimated it contains the reason.
+        The comparison. If gaze cannot be estimated, it contains the reason.
 
     Raises:
-        InputError: the two are not of the same frames and eyes.
+        InputError: the frames and eyes of the two differ.
     """
     if not name:
         name = f"regression {estimator.function}" if isinstance(estimator, Regression) else type(estimator).__name__
@@ -244,7 +244,7 @@ def _with_fixations(observations: Observations) -> Observations:
 
 
 def _joined(errors: Sequence[GazeErrors | None]) -> GazeErrors | None:
-    """Join the errors of several subjects, without those that have none."""
+    """Join the errors of several subjects, skipping those that have none."""
     known = [one for one in errors if one is not None]
     if len(known) < 2:
         return known[0] if known else None

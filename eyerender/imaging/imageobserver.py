@@ -1,4 +1,4 @@
-"""The image observer: it finds features in pixels and reports them in the form of the analytic observer."""
+"""The image observer: extracts features from pixels and reports them like the analytic observer."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ LEAST_FOR_POOL = 128
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageObserver:
-    """The observer of pixels: the pupil ellipse and the glints that the extractor finds; it never uses the truth.
+    """Observer of pixels: extracts pupil ellipse and glints; it never uses the truth.
 
     Args:
-        settings: settings of the extractor; where the rig is known, the range of pupil sizes is narrowed.
+        settings: settings of the extractor; if the rig is known, the range of pupil sizes is narrowed.
         gamma: encoding gamma of the images; 1 is linear.
         backend: backend that renders the frames.
         threads: number of processor threads for rendering; None: all.
@@ -96,7 +96,7 @@ class ImageObserver:
     ) -> Observations:
         """Extract the features of some images of a scene; `index` has a row for each of their records.
 
-        `exposed` turns each image into what the extractor sees, such as another exposure of it.
+        `exposed` converts each image before extraction, for instance to another exposure.
         """
         parts: list[Observations] = []
         few: list[Observations] = []  # single observations take ten times the memory of joined ones
@@ -125,10 +125,10 @@ class ImageObserver:
         pictures: Path | None = None,
         warn: Warn | None = None,
     ) -> Observations:
-        """Extract the features of any images, or of a folder: one that this package wrote, or any with image files.
+        """Extract the features of image files, or of a folder: one of this package, or any with image files.
 
-        Each image is a frame; with a scene its glints are assigned to lights. Images of a folder that cannot be
-        used are skipped with a warning; their frames are missing.
+        Each image is a frame; with a scene its glints are assigned to lights. Images of a folder that cannot be used
+        are skipped with a warning; their frames are missing.
 
         Args:
             paths: images, or one folder.
@@ -136,8 +136,8 @@ class ImageObserver:
             progress: called after each image.
             eyes: 1, or 2 for images of both eyes. The eye on the image's left is then the right eye, as a camera in
                 front of the subject sees it.
-            processes: how many images are worked on at the same time.
-            pictures: folder for a picture of what was found in each image.
+            processes: number of images processed at the same time.
+            pictures: folder for overlays of the results over the images.
             warn: receives a warning if images have colour, and one for each image that is skipped.
         """
         lenient = len(paths) == 1 and os.path.isdir(paths[0])
@@ -173,7 +173,7 @@ class ImageObserver:
     def observe_found(
         self, found: Sequence[Extraction], frame: int, shape: tuple[int, int], *, scene: Scene | None, source: str
     ) -> Observations:
-        """Report what was extracted from a whole sensor image (h, w): of one eye, or of the left and right half."""
+        """Convert extractions of a whole sensor image (h, w) to observations: of one eye, or of both halves."""
         parts = []
         for side, one in enumerate(found):
             lights: Sequence[int] = [-1] * len(one.glints)
@@ -223,7 +223,7 @@ class ImageObserver:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _FileJob:
-    """What is done with one image file; a process of its own may do it."""
+    """Extraction of one image file, which a separate process may run."""
 
     settings: ExtractionSettings
     gamma: float
@@ -232,7 +232,7 @@ class _FileJob:
     lenient: bool
 
     def __call__(self, path: str | Path) -> tuple[tuple[Extraction, ...], tuple[int, int], bool] | InputError:
-        """Extract a file's features, with its (h, w) and whether it has colour; or say why it cannot be read."""
+        """Extract a file's features, with its (h, w) and whether it has colour; or return why it cannot be read."""
         try:
             image, depth, colour = read_any_image(path)
         except InputError as error:
@@ -253,7 +253,7 @@ class _FileJob:
 
 
 def files_of(paths: Sequence[str | Path]) -> list[Path]:
-    """List the files of paths of images, or of one folder."""
+    """Return the image files of paths, or of one folder."""
     if len(paths) == 1 and os.path.isdir(paths[0]):
         return [Path(paths[0]) / name for name in image_files(paths[0])]
     return [Path(path) for path in paths]
@@ -278,7 +278,7 @@ def _refuse_inputs(pictures: Sequence[Path], paths: Sequence[str | Path]) -> Non
 
 
 def colour_warning(count: int, what: str) -> InputWarning:
-    """Make a warning that images or frames have colour."""
+    """Create a warning that images or frames have colour."""
     return InputWarning(
         code="colour", reason=f"{count} {what} in colour; the luminance is taken, but near-infrared images are grey"
     )
@@ -287,11 +287,11 @@ def colour_warning(count: int, what: str) -> InputWarning:
 def detect(
     images: EyeImage | Iterable[EyeImage], rig: RigLike | None = None, *, settings: ExtractionSettings | None = None
 ) -> Observations:
-    """Recover pupils and glints from rendered images, one row for each.
+    """Extract pupils and glints from rendered images, one row for each.
 
     Args:
         images: images from `render`; their labels are not used.
-        rig: identifies the glints, in place of the rendered rig.
+        rig: rig for the assignment of glints, instead of the rendered one.
         settings: settings of the extraction.
     """
     several = [images] if isinstance(images, EyeImage) else images
@@ -344,7 +344,7 @@ def _parsed(text: Any, source: str) -> Any:
 
 
 def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float) -> tuple[NDArray[Any], Floats]:
-    """Cut out the part of an image within `half_px` of a full-sensor point; also return its first pixel."""
+    """Crop an image to `half_px` around a full-sensor point; also return the crop's first pixel."""
     h, w = image.shape
     x0, y0 = np.clip(np.floor(centre_px - corner - half_px), 0, [w - 16, h - 16]).astype(int)
     x1, y1 = np.clip(np.ceil(centre_px - corner + half_px), [x0 + 16, y0 + 16], [w, h]).astype(int)
@@ -354,7 +354,7 @@ def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: flo
 def _lights(
     found: Extraction, corner: Floats, scene: Scene, camera: PinholeCamera, eye_mm: Floats
 ) -> tuple[list[int], Sequence[str | None]]:
-    """Assign glints to lights (-1: none, with the reason), from the rig and a rough position of the eye."""
+    """Assign glints to lights (-1: none, with the reason), from the rig and an approximate position of the eye."""
     if not found.glints or found.pupil.ellipse is None:
         return [-1] * len(found.glints), ["no pupil to place the reflections by"] * len(found.glints)
     spots = np.array([g.xy_px for g in found.glints]) + corner

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..rendering.renderer import Renderer
 
 PICTURE_FIELDS = frozenset({"image", "sensor", "look", "region", "lens", "motion", "ambient", "seed"})
-"""The fields of a scene that change its pictures alone."""
+"""Fields of a scene that affect only its images."""
 
 # A renderer keeps compiled kernels and scenes; a notebook needs one for each backend and number of threads.
 _renderer = lru_cache(maxsize=1)(make_renderer)
@@ -36,16 +36,16 @@ _renderer = lru_cache(maxsize=1)(make_renderer)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledImage(EyeImage):
-    """A rendered picture of one eye with its labels.
+    """A rendered image of one eye with its labels.
 
     Attributes:
-        labels: what a dataset holds for each image (docs/formats.md): pupil, iris, glints, lids, points in space.
+        labels: labels as in a dataset (docs/formats.md): pupil, iris, glints, lids, points in space.
     """
 
     labels: dict[str, Any]
 
     def _repr_png_(self) -> bytes:
-        """Encode the picture as PNG, for notebooks."""
+        """Encode the image as PNG, for notebooks."""
         return png_bytes(preview(self.counts, self.scene.spec.sensor.full_scale_dn))
 
 
@@ -69,17 +69,17 @@ def render(
     progress: Progress | None = None,
     **picture: Any,
 ) -> LabelledImage | list[LabelledImage]:
-    """Render frames in memory, each eye in a window of its own.
+    """Render frames in memory, one window per eye.
 
     Args:
         frames: one frame (`frames[0]`), several, or a scene for all of its frames.
-        rig: replaces the one that the frames were made for.
+        rig: replaces the rig of the frames.
         spp: samples per pixel.
         backend: the render backend.
         threads: number of processor threads for rendering; None: all.
         progress: called with (done, total, "") after each image.
-        picture: fields of the scene that change its pictures alone: `image`, `sensor`, `look`, `region`, `lens`,
-            `motion`, `ambient`, `seed`.
+        picture: fields of the scene that affect only its images: `image`, `sensor`, `look`, `region`, `lens`, `motion`,
+            `ambient`, `seed`.
 
     Returns:
         One image for one frame, else a list with an image for each row.
@@ -113,21 +113,21 @@ def render_folder(
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> dict[str, Any]:
-    """Render a scene into a folder of labelled images (docs/formats.md), completely or not at all.
+    """Render a scene into a folder of labelled images (docs/formats.md); on an error, nothing is left.
 
     Args:
         scene: the scene.
         path: the folder to write.
         backend: the render backend.
         threads: total number of processor threads; None: all.
-        overwrite: replace what the folder holds.
+        overwrite: replace the contents of the folder.
         exr: also write the noise-free linear irradiance as EXR.
         progress: called with (images done, images in all, "").
         warn: called for saturated images before the folder is put in place; if it raises, nothing is written. Warnings
             that need no rendering are in `Scene.warnings`.
 
     Returns:
-        What was written: schema eyerender/render/1, path, number of images, warnings of both kinds.
+        A mapping (schema eyerender/render/1): path, number of images, warnings of both kinds.
     """
     warnings = scene.warnings()
     refuse_non_empty(path, overwrite)  # before the work, not after it
@@ -180,7 +180,7 @@ def render_folder(
     }
 
 
-_LOOKED_AT = 6  # frames by which a run is exposed
+_LOOKED_AT = 6  # number of frames on which the exposure is measured
 _LONGEST_MS = 1000.0
 
 
@@ -192,15 +192,16 @@ def auto_exposed(
     backend: BackendChoice = "auto",
     threads: int | None = None,
 ) -> Scene:
-    """Give a scene one exposure for all of its images, as a camera's automatic exposure settles for a run.
+    """Set one exposure for all images of a scene, as the automatic exposure of a camera would.
 
-    The exposure time is chosen so that `share` of the pixels of a few of its frames, evenly chosen and rendered with
-    few samples, are at most `level` of full scale (linear, black level included). Frames around the view do not count.
+    The exposure time is chosen so that the share `share` of pixels is at most `level` of full scale (linear, black
+    level included). It is measured on a few evenly chosen frames, rendered with few samples. Frames around the view do
+    not count.
 
     Args:
         scene: the scene.
         level: share of full scale.
-        share: share of the pixels that are at most at this level.
+        share: share of the pixels at or below this level.
         backend: the render backend.
         threads: total number of processor threads; None: all.
 
@@ -221,7 +222,7 @@ def auto_exposed(
 
 
 def settled_exposure_ms(scene: Scene, level: float, renderer: Renderer, *, share: float = 0.98) -> float | None:
-    """Find the exposure time of `auto_exposed`, ms; None where the images are dark."""
+    """Compute the exposure time (ms) of `auto_exposed`; None if the images are dark."""
     sensor = scene.spec.sensor
     frames = scene.with_(spp=4).frames()
     count = min(_LOOKED_AT, len(frames))
@@ -248,14 +249,14 @@ def export_scene(
 
     Args:
         scene: the scene.
-        path: the folder to write, completely or not at all.
+        path: the folder to write; on an error, nothing is left.
         frame: the frame, counted from 0.
         side: the eye, right or left; by default the first one that the frame shows.
         spp: samples per pixel requested in the file.
-        overwrite: replace what the folder holds.
+        overwrite: replace the contents of the folder.
 
     Returns:
-        Schema eyerender/export-scene/1: path, name of the XML file, names of all files.
+        A mapping (schema eyerender/export-scene/1): path, name of the XML file, names of all files.
 
     Raises:
         InputError: there is no such frame or eye, the scene cannot be rendered, or the folder is not empty.

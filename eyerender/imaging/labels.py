@@ -1,10 +1,10 @@
-"""Labels of an image: predictions of ray optics, and measurements in the picture.
+"""Labels of an image: predictions of ray optics, and measurements in the image.
 
-They contain ellipses, glints, points and lines in space, and matrices.
+Labels contain ellipses, glints, points and lines in space, and matrices.
 
-`amodal` ellipses are those of the outline without occluders: that of the pupil seen through the cornea, and that of the
-iris at the curve of the limbus where the cornea is half clear. A `visible` ellipse has the second moments of the
-visible pixels (of pupil, or of iris and pupil together): semi-axes 2 sqrt(eigenvalues of covariance + 1/12).
+`amodal` ellipses describe outlines without occluders: of the pupil seen through the cornea, and of the iris at the
+limbus, where the cornea is half transparent. A `visible` ellipse has the second moments of the visible pixels (of
+pupil, or of iris and pupil together): semi-axes 2 sqrt(eigenvalues of covariance + 1/12).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class EyeInWindow:
 
     @classmethod
     def of(cls, frames: Frames, row: int) -> EyeInWindow:
-        """Make it for row `row` of frames."""
+        """Create it for row `row` of frames."""
         index, scene = frames.index, frames.scene
         camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
         M, t = eye_motion(frames, row)
@@ -83,7 +83,7 @@ def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
 
 
 def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
-    """Make all labels of an image, with the same keys for every image; the arguments are those of `seen_labels`."""
+    """Compute all labels of an image, with the same keys for every image; the arguments are those of `seen_labels`."""
     part, window, seen = image.parts, image.window, seen_labels(image, truth)
     known = known_labels(image.scene, truth, image)
     return {
@@ -109,7 +109,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
 
 
 def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> dict[str, Any]:
-    """Compute labels that follow from pose and parameters alone, without an image: a part of `image_labels`."""
+    """Compute the labels that follow from pose and parameters, without an image: a part of `image_labels`."""
     camera = scene.rig.cameras[view.camera]
     return {
         "pupil": {
@@ -135,9 +135,9 @@ def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | E
 
 
 def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
-    """Fit the ellipse with the moments of a mask's pixels, in full-sensor pixels; null numbers where there are none.
+    """Compute the ellipse with the moments of a mask's pixels, in full-sensor pixels; null if the mask is empty.
 
-    `pixels` is their number, `cut` whether they touch the window's edge.
+    `pixels` is their number, `cut` tells whether they touch the window's edge.
     """
     v, u = np.nonzero(inside)
     out: dict[str, Any] = {"centre_px": None, "semi_axes_px": None, "angle_rad": None, "pixels": len(u), "cut": False}
@@ -157,14 +157,14 @@ def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
 def visible_arcs_deg(
     part: Bytes, pupil: int, points_px: Floats, origin_px: tuple[int, int], reach_px: float = 1.5
 ) -> list[list[float]]:
-    """Find the visible arcs [from, to] of the pupil's outline, in degrees about its centre (image x towards y).
+    """Compute the visible arcs [from, to] of the pupil's outline, in degrees about its centre (image x towards y).
 
-    A point of the outline counts as visible where a pixel of the pupil lies within reach. Points outside the window do
-    not. A whole outline is [[0, 360]].
+    A point of the outline counts as visible if a pixel of the pupil lies within reach. Points outside the window are
+    not visible. A whole outline is [[0, 360]].
 
     Args:
         part: (h, w) part of the eye at each pixel of the window.
-        pupil: the value that means pupil.
+        pupil: the value of the pupil in `part`.
         points_px: (k, 2) points of the outline in full-sensor pixels.
         origin_px: first pixel of the window on the full sensor.
         reach_px: largest distance of a pixel of the pupil.
@@ -193,7 +193,7 @@ def visible_arcs_deg(
 
 
 def iris_outline(scene: Scene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
-    """Fit the ellipse of the apparent limbus (`limbus_px`), with a status and a reason where there is none."""
+    """Compute the ellipse of the apparent limbus (`limbus_px`), with a status, and a reason if there is none."""
     nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
     pixels, reason = limbus_px(scene, view, _OUTLINE_POINTS)
     if reason is not None:
@@ -217,7 +217,7 @@ def limbus_px(scene: Scene, view: EyeInWindow | EyeImage, count: int) -> tuple[F
     lower by the look's `limbus_aspect`.
 
     Returns:
-        The projected curve, and the reason why it is not visible as a whole (None where it is).
+        The projected curve, and the reason why it is not visible as a whole (None if it is).
     """
     surface, camera = view.eye.front[0], scene.rig.cameras[view.camera]
     rho = float(view.eye.limbus_radius_mm) - 0.5 * scene.spec.look.limbus_width_mm
@@ -238,7 +238,7 @@ def limbus_px(scene: Scene, view: EyeInWindow | EyeImage, count: int) -> tuple[F
 
 @remembered
 def entrance_diameter_mm(eye: EyeModel) -> float | None:
-    """Compute the diameter of the entrance pupil (circle of equal area), seen from afar on the optic axis.
+    """Compute the diameter (mm) of the entrance pupil (circle of equal area), seen from afar on the optic axis.
 
     It is None if a ray from the stop's margin does not leave the eye.
     """
@@ -249,7 +249,7 @@ def entrance_diameter_mm(eye: EyeModel) -> float | None:
 
 
 def cornea_centre(eye: EyeModel) -> Floats:
-    """Find the centre of curvature of the front cornea at its apex, eye frame, (3,) mm: apex - mean R times axis."""
+    """Compute the centre of curvature of the front cornea at its apex, eye frame, (3,) mm: apex - mean R times axis."""
     surface = eye.front[0]
     apex = float(surface.sag(0.0, 0.0))
     drop = 2 * apex - float(surface.sag(_SAG_STEP_MM, 0.0)) - float(surface.sag(0.0, _SAG_STEP_MM))
@@ -260,7 +260,7 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
     pupil = observations.pupil
     ok = bool(pupil.ok[row])
     return {
-        # The label needs the whole outline. A pupil of which only arcs are visible is missing here.
+        # The label needs the whole outline, so it is missing for a partially visible pupil.
         "status": "ok" if ok else "missing",
         "reason": pupil.reason[row] or None,
         "centre_px": pupil.centre_px[row].tolist() if ok else None,
@@ -270,7 +270,7 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
 
 
 def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> list[dict[str, Any]]:
-    """Compute the place of each lamp's glint centre by ray optics."""
+    """Compute the position of each lamp's glint centre by ray optics."""
     glints, row = observations.glints, view.row
     out = []
     for k in range(len(scene.rig.lights)):
@@ -291,7 +291,7 @@ def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeIma
 
 
 def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any]:
-    """Measure the visible part of a lamp's glint, which may exist without a mirror point of the lamp's centre."""
+    """Measure the visible part of a lamp's glint, which may exist even if the lamp's centre has no mirror point."""
     table = image.rendered.glints
     spot = table.xy_px[k]
     lit = bool(np.isfinite(spot).all())
@@ -310,10 +310,10 @@ def _share(value: float) -> float | None:
 def _space(
     scene: Scene, observations: Observations, view: EyeInWindow | EyeImage, camera: PinholeCamera
 ) -> dict[str, Any]:
-    """List points (mm) and lines in the world and the camera's frame, and rotation centres in the head's frame.
+    """Return points (mm) and lines in the world and the camera's frame, and rotation centres in the head's frame.
 
-    The rotation centres are fixed in the head: where they are in the unrotated eye. (Azimuth turns the eye last, so it
-    carries the eye's elevation axis about the azimuth centre.)
+    The rotation centres are fixed in the head, at their positions in the unrotated eye. (Azimuth turns the eye last, so
+    it carries the eye's elevation axis about the azimuth centre.)
     """
     eye, M, t, row = view.eye, view.M, view.t, view.row
     index = observations.index
@@ -332,7 +332,7 @@ def _space(
     }
     world = {k: p + index.head_mm[row] for k, p in head.items()}
     world |= {k: M @ np.asarray(p) + t for k, p in points.items()} | {k: M @ d for k, d in directions.items()}
-    axes, offset = camera.sensor_axes, camera.sensor_offset  # x to the right of the picture, also behind a mirror
+    axes, offset = camera.sensor_axes, camera.sensor_offset  # x to the right in the image, also behind a mirror
     seen = {k: axes @ v + (0.0 if k in directions else offset) for k, v in world.items()}
     target = index.target_mm[row]
     there = bool(np.isfinite(target).all())
@@ -345,7 +345,7 @@ def _space(
 
 
 def _line_of_sight(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> tuple[Floats, Floats]:
-    """Find the line of sight of the unturned eye: the fixed chief ray, or that of the entrance window."""
+    """Return the line of sight of the unrotated eye: the fixed chief ray, or that of the entrance window."""
     index, row = observations.index, view.row
     if scene.spec.eye.line_of_sight == "entrance_window" and np.isfinite(index.target_mm[row]).all():
         place = index.eye_position_mm[[row]] + index.head_mm[[row]]

@@ -1,4 +1,4 @@
-"""A video's features, frame by frame, as records in a file."""
+"""Extract a video's features, frame by frame, to records in a file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .imageobserver import ImageObserver, colour_warning
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoSummary:
-    """Numbers of a video's frames, of pupils that were searched, and of pupils that were found."""
+    """Counts of a video's frames, of searched pupils and of detected pupils."""
 
     source: str
     frames: int
@@ -38,19 +38,19 @@ class VideoSummary:
         }  # fmt: skip
 
     def to_text(self) -> str:
-        """Write a line for people."""
+        """Format the counts as one line."""
         where = f"; records in {self.records}" if self.records else ""
         return f"{self.source}: {self.frames} frames, pupil found in {self.found} of {self.pupils}{where}"
 
 
 @dataclass(frozen=True, slots=True)
 class VideoOutput:
-    """Files that an observed video gives.
+    """Files written for an observed video.
 
     Attributes:
-        records: one JSON object per line: the record, and the frame's `time_s` (null where the video has no times) and
-            the pupil's `confidence`.
-        overlay: video of what was found (.mp4, .avi or .mkv).
+        records: one JSON object per line: the record, the frame's `time_s` (null if unknown) and the pupil's
+            `confidence`.
+        overlay: video with the results drawn over the frames (.mp4, .avi or .mkv).
         version: version of the records.
     """
 

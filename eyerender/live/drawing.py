@@ -1,4 +1,4 @@
-"""The rig and its rays as coloured line segments for the three-dimensional view, in the colours of the reports."""
+"""The rig and its rays as coloured line segments for the three-dimensional view, in the reports' colours."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FEW_LIGHTS, MAX_LABELLED_LIGHTS, FAR_MM = 4, 24, 2000.0
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A word at a place of the world, (3,) mm."""
+    """A text at a position in the world, (3,) mm."""
 
     text: str
     place_mm: tuple[float, float, float]
@@ -44,7 +44,7 @@ class Label:
 
 @dataclass(slots=True)
 class Strokes:
-    """Line segments: ends in mm, colour, and width in pixels of the screen."""
+    """Line segments: ends in mm, colour, and width in screen pixels."""
 
     ends: list[Floats] = field(default_factory=list)
     colours: list[str] = field(default_factory=list)
@@ -57,7 +57,7 @@ class Strokes:
         self.pairs(np.stack([points[:-1], points[1:]], axis=1), colour, width)
 
     def pairs(self, ends_mm: ArrayLike, colour: str, width: float = 1.0) -> None:
-        """Add segments (n, 2, 3), without those that are not finite."""
+        """Add segments (n, 2, 3); segments with values that are not finite are skipped."""
         ends = np.asarray(ends_mm, dtype=float).reshape(-1, 2, 3)
         ends = ends[np.isfinite(ends).all(axis=(1, 2))]
         self.ends.append(ends)
@@ -65,7 +65,7 @@ class Strokes:
         self.widths += [width] * len(ends)
 
     def label(self, text: str, place_mm: ArrayLike, colour: str) -> None:
-        """Add a word at a place."""
+        """Add a text at a position."""
         x, y, z = np.asarray(place_mm, dtype=float)
         self.labels.append(Label(text, (float(x), float(y), float(z)), colour))
 
@@ -76,11 +76,11 @@ class Strokes:
 
 
 def strokes(frames: Frames, truth: Observations, row: int) -> Strokes:
-    """Draw the rig of a scene, its eyes in their poses, and the rays of one frame's eye.
+    """Draw the rig of a scene, its eyes in their poses, and the rays of one frame's eye, as line segments.
 
     Args:
         frames: the frames of one fixation: a row for each camera and eye.
-        truth: what the analytic observer reports for them.
+        truth: observations of the analytic observer for these frames.
         row: the row whose rays are drawn.
     """
     out, scene = Strokes(), frames.scene
@@ -97,7 +97,7 @@ def strokes(frames: Frames, truth: Observations, row: int) -> Strokes:
 
 
 def apex_mm(frames: Frames, row: int) -> Floats:
-    """Compute the apex of the unrotated eye of a row, (3,) mm in the world."""
+    """Return the apex of the unrotated eye of a row, (3,) mm in the world."""
     return np.asarray(frames.index.eye_position_mm[row] + frames.index.head_mm[row])
 
 
@@ -110,7 +110,7 @@ def circle(centre: Floats, first: Floats, second: Floats, count: int = 48) -> Fl
 def _camera(
     out: Strokes, camera: PinholeCamera, number: int, scene: Scene, frames: Frames, row: int, *, shown: bool
 ) -> None:
-    """Draw the pyramid of a camera's field, and for the camera that is shown the window that reaches the eye."""
+    """Draw the pyramid of a camera's field of view, and for the selected camera the window up to the eye."""
     width, height = camera.resolution_px
     origin = camera.nodal_point_mm
     distance = float(np.linalg.norm(apex_mm(frames, row) - origin))
@@ -128,7 +128,7 @@ def _camera(
 
 
 def _corners(camera: PinholeCamera, window: Window, depth_mm: float) -> Floats:
-    """Compute the corners (5, 3) of a window at a depth before a camera, closed."""
+    """Compute the corners (5, 3) of a window at a depth in front of a camera, closed."""
     x0, y0, w, h = window
     left, top, right, bottom = x0 - 0.5, y0 - 0.5, x0 + w - 0.5, y0 + h - 0.5
     rays = camera.rays(np.array([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]))
@@ -141,7 +141,7 @@ def _pyramid(out: Strokes, origin: Floats, corners: Floats, colour: str, width: 
 
 
 def _lamp(out: Strokes, lamp: Lamp, number: int, frames: Frames) -> None:
-    """Draw a lamp as a disc with its axis, large enough to be seen."""
+    """Draw a lamp as a disc with its axis, large enough to be visible."""
     distance = float(np.linalg.norm(lamp.position_mm - apex_mm(frames, 0)))
     size = max(lamp.radius_mm, 0.018 * distance)
     first = np.cross(lamp.axis, [0.0, 0.0, 1.0] if abs(lamp.axis[2]) < 0.9 else [0.0, 1.0, 0.0])
@@ -203,7 +203,7 @@ def _eye(out: Strokes, frames: Frames, row: int, *, shown: bool) -> None:
 
 
 def _globe(eye: EyeModel) -> list[Floats]:
-    """Make circles of latitude about the optic axis and half circles of longitude, behind the limbus, eye frame."""
+    """Compute circles of latitude about the optic axis and half circles of longitude, behind the limbus, eye frame."""
     centre, radius = np.asarray(eye.sclera.centre_mm, dtype=float), float(eye.sclera.radius_mm)
     start = np.arcsin(min(1.0, float(eye.limbus_radius_mm) / radius))
     out = []
@@ -227,7 +227,7 @@ def _on_cornea(eye: EyeModel, points: Floats) -> Floats:
 
 
 def _rays(out: Strokes, frames: Frames, truth: Observations, row: int) -> None:
-    """Draw the rays of the apparent pupil's centre and of each glint, by way of the cornea."""
+    """Draw the rays of the apparent pupil's centre and of each glint, through the cornea."""
     index, scene = frames.index, frames.scene
     camera = scene.rig.cameras[int(index.camera[row])]
     eye = scene.eye(EYES[index.eye[row]])
@@ -243,14 +243,14 @@ def _rays(out: Strokes, frames: Frames, truth: Observations, row: int) -> None:
 
 
 def _hit(eye: EyeModel, M: Floats, t: Floats, origin: Floats, direction: Floats) -> Floats:
-    """Find where a ray of the world meets the front cornea of a posed eye, (3,) mm; NaN where it does not."""
+    """Intersect a ray in the world with the front cornea of a posed eye, (3,) mm; NaN if it misses."""
     start, way = (origin - t) @ M, direction @ M
     distance, ok = eye.front[0].intersect(start, way)
     return np.asarray(origin + direction * distance if ok else np.full(3, np.nan))
 
 
 def extent_mm(drawn: Strokes, eye_mm: Floats) -> tuple[Floats, float]:
-    """Find middle (3,) and radius of a ball around the drawing, without what is more than 2 m from an eye."""
+    """Compute centre (3,) and radius of a ball around the drawing, without what is more than 2 m from an eye."""
     points = drawn.ends_mm.reshape(-1, 3)
     points = points[np.linalg.norm(points - eye_mm, axis=1) < FAR_MM]
     middle = (points.min(axis=0) + points.max(axis=0)) / 2

@@ -1,7 +1,7 @@
-"""The guard in front of the live page: it decides which requests reach the server.
+"""The guard in front of the live page, which decides which requests reach the server.
 
-A server on 127.0.0.1 can be reached by every program of the machine, and by every page that a browser on it shows. So
-the guard lets a request through only if all of this holds, for HTTP and for WebSockets alike:
+Every program of the machine can reach a server on 127.0.0.1, and so can every page in a browser on it. So the guard
+passes a request only if all of the following holds, for HTTP and WebSockets alike:
 
 - Its path begins with the token, 256 random bits that are printed once and change with every start. No cookie is
   used, because a browser sends cookies to all ports of a host, also to the server of another user.
@@ -26,7 +26,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 _LOOPBACK = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE | re.ASCII)
 _READING = ("GET", "HEAD")
-# A proxy's headers could change what the server takes for its own address.
+# Headers of a proxy could change what the server takes for its own address.
 _DROPPED = (b"x-forwarded-prefix", b"x-forwarded-host", b"x-forwarded-proto", b"x-forwarded-for", b"forwarded")
 _HEADERS = [
     (b"referrer-policy", b"no-referrer"),  # the token is in the address
@@ -39,16 +39,16 @@ _HEADERS = [
 
 
 def new_token() -> str:
-    """Make a random token of 256 bits that is valid in an address."""
+    """Create a random URL-safe token of 256 bits."""
     return secrets.token_urlsafe(32)
 
 
 class Guard:
-    """An ASGI application that refuses requests that may not reach another one.
+    """An ASGI application that forwards permitted requests to another one and refuses all others.
 
     Args:
         app: the application behind the guard. It sees paths with the token as its root path.
-        token: what the path of every request begins with.
+        token: the token with which the path of every request must begin.
     """
 
     def __init__(self, app: App, token: str) -> None:
@@ -56,7 +56,7 @@ class Guard:
         self._token = token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, or refuse it."""
+        """Forward a request, or refuse it."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -68,7 +68,7 @@ class Guard:
         await self._app({**scope, "headers": headers, "root_path": f"/{self._token}"}, receive, _hardened(send))
 
     def refusal(self, scope: Scope) -> str | None:
-        """Say why a request is refused; None where it may pass."""
+        """Return why a request is refused; None if it may pass."""
         headers: dict[bytes, list[str]] = {}
         for name, value in scope["headers"]:
             headers.setdefault(name.lower(), []).append(value.decode("latin-1"))
@@ -94,7 +94,7 @@ class Guard:
 
 
 def _hardened(send: Send) -> Send:
-    """Add headers to each answer that keep it from other pages."""
+    """Add headers to each response that keep other pages from reading it."""
 
     async def sending(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":

@@ -1,4 +1,4 @@
-"""The live page: what a tab shows, and what its knobs do."""
+"""The live page: the content of a tab, and the actions of its knobs."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ MAX_UNDO = 50
 SETTLED_S = 0.8
 """Changes in faster succession, such as those of a dragged slider, are undone together."""
 MAX_TABS = 20
-"""Pages at a time, those included whose WebSocket has not connected yet. Each takes some megabytes."""
+"""Largest number of pages, including those that have not connected yet. Each takes some megabytes."""
 STYLE = Path(__file__).with_name("page.css")
 Change = Callable[[Setup], Setup]
 
 
 class Slider(ui.slider):
-    """A slider that does not wait for the server's echo while it is dragged."""
+    """A slider that does not wait for the server's response while it is dragged."""
 
     LOOPBACK = False
 
 
 class Knob:
-    """A number with a name, a slider and a field for exact values, which may lie beyond the slider's ends.
+    """A number with a name, a slider, and a field for exact values, which may lie beyond the slider's ends.
 
-    Without a `step`, the slider has some 500 of them.
+    Without a `step`, the slider has some 500 steps.
     """
 
     def __init__(
@@ -67,11 +67,11 @@ class Knob:
 
     @property
     def value(self) -> float:
-        """The value that it shows."""
+        """Return the displayed value."""
         return self._value
 
     def set(self, value: float, low: float, high: float) -> None:
-        """Show a value between two ends, without acting."""
+        """Display a value between two ends, without triggering an action."""
         low, high, value = min(low, value), max(high, value), round(value, self._digits)
         self._quiet, self._value = True, value
         self._slider.props["min"], self._slider.props["max"] = low, high
@@ -97,7 +97,7 @@ class Knob:
 
 @dataclass(eq=False)
 class Studio:
-    """What all tabs share: the scene as it was loaded, the painter, and the pictures to fetch.
+    """State shared by all tabs: the loaded scene, the painter, and the images to be fetched.
 
     A page whose WebSocket does not connect within `connect_s` is deleted.
     """
@@ -108,7 +108,7 @@ class Studio:
     tabs: dict[str, Tab] = field(default_factory=dict)
 
     def register(self) -> None:
-        """Add the page and its pictures to NiceGUI's application."""
+        """Add the page and its images to NiceGUI's application."""
 
         @app.get("/picture/{key}")  # type: ignore[untyped-decorator]
         def picture(key: str) -> Response:
@@ -119,7 +119,7 @@ class Studio:
 
         @app.exception_handler(404)  # type: ignore[untyped-decorator]
         async def missing(_request: Request, _error: Exception) -> Response:
-            # NiceGUI's own answer is a page, which would be kept for a minute.
+            # NiceGUI's own response would be a page that is kept for a minute.
             return Response("404: no such page\n", 404, media_type="text/plain")
 
         @ui.page("/", title=f"{self.scene.name} · eyerender live", response_timeout=30)  # type: ignore[untyped-decorator]
@@ -145,7 +145,7 @@ def _delete(client: Client) -> None:
 
 
 class Tab:
-    """One tab of the browser: its setup, its knobs and what it shows."""
+    """One browser tab: its setup, its knobs and its displays."""
 
     def __init__(self, studio: Studio) -> None:
         self.key = secrets.token_urlsafe(16)
@@ -170,23 +170,23 @@ class Tab:
         self._refresh()
 
     def _deliver(self, shown: Shown) -> None:
-        """Take a picture from the painter's thread to the loop's."""
-        with suppress(RuntimeError):  # the loop has ended
+        """Pass an image from the painter's thread to the event loop."""
+        with suppress(RuntimeError):  # the event loop has ended
             self._loop.call_soon_threadsafe(self._receive, shown)
 
     def wake(self) -> None:
-        """Order a picture, because the page has connected, for the first time or again."""
+        """Request an image, because the page has connected or reconnected."""
         self.woken = self._awake = True
         self._studio.painter.open(self.key, self._deliver)
         self._order()
 
     def rest(self) -> None:
-        """Free the pictures: the page has disconnected."""
+        """Free the images, because the page has disconnected."""
         self._studio.painter.drop(self.key)
         self._awake, self.shown = False, None
 
     def close(self) -> None:
-        """Free what the tab holds."""
+        """Free the tab's resources."""
         self.rest()
         self._studio.tabs.pop(self.key, None)
 
@@ -284,7 +284,7 @@ class Tab:
     # What the knobs do
 
     def _apply(self, change: Change, *, refresh: bool = False) -> None:
-        """Change the setup, draw the rig, and order a picture; bad input leaves all as it was."""
+        """Change the setup, draw the rig, and request an image; bad input changes nothing."""
         if self._quiet:
             return
         try:
@@ -311,7 +311,7 @@ class Tab:
             self._refresh()
 
     def _remember(self, setup: Setup) -> None:
-        """Keep the present setup for `_undo`, unless it lasted for less than `SETTLED_S` or does not change."""
+        """Store the current setup for `_undo`, unless it lasted less than `SETTLED_S` or does not change."""
         now = time.monotonic()
         if setup is not self._setup and now - self._changed > SETTLED_S:
             self._before.append(self._setup)
@@ -319,10 +319,10 @@ class Tab:
         self._undo_button.set_enabled(bool(self._before))
 
     def _undo(self) -> None:
-        """Restore the setup before the last change; dragging a slider is one change."""
+        """Restore the setup before the last change; dragging a slider counts as one change."""
         if self._before:
             last = self._before.pop()
-            self._changed = time.monotonic()  # so that going back is not remembered
+            self._changed = time.monotonic()  # so that undoing is not remembered itself
             self._apply(lambda _: last, refresh=True)
 
     def _change(self, path: str, value: float) -> None:
@@ -330,7 +330,7 @@ class Tab:
         self._apply(lambda setup: setup.changed({path: value}))
 
     def _show(self, **fields: Any) -> None:
-        """Show another eye, or the picture of another camera."""
+        """Show another eye, or another camera's image."""
         self._apply(lambda setup: replace(setup, **fields), refresh=True)
 
     def _follow(self, fixation: int) -> None:
@@ -383,7 +383,7 @@ class Tab:
     # What the tab shows
 
     def _refresh(self) -> None:
-        """Show the values of the setup on the knobs."""
+        """Update the knobs with the values of the setup."""
         setup, scene = self._setup, self._setup.scene
         self._light = min(self._light, len(scene.rig.lights) - 1)
         self._lens = min(self._lens, len(scene.rig.cameras) - 1)
@@ -441,7 +441,7 @@ class Tab:
         self._studio.painter.ask(self.key, Order(self._orders, frame, extract=bool(self._found.value)))
 
     def _receive(self, shown: Shown) -> None:
-        """Show a picture that the painter made."""
+        """Display an image from the painter."""
         if not self._awake:
             return
         self._wait.set_visibility(False)
@@ -476,7 +476,7 @@ class Tab:
         if self._found.value and shown.found is not None:
             marks += feature_marks(shown.found, 0, shift, analytic=False, scale=scale)
         self._image.set_content(marks)
-        waits = self._found.value and shown.found is None  # what was found comes a moment after the picture
+        waits = self._found.value and shown.found is None  # features arrive shortly after the image
         if current and not waits:
             found = shown.found if self._found.value else None
             self._table.set_content(feature_table(truth, found, shown.hidden))
@@ -497,14 +497,14 @@ def _round_up(value: float) -> float:
 
 
 def _set_place(knobs: list[Knob], place_mm: Any, apex: Any) -> None:
-    """Show a place on three knobs, which reach as far as a third of its distance to the eye."""
+    """Show a position on three knobs, which reach up to a third of its distance to the eye."""
     reach = _round_up(max(10.0, float(np.linalg.norm(place_mm - apex)) / 3))
     for knob, value in zip(knobs, place_mm, strict=True):
         knob.set(float(value), float(np.floor(value - reach)), float(np.ceil(value + reach)))
 
 
 def _unplaced(error: EyerenderError) -> EyerenderError:
-    """Remove the file of the scene from an error, because it says nothing about what a knob set."""
+    """Remove the scene file's name from an error, because the value came from a knob."""
     return InputError(error.reason, path=error.path) if isinstance(error, InputError) else error
 
 
@@ -513,7 +513,7 @@ def _numbers(count: int) -> dict[Any, str]:
 
 
 def _offer(box: ui.select, choices: dict[Any, str]) -> None:
-    """Offer other choices; a box with one is not shown."""
+    """Offer choices; a box with a single choice is hidden."""
     if box.options != choices:
         box.set_options(choices)
         box.set_visibility(len(choices) > 1)

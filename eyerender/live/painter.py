@@ -1,11 +1,10 @@
-"""The one renderer of the live page, in a thread of its own.
+"""The renderer of the live page, in its own thread.
 
-Each tab has at most one order: the frame that it wants to see. A new order replaces the old one, so a slider that moves
-faster than frames render leaves no queue behind. A new order is answered with a preview of a few samples, with coarser
-pixels where whole ones would take too long. When the tab has rested for a moment, passes over the whole window follow:
-after the first one, each takes as many samples as all before it, so their mean has 4, 8, 16, 32 and 64. A pass goes
-over the window in bands, and the thread looks for new orders between them. Tabs take turns, and previews come before
-passes.
+Each tab has at most one order: the frame to show. A new order replaces the old one, so a slider that moves faster than
+frames render leaves no queue behind. A new order is first answered with a preview of a few samples, with coarse pixels
+if fine ones would take too long. While nothing changes, passes over the whole window refine the image to 4, 8, 16, 32
+and 64 samples per pixel. A pass renders the window in bands, and the thread checks for new orders between them. Tabs
+take turns, and previews come before passes.
 """
 
 from __future__ import annotations
@@ -45,24 +44,24 @@ if TYPE_CHECKING:
 PREVIEW_SPP = 4
 GOAL_SPP = 64
 BUDGET_S = 0.2
-"""Time that a preview, or a band of a pass, should take at most."""
+"""Longest desired time of a preview, or of a band of a pass."""
 PREVIEW_PX = (20_000, 160_000, 640_000)
-"""Pixels that a preview may have: the fewest, those of the first one, and the most."""
+"""Pixels of a preview: the fewest, those of the first one, and the most."""
 REST_S = 0.25
-"""How long a tab must rest after a preview before its picture is refined."""
+"""Time without changes after a preview before its image is refined."""
 BAND_PX = 20_000
-"""The fewest pixels of a band: the preparation of each takes some time."""
+"""Fewest pixels of a band, because preparing a band takes time."""
 MAX_REASON = 300
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What a tab wants to see.
+    """A tab's request for an image.
 
     Attributes:
-        number: counts the orders of the tab.
+        number: number of the order, counted per tab.
         frame: one row: the eye in its pose, and the scene.
-        extract: whether to find the features in the picture.
+        extract: whether to extract the features from the image.
     """
 
     number: int
@@ -72,21 +71,21 @@ class Order:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Shown:
-    """An answer to an order: a picture, or what prevents it.
+    """Answer to an order: an image, or the problem that prevents it.
 
     Attributes:
-        number: that of the order.
+        number: number of the order.
         samples: samples per pixel so far.
-        coarse: side of the preview's pixels in pixels of the sensor; 1 for a whole picture.
+        coarse: side of the preview's pixels, in sensor pixels; 1 for a full-resolution image.
         size_px: width and height of the picture.
         window: the window of the sensor.
-        data: the picture as a file, brightened for people.
+        data: the image as a file, brightened for viewing.
         kind: media type of that file.
-        found: the features that the image observer found; None where they were not wanted.
+        found: the extracted features; None if they were not requested.
         hidden: for each light, what hides its glint ("" for a visible one).
         saturated: whether the picture is saturated.
         seconds: time of the last rendering.
-        problem: one line; then there is no picture.
+        problem: one line that describes why there is no image; None if there is one.
     """
 
     number: int
@@ -108,10 +107,10 @@ Deliver = Callable[[Shown], None]
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class _Canvas:
-    """The work on one order: the mean of its passes."""
+    """Work in progress on one order: the mean of its passes."""
 
     order: Order
-    since: float  # when it was ordered, or shown first
+    since: float  # time of the order, or of its first image
     mean: Floats | None = None
     samples: int = 0
     hidden: tuple[str, ...] = ()
@@ -126,7 +125,7 @@ class _Tab:
 
 @dataclass(slots=True)
 class Pace:
-    """The number of pixels that a preview may have, from the measured times of earlier previews."""
+    """Allowed number of pixels of a preview, from the measured times of earlier previews."""
 
     pixels: int = PREVIEW_PX[1]
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=3))
@@ -136,7 +135,7 @@ class Pace:
         return math.ceil(math.sqrt(pixels / self.pixels))
 
     def took(self, seconds: float) -> None:
-        """Learn from the time of a preview. A single slow one changes nothing, because the first one is compiled."""
+        """Update the pace with the time of a preview; a single slow one has no effect, as the first one compiles."""
         self._times.append(seconds)
         if len(self._times) < 3:
             return
@@ -153,12 +152,12 @@ class Pace:
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Painter:
-    """Renders the orders of all tabs with one renderer; call `start` first and `close` at the end.
+    """Renderer for the orders of all tabs; call `start` first and `close` at the end.
 
     Args:
         backend: the render backend.
         threads: processor threads for rendering; None: all.
-        goal: samples per pixel after which a picture is finished.
+        goal: samples per pixel at which an image is finished.
     """
 
     backend: BackendChoice = "auto"
@@ -199,13 +198,13 @@ class Painter:
                 self._changed.notify()
 
     def drop(self, key: str) -> None:
-        """Forget a tab and its pictures."""
+        """Forget a tab and its images."""
         with self._changed:
             self._tabs.pop(key, None)
-            self._changed.notify()  # a waiting thread still refers to the tabs that it has seen
+            self._changed.notify()  # a waiting thread would still refer to the tabs in its local variables
 
     def close(self) -> None:
-        """Stop after the present band."""
+        """Stop after the current band."""
         with self._changed:
             self._stopped = True
             self._tabs.clear()
@@ -232,10 +231,10 @@ class Painter:
                 canvas.samples = self.goal
             if fresh:
                 canvas.since = time.monotonic()
-            del work, tab, canvas  # these names would keep what a tab that closes meanwhile should free
+            del work, tab, canvas  # these names would keep alive what a tab that closes meanwhile should free
 
     def _next(self) -> tuple[_Tab, _Canvas, bool] | None:
-        """Wait for work: the oldest order without a preview, else that of a resting tab with the fewest samples."""
+        """Wait for work: the oldest order without a preview, else the resting tab with the fewest samples."""
         with self._changed:
             while not self._stopped:
                 tabs = [(tab, tab.canvas) for tab in self._tabs.values() if tab.canvas is not None]
@@ -254,12 +253,12 @@ class Painter:
         return None
 
     def _busy(self, tab: _Tab, canvas: _Canvas) -> bool:
-        """Return whether something is more urgent than a pass of this canvas."""
+        """Return whether another task is more urgent than a pass of this canvas."""
         with self._changed:
             return self._stopped or tab.canvas is not canvas or any(other.fresh for other in self._tabs.values())
 
     def _preview(self, renderer: Renderer, canvas: _Canvas) -> Iterator[Shown]:
-        """Show the first picture of an order at once, and then with the features that were found in it."""
+        """Deliver the first image of an order at once, and again with the features extracted from it."""
         frame = canvas.order.frame
         check_windows(frame.scene)
         job = _job(frame, 0)
@@ -305,7 +304,7 @@ class Painter:
 
 
 def coarser(job: RenderJob, side: int) -> RenderJob:
-    """Make pixels of a window `side` times as wide, as if the sensor had such pixels.
+    """Make the pixels of a job's window `side` times as wide, as if the sensor had such pixels.
 
     Pixel centres lie at integers, so pixel u of the window holds the pixels side u to side u + side - 1.
     """
@@ -328,7 +327,7 @@ def coarser(job: RenderJob, side: int) -> RenderJob:
 
 
 def enlarged(picture: NDArray[Any], side: int, size_px: tuple[int, int]) -> Floats:
-    """Enlarge a picture (h, w) with coarse pixels to full size, interpolating between pixel centres."""
+    """Enlarge a coarse image (h, w) to full size, interpolating between pixel centres."""
     if side == 1:
         return np.asarray(picture, dtype=float)
     width, height = size_px
@@ -338,7 +337,7 @@ def enlarged(picture: NDArray[Any], side: int, size_px: tuple[int, int]) -> Floa
 
 
 def _job(frame: Frames, draw: int) -> RenderJob:
-    """Make the job of a pass, with its own samples and without what `developed` does to the whole picture."""
+    """Create the job of a pass, with new samples and without the effects that `developed` applies to the image."""
     job = render_job(frame, 0)
     seed = int(np.random.SeedSequence([job.seed, draw]).generate_state(1, np.uint64)[0])
     quiet = job.sensor.model_copy(update={"noise": False, "border_px": (0, 0, 0, 0)})
@@ -359,7 +358,7 @@ def developed(job: RenderJob, irradiance: Floats) -> tuple[Reals, NDArray[np.uin
 
 
 def _image(canvas: _Canvas, job: RenderJob, done: RenderedWindow, irradiance: Floats) -> EyeImage:
-    """Make the picture of a canvas as the sensor stores it, for the extractor."""
+    """Convert a canvas to an image as the sensor stores it, for the extractor."""
     frame = canvas.order.frame
     behind, codes = developed(render_job(frame, 0), irradiance)
     return EyeImage(
@@ -379,7 +378,7 @@ def _image(canvas: _Canvas, job: RenderJob, done: RenderedWindow, irradiance: Fl
 def _shown(
     canvas: _Canvas, image: EyeImage, samples: int, seconds: float, *, coarse: int = 1, last: bool = False
 ) -> Shown:
-    """Make a file of a picture, without loss for the last one."""
+    """Encode an image as a file; the last one losslessly."""
     sensor = image.scene.spec.sensor
     kind = "PNG" if last else "JPEG"
     return Shown(
@@ -398,7 +397,7 @@ def _shown(
 
 @lru_cache(maxsize=4)
 def _tones(full_scale: int) -> Bytes:
-    """Compute the grey level of the screen for each code of a sensor."""
+    """Return the screen's grey level for each code of a sensor."""
     return preview(np.arange(full_scale + 1), full_scale)
 
 
@@ -410,7 +409,7 @@ def _encoded(pixels: Bytes, kind: str) -> bytes:
 
 
 def line_of(error: Exception) -> str:
-    """Write one line for an error."""
+    """Format an error as one line."""
     if isinstance(error, EyerenderError):
         return one_line(str(error), MAX_REASON)
     if isinstance(error, MemoryError):

@@ -1,4 +1,4 @@
-"""Numbers and reasons on the page: the table of features, and the gaze error."""
+"""Numbers and reasons on the page: the feature table and the gaze error."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from .setup import Setup
 
 
 def calibrated(setup: Setup) -> Regression | None:
-    """Calibrate a regression on the scene's targets as the rig is now, with the exact features of the shown eye.
+    """Calibrate a regression on the scene's targets and current rig, with exact features of the selected eye.
 
-    The vector is that of the first light's glint, in px. The function is the one with the most terms that the targets
-    determine. None without a screen, without targets, or where too few of them show the features.
+    It uses the vector from the first light's glint, in px, and the function with the most terms that the targets
+    determine. None without a screen, without targets, or if the features are visible for too few of them.
     """
     scene = setup.with_all_targets()
     if scene is None or scene.rig.screen is None:
@@ -39,7 +39,7 @@ def calibrated(setup: Setup) -> Regression | None:
 
 
 def gaze_line(setup: Setup, estimator: Regression | None, truth: Observations, found: Observations | None) -> str:
-    """State the gaze error of a regression calibrated on this rig at the shown target, for both observers."""
+    """Describe the gaze error at the current target for both observers, with a regression calibrated on this rig."""
     if estimator is None:
         return "Gaze error: this scene has no screen with targets that determine a regression."
     if not np.isfinite(truth.index.target_mm).all():
@@ -54,11 +54,11 @@ def gaze_line(setup: Setup, estimator: Regression | None, truth: Observations, f
 
 
 def feature_table(truth: Observations, found: Observations | None, hidden: tuple[str, ...]) -> str:
-    """Make an HTML table of pupil and glints of one row: by ray optics, in the rendered scene, and extracted.
+    """Build an HTML table of one row's pupil and glints: by ray optics, in the rendered scene, and extracted.
 
     Args:
-        truth: what the analytic observer reports, one row.
-        found: what the image observer reports, one row; None where it was not asked.
+        truth: observation of the analytic observer, one row.
+        found: observation of the image observer, one row; None if not requested.
         hidden: what hides the glint of each light in the scene ("" or "visible" if nothing does).
     """
     rows = [_pupil_row(truth, found)]
@@ -87,7 +87,7 @@ def _glint_row(truth: Observations, found: Observations | None, k: int, light: i
 
 
 def _row(name: str, exact: tuple[Any, Any], hidden: str, seen: tuple[Any, Any]) -> str:
-    """Make a row: place and reason by ray optics, what hides it in the scene, place and reason of the extractor."""
+    """Build a table row: position and reason by ray optics, occluder in the scene, extracted position and reason."""
     (place, _), (found, _) = exact, seen
     apart = f"{np.hypot(*(np.asarray(found) - place)):.2f}" if place is not None and found is not None else ""
     scene = "" if hidden in ("", "visible") else html.escape(hidden)

@@ -1,4 +1,4 @@
-"""The rig in three dimensions: a view of the page that shows strokes and their labels."""
+"""Three-dimensional view of the rig: strokes and their labels."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from ..arrays import Floats
 from .drawing import Label, Strokes, colours_of, extent_mm
 
 _CM = 0.1
-"""The view's unit is 1 cm, which suits its near plane and its wheel."""
+"""The view's unit is 1 cm, which suits its near plane and mouse wheel."""
 _FIELD_DEG = 40.0
 _IDLE_FPS, _TURNED_FPS = 8, 30
 
 
 class Segments(Object3D, component="segments.js"):  # type: ignore[call-arg]
-    """Line segments, with a colour and a width in pixels each."""
+    """Line segments with individual colours and widths in pixels."""
 
     def __init__(self, drawn: Strokes) -> None:
         super().__init__(*_packed(drawn))
 
     def draw(self, drawn: Strokes) -> None:
-        """Show other segments."""
-        self.args = _packed(drawn)  # for a browser that connects again
+        """Replace the segments."""
+        self.args = _packed(drawn)  # for a browser that reconnects
         self.scene.run_method("run_method_on_component", self.id, "draw", *self.args)
 
 
@@ -41,7 +41,7 @@ class RigView:
             self._segments = Segments(Strokes())
             self._labels: list[Any] = []
         self._scene.classes("rig-view").props('aria-label="the rig in three dimensions"')
-        # It is drawn all the time, and without a graphics card that takes the time of the renderer.
+        # It is drawn continuously, and without a graphics card that takes time from the renderer.
         self._scene.on("pointerenter", lambda: self._draw_at(_TURNED_FPS))
         self._scene.on("pointerleave", lambda: self._draw_at(_IDLE_FPS))
         self._shown: list[Label] = []
@@ -68,7 +68,7 @@ class RigView:
         self._look(apex_mm - np.array([6.0, 0, 0]), 70.0, np.array([0.75, -0.6, 0.35]))
 
     def look_from(self, place_mm: Floats, target_mm: Floats) -> None:
-        """Look from a place, such as a camera's, at another one."""
+        """Look from a position, such as that of a camera, at a target."""
         (x, y, z), (u, v, w) = _CM * place_mm, _CM * target_mm
         self._scene.move_camera(x=x, y=y, z=z, look_at_x=u, look_at_y=v, look_at_z=w, duration=0.4)
 

@@ -27,9 +27,9 @@ from .painter import Painter
 
 HOST = "127.0.0.1"
 RECONNECT_S = 20.0
-"""How long a tab may be away, on a slow line or a busy machine, before it is deleted."""
+"""Time for which a tab may be disconnected, on a slow line or a busy machine, before it is deleted."""
 _CLOSING_S = 0.4
-"""How long open connections may take to close at the end."""
+"""Time for open connections to close at the end."""
 _ENDING_S = 1.2
 """Longest time between Ctrl-C and the end of the process, even while it computes, renders or serves a tab."""
 
@@ -42,11 +42,11 @@ def serve(
     threads: int | None = None,
     announce: Callable[[str], None] = print,
 ) -> None:
-    """Show a scene on a page of this machine. An interrupt ends the process, with exit code 130.
+    """Show a scene on a local web page. An interrupt ends the process with exit code 130.
 
     Args:
         scene: the scene.
-        port: the port; 0 takes a free one.
+        port: the port; 0 selects a free one.
         backend: the render backend.
         threads: processor threads for rendering; None: all.
         announce: called with the address (with its token) as soon as the page can be opened.
@@ -70,9 +70,9 @@ def serve(
 
 
 def _end() -> NoReturn:
-    """End the process at once.
+    """End the process immediately.
 
-    Python's own end would unload Mitsuba and LLVM, and wait for a running kernel, which cannot be interrupted.
+    A normal exit would unload Mitsuba and LLVM, and wait for a running kernel, which cannot be interrupted.
     """
     with contextlib.suppress(OSError):
         sys.stdout.flush()
@@ -82,7 +82,7 @@ def _end() -> NoReturn:
 
 @contextlib.contextmanager
 def _listening(port: int) -> Iterator[socket.socket]:
-    """Open a socket that listens on the loopback alone."""
+    """Open a socket that listens only on the loopback interface."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -112,7 +112,7 @@ def _run(studio: Studio, listener: socket.socket, announce: Callable[[str], None
     config = uvicorn.Config(
         Guard(inner, token),
         log_level="critical",
-        access_log=False,  # the addresses hold the token
+        access_log=False,  # the addresses contain the token
         server_header=False,
         proxy_headers=False,
         timeout_graceful_shutdown=_CLOSING_S,
@@ -124,7 +124,7 @@ def _run(studio: Studio, listener: socket.socket, announce: Callable[[str], None
 
 
 class _Server(uvicorn.Server):
-    """A server that reports when it listens, and starts `deadline` when a signal ends it."""
+    """A server that reports when it is listening, and starts `deadline` when a signal ends it."""
 
     def __init__(self, config: uvicorn.Config, ready: Callable[[], None], deadline: threading.Timer) -> None:
         super().__init__(config)

@@ -1,4 +1,4 @@
-"""What one tab of the live page shows: a scene that its knobs change, and which of its frames is in the picture."""
+"""State of one tab of the live page: a scene modified by its knobs, and the selected frame."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from ..scene.spec import MOST_ACCOMMODATION_D, EyeDirection, SceneSpec
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """A scene with one fixation and one head position, taken from a scene that may have many.
+    """A scene with one fixation and one head position, selected from a scene that may have many.
 
-    Every method that changes something returns a new setup, and raises `InputError` for a value that does not fit.
+    Methods that change something return a new setup, and raise `InputError` for a value that does not fit.
 
     Attributes:
         origin: the spec as it was loaded, with all of its fixations and head positions.
-        scene: the scene that is shown; it has one fixation and one head position.
-        eye: the eye that is shown, "right" or "left".
-        camera: the camera that takes the picture.
-        fixation: number of the fixation of `origin` that is shown; None for a gaze that the user has set.
+        scene: the current scene, with one fixation and one head position.
+        eye: the selected eye, "right" or "left".
+        camera: number of the selected camera.
+        fixation: number of the current fixation of `origin`; None for a gaze set by the user.
         head: number of the head position of `origin`.
     """
 
@@ -45,7 +45,7 @@ class Setup:
     def of(cls, scene: Scene) -> Self:
         """Start with the first frame of a scene."""
         spec = scene.spec
-        # Eyes that respond to all targets must not respond to the one that is shown.
+        # Eyes respond to the mean of all targets, so they must not respond to the current one only.
         if spec.person is not None or spec.subject.accommodation_d == "targets":
             demand = min(demand_d(spec, scene.targets_mm), MOST_ACCOMMODATION_D)
             scene = scene.with_({"subject.accommodation_d": demand})
@@ -60,16 +60,16 @@ class Setup:
 
     @property
     def apex_mm(self) -> Floats:
-        """Apex of the unrotated eye that is shown, (3,) mm in the world."""
+        """Apex of the selected unrotated eye, (3,) mm in the world."""
         head = np.array(self.scene.spec.subject.head_positions_mm[0])
         return np.asarray(self.scene.eye_position_mm(self.eye) + head)
 
     def frames(self) -> Frames:
-        """Make all frames of the shown fixation: a row for each camera and eye."""
+        """Compute all frames of the current fixation: a row for each camera and eye."""
         return self.scene.frames()
 
     def row(self, frames: Frames) -> int:
-        """Find the row of `frames` that is shown."""
+        """Return the selected row of `frames`."""
         index = frames.index
         return int(np.flatnonzero((index.camera == self.camera) & (index.eye == EYES.index(self.eye)))[0])
 
@@ -78,11 +78,11 @@ class Setup:
         return replace(self, scene=self.scene.with_(changes))
 
     def looking(self, azimuth_deg: float, elevation_deg: float) -> Self:
-        """Turn the optic axes of the eyes in a direction, without regard to targets."""
+        """Turn the optic axes of the eyes in a direction, ignoring targets."""
         return replace(self, scene=self.scene.with_(gaze_deg=(azimuth_deg, elevation_deg)), fixation=None)
 
     def following(self, fixation: int) -> Self:
-        """Let the eyes fixate a target of the loaded scene, or take one of its poses."""
+        """Fixate a target of the loaded scene, or take one of its poses."""
         if not 0 <= fixation < self.fixations:
             raise InputError(f"there is no fixation {fixation}, only {self.fixations}", path="fixation")
         targets = self._targets()
@@ -105,11 +105,11 @@ class Setup:
         return self.changed({"region.blink": round(1 - share, 6)})
 
     def with_light(self, light: int, **changes: Any) -> Self:
-        """Change a light. LEDs of rings become LEDs of their own (`Rig.with_light`)."""
+        """Change a light; rings are replaced by single LEDs (`Rig.with_light`)."""
         return self._with_rig(self.scene.spec.rig.with_light(light, **changes))
 
     def with_light_added(self, light: int) -> Self:
-        """Add a copy of a light, a twelfth of its distance to the eye beside it."""
+        """Add a copy of a light, shifted sideways by a twelfth of its distance to the eye."""
         place = self.scene.rig.lights[light].position_mm
         aside = np.cross(place - self.apex_mm, [0.0, 0.0, 1.0])
         if not aside.any():
@@ -121,30 +121,30 @@ class Setup:
         return self._with_rig(self.scene.spec.rig.without_light(light))
 
     def with_camera_added(self, camera: int) -> Self:
-        """Add a copy of a camera at the same place, with another name, to be moved from there."""
+        """Add a copy of a camera at the same position, with another name."""
         cameras = self.scene.spec.rig.cameras
         copy = {**cameras[camera].to_mapping(), "name": f"camera {len(cameras)}"}
         return self.changed({"rig.cameras": [*(one.to_mapping() for one in cameras), copy]})
 
     def without_camera(self, camera: int) -> Self:
-        """Remove a camera; the picture is then that of the first one."""
+        """Remove a camera and select the first one."""
         return replace(self._with_rig(self.scene.spec.rig.without_camera(camera)), camera=0)
 
     def with_focal_length(self, camera: int, focal_length: float) -> Self:
-        """Change a camera's focal length, in the unit in which the scene gives it (mm or px)."""
+        """Change a camera's focal length, in the unit used by the scene (mm or px)."""
         key, _ = self.focal_length(camera)
         return self.changed({f"rig.cameras.{camera}.{key}": focal_length})
 
     def focal_length(self, camera: int) -> tuple[str, float | None]:
-        """Return key and value of a camera's focal length; the value is None where a calibration gives the lens."""
+        """Return key and value of a camera's focal length; the value is None if a calibration defines the lens."""
         spec = self.scene.spec.rig.cameras[camera]
         key = "focal_length_px" if spec.focal_length_mm is None else "focal_length_mm"
         return key, getattr(spec, key)
 
     def with_camera_at(self, camera: int, position_mm: ArrayLike) -> Self:
-        """Move a camera. One with a target point keeps looking at it; one without keeps its direction."""
+        """Move a camera. A camera with a target point keeps looking at it; others keep their direction."""
         spec = self.scene.spec.rig.cameras[camera]
-        # The place that is shown is that of the mirror image behind a mirror.
+        # For a camera with a mirror, the numeric position is that of the mirror image.
         place = np.round(np.asarray(position_mm if spec.mirror is None else spec.mirror.image_of(position_mm)), 6)
         if spec.calibration is None:
             return self.changed({f"rig.cameras.{camera}.position_mm": place.tolist()})
@@ -152,7 +152,7 @@ class Setup:
         return self.changed({f"rig.cameras.{camera}.calibration.t_mm": (-turn @ place).tolist()})
 
     def with_camera_aimed(self, camera: int) -> Self:
-        """Turn a camera to the shown eye."""
+        """Turn a camera to the selected eye."""
         spec = self.scene.spec.rig.cameras[camera]
         if spec.calibration is not None:
             raise InputError("has a calibration, which fixes its direction", path=f"rig.cameras.{camera}")
@@ -161,10 +161,10 @@ class Setup:
         return self.changed({f"{path}.look_at_mm": aim.tolist(), f"{path}.pan_deg": None, f"{path}.tilt_deg": None})
 
     def saved(self) -> SceneSpec:
-        """Make the spec to save: what the knobs changed, with all fixations and head positions of the loaded scene.
+        """Return the spec to save: the changes of the knobs, with all fixations and head positions of the loaded scene.
 
-        A gaze set by the user replaces the fixations. Files are absolute paths, so the scene means the
-        same in every folder.
+        A gaze set by the user replaces the fixations. Files are absolute paths, so the scene means the same in every
+        folder.
         """
         shown = self.scene.located()
         data = shown.to_mapping()
@@ -181,7 +181,7 @@ class Setup:
         return SceneSpec.from_mapping(data)
 
     def with_all_targets(self) -> Scene | None:
-        """Restore all targets of the loaded scene, on the present screen; None where it gives poses."""
+        """Restore all targets of the loaded scene, on the current screen; None if it gives poses."""
         if self.origin.targets is None:
             return None
         spec = self.scene.spec.model_copy(update={"targets": self.origin.targets, "poses": None})
@@ -191,18 +191,18 @@ class Setup:
         return replace(self, scene=self.scene.with_(rig=rig))
 
     def _targets(self) -> Any:
-        """List the targets of the loaded scene on the present screen, (f, 3); None where it gives poses."""
+        """Return the targets of the loaded scene on the current screen, (f, 3); None if it gives poses."""
         scene = self.with_all_targets()
         return None if scene is None else scene.targets_mm
 
 
 def named(cameras: tuple[Camera, ...]) -> list[str]:
-    """Name cameras for people: number and name."""
+    """Return labels of cameras: number and name."""
     return [f"{k}: {camera.name}" for k, camera in enumerate(cameras)]
 
 
 def directions(setup: Setup) -> EyeDirection:
-    """Return the direction of the optic axis of the shown eye, rounded to what a knob can show."""
+    """Return the direction of the selected eye's optic axis, rounded to a knob's precision."""
     frames = setup.frames()
     row = setup.row(frames)
     azimuth, elevation = np.degrees([frames.pose.azimuth_rad[row], frames.pose.elevation_rad[row]])

@@ -1,4 +1,4 @@
-"""A scene as a Python script that builds an equal one from objects."""
+"""Export a scene as a Python script that builds an equal one from objects."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _SCENE_KEYS = ("format", "name", "eye", "subject", "rig")
 
 
 def python_source(spec: SceneSpec) -> str:
-    """Write a scene as Python.
+    """Return a scene as Python source.
 
-    Values that equal their defaults are left out. The script defines `scene`, and prints it as YAML where it is run.
+    Values that equal their defaults are omitted. The script defines `scene`, and prints it as YAML when run.
 
     Args:
-        spec: what a scene file says.
+        spec: the content of a scene file.
     """
     subject = _call("er.Subject", [_value(spec.eye, 1)], _fields(spec.subject, 0), 0)
     rest = [f"name={_value(spec.name, 0)}", *(text for key, text in _pairs(spec, 0) if key not in _SCENE_KEYS)]
@@ -42,7 +42,7 @@ def python_source(spec: SceneSpec) -> str:
 
 
 def _value(value: Any, depth: int) -> str:
-    """Write a value that begins `depth` levels deep as Python text."""
+    """Return a value as Python text; it starts `depth` levels deep."""
     if isinstance(value, Spec):
         name = type(value).__name__
         if name not in eyerender.__all__:
@@ -64,7 +64,7 @@ def _fields(spec: Spec, depth: int) -> list[str]:
 
 
 def _pairs(spec: Spec, depth: int) -> list[tuple[str, str]]:
-    """List (key, "key=value") of the fields that differ from their defaults."""
+    """Return (key, "key=value") of the fields that differ from their defaults."""
     out = []
     for key, field in type(spec).model_fields.items():
         value = getattr(spec, key)
@@ -78,7 +78,7 @@ def _call(name: str, values: list[str], fields: list[str], depth: int) -> str:
 
 
 def _joined(start: str, items: list[str], end: str, depth: int) -> str:
-    """Join items on one line where they fit, else write each on its own line."""
+    """Join items on one line if they fit, otherwise write one per line."""
     line = start + ", ".join(items) + end
     if len(line) + 4 * depth + 20 <= _WIDTH and "\n" not in line:
         return line

@@ -1,15 +1,15 @@
-"""How far light travels in a turbid tissue between the points where it enters and leaves.
+"""Distance that light travels in a turbid tissue between the points where it enters and leaves.
 
-The tissue scatters with the reduced coefficient mu' and absorbs. The share of its diffuse reflectance that leaves per
-unit of area at the distance r from where it entered is close to
+The tissue scatters with the reduced coefficient mu' and absorbs. The share of the diffuse reflectance that leaves per
+unit of area at a distance r from the point of entry is close to
 
     R(r) = (exp(-r / d) + exp(-r / (3 d))) / (8 pi d r)
 
-for any tissue (Burley 2015, "Extending the Disney BRDF to a BSDF with integrated subsurface scattering";
-Christensen and Burley 2015). The length d follows from mu' and the reflectance rho. The lines below were fitted to
-Monte Carlo simulations (isotropic scattering, index 1.4): a half space of absorption 0.005 to 0.25 per mm, and slabs
-0.4 to 1.3 mm thick before a dark layer of reflectance 0.05 to 0.2. With them the light behind the edge of a shadow is
-right to 0.016 of the full light.
+for any tissue (Burley 2015, "Extending the Disney BRDF to a BSDF with integrated subsurface scattering"; Christensen
+and Burley 2015). The length d follows from mu' and the reflectance rho. The lines below were fitted to Monte Carlo
+simulations (isotropic scattering, index 1.4): a half space of absorption 0.005 to 0.25 per mm, and slabs 0.4 to 1.3 mm
+thick before a dark layer of reflectance 0.05 to 0.2. With these fits, the light behind the edge of a shadow is accurate
+to 0.016 of the full light.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy.optimize import brentq
 
 from ..arrays import Floats, frozen
 
-_TAIL = 60.0  # in units of d, beyond all light
+_TAIL = 60.0  # radius in units of d, beyond practically all light
 
 
 def half_space_length_mm(albedo: float, scattering_per_mm: float) -> float:
@@ -41,7 +41,7 @@ def share_within(r: Floats | float) -> Floats:
 
 
 def radius_of(share: float) -> float:
-    """Find the distance, in units of d, within which a share of the light leaves."""
+    """Compute the distance, in units of d, within which a share of the light leaves."""
     return float(brentq(lambda r: float(share_within(r)) - share, 0.0, _TAIL))
 
 
@@ -52,7 +52,7 @@ def rings(count: int) -> Floats:
 
 
 def transmitted(albedo: float, scattering_per_mm: float) -> float:
-    """Compute k (1/mm) of the share exp(-k t) of light that a layer of thickness t passes on to the tissue behind it.
+    """Compute k (1/mm) in the share exp(-k t) of light that a layer of thickness t transmits.
 
     Fitted to Monte Carlo simulations of layers 0.5 to 3.5 mm thick, albedos of a half space from 0.3 to 0.7.
     """

@@ -1,4 +1,4 @@
-"""The two-point problem by Fermat's principle, compiled: paths of stationary optical length across graphs of surfaces.
+"""Compiled solver of the two-point problem by Fermat's principle: stationary optical length across graphs of surfaces.
 
 A path from a viewpoint X_0 over the points X_i = (h_i(y_i, z_i), y_i, z_i) of m surfaces to an object X_{m+1} has the
 optical length S = sum_j n_j |X_{j+1} - X_j|. It is a ray where dS = 0. With e_j the unit vectors along the segments,
@@ -10,12 +10,12 @@ e_j^T) n_j / L_j,
     Hessian, next       -t_i . A_i t_{i+1}
 
 (Born & Wolf 1999, 3.3.2; the Hessian is that of Walter et al. 2009, "Single scattering in refractive media with
-triangle mesh boundaries", eq. 6, for any number of surfaces.) Newton needs no intersections, so a biconic costs as
-much as a sphere. A mirror point is the same problem with m = 1, equal indices and the object outside. This solver is
-fast and serves almost all rays; `shooting` is slower and more robust, and solves the rest.
+triangle mesh boundaries", eq. 6, for any number of surfaces.) Newton needs no intersections, so a biconic costs as much
+as a sphere. A mirror point is the same problem with m = 1, equal indices and the object outside. This solver is fast
+and serves almost all rays; `shooting` is slower and more robust, and solves the rest.
 
 Rays are solved `LANES` at a time, so that the loops over them become vector instructions. `nodes` (m + 2, ROWS, LANES)
-holds the viewpoints, the points on each surface outside in and the targets, with all that is known at each.
+holds the viewpoints, the points on each surface outside in and the targets, with everything known at each.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def evaluate(kinds, numbers, table, j, first, count, columns, nodes):  # type: i
 
 @merged
 def paraxial_start(kinds, numbers, table, first, count, columns, nodes):  # type: ignore[no-untyped-def]
-    """Guess the start (y, z) on each surface.
+    """Guess the start (y, z) on each surface by paraxial optics.
 
     On the outermost surface the guess is the straight line's point, moved by m = 1 / (1 - d (n - 1) / (n R)) away from
     the line through the viewpoint and the centre of curvature, which is not refracted; d is the object's depth, n its
@@ -123,7 +123,7 @@ def paraxial_start(kinds, numbers, table, first, count, columns, nodes):  # type
             evaluate(kinds, numbers, table, j, first, count, columns, nodes)
         if turn == 0:
             for lane in range(LANES):
-                # At the axis; the rows of the traced ray are free until then.
+                # At the axis; the rows of the traced ray are unused until then.
                 start[P_X, lane], start[T, lane] = start[X, lane], -1.0 / start[YY, lane]
                 start[Y, lane], start[Z, lane] = end[Y, lane], end[Z, lane]
             continue
@@ -217,7 +217,7 @@ def couple(nodes, j):  # type: ignore[no-untyped-def]
 
 @inlined
 def step(nodes, j, innermost):  # type: ignore[no-untyped-def]
-    """Move node j by Newton's step; the number of lanes that are not settled."""
+    """Move node j by Newton's step; return the number of lanes that have not converged."""
     for lane in range(LANES):
         yy, yz, zz = nodes[j, H_YY, lane], nodes[j, H_YZ, lane], nodes[j, H_ZZ, lane]
         y, z = nodes[j, G_Y, lane], nodes[j, G_Z, lane]
@@ -281,7 +281,7 @@ def bend(nodes, j, reflects):  # type: ignore[no-untyped-def]
 def trace(kinds, numbers, table, reflects, first, count, columns, nodes):  # type: ignore[no-untyped-def]
     """Trace the ray that leaves the viewpoint for the outermost surface through all others.
 
-    Each is met by Newton from the path's own point.
+    Each hit is solved by Newton's method from the path's point.
     """
     for lane in range(LANES):
         dx = nodes[1, X, lane] - nodes[0, X, lane]
@@ -304,7 +304,7 @@ def trace(kinds, numbers, table, reflects, first, count, columns, nodes):  # typ
 
 @merged
 def meet(kinds, numbers, table, j, first, count, columns, nodes):  # type: ignore[no-untyped-def]
-    """Move the traced ray from the node before to the surface of node j."""
+    """Move the traced ray from the previous node to the surface of node j."""
     for lane in range(LANES):
         nodes[j, T, lane] = (
             (nodes[j, X, lane] - nodes[j - 1, P_X, lane]) * nodes[j - 1, W_X, lane]
@@ -371,7 +371,7 @@ def mirror_start(kinds, numbers, table, rims, first, count, columns, nodes, out,
     """Guess mirror points: where the bisectors through the centre of curvature of the apex meet the surface.
 
     The guesses are exact on a sphere for source and viewpoint at infinity. A ray is marked OUTSIDE if its guess is far
-    outside the rim, or if its bisector does not point to the front, because then no mirror point can be on the surface.
+    outside the rim, or its bisector does not point to the front, because then the surface has no mirror point.
     """
     last = nodes.shape[0] - 1
     w = nodes[1]
@@ -414,21 +414,21 @@ def connect_all(
     out: Floats,
     state: Statuses,
 ) -> None:
-    """Find the rays from viewpoints to targets, through all surfaces or by way of one that reflects them outside.
+    """Solve for the rays from viewpoints to targets, through all surfaces or reflected by one of them outside.
 
     Every path is traced from the viewpoint; a ray that misses the target by more than rounding is LOST.
 
     Args:
-        kinds: of the surfaces, outside in.
-        numbers: of the surfaces.
-        table: of the surfaces.
-        ladder: (1 or n, s + 1) the index before the first surface, then that behind each.
+        kinds: kinds of the surfaces, outside in.
+        numbers: numbers of the surfaces.
+        table: table of the surfaces.
+        ladder: (1 or n, s + 1) index in front of the first surface, then that behind each.
         rims: (1 or n,) radius at which the outermost surface ends.
-        viewpoint: (3, 1 or n, 1 or m).
-        target: (3, 1 or n, 1 or m).
+        viewpoint: (3, 1 or n, 1 or m) mm.
+        target: (3, 1 or n, 1 or m) mm.
         reflects: whether the only surface reflects the rays.
         out: (RESULTS, n, m), written.
-        state: (n, m), LOST, written.
+        state: (n, m), initially LOST, written.
     """
     nodes = np.zeros((len(kinds) + 2, ROWS, LANES))
     count, columns = state.size, max(state.shape[1], 1)

@@ -1,4 +1,4 @@
-"""Rays through a medium whose index decreases from a core to its edge, as in the lens of the eye.
+"""Trace rays through a medium whose index decreases from a core to its edge, as in the lens of the eye.
 
 The medium lies between a front and a back surface. Each of them, scaled by p about the centre, is a surface of constant
 index (p = 1: the surface itself):
@@ -49,8 +49,8 @@ class Passage(NamedTuple):
         hit: the intersection; its `distance` is 0.
         way: unit direction on arrival.
         optical_path_mm: the integral of n ds.
-        moves: differentials of the point on the surface, one for each that was given.
-        turns: differentials of the direction, one for each that was given.
+        moves: differentials of the point on the surface, one for each given one.
+        turns: differentials of the direction, one for each given one.
     """
 
     hit: Hit
@@ -84,7 +84,7 @@ class GradientMedium(ArrayValue):
 
     @classmethod
     def between(cls, front: Quadric, back: Quadric, centre_mm: Floats, edge: float, core: float) -> GradientMedium:
-        """Make the medium between two single surfaces on either side of `centre_mm` (3,)."""
+        """Create the medium between two single surfaces on either side of `centre_mm` (3,)."""
         matrices, vectors = [], []
         for surface in (front, back):
             xx, yy, zz, xy, xz, yz, bx, by, bz, c = (float(v) for v in surface.coefficients)
@@ -113,15 +113,15 @@ class GradientMedium(ArrayValue):
         turns: Sequence[Xyz] = (),
         steps: int | None = None,
     ) -> Passage:
-        """Follow rays from one surface of the medium to the other.
+        """Trace rays from one surface of the medium to the other.
 
-        `hit.ok` is False where a ray leaves the medium through the surface where it entered.
+        `hit.ok` is False if a ray leaves the medium through the surface where it entered.
 
         Args:
-            surface: the surface where the rays leave.
+            surface: the surface through which the rays leave.
             inward: whether the rays go from the front to the back.
-            point: where they start.
-            way: their direction behind the first surface.
+            point: start points of the rays.
+            way: directions of the rays behind the first surface.
             moves: differentials of `point` (along the surface) to propagate.
             turns: differentials of `way` to propagate.
             steps: steps in each half; None: STEPS.
@@ -182,7 +182,7 @@ class GradientMedium(ArrayValue):
         return front, back
 
     def take(self, index: Indices) -> GradientMedium:
-        """Select media of the batch by `index`; a single medium is returned as it is."""
+        """Select media of the batch by `index`; a single medium is returned unchanged."""
         return self if self.core.ndim == 0 else GradientMedium(*(part[index] for part in self._parts()))
 
     def mirrored(self) -> GradientMedium:
@@ -220,7 +220,7 @@ class _Half(NamedTuple):
         turned = self._turned(q)
         lead = _dot(self.vector, q)
         s = np.sqrt(lead * lead + _dot(q, turned))
-        s = np.maximum(s, 1e-300)  # at the centre itself, every product with p vanishes
+        s = np.maximum(s, 1e-300)  # at the centre, every product with p vanishes
         size = lead + s
         return _Size(size, s, (turned + size * self.vector) / s)
 
@@ -255,7 +255,7 @@ class _Rays(NamedTuple):
 
 
 def _to_ridge(rays: _Rays, first: _Half, last: _Half, steps: int) -> _Rays:
-    """Follow rays to the ridge, where both halves have the same p."""
+    """Trace rays to the ridge, where both halves have the same p."""
     # The straight line gives the time to its point closest to the centre.
     time = -_dot(rays.place, rays.speed) / _dot(rays.speed, rays.speed)
     for _ in range(_AIMS):
@@ -265,7 +265,7 @@ def _to_ridge(rays: _Rays, first: _Half, last: _Half, steps: int) -> _Rays:
         rays = _step(rays, first, _to_go(rays.place, rays.speed, first, last))
     if not rays.differentials:
         return rays
-    # Neighbouring rays meet the ridge earlier or later, and the pull behind it differs.
+    # Neighbouring rays meet the ridge earlier or later, and the acceleration behind it differs.
     before, after = first.at(rays.place), last.at(rays.place)
     slope, jump = before.slope - after.slope, first.pull(before) - last.pull(after)
     late = -_per_time(slope, rays.speed)

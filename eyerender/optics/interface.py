@@ -1,4 +1,4 @@
-"""Rays at an interface: reflection, refraction and Fresnel's shares of the energy.
+"""Rays at an interface: reflection, refraction and Fresnel reflectances.
 
 Vectors are `Xyz` (one array per coordinate). d is the unit direction of travel, N a unit normal on either side.
 """
@@ -34,7 +34,7 @@ def refract(direction: Xyz, normal: Xyz, n_before: FloatLike, n_after: FloatLike
         n_after: index behind it.
 
     Returns:
-        w, and whether light passes. At total reflection it does not, and w is the grazing direction.
+        w, and whether light passes. At total reflection no light passes, and w is the grazing direction.
     """
     eta = n_before / n_after
     cosine = -dot(direction, normal)
@@ -51,7 +51,7 @@ def refract(direction: Xyz, normal: Xyz, n_before: FloatLike, n_after: FloatLike
 
 
 class FresnelShares(NamedTuple):
-    """Reflected shares of the energy: s and p polarized, and unpolarized. The rest is transmitted."""
+    """Reflectances: s- and p-polarised, and unpolarised. The rest is transmitted."""
 
     s: Floats
     p: Floats
@@ -91,7 +91,7 @@ def fresnel(
 
 
 def _stacked(first: Floats, second: Floats) -> Floats:
-    """Compute the reflected share of two parallel interfaces; exactly 1 where either reflects all."""
+    """Compute the reflectance of two parallel interfaces; exactly 1 if either reflects everything."""
     both = first * second
     total = (first >= 1.0) | (second >= 1.0)
     through = np.where(total, 1.0, 1.0 - both)

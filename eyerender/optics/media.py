@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ConstantMedium:
-    """A medium whose index n is the same at every wavelength, for sources that name no wavelength."""
+    """A medium with the same index n at every wavelength, for sources that name no wavelength."""
 
     n: float
 

@@ -1,17 +1,15 @@
-"""Purkinje images from inside the eye: light enters, is reflected by a surface and leaves to a viewpoint.
+"""Purkinje images inside the eye: light enters, is reflected by a surface and leaves to a viewpoint.
 
 Such a mirror point need not exist: a hyperboloid, for example the front of a lens that flattens outwards, faces no
-farther than its asymptotic cone. Where several exist, one of them is the Purkinje image: the one that continues the
-single solution of paraxial optics on the axis. It is followed from there. With t from 0 to 1, source and viewpoint move
-along
+farther than its asymptotic cone. If several exist, the Purkinje image is the one that continues the single paraxial
+solution on the axis, and it is followed from there. With t from 0 to 1, source and viewpoint move along
 
     p(t) = o + (1 - t) |p - o| a + t (p - o)        (o, a: apex and axis of the outermost surface)
 
 The exit point is predicted along the secant of the two previous positions, then corrected by Newton with ray
-differentials. The step in t is halved where that fails or where the ray tube's determinant has changed its sign
-(another branch), and doubled where it succeeds (Allgower & Georg 1990, "Numerical continuation methods", chapter 2). A
-branch ends at a fold, where the determinant vanishes (the viewpoint lies on a caustic), at total reflection, or where a
-surface ends.
+differentials. The step in t is halved if that fails or the ray tube's determinant changes its sign (another branch),
+and doubled if it succeeds (Allgower & Georg 1990, "Numerical continuation methods", chapter 2). A branch ends at a
+fold, where the determinant vanishes (the viewpoint lies on a caustic), at total reflection, or where a surface ends.
 """
 
 from __future__ import annotations
@@ -41,16 +39,16 @@ determinant falls as the square root of what is left of t: to about 0.01 at the 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PurkinjePoints(ArrayValue):
-    """Where light from a source is reflected to a viewpoint inside the eye.
+    """Points at which a surface inside the eye reflects light from a source to a viewpoint.
 
-    Values are NaN where there is no such ray.
+    Values are NaN if there is no such ray.
 
     Attributes:
         points_mm: (..., 3) mirror point on the reflecting surface.
         exit_points_mm: (..., 3) where the ray meets the outermost surface on its way to the viewpoint.
         directions: (..., 3) unit vectors from there to the viewpoint.
-        course_mm: (2 k - 1, ..., 3) all points of the ray on k surfaces, from the exit point over the mirror point back
-            to where the light came in.
+        course_mm: (2 k - 1, ..., 3) all points of the ray on k surfaces, from the exit point over the mirror point to
+            the point of entry.
         residual_mm: (...,) miss distance of the ray.
         status: (...,).
     """
@@ -71,14 +69,14 @@ def purkinje_path(
     gradient: GradientMedium | None = None,
     n_outside: float = 1.0,
 ) -> tuple[Crossing, ...]:
-    """List the crossings of a ray that the innermost of `surfaces` reflects.
+    """Return the crossings of a ray that the innermost of `surfaces` reflects.
 
     Args:
         surfaces: outside in; the last one reflects.
         indices: the index behind each surface.
         rims_mm: the rim radius of each surface.
         passing: whether a ray that misses a surface continues (shells of a gradient lens).
-        gradient: the medium before the innermost surface where its index is not constant.
+        gradient: the medium in front of the innermost surface, if its index is not constant.
         n_outside: index outside the eye.
     """
 
@@ -122,10 +120,10 @@ def purkinje_points(
     gradient: GradientMedium | None = None,
     n_outside: float = 1.0,
 ) -> PurkinjePoints:
-    """Find rays that the innermost of `surfaces` reflects, and that the outer ones refract on the way in and out.
+    """Solve for rays that the innermost of `surfaces` reflects, and that the outer ones refract in and out.
 
-    The status is NO_MIRROR_POINT where the image, followed from the axis, ends before source and viewpoint reach their
-    places, or where it lies beyond the rim of the reflecting surface.
+    The status is NO_MIRROR_POINT if the image, followed from the axis, ends before source and viewpoint reach their
+    positions, or lies beyond the rim of the reflecting surface.
 
     Args:
         surfaces: outside in; the last one reflects.
@@ -161,7 +159,7 @@ def purkinje_points(
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Route:
-    """Path along which viewpoints and sources move from the axis to their places.
+    """Path along which viewpoints and sources move from the axis to their positions.
 
     Viewpoints and sources (m, 3) are given relative to the apex; apex and axis are (3,) or (m, 3).
     """
@@ -184,7 +182,7 @@ class _Route:
 
 
 def _followed(path: Sequence[Crossing], n_outside: float, route: _Route) -> PurkinjePoints:
-    """Follow the images of a route's m rays."""
+    """Follow the images of a route's m rays from the axis."""
     count = len(route.source)
     t, t_before, step = np.zeros(count), np.zeros(count), np.full(count, FIRST_STEP)
     point, exits, way = (np.zeros((count, 3)) for _ in range(3))

@@ -1,8 +1,8 @@
-"""The two-point problem by shooting: the ray that leaves one point, passes a path of crossings and meets another point.
+"""The two-point problem by shooting: the ray from one point through a path of crossings to another point.
 
-It is solved by Newton on the direction at the source with ray differentials. A unit direction d is varied along e1, e2
-orthogonal to it. Each crossing carries along the differentials dy of the point and dw of the direction (Igehy 1999,
-"Tracing ray differentials", eq. 8-19):
+It is solved by Newton's method on the direction at the source, with ray differentials. A unit direction d is varied
+along e1, e2 orthogonal to it. Each crossing carries along the differentials dy of the point and dw of the direction
+(Igehy 1999, "Tracing ray differentials", eq. 8-19):
 
     transfer    dt = -N.(dy + t dw) / (N.w),  dy <- dy + t dw + dt w,   dN = (H dy - N (N.H dy)) / |g|
     refraction  w = eta d + f N, f = eta c - c2:  dw = eta dd + df N + f dN,  df = (eta - eta^2 c / c2) dc
@@ -47,7 +47,7 @@ class Connection:
         start: unit direction at the source.
         first: the point on the first crossing.
         last: the point on the last crossing.
-        turning: the point where the ray was last reflected; the first point if it never was.
+        turning: the point of the last reflection; the first point if there is none.
         end: unit direction in the last medium.
         residual_mm: miss distance of the traced ray at the target. For a target more than `FAR_MM` from the last
             surface it is measured at `FAR_MM`.
@@ -89,16 +89,16 @@ class _Shot(NamedTuple):
 
 
 def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz) -> Connection:
-    """Find the rays from a source through a path to a target.
+    """Solve for the rays from a source through a path to a target.
 
-    Undamped Newton is tried for all rays. The rays that it does not find go through a guarded search, in which steps
-    are halved until the miss shrinks. It starts from `aim`, and then from points between it and the target.
+    Undamped Newton steps are tried for all rays. The rays that do not converge go through a guarded search, in which
+    steps are halved until the miss shrinks. It starts from `aim`, then from points between it and the target.
 
     Args:
         path: the crossings, in order.
         n_start: index of the medium at the source.
-        source: points where the rays start.
-        target: points that they must meet; source and target broadcast.
+        source: start points of the rays.
+        target: end points of the rays; source and target broadcast.
         aim: points at which the rays are aimed first.
     """
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *target, *aim)))
@@ -137,15 +137,15 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
 def correct(
     path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz, steps: int = _FAST_STEPS
 ) -> Corrected:
-    """Refine rays (m,) whose aim is already close, without any other attempt.
+    """Refine rays (m,) whose aim is already close, without the guarded search.
 
-    The surfaces must be met, but their rims are not checked.
+    The rays must meet the surfaces, but rims are not checked.
 
     Args:
         path: the crossings, in order.
         n_start: index of the medium at the source.
-        source: (m,) points where the rays start.
-        target: (m,) points that they must meet.
+        source: (m,) start points of the rays.
+        target: (m,) end points of the rays.
         aim: (m,) points at which they are aimed first.
         steps: largest number of undamped Newton steps.
     """
@@ -165,8 +165,8 @@ class RayTube(NamedTuple):
     """The tube of rays around a traced ray, arrays (...) and components.
 
     Attributes:
-        cross_section_mm2_sr: cross section at the target per solid angle at the source, |w . (a1 x a2)|. Where source
-            and target lie in media of the same index it is the same in both directions.
+        cross_section_mm2_sr: cross section at the target per solid angle at the source, |w . (a1 x a2)|. If source and
+            target lie in media of the same index, it is the same in both directions.
         end: the ray's unit direction at the target.
     """
 
@@ -180,7 +180,7 @@ def ray_tube(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, directio
     Args:
         path: the crossings, in order.
         n_start: index of the medium at the source.
-        source: points where the rays start.
+        source: start points of the rays.
         direction: unit directions of the rays at the source.
         target: points that the rays pass.
     """
@@ -312,7 +312,7 @@ def _rescue(
     shot: _Shot,
     left: Bools,
 ) -> tuple[Xyz, _Shot]:
-    """Search the rays that undamped Newton did not find; the remaining ones are returned unchanged."""
+    """Run the guarded search for rays that did not converge; the remaining ones are returned unchanged."""
     index = np.nonzero(left)
     frame = index[0] if left.ndim else np.zeros(1, dtype=np.intp)
     few_path = [taken(crossing, frame) for crossing in path]
@@ -338,7 +338,7 @@ def _rescue(
 def _guarded(
     path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, way: Xyz, shot: _Shot, done: Bools
 ) -> tuple[Xyz, _Shot]:
-    """Run Newton with steps that are halved until the miss shrinks."""
+    """Run Newton's method with steps that are halved until the miss shrinks."""
     for _ in range(_GUARDED_STEPS):
         active = ~done & (shot.status == Status.OK) & ~_settled(shot, 1.0)
         if not active.any():
@@ -360,7 +360,7 @@ def _guarded(
 
 
 def _settled(shot: _Shot, slack: float) -> Bools:
-    """Return whether the miss is at most `slack` times what Newton can reach."""
+    """Return whether the miss is at most `slack` times the smallest miss that Newton's method can reach."""
     reach = SETTLED_MM + ROUNDING_RAD * np.sqrt(np.abs(shot.determinant)) * nearness(shot.along)
     return np.asarray(shot.residual_mm <= slack * reach)
 
@@ -376,7 +376,7 @@ def nearness(along_mm: Floats) -> Floats:
 
 
 def taken(crossing: Crossing, frame: Indices) -> Crossing:
-    """Gather the per-eye parameters of a crossing for single rays."""
+    """Select the per-eye parameters of a crossing for single rays."""
     n_after, rim = crossing.n_after, crossing.rim_mm
     return Crossing(
         surface=crossing.surface.take(frame),
@@ -390,7 +390,7 @@ def taken(crossing: Crossing, frame: Indices) -> Crossing:
 
 
 def _each(function: Callable[..., Any], *values: _Nested) -> _Nested:
-    """Apply a function to each array of nested tuples of one structure."""
+    """Apply a function to each array of nested tuples with the same structure."""
     first: Any = values[0]
     if not isinstance(first, tuple):
         return function(*values)  # type: ignore[no-any-return]
@@ -399,7 +399,7 @@ def _each(function: Callable[..., Any], *values: _Nested) -> _Nested:
 
 
 def _put(old: _Nested, new: _Nested, index: tuple[Indices, ...]) -> _Nested:
-    """Copy of old values with new ones at an index."""
+    """Return a copy of the old values with new ones at an index."""
 
     def put(old: Floats, new: Floats) -> Floats:
         out = np.array(old)
@@ -424,7 +424,7 @@ def _spread(point: Xyz, shape: tuple[int, ...]) -> Xyz:
 
 
 def _basis(direction: Xyz) -> tuple[Xyz, Xyz]:
-    """Make two unit vectors orthogonal to a unit direction and to each other (Duff et al. 2017, listing 3)."""
+    """Compute two unit vectors orthogonal to a unit direction and to each other (Duff et al. 2017, listing 3)."""
     x, y, z = direction
     # The formula is singular at -z. It is rotated here so that -sign(x) x is the pole.
     sign = np.copysign(1.0, x)

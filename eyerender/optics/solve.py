@@ -1,10 +1,10 @@
-"""Apparent points (refraction), mirror points (reflection) and Purkinje images: the rays that join two points.
+"""Apparent points (refraction), mirror points (reflection) and Purkinje images: rays that join two points.
 
-Most rays are found by Newton on the optical length (`fermat_kernels`). Every path is then traced from the
-viewpoint through the surfaces; the distance by which the traced ray misses the other point is the residual. A path that
-misses by more than rounding is searched again by shooting with ray differentials and guarded steps (`shooting`), which
-also handles surfaces that have no common graph. A refracted ray that is still not found is searched from the object's
-side: at grazing angles, Newton from a straight line's guess may miss a ray that exists.
+Most rays are solved by Newton's method on the optical length (`fermat_kernels`). Every path is then traced from the
+viewpoint through the surfaces; the residual is the distance by which the traced ray misses the other point. If it
+exceeds rounding, the path is searched again by shooting with ray differentials and guarded steps (`shooting`), which
+also handles surfaces without a common graph. A refracted ray that is still missing is searched from the object's side,
+because at grazing angles Newton's method from a straight line may miss an existing ray.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .trace import Crossing, outward_path, trace
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ApparentPoints(ArrayValue):
-    """Where the rays from object points to a viewpoint leave the outermost surface.
+    """Points at which rays from object points to a viewpoint leave the outermost surface.
 
     Attributes:
         exit_points_mm: (..., 3) points on the outermost surface.
@@ -46,13 +46,13 @@ class ApparentPoints(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MirrorPoints(ArrayValue):
-    """Where light from a source is reflected to a viewpoint.
+    """Points at which a surface reflects light from a source to a viewpoint.
 
     Attributes:
         points_mm: (..., 3) points on the surface.
         directions: (..., 3) unit vectors from there to the viewpoint.
         residual_mm: (...,) distance by which the traced ray misses the source, 1e-9 at most. It is measured at 1000 mm
-            where the source is farther away.
+            if the source is farther away.
         status: (...,).
     """
 
@@ -89,7 +89,7 @@ def apparent_points(
     rim_mm: FloatLike = np.inf,
     n_outside: float = 1.0,
 ) -> ApparentPoints:
-    """Find where rays from object points to a viewpoint leave the outermost surface (refraction).
+    """Compute where rays from object points to a viewpoint leave the outermost surface (refraction).
 
     Args:
         surfaces: outside in.
@@ -114,7 +114,7 @@ def apparent_points(
 def mirror_points(
     surface: Surface, source_mm: npt.ArrayLike, viewpoint_mm: npt.ArrayLike, *, rim_mm: FloatLike = np.inf
 ) -> MirrorPoints:
-    """Find where a surface reflects a source to a viewpoint outside: the first Purkinje image.
+    """Compute where a surface reflects a source to a viewpoint outside: the first Purkinje image.
 
     Args:
         surface: the mirror.
@@ -164,7 +164,7 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Floa
 def _joined(
     graphs: Graphs, ladder: Floats, rim_mm: FloatLike, viewpoint: Xyz, target: Xyz, *, reflects: bool = False
 ) -> tuple[Rays, Bools, Xyz]:
-    """Run the compiled solver: its rays, which of them it found, and the first guesses of mirror points."""
+    """Run the compiled solver; return its rays, which of them converged, and the first guesses of mirror points."""
     shape = np.broadcast_shapes(*(p.shape for p in (*viewpoint, *target)))
     full = shape or (1,)
     if not graphs.plain:
@@ -196,10 +196,10 @@ def _rows(point: Xyz, full: tuple[int, ...]) -> Floats:
 
 
 def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target: Xyz, rays: Rays) -> Rays:
-    """Search from the object for the refracted rays that were not found.
+    """Search from the object's side for refracted rays that are still missing.
 
-    A cone of rays is launched from the object. Each of those that leave closest to the viewpoint's direction starts a
-    search.
+    A cone of rays is traced from the object. The rays that leave closest to the viewpoint's direction are the starts of
+    searches.
     """
     lost = (rays.status != Status.OK) & (rays.status != Status.OUTSIDE_LIMBUS)
     if not lost.any():
@@ -234,7 +234,7 @@ def _launched(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target
 
 
 def _cone(count: int, reach_rad: float) -> Floats:
-    """Make unit directions (count, 3) spread evenly about +x, up to `reach_rad` from it."""
+    """Return unit directions (count, 3) spread evenly about +x, up to `reach_rad` from it."""
     step = np.arange(count) + 0.5
     angle, turn = reach_rad * np.sqrt(step / count), np.pi * (1.0 + np.sqrt(5.0)) * step
     return np.column_stack([np.cos(angle), np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn)])
@@ -248,7 +248,7 @@ _LAUNCHED_AT_ONCE = 200
 def _searched(
     path: Sequence[Crossing], n_start: FloatLike, viewpoint: Xyz, target: Xyz, aim: Xyz, rays: Rays, left: Bools
 ) -> Rays:
-    """Find the rays at `left` by shooting, and keep the remaining ones."""
+    """Solve for the rays at `left` by shooting, and keep the other ones."""
     rows = np.nonzero(left) if left.ndim else (np.zeros(1, dtype=np.intp),)
     shape = left.shape or (1,)
 
@@ -282,6 +282,6 @@ def _from_connection(found: Connection) -> Rays:
 
 
 def apex_of(surface: Surface) -> Floats:
-    """Find the point of the sheet on its local axis, (..., 3)."""
+    """Return the point of the sheet on its local axis, (..., 3) mm."""
     zero = np.zeros(surface.batch_shape)
     return surface.to_eye(np.stack([surface.sag(zero, zero), zero, zero], axis=-1))

@@ -1,4 +1,4 @@
-"""Sequential tracing of rays through any number of surfaces, with a status for each ray."""
+"""Sequential ray tracing through any number of surfaces, with a status for each ray."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from .interface import dot, moved, reflect, refract, unit
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Crossing:
-    """How a ray crosses a surface.
+    """Crossing of a surface by a ray.
 
     Attributes:
         surface: the surface.
-        n_after: index behind the crossing, () or (n,), one per eye. Ignored where the ray is reflected.
+        n_after: index behind the crossing, () or (n,), one per eye. Ignored for a reflection.
         inward: whether the ray goes into the eye (towards -x of the surface's frame).
         reflects: whether the ray is reflected instead of refracted.
-        rim_mm: distance from the axis at which the surface ends; infinite for one without an end.
-        beyond_rim: the status of a ray that meets the surface outside its rim. None: such a ray continues undisturbed,
-            as does one that misses the surface (the inner shells of a gradient lens do not reach as far as the pupil).
-        through: the gradient medium before the crossing; None: the ray runs straight.
+        rim_mm: distance from the axis at which the surface ends; infinite without an end.
+        beyond_rim: status of a ray that meets the surface outside its rim. None: such a ray continues straight on, like
+            one that misses the surface (the inner shells of a gradient lens are smaller than the pupil).
+        through: gradient medium in front of the crossing; None: the ray is straight.
     """
 
     surface: Surface
@@ -41,16 +41,16 @@ class Crossing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Traced(ArrayValue):
-    """The rays of a trace over S crossings.
+    """Rays traced over S crossings.
 
-    The leading axis of the points is 0 for the start and k for the k-th crossing. Values after a failed crossing have
-    no meaning.
+    The leading axis of the points is 0 for the start and k for the k-th crossing. Values after a failed crossing are
+    undefined.
 
     Attributes:
         points_mm: (S + 1, ..., 3) points.
         directions: (S + 1, ..., 3) unit directions on leaving each point.
-        optical_path_mm: (...,) from the start to the last crossing.
-        status: (...,).
+        optical_path_mm: (...,) optical path from the start to the last crossing.
+        status: (...,) of `Status`.
     """
 
     points_mm: Floats
@@ -60,14 +60,14 @@ class Traced(ArrayValue):
 
 
 def inward_path(surfaces: Sequence[Surface], indices: Sequence[FloatLike]) -> tuple[Crossing, ...]:
-    """List the refractions at `surfaces`, given from outside in, with the index behind each."""
+    """Return the refractions at `surfaces`, given from outside in, with the index behind each."""
     return tuple(Crossing(surface=surface, n_after=index) for surface, index in zip(surfaces, indices, strict=True))
 
 
 def outward_path(
     surfaces: Sequence[Surface], indices: Sequence[FloatLike], n_outside: FloatLike = 1.0
 ) -> tuple[Crossing, ...]:
-    """List the refractions at the same surfaces (given from outside in) on the way out."""
+    """Return the refractions at the same surfaces (given from outside in) on the way out."""
     behind = [n_outside, *indices[:-1]]
     return tuple(
         Crossing(surface=s, n_after=n, inward=False) for s, n in zip(reversed(surfaces), reversed(behind), strict=True)

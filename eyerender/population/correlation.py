@@ -1,4 +1,4 @@
-"""The nearest correlation matrix, by alternating projections."""
+"""Nearest correlation matrix, and completion of a partial one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ..arrays import Floats
 from ..errors import InputError
 
 SMALLEST = 1e-6
-"""Smallest eigenvalue of a matrix that is used: it can be inverted, which conditions need."""
+"""Smallest eigenvalue of the matrices used, which must be invertible for conditions."""
 
 
 def nearest_correlation(matrix: Floats, *, smallest: float = SMALLEST, steps: int = 2000) -> Floats:
@@ -23,7 +23,7 @@ def nearest_correlation(matrix: Floats, *, smallest: float = SMALLEST, steps: in
         steps: largest number of steps.
 
     Raises:
-        InputError: the matrix is not symmetric, or the search does not end.
+        InputError: the matrix is not symmetric, or the iteration does not converge.
     """
     if matrix.ndim != 2 or not np.allclose(matrix, matrix.T, atol=1e-12):
         raise InputError("must be a symmetric matrix", path="correlations")
@@ -45,13 +45,13 @@ def completed(matrix: Floats, pairs: list[tuple[int, int]], *, sweeps: int = 500
     """Compute the correlation matrix with the given correlations of `pairs` and the largest determinant.
 
     All other pairs are independent given the rest: their entries of the inverse are 0 (Dempster 1972, "Covariance
-    selection", Biometrics 28, 157-175). The pairs are fitted in turn; where no matrix has them all, the last sweep's is
-    returned.
+    selection", Biometrics 28, 157-175). The pairs are fitted in turn; if no matrix satisfies them all, that of the last
+    sweep is returned.
 
     Args:
-        matrix: (m, m), of which only the entries of `pairs` count.
-        pairs: places of the correlations that are given.
-        sweeps: largest number of turns.
+        matrix: (m, m); only the entries of `pairs` are used.
+        pairs: indices of the given correlations.
+        sweeps: largest number of sweeps.
     """
     current = np.eye(len(matrix))
     for _ in range(sweeps):
@@ -60,7 +60,7 @@ def completed(matrix: Floats, pairs: list[tuple[int, int]], *, sweeps: int = 500
             at = np.ix_((i, j), (i, j))
             wanted = np.array([[1.0, matrix[i, j]], [matrix[i, j], 1.0]])
             worst = max(worst, float(np.max(np.abs(current[at] - wanted))))
-            # The 2 x 2 block becomes the wanted one; the regressions of all others on the pair stay.
+            # The 2 x 2 block gets the required value; the regressions of all others on the pair stay.
             gain = current[:, (i, j)] @ np.linalg.inv(current[at])
             current = current + gain @ (wanted - current[at]) @ gain.T
         if worst < 1e-13:

@@ -1,8 +1,8 @@
-"""Drawing people: pure functions of (population, seed, subject).
+"""Draw people as pure functions of (population, seed, subject).
 
 The latent numbers of subject k at attempt a are the outputs k w, k w + 1, ... of the counter-based generator Philox
 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3", SC11) whose key is (seed, a). Matrix products are
-sums in one order for each person, which those of BLAS are not. So a subject depends neither on how many are drawn nor
+sums in one order for each person, which those of BLAS are not. So a subject depends neither on the number of people nor
 on the pieces in which they are drawn.
 
 Conditions. An exact value of a predictor or of another quantity with a marginal of its own fixes its latent number, and
@@ -33,23 +33,23 @@ from .table import ROOTS, Distribution, Regression
 
 Condition = float | tuple[float, float]
 ATTEMPTS = 2000
-"""So often a subject is drawn until it meets the conditions."""
+"""Number of draws of a subject until it meets the conditions."""
 _FEW = 32
 _TAG = 0x9E0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """Conditions, sorted by how they are met.
+    """Conditions on a population, sorted by how they are met.
 
     Attributes:
         exact: quantities with a regression -> value.
         ranges: quantity -> low and high.
         cut: latent column -> ends of the truncated latent number, and how the others follow it (width,).
-        fixed: (f,) latent numbers of `columns`.
-        columns: (f,) their columns.
-        carry: (f, w) change of all latent numbers per change of those.
-        mean: (r, e) conditional mean of the latent numbers of `exact`, of those of `given`.
+        fixed: (f,) required values of fixed latent numbers.
+        columns: (f,) columns of the fixed latent numbers.
+        carry: (f, w) change of all latent numbers per change of the fixed ones.
+        mean: (r, e) coefficients of the conditional mean of `exact`'s latent numbers, given those of `given`.
         given: (r,) columns of the predictors and of fixed numbers.
         fitted: (e,) columns of `exact`.
         precision: (e, e) inverse V^-1.
@@ -70,10 +70,10 @@ class Conditions:
 
     @classmethod
     def of(cls, model: Model, where: Mapping[str, Condition]) -> Conditions:
-        """Sort conditions.
+        """Sort conditions by how they are met.
 
         Raises:
-            InputError: there is no such quantity, or it never has that value.
+            InputError: there is no such quantity, or it cannot have that value.
         """
         fixed: dict[int, float] = {}
         exact: dict[str, float] = {}
@@ -124,7 +124,7 @@ class Conditions:
 
 
 def latent_numbers(model: Model, conditions: Conditions, seed: int, first: int, count: int) -> Floats:
-    """List latent numbers (count, width) of subjects `first` and following that meet the conditions.
+    """Draw latent numbers (count, width) of subjects from `first` on that meet the conditions.
 
     Raises:
         InputError: hardly anybody meets them.
@@ -146,7 +146,7 @@ def latent_numbers(model: Model, conditions: Conditions, seed: int, first: int, 
 
 
 def uniform_numbers(seed: int, stream: int, first: int, count: int, width: int) -> Floats:
-    """Numbers in (0, 1), (count, width), of items `first` and following; a pure function of (seed, stream, item)."""
+    """Compute uniform numbers in (0, 1), (count, width), of items from `first` on; pure in (seed, stream, item)."""
     padded = -(-width // 4) * 4
     generator = np.random.Philox(key=np.array([seed, stream], dtype=np.uint64))
     generator.advance(first * (padded // 4))
@@ -155,7 +155,7 @@ def uniform_numbers(seed: int, stream: int, first: int, count: int, width: int) 
 
 
 def _conditioned(model: Model, conditions: Conditions, z: Floats, u: Floats) -> tuple[Floats, Bools]:
-    """List latent numbers with the exact conditions, and whether each subject is accepted."""
+    """Apply the exact conditions to latent numbers; also return whether each subject is accepted."""
     good = np.ones(len(z), dtype=bool)
     for column, (low, high, follow) in conditions.cut.items():
         z = z + (truncated(z[:, column], low, high) - z[:, column])[:, None] * follow
@@ -173,7 +173,7 @@ def _conditioned(model: Model, conditions: Conditions, z: Floats, u: Floats) -> 
 
 
 def _times(rows: Floats, matrix: Floats) -> Floats:
-    """Compute the matrix product whose sums run in one order, whatever the number of rows."""
+    """Multiply matrices with sums in a fixed order, independent of the number of rows."""
     return np.asarray(np.einsum("ij,jk->ik", rows, np.ascontiguousarray(matrix)))
 
 
@@ -186,7 +186,7 @@ def _range(name: str, wanted: tuple[float, float] | float) -> tuple[float, float
 
 
 def _ends(name: str, found: Distribution, wanted: Condition) -> tuple[float, float]:
-    """Compute ends of the latent number of a quantity with a marginal."""
+    """Convert the limits of a quantity with a marginal to limits of its latent number."""
     assert not isinstance(found, Regression)
     if isinstance(found, Share):
         number = float(found.latent(np.array(wanted))) if isinstance(wanted, int | float) else np.nan

@@ -1,4 +1,4 @@
-"""From the numbers of a drawn eye to its eye file, at one accommodation and with one entrance pupil."""
+"""Convert the numbers of a drawn eye to its eye file, at one accommodation and with one entrance pupil."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ FORWARD = 0.75
 """Share of the lens' thickening that moves its front forward (chosen; Dubbelman et al. 2005, from memory)."""
 _ROOT_GAP_MM = 0.1
 _IRIS_GAP_MM = 0.02
-_SHIFTED_MM = 0.3  # how far pupils move with their size
+_SHIFTED_MM = 0.3  # distance by which pupils may move with their size
 _LIMBUS_GAP_MM = 0.35
 _DESIGN_NM = 850.0
 
 
 def amplitude_d(table: Table, age_years: float) -> float:
-    """Compute the largest accommodation at an age."""
+    """Compute the accommodation amplitude (D) at an age."""
     return max(table.constant("amplitude_d") + table.constant("amplitude_d_per_year") * age_years, 0.0)
 
 
 def thickening_mm(age_years: float, accommodation_d: float) -> float:
-    """Compute the increase of the lens' thickness by accommodation."""
+    """Compute the increase (mm) of the lens' thickness by accommodation."""
     return (LENS_MM_PER_D + LENS_MM_PER_D_YEAR * age_years) * accommodation_d
 
 
@@ -62,20 +62,20 @@ def eye_file(
 
     Args:
         name: name of the eye.
-        eye: numbers of the eye by their names in the table, with those that `refraction.solve` finds.
+        eye: numbers of the eye by their names in the table, including those from `refraction.solve`.
         table: the table, for its constants.
         age_years: age of the person.
         accommodation_d: dioptres by which the lens is accommodated.
-        entrance_mm: diameter of the entrance pupil, which the stop is made for.
+        entrance_mm: diameter of the entrance pupil.
         seed: selects the outline of the pupil.
 
     Raises:
-        InputError: the eye cannot exist: surfaces cross, or the stop lies outside the chamber.
+        InputError: the eye is physically impossible: surfaces cross, or the stop lies outside the chamber.
     """
     drawn = _accommodated(name, tuple(sorted(eye.items())), _Table(table), age_years, accommodation_d, seed)
 
     def shaped(diameter: float) -> Any:
-        # The size at which the file's own pupil is, so that its shift is the same at every other size.
+        # Diameter of the file's own pupil, so that its shift is the same at every other size.
         flat, axis = ellipticity(diameter)
         own = drawn.parts.stop.model_copy(update={"ellipticity": flat, "axis_deg": axis})
         return stop_of(drawn.parts.model_copy(update={"stop": own}), diameter)
@@ -89,7 +89,7 @@ def eye_file(
         "axis_deg": axis,
     }
     stop = drawn.parts.stop.model_copy(update=changes)
-    # Every value is checked already, so that only the geometry is left to check.
+    # All values are already checked; only the geometry remains.
     found = EyeSpec.model_construct(**{**dict(drawn.parts), "stop": stop})
     check_eye(found)
     return found
@@ -97,7 +97,7 @@ def eye_file(
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """A table that equals only itself, as a key of a cache."""
+    """Cache key: a table that is compared by identity."""
 
     table: Table
 
@@ -132,7 +132,7 @@ def _accommodated(
     accommodation_d: float,
     seed: int,
 ) -> _Accommodated:
-    """What all pupils of an eye share, kept because a person's frames differ in the pupil more often than in the lens.
+    """Build what all pupils of an eye share; cached, as frames of a person differ more often in pupil than in lens.
 
     Raises:
         InputError: there is no such lens.
@@ -150,7 +150,7 @@ def _accommodated(
 
 
 def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, accommodation: float) -> dict[str, Any]:
-    """The keys of the eye file, with the stop at the table's reference diameter, and the fovea on the optic axis."""
+    """Return the keys of the eye file, with the stop at its reference diameter and the fovea on the optic axis."""
     constant = table.constant
     thicker = thickening_mm(age, accommodation)
     lens_front = -(eye["chamber_depth_mm"] - FORWARD * thicker)
@@ -244,9 +244,10 @@ def _lens(eye: Mapping[str, float], table: Table, age: float, accommodation: flo
 
 
 def _fovea(eye: Mapping[str, float], relaxed: dict[str, Any], wavelength_nm: float) -> dict[str, Any]:
-    """Place of the fovea, from the angle kappa of the relaxed eye with the stop at the table's reference diameter.
+    """Compute the fovea from the angle kappa of the relaxed eye, with the stop at the table's reference diameter.
 
-    So it stays where it is when pupil and lens change. Numbers of people drawn with version 0.1 have the angle alpha.
+    So the fovea does not move when pupil and lens change. Numbers of people drawn with version 0.1 have the angle
+    alpha.
     """
     if "kappa_horizontal_deg" not in eye:
         return {"field_deg": [eye["alpha_horizontal_deg"], eye["alpha_vertical_deg"]]}
@@ -256,14 +257,14 @@ def _fovea(eye: Mapping[str, float], relaxed: dict[str, Any], wavelength_nm: flo
 
 @lru_cache(maxsize=64)
 def _fovea_of(relaxed: str, kappa_deg: tuple[float, float], wavelength_nm: float) -> tuple[float, ...]:
-    """Place of the fovea of an eye (JSON), kept because a person's eye has it in any light and at any distance."""
+    """Compute the fovea of an eye (JSON); cached, because it is the same in any light and at any distance."""
     parts = EyeParts.from_mapping(json.loads(relaxed))
     bare = bare_eye(parts, wavelength_nm, stop_of(parts, parts.stop.diameter_mm))
     return tuple(float(v) for v in fovea_of_kappa(bare, kappa_deg))
 
 
 def _toric(flat_mm: float, steep_mm: float, axis_deg: float, asphericity: float) -> dict[str, Any]:
-    """Compute the biconic whose meridian `axis_deg`, from nasal towards up, has the larger radius."""
+    """Create the biconic whose meridian `axis_deg`, from nasal towards up, has the larger radius."""
     # A turn about x of +t carries nasal (+y) towards up (+z).
     return {
         "shape": {"kind": "biconic", "radii_mm": [flat_mm, steep_mm], "conic_constants": [asphericity, asphericity]},
@@ -272,14 +273,14 @@ def _toric(flat_mm: float, steep_mm: float, axis_deg: float, asphericity: float)
 
 
 def _stop_gap(eye: Mapping[str, float]) -> float:
-    """Find the distance of the stop before the lens' apex, so that its centre is before a tilted lens at every size."""
+    """Compute the stop's distance in front of the lens' apex, so that its centre clears a tilted lens at every size."""
     away = np.hypot(eye["pupil_nasal_mm"] - eye["lens_nasal_mm"], eye["pupil_up_mm"] - eye["lens_up_mm"])
     tilt = np.radians(np.hypot(eye["lens_tilt_y_deg"], eye["lens_tilt_z_deg"]))
     return float(_IRIS_GAP_MM + (away + _SHIFTED_MM) * np.tan(tilt))
 
 
 def _iris_root(eye: Mapping[str, float], stop_x: float, limbus: float) -> float:
-    """Radius of the iris' root: just inside the posterior cornea in the stop's plane, and inside the limbus."""
+    """Compute the radius of the iris' root: just inside the posterior cornea in the stop's plane and the limbus."""
     depth = max(-stop_x - eye["corneal_thickness_mm"], 0.0)
     radius, q = eye["posterior_steep_mm"], eye["posterior_asphericity"]
     reach = np.sqrt(max(2.0 * radius * depth - (1.0 + q) * depth**2, 0.0))

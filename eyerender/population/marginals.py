@@ -1,4 +1,4 @@
-"""Marginal distributions: each is a monotone map from a standard normal number z to a value, and back.
+"""Marginal distributions: monotone maps between a standard normal number z and a value.
 
 The map is F^-1(Phi(z)), where F is the cumulative distribution of the quantity.
 """
@@ -16,7 +16,7 @@ from ..arrays import Floats
 from ..spec import ByKind, Number, Positive, Spec
 
 FARTHEST = 8.0
-"""Standard normal numbers are cut here; beyond it lies one of 1e15."""
+"""Standard normal numbers are clipped here; one in 1e15 lies beyond."""
 
 
 class Fixed(Spec):
@@ -30,12 +30,12 @@ class Fixed(Spec):
         return np.full(np.shape(z), self.value)
 
     def latent(self, x: Floats) -> Floats:
-        """List standard normal numbers of values."""
+        """Return the standard normal numbers of values."""
         return np.zeros(np.shape(x))
 
     @property
     def moments(self) -> tuple[float, float]:
-        """Mean and standard deviation."""
+        """Return mean and standard deviation."""
         return self.value, 0.0
 
 
@@ -68,7 +68,7 @@ class Normal(Spec):
         return np.asarray(self.mean + self.sd * truncated(z, low, high))
 
     def latent(self, x: Floats) -> Floats:
-        """List standard normal numbers of values."""
+        """Return the standard normal numbers of values."""
         low, high = self._ends
         t = (np.asarray(x) - self.mean) / self.sd
         if low == -np.inf and high == np.inf:
@@ -78,7 +78,7 @@ class Normal(Spec):
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Mean and standard deviation, in closed form."""
+        """Compute mean and standard deviation, in closed form."""
         low, high = self._ends
         mass = float(ndtr(high) - ndtr(low))
         at = [0.0 if np.isinf(e) else float(np.exp(-e * e / 2) / np.sqrt(2 * np.pi)) for e in (low, high)]
@@ -100,13 +100,13 @@ class Lognormal(Spec):
         return np.asarray(self.median * np.exp(self.sigma * z))
 
     def latent(self, x: Floats) -> Floats:
-        """List standard normal numbers of values."""
+        """Return the standard normal numbers of values."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.log(np.asarray(x) / self.median) / self.sigma)
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Mean and standard deviation, in closed form."""
+        """Compute mean and standard deviation, in closed form."""
         mean = self.median * float(np.exp(self.sigma**2 / 2))
         return mean, mean * float(np.sqrt(np.expm1(self.sigma**2)))
 
@@ -129,13 +129,13 @@ class Uniform(Spec):
         return np.asarray(self.low + (self.high - self.low) * ndtr(z))
 
     def latent(self, x: Floats) -> Floats:
-        """List standard normal numbers of values."""
+        """Return the standard normal numbers of values."""
         share = (np.asarray(x) - self.low) / (self.high - self.low)
         return np.asarray(ndtri(np.where((share >= 0) & (share <= 1), share, np.nan)))
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Mean and standard deviation, in closed form."""
+        """Compute mean and standard deviation, in closed form."""
         return (self.low + self.high) / 2, (self.high - self.low) / float(np.sqrt(12.0))
 
 
@@ -150,7 +150,7 @@ class Share(Spec):
         return np.asarray(ndtr(z) > 1.0 - self.share, dtype=np.float64)
 
     def latent(self, x: Floats) -> Floats:
-        """Compute the median of the latent numbers that give a value."""
+        """Return the median of the standard normal numbers that give a value."""
         x = np.asarray(x)
         middle = np.where(x > 0.5, 1.0 - self.share / 2, (1.0 - self.share) / 2)
         possible = ((x == 1) & (self.share > 0)) | ((x == 0) & (self.share < 1))
@@ -158,7 +158,7 @@ class Share(Spec):
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Mean and standard deviation, in closed form."""
+        """Compute mean and standard deviation, in closed form."""
         return self.share, float(np.sqrt(self.share * (1.0 - self.share)))
 
 
@@ -182,10 +182,10 @@ class Mixture(Spec):
         return weight / weight.sum(), mean, sd
 
     def latent(self, x: Floats) -> Floats:
-        """List standard normal numbers of values."""
+        """Return the standard normal numbers of values."""
         weight, mean, sd = self._parts
         t = (np.asarray(x, dtype=np.float64)[..., None] - mean) / sd
-        # The smaller tail is used, so that the far upper tail keeps its digits.
+        # The smaller tail is used, so that the far upper tail keeps its precision.
         lower = np.sum(weight * ndtr(t), axis=-1)
         upper = np.sum(weight * ndtr(-t), axis=-1)
         with np.errstate(divide="ignore"):
@@ -218,7 +218,7 @@ class Mixture(Spec):
 
     @cached_property
     def moments(self) -> tuple[float, float]:
-        """Mean and standard deviation, in closed form."""
+        """Compute mean and standard deviation, in closed form."""
         weight, mean, sd = self._parts
         centre = float(weight @ mean)
         return centre, float(np.sqrt(weight @ (sd**2 + (mean - centre) ** 2)))
@@ -228,7 +228,7 @@ Marginal = Annotated[Fixed | Normal | Lognormal | Uniform | Share | Mixture, ByK
 
 
 def truncated(z: Floats, low: float, high: float) -> Floats:
-    """Find the standard normal numbers truncated to [low, high]: Phi^-1(Phi(low) + Phi(z) (Phi(high) - Phi(low)))."""
+    """Truncate standard normal numbers to [low, high]: Phi^-1(Phi(low) + Phi(z) (Phi(high) - Phi(low)))."""
     if low > 0:
         return -truncated(-z, -high, -low)
     log_low, log_high = float(log_ndtr(low)), float(log_ndtr(high))

@@ -5,13 +5,14 @@ regression m_q(age, sex, refraction) + s_q z_q. The latent numbers have one corr
 quantities and of those of both eyes. For eye quantities i and j with correlation C_ij within an eye and correlations
 r_i, r_j between the eyes, that between i of one eye and j of the other is sqrt(r_i r_j) C_ij.
 
-The table gives total means, spreads and correlations of its reference population. What the predictors explain is
-subtracted: s_i^2 = sd_i^2 - var(m_i), and the residuals' correlation is (r_ij sd_i sd_j - cov(m_i, m_j)) / (s_i s_j).
-Pairs that the table does not name are independent given the others (Dempster 1972). The nearest correlation matrix
-(Higham 2002) replaces the one that results, where that is none.
+The table gives total means, spreads and correlations of its reference population. The part explained by the predictors
+is subtracted: s_i^2 = sd_i^2 - var(m_i), and the residuals' correlation is (r_ij sd_i sd_j - cov(m_i, m_j)) / (s_i
+s_j). Pairs that the table does not name are independent given the others (Dempster 1972). If the result is not a
+correlation matrix, the nearest one (Higham 2002) replaces it.
 
-The predictors are independent but for age and refraction, whose latent numbers have a correlation r. The covariance of
-two monotone functions F, G of such numbers is the sum over k >= 1 of r^k E[F He_k] E[G He_k] / k! (Mehler's formula).
+The predictors are independent except for age and refraction, whose latent numbers have a correlation r. The covariance
+of two monotone functions F, G of such numbers is the sum over k >= 1 of r^k E[F He_k] E[G He_k] / k! (Mehler's
+formula).
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class Reference:
         distributions: distribution of each quantity.
         correlation: (e, e) latent correlations that the table gives within an eye; 0 where it gives none.
         latent: (s + 2 e, s + 2 e) correlation matrix of subject, right eye and left eye.
-        distance: Frobenius distance of `latent` from the completed matrix, of which it is the nearest that is one.
+        distance: Frobenius distance between `latent` and the completed matrix, to which it is the nearest correlation
+            matrix.
     """
 
     table: Table
@@ -87,7 +89,7 @@ class Model:
     """The joint distribution of one population.
 
     Attributes:
-        reference: where the residuals come from.
+        reference: source of the residuals.
         distributions: distribution of each quantity, replaced ones included.
     """
 
@@ -115,7 +117,7 @@ class Model:
         return np.asarray(np.linalg.cholesky(self.reference.latent))
 
     def places(self, name: str) -> tuple[int, ...]:
-        """Return columns of a quantity's latent numbers: one, or right and left.
+        """Return the columns of a quantity's latent numbers: one, or right and left.
 
         Raises:
             InputError: there is no such quantity.
@@ -128,9 +130,9 @@ class Model:
         raise InputError(f"no such quantity; there are {', '.join(self.distributions)}", path=name)
 
     def value(self, name: str, latent: Floats, known: Mapping[str, Floats] | None = None) -> Floats:
-        """Return values of a quantity, (n,) or (n, 2) for right and left, of latent numbers (n, width).
+        """Compute a quantity, (n,) or (n, 2) for right and left, from latent numbers (n, width).
 
-        `known` holds values of the predictors, where they were computed before.
+        `known` holds values of predictors that are already computed.
         """
         places, found = self.places(name), self.distributions[name]
         z = latent[:, places[0]] if len(places) == 1 else latent[:, places]
@@ -139,7 +141,7 @@ class Model:
         return found.at(z)
 
     def mean(self, name: str, latent: Floats, known: Mapping[str, Floats] | None = None) -> Floats:
-        """Compute the mean (n,) or (n, 2) of a regression, of the predictors of latent numbers (n, width).
+        """Compute the mean (n,) or (n, 2) of a regression, for the predictors of latent numbers (n, width).
 
         A regression of a subject's quantity on the refraction uses the mean of both eyes.
         """
@@ -157,12 +159,12 @@ class Model:
         return np.broadcast_to(mean, shape)
 
     def values(self, latent: Floats) -> dict[str, Floats]:
-        """Return values of every quantity, (n,) or (n, 2), of latent numbers (n, width)."""
+        """Compute every quantity, (n,) or (n, 2), from latent numbers (n, width)."""
         roots = {root: self.value(root, latent) for root in ROOTS}
         return {name: roots[name] if name in roots else self.value(name, latent, roots) for name in self.distributions}
 
     def required(self, name: str, value: float, latent: Floats) -> Floats:
-        """List latent numbers (n,) or (n, 2) that give a quantity one value."""
+        """Compute the latent numbers (n,) or (n, 2) that give a quantity one value."""
         found, places = self.distributions[name], self.places(name)
         shape = (len(latent),) if len(places) == 1 else (len(latent), 2)
         if isinstance(found, Regression):
@@ -178,7 +180,7 @@ class Model:
         return _mean(found, self.distributions), float(np.sqrt(variance))
 
     def expected_correlation(self, first: str, second: str) -> float:
-        """Compute the correlation of two quantities of one eye: regressions exactly, others by their latent number."""
+        """Compute the correlation of two quantities of one eye: exactly for regressions, else of latent numbers."""
         a, b = self.distributions[first], self.distributions[second]
         i, j = self.places(first)[0], self.places(second)[0]
         latent = float(self.reference.latent[i, j])
@@ -191,7 +193,7 @@ class Model:
 
 @cache
 def default_reference() -> Reference:
-    """Compute the reference population of the package's table, solved once."""
+    """Return the reference population of the package's table; solved once."""
     return Reference.of(default_table())
 
 
@@ -249,7 +251,7 @@ def _covariance(first: str, second: str, roots: Mapping[str, Distribution], tabl
 
 
 def _hermite(found: Distribution) -> Floats:
-    """Compute the E[F(z) He_k(z)] for k >= 1 of the map F of a marginal."""
+    """Compute E[F(z) He_k(z)] for k >= 1 of the map F of a marginal."""
     assert not isinstance(found, Regression)
     z, weight = hermegauss(_NODES)
     return np.asarray((weight / weight.sum() * found.at(z)) @ hermevander(z, _ORDERS - 1)[:, 1:])

@@ -74,11 +74,11 @@ class PopulationSpec(Spec):
         return Model(reference, {**reference.distributions, **preset.replace, **self.replace})
 
     def numbers(self, n: int, seed: int = 0, *, first: int = 0) -> dict[str, Floats]:
-        """List numbers of subjects `first` to `first + n - 1`, name -> (n,) or (n, 2) for right and left.
+        """Draw the numbers of subjects `first` to `first + n - 1`: name -> (n,) or (n, 2) for right and left.
 
-        A subject's numbers depend on (this population, seed, subject) alone. Besides the quantities of the table they
-        are `entrance_pupil_mm`, at the table's luminance, and what follows from the refraction: the cornea's principal
-        radii (`steep_mm`, `flat_mm`, ...) and the lens (`lens_c0`).
+        A subject's numbers depend on (this population, seed, subject) alone. Besides the quantities of the table these
+        are `entrance_pupil_mm`, at the table's luminance, and numbers that follow from the refraction: the cornea's
+        principal radii (`steep_mm`, `flat_mm`, ...) and the lens (`lens_c0`).
 
         Raises:
             InputError: n < 1, or hardly anybody meets the conditions.
@@ -104,7 +104,7 @@ class Person(Spec):
 
     @classmethod
     def of(cls, preset: str, seed: int, subject: int, numbers: Mapping[str, Any]) -> Self:
-        """Compute the person of numbers that may be NumPy's."""
+        """Create the person from its numbers, which may be NumPy's."""
         plain = {name: np.asarray(value).tolist() for name, value in numbers.items()}
         return cls(preset=preset, seed=seed, subject=subject, numbers=plain)
 
@@ -130,39 +130,39 @@ class Person(Spec):
 
     @property
     def ipd_mm(self) -> float:
-        """Far pupil distance; scenes count from the corneal apexes instead, see `apex_distance_mm`."""
+        """Far interpupillary distance (mm); scenes use the corneal apexes' distance, see `apex_distance_mm`."""
         return self.number("ipd_mm")
 
     @property
     def apex_distance_mm(self) -> float:
-        """Distance of the corneal apexes of the unrotated eyes, at which the far pupil distance is `ipd_mm`.
+        """Distance (mm) of the unrotated corneal apexes at which the far interpupillary distance is `ipd_mm`.
 
-        A pupillometer lets each eye look into the distance and sees its entrance pupil from the front, so it measures
-        the horizontal distance of the parallel lines of sight, which lead through the centres of the entrance pupils.
-        It holds as the person looks far away without glasses, in the table's light, at 850 nm.
+        A pupillometer lets each eye look into the distance and sees its entrance pupil from the front. So it measures
+        the horizontal distance of the parallel lines of sight, which pass through the centres of the entrance pupils.
+        The value holds for a person who looks far away without glasses, in the table's light, at 850 nm.
 
         Raises:
-            InputError: an eye cannot exist.
+            InputError: an eye is physically impossible.
         """
         return _apex_distance_mm(self.to_json())
 
     @property
     def mean_refraction_d(self) -> float:
-        """Mean refraction of both eyes at the cornea; hyperopes have to accommodate by it to see far away."""
+        """Mean refraction (D) of both eyes at the cornea; hyperopes must accommodate by it to see far away."""
         return float(np.mean([at_cornea_d(self.number("refraction_d", side)) for side in SIDES]))
 
     def draw_seed(self, purpose: str) -> int:
-        """Return a seed of 31 bits for something that has no quantity of the table, such as hairs."""
+        """Return a seed of 31 bits for something without a quantity in the table, such as hairs."""
         text = f"{self.preset}/{self.seed}/{self.subject}/{purpose}"
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") >> 1
 
     @property
     def amplitude_d(self) -> float:
-        """Largest accommodation by age; 0 at the least."""
+        """Accommodation amplitude (D) at the person's age, at least 0."""
         return amplitude_d(default_table(), self.number("age_years"))
 
     def accommodation_d(self, demand_d: float) -> float:
-        """Compute the accommodation to a demand: the demand itself, as far as the age allows."""
+        """Compute the accommodation (D) to a demand: the demand itself, as far as the age allows."""
         return min(max(demand_d, 0.0), self.amplitude_d)
 
     def entrance_pupil_mm(
@@ -173,17 +173,17 @@ class Person(Spec):
         *,
         side: Side | None = None,
     ) -> float:
-        """Find the diameter of the entrance pupil in a field of a luminance and diameter (deg), looking at a distance.
+        """Compute the entrance pupil (mm) for a field of given luminance and diameter (deg), and a viewing demand (D).
 
-        The near response narrows it by the person's miosis per dioptre of the demand that it accommodates to. The
-        pupils of both eyes differ by the person's anisocoria; without a `side` it is their mean.
+        The near response reduces it by the person's miosis per dioptre of accommodation. The pupils of both eyes differ
+        by the person's anisocoria; without a `side` it is their mean.
         """
         table = default_table()
         luminance = table.constant("luminance_cd_m2") if luminance_cd_m2 is None else luminance_cd_m2
         field = table.constant("field_deg") if field_deg is None else field_deg
         far = far_pupil_mm(table, luminance, field, np.array(self.number("age_years")), self.number("pupil_score"))
         near = float(far) - self.number("miosis_mm_per_d") * self.accommodation_d(demand_d)
-        # People of earlier versions have none.
+        # People of earlier versions lack this.
         if side is not None and "anisocoria_mm" in self.numbers:
             near += self.number("anisocoria_mm") * (0.5 if side == "right" else -0.5)
         return float(np.clip(near, table.constant("smallest_pupil_mm"), table.constant("largest_pupil_mm")))
@@ -200,12 +200,12 @@ class Person(Spec):
 
         Args:
             side: right or left.
-            luminance_cd_m2: luminance of what the person sees; default: the table's.
+            luminance_cd_m2: luminance of the visual field; default: the table's.
             field_deg: diameter of the lit field; default: the table's.
-            demand_d: accommodation that the target asks for, in dioptres.
+            demand_d: accommodation that the target demands, in dioptres.
 
         Raises:
-            InputError: the eye cannot exist.
+            InputError: the eye is physically impossible.
         """
         k = SIDES.index(side)
         numbers = {name: value[k] for name, value in self.numbers.items() if isinstance(value, tuple)}
@@ -220,7 +220,7 @@ class Person(Spec):
         )
 
     def region(self) -> Region:
-        """Compute lids, lashes, brow, face and skin; numbers outside the range of a key are moved to its end."""
+        """Return lids, lashes, brow, face and skin; numbers outside the range of a key are clipped."""
         data: dict[str, Any] = {"seed": self.draw_seed("region")}
         for group, kind in Region.model_fields.items():
             fields = getattr(kind.annotation, "model_fields", {})
@@ -230,7 +230,7 @@ class Person(Spec):
         return Region.from_mapping(data)
 
     def look(self) -> Look:
-        """Compute albedos and textures of the eyes; numbers outside the range of a key are moved to its end."""
+        """Return albedos and textures of the eyes; numbers outside the range of a key are clipped."""
         mine = {key: _within(Look.model_fields[key], value) for key, value in self._under("look.").items()}
         if "limbus_albedo" in mine:
             passed = mine.get("limbus_transmittance", Look.model_fields["limbus_transmittance"].default)
@@ -243,7 +243,7 @@ class Person(Spec):
 
 @lru_cache(maxsize=64)
 def _apex_distance_mm(text: str) -> float:
-    """`apex_distance_mm` of a person from its JSON, solved once for all frames."""
+    """Solve for `apex_distance_mm` of a person from its JSON; cached for all frames."""
     person = Person.from_mapping(json.loads(text))
     eyes = (person.eye(side, demand_d=max(person.mean_refraction_d, 0.0)).build() for side in SIDES)
     # Eye files are written as right eyes, so +y is nasal in both.
@@ -263,7 +263,7 @@ class PersonChoice(PopulationSpec):
 
 @lru_cache(maxsize=64)
 def choice_of(text: str) -> PersonChoice:
-    """Return the choice of a subject from its JSON."""
+    """Parse the choice of a subject from its JSON."""
     return PersonChoice.from_mapping(json.loads(text))
 
 
@@ -273,10 +273,10 @@ def _chosen(text: str) -> Person:
 
 
 def chosen_person(data: object) -> Person:
-    """Return the person of a mapping of `PersonChoice`, drawn once for all frames.
+    """Return the person of a mapping of `PersonChoice`; drawn once for all frames.
 
     Raises:
-        InputError: the mapping is no choice, or hardly anybody meets its conditions.
+        InputError: the mapping is not such a choice, or hardly anybody meets its conditions.
     """
     try:
         text = json.dumps(data, sort_keys=True)
@@ -286,7 +286,7 @@ def chosen_person(data: object) -> Person:
 
 
 def far_pupil_mm(table: Table, luminance: float, field: float, age_years: Floats, score: Floats | float) -> Floats:
-    """Entrance pupils of people who look far away: the mean of their age, and their standard score times its spread."""
+    """Compute entrance pupils (mm) of people who look far away: the mean for their age plus score times spread."""
     mean = watson_yellott_mm(luminance, field, age_years)
     small, large = table.constant("pupil_sd_small_mm"), table.constant("pupil_sd_large_mm")
     spread = small + (large - small) * np.clip((mean - 2.5) / 4.0, 0.0, 1.0)
@@ -295,7 +295,7 @@ def far_pupil_mm(table: Table, luminance: float, field: float, age_years: Floats
 
 
 def _values(model: Model, latent: Floats) -> dict[str, Floats]:
-    """Return every number of people with latent numbers."""
+    """Compute every number of people from latent numbers."""
     values = model.values(latent)
     table = model.reference.table
     values["entrance_pupil_mm"] = far_pupil_mm(
@@ -312,7 +312,7 @@ def _values(model: Model, latent: Floats) -> dict[str, Floats]:
 
 
 def biometry(table: Table, values: Mapping[str, Floats]) -> Biometry:
-    """Compute lengths and radii of people's eyes, (n, 2) each."""
+    """Return lengths and radii of people's eyes, (n, 2) each."""
     return Biometry(
         refraction=(values["refraction_d"], values["refraction_j0_d"], values["refraction_j45_d"]),
         corneal_radius_mm=values["corneal_radius_mm"],
@@ -329,7 +329,7 @@ def biometry(table: Table, values: Mapping[str, Floats]) -> Biometry:
 
 
 def _within(field: Any, value: float) -> float | int:
-    """Return a number moved into the range of a key, whole where the key is."""
+    """Clip a number to the range of a key; round it if the key is a whole number."""
     low = next((m.ge for m in field.metadata if getattr(m, "ge", None) is not None), -np.inf)
     high = next((m.le for m in field.metadata if getattr(m, "le", None) is not None), np.inf)
     moved = min(max(value, low), high)

@@ -1,4 +1,4 @@
-"""The pupil's size and shape: light, age, accommodation."""
+"""Pupil size and shape: light, age, accommodation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OLDEST, YOUNGEST = 83.0, 20.0
 def watson_yellott_mm(
     luminance_cd_m2: FloatLike, field_deg: FloatLike, age_years: FloatLike, *, eyes: int = 2
 ) -> Floats:
-    """Compute the diameter of the entrance pupil by Watson and Yellott's unified formula.
+    """Compute the diameter (mm) of the entrance pupil by Watson and Yellott's unified formula.
 
     F = L a e with the luminance L, the field's area a = pi d^2 / 4 (deg^2) and e = 1 for two eyes, 0.1 for one;
 
@@ -26,7 +26,7 @@ def watson_yellott_mm(
     Args:
         luminance_cd_m2: luminance of the field.
         field_deg: diameter of the field.
-        age_years: age; it is taken within 20 and 83.
+        age_years: age, clipped to 20 to 83.
         eyes: number of eyes that see the field.
     """
     area = np.pi / 4.0 * np.asarray(field_deg) ** 2

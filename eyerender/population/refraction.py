@@ -1,8 +1,8 @@
-"""The eye that has a drawn refraction: which corneal astigmatism and which lens make it so.
+"""Solve for the eye that has a drawn refraction: its corneal astigmatism and its lens.
 
-All vergences are power matrices [[m + a, b], [b, m - a]] in the meridians y (nasal) and z (up), written (m, a, b) =
-(M, J0, J45), in 1/mm. The spectacles of power F at the distance d from the cornea leave light of vergence K = F / (1 -
-d F) at the cornea. With the powers P_a and P_p of the cornea's surfaces, its thickness t and index n, light behind the
+All vergences are power matrices [[m + a, b], [b, m - a]] in the meridians y (nasal) and z (up), written (m, a, b) = (M,
+J0, J45), in 1/mm. The spectacles of power F at the distance d from the cornea leave light of vergence K = F / (1 - d F)
+at the cornea. With the powers P_a and P_p of the cornea's surfaces, its thickness t and index n, light behind the
 cornea has the vergence
 
     W = V / (1 - V t / n) + P_p,   V = K + P_a.
@@ -11,11 +11,11 @@ The lens is symmetric about the axis, so W must be the same in all meridians. It
 radius, and P_a = V - K is then the power matrix of the front surface: the corneal astigmatism that, with the posterior
 one, makes that of the drawn refraction.
 
-The residual of all lengths and radii goes into the equivalent index of the lens, because lens powers are what biometry
-leaves open and differ most between eyes: the index is the one that brings W to a focus on the retina. (SyntEyes derives
-its index from a lens power in the same way: Rozema et al. 2016, Invest. Ophthalmol. Vis. Sci. 57, 683.) A gradient
-n_core - (n_core - n_edge) p^2 like that of E5 is far too strong with the radii of Navarro 2014, so the lens is
-homogeneous.
+The residual of all lengths and radii is absorbed by the equivalent index of the lens, because biometry does not
+determine lens power, which differs most between eyes: the index is the one that brings W to a focus on the retina.
+(SyntEyes derives its index from a lens power in the same way: Rozema et al. 2016, Invest. Ophthalmol. Vis. Sci. 57,
+683.) A gradient n_core - (n_core - n_edge) p^2 like that of E5 is far too strong with the radii of Navarro 2014, so the
+lens is homogeneous.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ CORNEA = (1.362994, 6009.687, -6.760760e8, 5.908450e13)
 AQUEOUS = (1.323031, 6070.796, -7.062305e8, 6.147861e13)
 VITREOUS = (1.323757, 5560.240, -5.817391e8, 5.036810e13)
 LENS = (6521.218, -6.11066e8, 5.908191e13)
-"""Coefficients of the lens after the first, as of the core of E5's lens."""
+"""Coefficients of the lens after the first, as in the core of E5's lens."""
 SMALLEST_INDEX, LARGEST_INDEX = 1.345, 1.6
-"""Limits of the lens' equivalent index; one outside makes an eye that cannot exist."""
+"""Limits of the lens' equivalent index; outside them an eye is physically impossible."""
 _START = 1.41
 _NEWTON = 8
 
@@ -44,7 +44,7 @@ Power = tuple[Floats, Floats, Floats]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Optics(ArrayValue):
-    """What makes eyes have their refraction, (...,) each.
+    """Optics that give eyes their refraction, (...,) each.
 
     Attributes:
         steep_mm: smaller principal radius of the front cornea.
@@ -53,8 +53,7 @@ class Optics(ArrayValue):
         posterior_steep_mm: smaller principal radius of the back cornea.
         posterior_flat_mm: larger principal radius.
         posterior_flat_axis_deg: direction of its meridian.
-        lens_c0: first coefficient of the lens' equivalent index; NaN where none within its limits makes the
-            refraction.
+        lens_c0: first coefficient of the lens' equivalent index; NaN if none within its limits gives the refraction.
     """
 
     steep_mm: Floats
@@ -89,7 +88,7 @@ def lens_index(lens_c0: Floats, wavelength_nm: float) -> Floats:
 
 
 def solve(eyes: Biometry) -> Optics:
-    """Find the cornea's astigmatism and the lens' index of eyes with drawn refractions."""
+    """Compute the corneal astigmatism and the lens index of eyes with drawn refractions."""
     cornea, aqueous, _ = _indices(eyes.wavelength_nm)
     mean, j0, j45 = (np.asarray(p) / 1000.0 for p in eyes.refraction)
     at_cornea = _mapped((mean, j0, j45), lambda v: v / (1.0 - eyes.vertex_mm * v))
@@ -120,7 +119,7 @@ def solve(eyes: Biometry) -> Optics:
 
 
 def _lens(eyes: Biometry, behind: Floats) -> Floats:
-    """Compute the first coefficient of the lens that brings the vergence behind the cornea to a focus on the retina."""
+    """Compute the first coefficient of the lens that focuses the vergence behind the cornea on the retina."""
     _, aqueous, vitreous = _indices(eyes.wavelength_nm)
     at_lens = behind / (1.0 - (eyes.chamber_depth_mm - eyes.corneal_thickness_mm) / aqueous * behind)
     front, back = eyes.lens_radii_mm
@@ -158,7 +157,7 @@ def _before(behind: Floats, back: Power, share: Floats) -> Power:
 
 
 def _mapped(power: Power, f: Callable[[Floats], Floats]) -> Power:
-    """Compute the function of a power matrix: of its two eigenvalues."""
+    """Apply a function to a power matrix, through its two eigenvalues."""
     m, a, b = power
     r = np.hypot(a, b)
     high, low = f(m + r), f(m - r)
@@ -168,7 +167,7 @@ def _mapped(power: Power, f: Callable[[Floats], Floats]) -> Power:
 
 
 def _principal(power: Power, step: float) -> tuple[Floats, Floats, Floats]:
-    """Larger and smaller radius of a surface's power, and the direction of the larger one's meridian, 0 to 180 deg."""
+    """Compute the larger and smaller radius of a surface's power, and the larger one's meridian, 0 to 180 deg."""
     m, a, b = power
     r = np.hypot(a, b)
     high, low = step / (m + r), step / (m - r)

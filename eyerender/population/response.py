@@ -1,8 +1,8 @@
-"""The near response and the light of eyes that are not drawn: published models, and files of one's own.
+"""Response of eyes to light and accommodation, for published models and own eye files.
 
-Age, light and accommodation give such an eye the lens of Navarro 2014 in the same way as a drawn person: curvatures,
-thickness and asphericity change by so much per dioptre from those of the file, and iris and front of the lens move
-forward. The pupil gets the size of Watson and Yellott's formula, or keeps its own, less the near miosis.
+The lens responds as that of a drawn person (Navarro 2014): curvatures, thickness and asphericity change per dioptre,
+starting from those of the file, and iris and front of the lens move forward. The pupil gets the size of Watson and
+Yellott's formula, or keeps its own, minus the near miosis.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .pupil import watson_yellott_mm
 from .table import default_table
 
 REFERENCE_AGE = 28.58
-"""The age about which Watson and Yellott's formula turns."""
+"""Reference age of Watson and Yellott's formula."""
 _ROOT_GAP_MM = 0.1
 _DIRECTIONS = 16
 
@@ -39,26 +39,26 @@ def responding(
     own_pupil: bool = False,
     wavelength_nm: float = 850.0,
 ) -> EyeSpec:
-    """Copy of an eye as it is in some light, looking at some distance.
+    """Copy an eye file, adapted to some light and viewing distance.
 
     Args:
         spec: the eye, which looks far away.
         age_years: age of the eye.
-        accommodation_d: dioptres to which it is asked to accommodate; the age sets a limit.
-        luminance_cd_m2: luminance of what it sees; None: its own pupil holds far away.
+        accommodation_d: demanded accommodation in dioptres, limited by age.
+        luminance_cd_m2: luminance of the visual field; None: the eye's own pupil holds for far vision.
         field_deg: diameter of the lit field; default: the table's.
         own_pupil: whether the stop keeps its diameter.
-        wavelength_nm: wavelength at which it is traced.
+        wavelength_nm: wavelength of the traced rays.
 
     Raises:
-        InputError: the eye has no lens that could accommodate, or it cannot be.
+        InputError: the eye has no lens that could accommodate, or the result is physically impossible.
     """
     table = default_table()
     response = min(accommodation_d, amplitude_d(table, age_years))
     data = spec.to_mapping()
     far = spec.build(wavelength_nm=wavelength_nm)
     if response > 0.0:
-        # The fovea stays on its place of the retina.
+        # The fovea keeps its position on the retina.
         data["fovea"] = {"position_mm": [float(v) for v in far.fovea_mm]}
         forward = _accommodate(data, age_years, response)
         reach = _reach_mm(far.front[-1], data["stop"]["position_mm"][0]) - _ROOT_GAP_MM
@@ -76,7 +76,7 @@ def responding(
 
 
 def _accommodate(data: dict[str, Any], age_years: float, response_d: float) -> float:
-    """Change the lens in the keys of an eye file, and return how far (mm) its front and the stop move forward."""
+    """Change the lens in the keys of an eye file; return how far (mm) its front and the stop move forward."""
     lens = data.get("lens") or {}
     surfaces = [lens["front"], lens["back"]] if lens.get("kind") == "gradient" else list(lens.get("surfaces", ()))
     if len(surfaces) != 2:
@@ -92,7 +92,7 @@ def _accommodate(data: dict[str, Any], age_years: float, response_d: float) -> f
 
 
 def _curved(shape: dict[str, Any], curvature: float, q: float) -> dict[str, Any]:
-    """Compute the shape with other apex curvatures (1/mm) and conic constants."""
+    """Return a shape with other apex curvatures (1/mm) and conic constants."""
     if shape["kind"] in ("sphere", "conic"):
         radius = 1.0 / (1.0 / shape["radius_mm"] + curvature)
         return {"kind": "conic", "radius_mm": radius, "conic_constant": shape.get("conic_constant", 0.0) + q}
@@ -107,7 +107,7 @@ def _shifted(position: Any, forward_mm: float) -> list[float]:
 
 
 def _set_pupil(data: dict[str, Any], entrance_mm: float, wavelength_nm: float) -> None:
-    """Give the stop of an eye file the diameter that has an entrance pupil."""
+    """Set the stop of an eye file to the diameter that gives an entrance pupil of `entrance_mm`."""
     parts = EyeParts.from_mapping(data)
     front = tuple(surface_of(s) for s in parts.cornea)
     indices = tuple(index_at(s.medium, wavelength_nm, f"cornea.{k}.medium") for k, s in enumerate(parts.cornea))
@@ -117,7 +117,7 @@ def _set_pupil(data: dict[str, Any], entrance_mm: float, wavelength_nm: float) -
 
 
 def _reach_mm(cornea: Surface, depth_x: float) -> float:
-    """Compute the smallest distance from the axis at which a surface lies at a depth x."""
+    """Compute the smallest distance (mm) from the axis at which a surface reaches the depth x."""
     angle = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     way = np.stack([np.zeros_like(angle), np.cos(angle), np.sin(angle)], axis=-1)
 

@@ -1,4 +1,4 @@
-"""Statistics of drawn people against their table, and the eyes that physics refuses."""
+"""Statistics of drawn people against their table, and of eyes that are physically impossible."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .people import PopulationSpec
 
 CHUNK = 4096
 BINS = 48
-_REACH = 4.0  # standard deviations that histograms reach on either side of the mean
+_REACH = 4.0  # range of histograms on either side of the mean, in standard deviations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moments:
-    """Mean and standard deviation of a quantity as drawn, with standard errors, and as expected.
+    """Mean and standard deviation of a drawn quantity, with standard errors, and the expected values.
 
     Attributes:
-        name: the quantity; of an eye's quantity the right eyes count.
+        name: the quantity; for an eye's quantity, that of right eyes.
         n: number of people.
         mean: mean.
         mean_error: its standard error.
@@ -49,7 +49,7 @@ class Moments:
 
     @property
     def errors(self) -> tuple[float, float]:
-        """How many standard errors mean and standard deviation are off; 0 where nothing is expected or varies."""
+        """By how many standard errors mean and standard deviation are off; 0 if nothing is expected or varies."""
         if not np.isfinite(self.expected_mean) or self.expected_sd == 0:
             return 0.0, 0.0
         return (self.mean - self.expected_mean) / self.mean_error, (self.sd - self.expected_sd) / self.sd_error
@@ -57,7 +57,7 @@ class Moments:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairStatistic:
-    """Correlation of two quantities of the right eyes as drawn and as expected, with its source."""
+    """Correlation of two quantities of right eyes, drawn and expected, with its source."""
 
     pair: tuple[str, str]
     r: float
@@ -69,7 +69,7 @@ class PairStatistic:
 
     @property
     def off(self) -> float:
-        """How many standard errors it is off the expected one."""
+        """By how many standard errors it differs from the expected one."""
         return (self.r - self.expected) / self.error
 
 
@@ -86,13 +86,13 @@ class Survey:
 
 @dataclass(frozen=True, slots=True)
 class Refusals:
-    """What physics refuses of n people.
+    """Physically impossible eyes among n people.
 
     Attributes:
         n: number of people.
-        people: how many have an eye that cannot be.
+        people: number of people with an impossible eye.
         reasons: reason -> number of eyes.
-        shifts: quantity -> mean of the people who stay less that of all, in standard deviations.
+        shifts: quantity -> mean of the remaining people minus that of all, in standard deviations.
     """
 
     n: int
@@ -102,7 +102,7 @@ class Refusals:
 
 
 def pieces(population: PopulationSpec, n: int, seed: int) -> Iterator[dict[str, Floats]]:
-    """List numbers of n people in pieces, name -> (k,) or (k, 2)."""
+    """Yield the numbers of n people in pieces, name -> (k,) or (k, 2)."""
     for start in range(0, n, CHUNK):
         yield population.numbers(min(CHUNK, n - start), seed, first=start)
 
@@ -154,7 +154,7 @@ def survey(population: PopulationSpec, n: int, seed: int = 0) -> Survey:
 
 
 def refusals(population: PopulationSpec, n: int, seed: int = 0, *, progress: Progress | None = None) -> Refusals:
-    """Build both eyes of n people, and compare those who can be with all.
+    """Build both eyes of n people, and compare the people whose eyes are possible with all.
 
     Raises:
         InputError: hardly anybody meets the population's conditions.

@@ -1,4 +1,4 @@
-"""SyntEyes: eyes of a statistical model with corneas as Zernike terms, from the user's own file of its numbers.
+"""SyntEyes: a statistical eye model with corneas as Zernike terms, from the user's own file of its numbers.
 
 Rozema, Rodriguez, Navarro and Tassignon (2016), "SyntEyes: a higher-order statistical eye model for healthy eyes", IOVS
 57:683-691. The file is `modeldata.npz` as visisipy distributes it. A vector of 18 numbers is drawn from one of two
@@ -33,7 +33,7 @@ CORNEA_RADIUS_MM, LENS_RADIUS_MM = 3.25, 2.75
 LENS_FRONT_Q, LENS_BACK_Q = -3.1316, -1.0
 MAX_FILE_BYTES, MAX_ARRAY_BYTES = 16 * 2**20, 2**20
 MAX_REFUSED = 100
-"""Largest number of draws of one subject that are no eye."""
+"""Largest number of impossible draws of one subject."""
 _SHAPES: dict[str, tuple[int, ...]] = {
     "conv_ec_orig": (91, 12),
     "avg_ec_orig": (91,),
@@ -63,8 +63,8 @@ class SyntEye(ArrayValue):
         cornea_mm: (2, 45) Zernike terms of front and back.
         thickness_mm: thickness of the cornea.
         retina_mm: (3,) semi-axes of the retina: horizontal, vertical, axial.
-        component: which of the two Gaussians it is from.
-        refused: number of draws before this one that were no eye.
+        component: number of the Gaussian that it is drawn from.
+        refused: number of impossible draws before this one.
     """
 
     chamber_depth_mm: float
@@ -106,7 +106,7 @@ class SyntEyes(ArrayValue):
         weights: (2,) weights of the Gaussians.
         means: (2, 18) their means.
         factors: (2, 18, 18) F with F F^T the covariance, whose negative eigenvalues are 0.
-        corneas: (91, 12) what the eigencorneas add to the terms and the thickness, um.
+        corneas: (91, 12) contribution of the eigencorneas to the terms and the thickness, um.
         mean_cornea: (91,) mean terms and thickness, mm.
         lens_mm: (k,) Zernike terms of the lens' front.
         retina_mean: (4,) mean of the axial length without the retina, and of its semi-axes.
@@ -127,7 +127,7 @@ class SyntEyes(ArrayValue):
         """Read the model's file.
 
         Raises:
-            InputError: it is not such a file.
+            InputError: the file is of another kind.
         """
         arrays = _arrays(path)
         for name, shape in _SHAPES.items():
@@ -154,9 +154,9 @@ class SyntEyes(ArrayValue):
         )
 
     def draw(self, subject: int, seed: int = 0, **keys: Any) -> tuple[SyntEye, EyeSpec]:
-        """Draw the eye of a subject, a pure function of (seed, subject), and its eye file.
+        """Draw the eye of a subject, a pure function of (seed, subject), and return it with its eye file.
 
-        Draws that are no eye (surfaces that cross, a stop outside the chamber) are made again.
+        Impossible draws (surfaces that cross, a stop outside the chamber) are repeated.
 
         Args:
             subject: number of the subject.
@@ -164,7 +164,7 @@ class SyntEyes(ArrayValue):
             keys: see `eye_file`.
 
         Raises:
-            InputError: a hundred draws were no eye.
+            InputError: a hundred draws were impossible.
         """
         for refused in range(MAX_REFUSED):
             rng = np.random.default_rng([seed, subject, refused])
@@ -173,7 +173,7 @@ class SyntEyes(ArrayValue):
                 return found, self.eye_file(found, name=f"SyntEyes {seed}/{subject}", **keys)
             except InputError as error:
                 last = error
-        raise InputError(f"subject {subject}: {MAX_REFUSED} draws were no eye; the last one: {last}")
+        raise InputError(f"subject {subject}: {MAX_REFUSED} draws were not possible eyes; the last one: {last}")
 
     def _drawn(self, rng: np.random.Generator, refused: int) -> SyntEye:
         # The weighted sum of two draws, one of each component, would have the mixture's mean but too small a spread.
@@ -182,7 +182,7 @@ class SyntEyes(ArrayValue):
         return self.of_latent(latent, rng.normal(size=3), component, refused)
 
     def of_latent(self, latent: Floats, retina_score: Floats, component: int = 0, refused: int = 0) -> SyntEye:
-        """Return the eye of a latent vector (18,); `retina_score` (3,) are standard normal numbers of the retina."""
+        """Create the eye of a latent vector (18,); `retina_score` (3,) are standard normal numbers of the retina."""
         terms = self.mean_cornea + 1e-3 * (self.corneas @ latent[6:])
         mean, covariance = self.retina_mean, self.retina_covariance
         slope = covariance[1:, 0] / covariance[0, 0]
@@ -221,7 +221,8 @@ class SyntEyes(ArrayValue):
             limbus_radius_mm: half of the visible diameter of the iris.
             sclera_radius_mm: radius of the sclera.
             alpha_deg: field direction of the fovea from the optic axis, nasal and up.
-            kappa_deg: the line of sight from the pupillary axis in place of alpha, which is then found by tracing.
+            kappa_deg: angle from the pupillary axis to the line of sight; replaces alpha, which is then found by
+                tracing.
 
         Raises:
             InputError: the numbers do not make a possible eye.
@@ -330,6 +331,6 @@ def _arrays(path: str | Path) -> dict[str, Floats]:
 
 
 def _factor(covariance: Floats) -> Floats:
-    """F with F F^T = the covariance, whose negative eigenvalues (the first one of the file has some) count as 0."""
+    """Compute F with F F^T = the covariance; negative eigenvalues (the file's first covariance has some) count as 0."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -21,7 +21,7 @@ Correlation = Annotated[float, Field(gt=-1, lt=1)]
 
 
 class Source(Spec):
-    """Where a number comes from."""
+    """Source of a number."""
 
     what: str = Field(description="the keys that it is for, or all")
     mark: Mark = Field(description="how well the source is known")
@@ -98,7 +98,7 @@ class Constant(Spec):
 class Preset(Spec):
     """A population: the reference population with other distributions."""
 
-    description: str = Field(description="who they are")
+    description: str = Field(description="description of the people")
     replace: dict[str, Distribution] = Field(default_factory=dict, description="quantity -> its distribution")
     sources: tuple[Source, ...] = Field(default=(), description="where the numbers come from")
 
@@ -144,11 +144,11 @@ class Table(FileSpec):
         return self.quantities["refraction_d"].age_r
 
     def constant(self, name: str) -> float:
-        """Compute the value of a constant."""
+        """Return the value of a constant."""
         return self.constants[name].value
 
     def median(self, name: str) -> float:
-        """Compute the median of a quantity with a marginal."""
+        """Return the median of a quantity with a marginal."""
         marginal = self.quantities[name].marginal
         assert marginal is not None
         return float(marginal.at(np.zeros(())))

@@ -1,4 +1,4 @@
-"""Figures of how real pictures look, for any folders of near-infrared images of eyes (docs/realism.md)."""
+"""Image statistics of real and rendered pictures, for any folders of near-infrared images of eyes (docs/realism.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The figures of one folder of pictures, or of two to compare, as numbers and as a page."""
+"""Statistics of one folder of pictures, or a comparison of two, as numbers and as a page."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def measure_folder(
 
 
 def _encoding(source: Source) -> tuple[float, str]:
-    """Return the gamma of a folder's images, and where it is known from."""
+    """Return the gamma of a folder's images, and its source."""
     if source.entries:
         return source.entries[0].gamma, "the folder"
     gamma = exported_gamma(source.path)
@@ -79,7 +79,7 @@ def _encoding(source: Source) -> tuple[float, str]:
 
 
 def _tile(s: Scaled) -> Bytes:
-    """Return the picture about its eye, with R at 50 px and its 98th percentile at one grey level."""
+    """Crop the picture around its eye, with R at 50 px and its 98th percentile at one grey level."""
     width, height = (round(k * RADIUS_PX) for k in _TILE_R)
     x, y = round(s.centre[0]) - width // 2, round(s.centre[1]) - height // 2
     rows, columns = np.arange(height) + y, np.arange(width) + x
@@ -107,8 +107,8 @@ def realism(
         progress: called with (images done, images in all, "") for each folder.
 
     Returns:
-        Schema eyerender/realism/2: the definitions, the figures of each folder, and for two folders the ratio of their
-        medians, first over second, and how separable their patches are.
+        A mapping (schema eyerender/realism/2): the definitions, the statistics of each folder, and for two folders the
+            ratio of their medians, first over second, and the separability of their patches.
 
     Raises:
         InputError: a folder or an argument cannot be used.

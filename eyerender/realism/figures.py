@@ -1,7 +1,7 @@
-"""The figures: contrasts, edge widths, texture, highlights and noise of a picture of one eye.
+"""Image statistics of one eye: contrasts, edge widths, texture, highlights and noise.
 
-Every figure but the noise and the clipped pixels is measured in the picture resized so that the iris' radius R is 50
-px. Levels run from 0 to 255. A figure is None where the picture does not show what it needs. docs/realism.md gives the
+All statistics except noise and clipped pixels are measured after resizing the picture so that the iris' radius R is 50
+px. Levels run from 0 to 255. A statistic is None if the picture does not show what it needs. docs/realism.md gives the
 definitions with their reasons.
 """
 
@@ -20,9 +20,9 @@ from ..folders.imagefolder import BACKGROUND, IRIS, PUPIL, SCLERA
 from ..geometry.ellipse import Ellipse
 
 RADIUS_PX = 50.0  # R in the resized picture
-CLIPPED_CODE = 245.0  # of 255; cameras clip slightly below full scale, and JPEG lowers clipped codes by a few
+CLIPPED_CODE = 245.0  # out of 255; cameras clip slightly below full scale, and JPEG lowers clipped codes by a few
 BANDS_R = ((0.0, 0.02), (0.02, 0.04), (0.04, 0.08), (0.08, 0.16))
-_HIGHLIGHTS_R = 2.0  # from the cornea to here lie the margins, the lash roots and the caruncle
+_HIGHLIGHTS_R = 2.0  # margins, lash roots and caruncle lie between the cornea and this radius
 _LEAST_PX = 40  # pixels of an area from which a level is taken
 _LEAST_TEXTURE_PX = 150
 
@@ -41,12 +41,12 @@ FIGURES: dict[str, str] = {
     "fall-off": "90th over 10th percentile of the blurred surroundings of the eye",
     "noise (codes)": "standard deviation of a pixel's noise in stored codes",
 }
-"""The names of all figures, in the order of the table, with what they mean."""
+"""Names of all statistics, in the order of the table, with their meanings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyePicture:
-    """A picture of one eye and where the eye is; places are in px of the picture, pixel centres at integers.
+    """A picture of one eye with its landmarks; positions in px of the picture, pixel centres at integers.
 
     Attributes:
         name: name of the image.
@@ -123,14 +123,14 @@ class Scaled:
         )
 
     def is_part(self, *which: int) -> Bools:
-        """Return pixels of some parts of the eye; everywhere where the parts are unknown."""
+        """Return the pixels of some parts of the eye; all pixels if the parts are unknown."""
         if self.parts is None:
             return np.ones(self.level.shape, dtype=bool)
         return np.isin(self.parts, which)
 
 
 def measure(picture: EyePicture, scaled: Scaled | None = None) -> dict[str, float | None]:
-    """Find all figures of a picture, in the order of `FIGURES`; `scaled` is its resized form, if it exists already."""
+    """Compute all statistics of a picture, in the order of `FIGURES`; `scaled` is its resized form, if available."""
     s = scaled or Scaled.of(picture)
     unclipped = s.level <= s.clip
     iris_at, skin_at = _iris(s), _skin(s)
@@ -162,21 +162,21 @@ def measure(picture: EyePicture, scaled: Scaled | None = None) -> dict[str, floa
 
 
 def _iris(s: Scaled) -> Bools:
-    """Between 1.15 pupil radii + 2 px and .85 R, within 40 degrees of the horizontal."""
+    """Return the iris: between 1.15 pupil radii + 2 px and .85 R, within 40 degrees of the horizontal."""
     smallest = float(np.min(s.pupil.semi_axes_px))
     outside = s.in_pupil > 1.15 + 2.0 / smallest
     return outside & (s.rings < 0.85) & (s.beside < 40) & s.is_part(IRIS)
 
 
 def _sclera(s: Scaled) -> Bools:
-    """Find the labelled sclera without its edge, else between 1.12 and 1.35 R, within 15 degrees of the horizontal."""
+    """Return the labelled sclera without its edge, else 1.12 to 1.35 R within 15 degrees of the horizontal."""
     if s.parts is not None:
         return np.asarray(ndimage.binary_erosion(s.parts == SCLERA, iterations=2))
     return (s.rings > 1.12) & (s.rings < 1.35) & (s.beside < 15)
 
 
 def _skin(s: Scaled) -> Bools:
-    """Return a patch below the eye: 1.6 to 2.3 R below the pupil's centre, 2 R wide."""
+    """Return a patch of skin below the eye: 1.6 to 2.3 R below the pupil's centre, 2 R wide."""
     v, u = np.indices(s.level.shape)
     below = (v - s.pupil.centre_px[1]) / RADIUS_PX
     at = (below > 1.6) & (below < 2.3) & (np.abs(u - s.pupil.centre_px[0]) < RADIUS_PX)
@@ -189,12 +189,12 @@ def _level(s: Scaled, at: Bools) -> float | None:
 
 
 def ratio(over: float | None, under: float | None) -> float | None:
-    """Divide two figures; None where one is unknown or the second is not positive."""
+    """Divide two statistics; None if one is unknown or the second is not positive."""
     return over / under if over is not None and under is not None and under > 0 else None
 
 
 def _lashes(s: Scaled) -> float | None:
-    """Return the band .5 to 1.7 R above the pupil's centre, 2 R wide, without the eye."""
+    """Return the lashes: the band .5 to 1.7 R above the pupil's centre, 2 R wide, without the eye."""
     v, u = np.indices(s.level.shape)
     above = (s.pupil.centre_px[1] - v) / RADIUS_PX
     at = (above > 0.5) & (above < 1.7) & (np.abs(u - s.pupil.centre_px[0]) < RADIUS_PX) & s.is_part(BACKGROUND)
@@ -205,9 +205,9 @@ def _lashes(s: Scaled) -> float | None:
 
 
 def _rays(s: Scaled, radii: Floats, within_deg: float) -> Floats:
-    """Find levels (rays, k) along rays from the iris' centre, `within_deg` of the horizontal on both sides; radii in R.
+    """Sample levels (rays, k) along rays from the iris' centre, within `within_deg` of the horizontal; radii in R.
 
-    NaN where the picture ends and, of a labelled picture, where lids and lashes hide the eye.
+    NaN outside the picture and, in a labelled picture, where lids and lashes hide the eye.
     """
     tilt = np.radians(np.linspace(-within_deg, within_deg, 2 * int(within_deg) + 1))
     angle = np.concatenate([tilt, np.pi + tilt])[:, None]
@@ -252,7 +252,7 @@ def _limbus_edge(s: Scaled) -> float | None:
 
 
 def edge_width(rays: Floats, radii: Floats) -> float | None:
-    """Return the width of a rising edge from 10 to 90 %, in units of `radii`, from the median of profiles (rays, k).
+    """Compute the 10-90 % width of a rising edge, in units of `radii`, from the median of profiles (rays, k).
 
     Each profile is moved so that its own 50 % crossing, the one nearest to 1, lies at 1. The levels of 0 and 100 % are
     the medians of the inner and the outer quarter. None where fewer than five profiles have an edge.
@@ -274,7 +274,7 @@ def edge_width(rays: Floats, radii: Floats) -> float | None:
 
 
 def _crossing(profile: Floats, radii: Floats, share: float, quarter: int) -> float | None:
-    """Return the place where a profile rises through a share of its step: of several, the nearest to 1."""
+    """Return the position where a profile rises through a share of its step: of several, the nearest to 1."""
     low, high = median(profile[:quarter]), median(profile[-quarter:])
     if not high > low:
         return None
@@ -287,7 +287,7 @@ def _crossing(profile: Floats, radii: Floats, share: float, quarter: int) -> flo
 
 
 def texture(level: Singles, at: Bools) -> list[float | None]:
-    """Contrast of each of `BANDS_R` in an area: the scatter within four median deviations over the mean level."""
+    """Compute the contrast in each of `BANDS_R` of an area: scatter within four median deviations over the mean."""
     if np.count_nonzero(at) < _LEAST_TEXTURE_PX:
         return [None] * len(BANDS_R)
     mean = float(level[at].mean())
@@ -304,9 +304,9 @@ def texture(level: Singles, at: Bools) -> list[float | None]:
 
 
 def _bright_points(s: Scaled) -> float | None:
-    """Return the components larger than .0008 R^2 that exceed a median of 21 px by .35 of the 99th percentile, per R^2.
+    """Count components larger than .0008 R^2 that exceed a 21 px median by .35 of the 99th percentile, per R^2.
 
-    They are counted from the cornea (of an unlabelled picture, a circle of radius R) out to 2 R.
+    The area extends from the cornea (without labels, a circle of radius R) out to 2 R.
     """
     outside = (s.rings > 1.0) if s.parts is None else ~s.is_part(IRIS, PUPIL)
     outside &= s.rings < _HIGHLIGHTS_R
@@ -327,7 +327,7 @@ def _fall_off(s: Scaled) -> float | None:
 
 
 def noise(codes: Singles) -> float | None:
-    """Find the standard deviation of a pixel's noise: .7413 times the median size of the 2 x 2 checkerboard difference.
+    """Estimate the noise of a pixel: .7413 times the median magnitude of the 2 x 2 checkerboard difference.
 
     The difference a - b - c + d of four neighbours removes planes and has twice the noise of a pixel; the median of its
     size is .6745 of its standard deviation, and 1 / (2 x .6745) is .7413.
@@ -339,7 +339,7 @@ def noise(codes: Singles) -> float | None:
 
 
 def _medians(rays: Floats) -> Floats:
-    """Return the median of each column, NaN where there is none."""
+    """Compute the median of each column, NaN for an empty column."""
     known = np.isfinite(rays).any(axis=0)
     out = np.full(rays.shape[1], np.nan)
     out[known] = np.nanmedian(rays[:, known], axis=0)

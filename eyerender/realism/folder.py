@@ -1,6 +1,6 @@
-"""Pictures of eyes from a folder: one that this package wrote, with its masks, or any folder of image files.
+"""Read pictures of eyes from a folder of this package, with its masks, or from any folder of image files.
 
-The files may come from anybody; they are read as untrusted ones are everywhere in the package.
+Files are not trusted.
 """
 
 from __future__ import annotations
@@ -53,24 +53,24 @@ class Source:
 
     @property
     def landmarks(self) -> str:
-        """Where pupil and iris come from: masks, or what is found in the picture."""
+        """Source of pupil and iris: masks, or detection in the picture."""
         return "masks" if self.entries else "found in the picture"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FolderFigures:
-    """The figures of a folder.
+    """Statistics of a folder.
 
     Attributes:
         path: the folder.
         images: how many images were read.
         gamma: the images store intensity^(1 / gamma).
-        gamma_from: why this gamma was used: the folder states it, it was given, or neither ("assumed").
-        landmarks: where pupil and iris come from.
-        rows: name and figures of each measured image.
+        gamma_from: source of this gamma: stated by the folder, given, or "assumed".
+        landmarks: source of pupil and iris.
+        rows: name and statistics of each measured image.
         skipped: images that could not be measured.
-        tiles: every measured image about its eye, at equal scale.
-        patches: of every measured image, kind -> patches of it.
+        tiles: every measured image, cropped around its eye, at equal scale.
+        patches: patches of every measured image, by kind.
     """
 
     path: str
@@ -84,16 +84,16 @@ class FolderFigures:
     patches: tuple[dict[str, tuple[Bytes, ...]], ...]
 
     def values(self, name: str) -> list[float]:
-        """Return values of a figure in all images that have it."""
+        """Return the values of a statistic in all images that have it."""
         return [row[name] for _, row in self.rows if row[name] is not None]  # type: ignore[misc]
 
     def median(self, name: str) -> float | None:
-        """Return the median of a figure over the images; None where no image has it."""
+        """Return the median of a statistic over the images; None if no image has it."""
         values = self.values(name)
         return float(np.median(values)) if values else None
 
     def to_mapping(self) -> dict[str, Any]:
-        """Say what the JSON holds of the folder."""
+        """Convert the folder's statistics to a mapping for JSON."""
         return {
             "path": self.path,
             "images": self.images,
@@ -114,7 +114,7 @@ def _summary(values: Sequence[float]) -> dict[str, float | int | None]:
 
 
 def open_source(path: str | Path, limit: int) -> Source:
-    """Open a folder and choose `limit` of its images, evenly over all of them.
+    """Open a folder and select `limit` of its images, spread evenly.
 
     Raises:
         InputError: there is no such folder, or it holds no images.
@@ -135,7 +135,7 @@ def _spread(count: int, limit: int) -> list[int]:
 
 
 def pictures(source: Source, gamma: float) -> Iterator[EyePicture | Skipped]:
-    """Return each image of a source with its landmarks, or the reason why it cannot be measured.
+    """Yield each image of a source with its landmarks, or the reason why it cannot be measured.
 
     Args:
         source: the folder.
@@ -165,7 +165,7 @@ def _labelled(entry: ImageEntry, gamma: float) -> EyePicture | Skipped:
 
 
 def _pupil(entry: ImageEntry, mask: Bytes) -> Ellipse | None:
-    """Return the outline of the pupil by ray optics, if the picture shows some of it."""
+    """Return the outline of the pupil by ray optics, if a part of it is visible."""
     if np.count_nonzero(mask == PUPIL) < _LEAST_MASK_PX:
         return None
     found = entry.truth().pupil
@@ -195,5 +195,5 @@ def _checked(picture: EyePicture) -> EyePicture | Skipped:
 
 
 def _codes(image: NDArray[Any], bits: int) -> Singles:
-    """Return stored codes with full scale 255."""
+    """Convert an image to stored codes with full scale 255."""
     return image.astype(np.float32) * np.float32(255 / (2**bits - 1))

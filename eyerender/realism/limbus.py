@@ -1,7 +1,7 @@
-"""The iris' radius in a picture without labels: the strongest step from iris to sclera on both sides of the pupil.
+"""Radius of the iris in an unlabelled picture: the strongest step from iris to sclera on both sides of the pupil.
 
-The search is that of Daugman's operator (1993, IEEE PAMI 15, 1148), limited to sectors beside the pupil, which the lids
-leave free. It takes the median over the rays of a sector, so glints and lashes hardly matter.
+The search is that of Daugman's operator (1993, IEEE PAMI 15, 1148), limited to sectors beside the pupil, which lids do
+not cover. The median over the rays of a sector makes it robust to glints and lashes.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from ..arrays import Floats, Singles
 from ..geometry.ellipse import Ellipse
 
 _WITHIN_DEG = 24
-_RATIOS = (1.35, 6.5)  # of the radii of iris and pupil: 11.8 mm over 8.2 and over 1.9 mm
+_RATIOS = (1.35, 6.5)  # ratio of the radii of iris and pupil: 11.8 mm over 8.2 and over 1.9 mm
 _MOST_OFF = 0.12  # offset of the iris' middle from the pupil's, R
-_STEP = 0.02  # of the search, as a share of the radius
-_SIDE = 6  # steps on either side of a radius whose mean levels are compared
+_STEP = 0.02  # step of the search, as a share of the radius
+_SIDE = 6  # number of steps on either side of a radius over which levels are averaged and compared
 
 
 def iris_extent(level: Singles, pupil: Ellipse) -> tuple[float, float] | None:
-    """Return the middle and half of the iris' horizontal extent (px), or None where no limbus is found on both sides.
+    """Return the centre and half width (px) of the iris' horizontal extent; None if no limbus is found on both sides.
 
     Args:
         level: (h, w) linear levels.
@@ -52,7 +52,7 @@ def iris_extent(level: Singles, pupil: Ellipse) -> tuple[float, float] | None:
 
 
 def _steps(level: Singles, x: float, y: float, radii: Floats, side: float) -> Floats:
-    """Rise of the level across each radius on one side, as a share of the level there; 0 outside the picture."""
+    """Compute the rise of the level across each radius on one side, as a share of the level; 0 outside the picture."""
     tilt = np.radians(np.arange(-_WITHIN_DEG, _WITHIN_DEG + 1, 2))[:, None]
     u, v = x + side * radii * np.cos(tilt), y + radii * np.sin(tilt)
     rays = ndimage.map_coordinates(level.astype(float), [v, u], order=1, cval=np.nan)

@@ -1,4 +1,4 @@
-"""The page of `realism`: the table, the spread of every figure, and montages at equal scale and contrast."""
+"""The page of `realism`: the table, the spread of every statistic, and montages at equal scale and contrast."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _about(f: FolderFigures) -> str:
 
 
 def text(value: float | None) -> str:
-    """Return a figure with three significant digits."""
+    """Format a statistic with three significant digits."""
     return "-" if value is None else f"{value:.3g}"
 
 
@@ -90,7 +90,7 @@ def _cell(f: FolderFigures, name: str) -> str:
 
 
 def _separability(found: Sequence[FolderFigures], test: Mapping[str, Separability | None]) -> Section:
-    """How well a classifier tells the folders apart, with the patches that reveal most."""
+    """Describe how well a classifier tells the folders apart, with the most revealing patches."""
     rows, figures = [], []
     for kind, result in test.items():
         if result is None:
@@ -110,7 +110,7 @@ def _separability(found: Sequence[FolderFigures], test: Mapping[str, Separabilit
 
 
 def _spread(found: Sequence[FolderFigures]) -> list[Figure]:
-    """Return the middle half of the images of both folders, over the median of the second."""
+    """Plot the middle half of the images of both folders, relative to the median of the second."""
     names = [n for n in FIGURES if all(f.values(n) for f in found) and (found[1].median(n) or 0) > 0]
     if not names:
         return []

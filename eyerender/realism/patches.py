@@ -1,8 +1,8 @@
-"""Patches of pictures of eyes at equal scale, blur, compression and noise, which a two-sample test compares.
+"""Patches of pictures of eyes at equal scale, blur, compression and noise, for a two-sample test.
 
-Cameras differ in what no renderer has to imitate: resolution, sharpness, noise, compression and exposure. So each
-picture is first resized to one iris' radius, blurred more than any lens in question, shown with its 98th percentile at
-one grey level, compressed as JPEG, and covered with noise of its own.
+Cameras differ in properties that a renderer need not imitate: resolution, sharpness, noise, compression and exposure.
+So each picture is first resized to the same iris radius, blurred more than any lens in question, scaled so that its
+98th percentile has a fixed grey level, compressed as JPEG, and covered with new noise.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ _BLUR_R = 0.04
 _JPEG_QUALITY = 75
 _NOISE_CODES = 2.0
 _WHITE = 200.0
-_SIDE_PX = 20  # of a patch, .8 R
+_SIDE_PX = 20  # side of a patch, .8 R
 _EYE_PX = (64, 100)  # height and width of a whole eye, 2.6 R x 4 R
 _DIRECTIONS = 8
-_CELLS = {(_SIDE_PX, _SIDE_PX): (2, 2), _EYE_PX: (4, 6)}  # in which directions of edges are counted
+_CELLS = {(_SIDE_PX, _SIDE_PX): (2, 2), _EYE_PX: (4, 6)}  # cells in which directions of edges are counted
 
 
 def patches(s: Scaled, seed: int) -> dict[str, tuple[Bytes, ...]]:
-    """Cut the patches of every kind out of a picture; those that the picture does not wholly show are left out.
+    """Cut patches of every kind from a picture; patches that are not wholly inside are omitted.
 
     Args:
         s: the picture, with R at 50 px.
-        seed: of the noise.
+        seed: seed of the noise.
 
     Returns:
         Kind -> patches, (20, 20) each, and (64, 100) for the whole eye.
@@ -62,7 +62,7 @@ def patches(s: Scaled, seed: int) -> dict[str, tuple[Bytes, ...]]:
 
 
 def _equalised(s: Scaled, seed: int) -> Bytes:
-    """8-bit picture with R at 25 px."""
+    """Return the 8-bit picture with R at 25 px, equalised in blur, brightness, compression and noise."""
     blurred = ndimage.gaussian_filter(s.level, _BLUR_R * RADIUS_PX)[::_STEP, ::_STEP]
     white = max(float(np.percentile(blurred, 98)), 1e-6)
     codes = np.clip(np.round(blurred * (_WHITE / white)), 0, 255).astype(np.uint8)
@@ -81,7 +81,7 @@ def _cut(codes: Bytes, x: float, y: float, height: int, width: int) -> Bytes | N
 
 
 def features(patch: Bytes) -> Floats:
-    """Describe a patch by numbers that do not depend on exposure: contrasts by scale, and directions of its edges."""
+    """Compute features of a patch that do not depend on exposure: contrasts by scale, and directions of edges."""
     level = patch / max(float(patch.mean()), 1.0)
     blurred = [level, *(ndimage.gaussian_filter(level, sigma) for sigma in (1.0, 2.0, 4.0))]
     bands = [a - b for a, b in pairwise(blurred)]
@@ -91,7 +91,7 @@ def features(patch: Bytes) -> Floats:
 
 
 def _edges(level: Floats) -> Floats:
-    """Share of the edges in each of eight directions, weighted by their steepness, in each cell of a grid."""
+    """Compute the share of edges in each of eight directions, weighted by steepness, in each cell of a grid."""
     down, across = np.gradient(level)
     direction = np.minimum((np.arctan2(down, across) % np.pi * (_DIRECTIONS / np.pi)).astype(int), _DIRECTIONS - 1)
     rows, columns = (

@@ -1,9 +1,8 @@
 """A two-sample test: can a classifier tell the patches of two folders apart?
 
-The classifier (extremely randomised trees, Geurts, Ernst and Wehenkel 2006, by scikit-learn) only measures and is
-thrown away. It is trained on some images and asked about others; the patches of an image are always on one side. The
-result is the area under the ROC curve of its held-out answers, averaged per image: .5 means that the folders cannot be
-told apart, 1 that every image can.
+The classifier (extremely randomised trees, Geurts, Ernst and Wehenkel 2006, by scikit-learn) is trained on some images
+and tested on others; the patches of an image are never split. The result is the area under the ROC curve of its
+held-out predictions, averaged per image: .5 means that the folders cannot be told apart, 1 that every image can.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from .folder import FolderFigures
 from .patches import KINDS, features
 
 LEAST_IMAGES = 5
-"""Images with patches of a kind that each folder needs."""
+"""Smallest number of images with patches of a kind, per folder."""
 MISSING = "needs scikit-learn: pip install scikit-learn"
 _FOLDS, _TREES, _RESAMPLED = 5, 200, 1000
 _REVEALING = 8
@@ -28,13 +27,13 @@ _REVEALING = 8
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Separability:
-    """How well patches of one kind of two folders can be told apart.
+    """How well patches of one kind from two folders can be told apart.
 
     Attributes:
         images: number of images of both folders.
         auc: area under the ROC curve over images.
         interval: its 5 % and 95 % quantiles over images drawn with replacement.
-        revealing: for each folder, the patches of which the classifier was most certain that they belong to it.
+        revealing: for each folder, its patches that the classifier assigned with the highest certainty.
     """
 
     images: tuple[int, int]
@@ -43,12 +42,12 @@ class Separability:
     revealing: tuple[tuple[Bytes, ...], tuple[Bytes, ...]]
 
     def to_mapping(self) -> dict[str, Any]:
-        """What the JSON holds of it."""
+        """Convert to a mapping for JSON."""
         return {"images": list(self.images), "auc": self.auc, "interval_90": list(self.interval)}
 
 
 def separability(one: FolderFigures, other: FolderFigures, seed: int = 0) -> dict[str, Separability | None]:
-    """Test every kind of patch of two folders; None where a folder has fewer than `LEAST_IMAGES` images with it.
+    """Test every kind of patch of two folders; None if a folder has fewer than `LEAST_IMAGES` images with it.
 
     Raises:
         ImportError: scikit-learn is not installed.
@@ -57,7 +56,7 @@ def separability(one: FolderFigures, other: FolderFigures, seed: int = 0) -> dic
 
 
 def available() -> bool:
-    """Whether scikit-learn is installed."""
+    """Return whether scikit-learn is installed."""
     return find_spec("sklearn") is not None
 
 
@@ -85,7 +84,7 @@ def _tested(one: Sequence[tuple[Bytes, ...]], other: Sequence[tuple[Bytes, ...]]
 
 
 def _held_out(values: Floats, second: Any, group: Any, seed: int) -> Floats:
-    """Chance (patches,) that a patch belongs to the second folder, by a classifier that has not seen its image."""
+    """Predict the probability (patches,) of belonging to the second folder, with each patch's image held out."""
     from sklearn.ensemble import ExtraTreesClassifier
     from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict
 
@@ -96,7 +95,7 @@ def _held_out(values: Floats, second: Any, group: Any, seed: int) -> Floats:
 
 
 def _auc(answer: Floats, second: Any) -> float:
-    """Share of pairs of images that are in the right order; ties count half."""
+    """Compute the area under the ROC curve: the share of correctly ordered pairs of images; ties count half."""
     ahead = answer[second][:, None] - answer[~second]
     return float(np.mean((ahead > 0) + 0.5 * (ahead == 0)))
 
@@ -114,5 +113,5 @@ def _interval(answer: Floats, second: Any, seed: int) -> tuple[float, float]:
 
 
 def to_mapping(found: Mapping[str, Separability | None]) -> dict[str, Any]:
-    """What the JSON holds of the test of all kinds."""
+    """Convert the tests of all kinds to a mapping for JSON."""
     return {kind: None if result is None else result.to_mapping() for kind, result in found.items()}

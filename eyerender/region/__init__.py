@@ -1,4 +1,4 @@
-"""The eye region: materials and textures as geometry and numbers, without any renderer.
+"""The eye region: materials and textures as geometry and numbers, independent of any renderer.
 
 The names in `__init__.pyi` load their modules on first use.
 """

@@ -1,7 +1,8 @@
 """Specification of the anatomy of the eye region: lids, lashes, brow, face, tears and skin.
 
 Every length is in mm, every angle in degrees. Defaults are those of a European adult; ranges cover the spread of
-adults. Sources, by the name used in the descriptions; "chosen" marks values that were set by eye or lack a source:
+adults. Sources, by the name used in the descriptions; "chosen" marks values set by visual judgement or without a
+source:
 
 - Read: Read, Collins, Carney, Iskander 2006, Optom Vis Sci 83, 738 (fissure of young adults by vertical gaze: 9.7 (1.2)
   mm high straight ahead, 6.4 (1.1) mm at 40 degrees down).
@@ -12,8 +13,8 @@ adults. Sources, by the name used in the descriptions; "chosen" marks values tha
   above the margin, at 41 to 60 years).
 - Zhu: Zhu et al. 2022, Ophthalmol Ther 11, 177 (margin from the lash line to the mucocutaneous junction 1.4 (0.25) mm
   above, 1.0 (0.2) mm below).
-- Becker: Becker and Fuchs 1988, J Neurophysiol 60, 1227 (during fixation the upper lid turns as far as the eye; upward
-  lid saccades are often smaller).
+- Becker: Becker and Fuchs 1988, J Neurophysiol 60, 1227 (during fixation the upper lid turns by the same angle as the
+  eye; upward lid saccades are often smaller).
 - Doughty: Doughty, Laiquzzaman, Oblak, Button 2002, Cont Lens Anterior Eye 25, 57 (published means of the meniscus'
   height: 0.215 mm, 0.16 to 0.35 mm).
 - textbooks: numbers and lengths of lashes as anatomies and reviews repeat them (90 to 160 above, 75 to 80 below; 8 to
@@ -129,7 +130,7 @@ class Face(Spec):
 
 
 class Skin(Spec):
-    """Appearance of the surfaces at 850 nm."""
+    """Optical appearance of the surfaces at 850 nm."""
 
     albedo: float = _number(0.55, 0.30, 0.75, "albedo of the skin (chosen; forearms: Cooksey, Allen, Tsai 2017)")
     mottling: Share = Field(default=0.5, description="unevenness of the albedo (chosen)")
@@ -166,7 +167,7 @@ class TearFilm(Spec):
 
 
 class Region(Spec):
-    """The eye region of one subject. Without this key a scene shows the bare eye in front of a matte surround."""
+    """The eye region of one subject. Without this key, a scene shows the bare eye in front of a matte background."""
 
     fissure: Fissure = Field(default=Fissure(), description="the opening between the lids")
     lids: Lid = Field(default=Lid(), description="shape and movement of the lids")
@@ -191,7 +192,7 @@ class Region(Spec):
         return self
 
     def of_side(self, side: str) -> Self:
-        """Return the region of the right or left eye: their brows may differ in height."""
+        """Return the region of the right or left eye; brows may differ in height."""
         if self.brow.asymmetry_mm == 0:
             return self
         half = 0.5 * self.brow.asymmetry_mm * (1 if side == "left" else -1)

@@ -1,7 +1,7 @@
 """The brow: hairs in a band over the supraorbital ridge, lying on the skin.
 
-At its head, near the nose, hairs stand up. Along the arch they turn to the temple, and those of the upper border
-downwards, so that they meet in a line (directions as commonly described). The brow does not move.
+At its head, near the nose, hairs point upwards. Along the arch they turn towards the temple, and those of the upper
+border downwards, so that they meet in a line (directions as commonly described). The brow does not move.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from .contour import step
 from .face import face_depth
 from .hairs import Hairs, taper
 
-PLACES = np.array([0.0, 0.4, 1.0])  # of a hair's points, as shares of its length; it bends most at its root
+PLACES = np.array([0.0, 0.4, 1.0])  # positions of a hair's points along its length; it bends most at its root
 
 
 @lru_cache(maxsize=16)
 def brow(spec: Region) -> Hairs:
-    """Make the brow of a subject in the region's frame."""
+    """Generate the brow of a subject in the region's frame."""
     b = spec.brow
     rng = np.random.default_rng((0xB405, spec.seed))
     n = b.count
@@ -54,7 +54,7 @@ def brow(spec: Region) -> Hairs:
 
 
 def brow_band(spec: Region, s: Floats) -> tuple[Floats, Floats, Floats]:
-    """Compute the coordinates y, lower z and upper z of the band at s."""
+    """Compute coordinate y and lower and upper z (mm) of the band at s."""
     b = spec.brow
     y = 21.0 - 46.0 * s
     arch = b.arch_mm * np.sin(np.pi * np.clip(s / 1.25, 0, 1)) ** 1.5
@@ -64,5 +64,5 @@ def brow_band(spec: Region, s: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _skin(spec: Region, y: Floats, z: Floats) -> Floats:
-    # Here the hairs lie on the face alone; the transition to the lids' shell adds less than a tenth of a mm.
+    # Here the hairs follow the face only; the transition to the lids' shell adds less than a tenth of a mm.
     return face_depth(spec.face, y, z)

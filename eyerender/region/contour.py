@@ -9,8 +9,8 @@ temporal and +1 nasal; the height of a lid above or below the chord is
 with its peak at a = (p - q) / (p + q). The upper lid's height follows the turn of the eye and the blink: its middle
 lies at an angle about the globe's centre that turns by `upper_follows` of the eye's elevation.
 
-Where the contour is in front of the globe it lies on the globe. Beyond a polar angle of 51 (nasal) to 58 degrees
-(temporal) it leaves along the tangent, which softens towards the canthi.
+In front of the globe, the contour lies on it. Beyond a polar angle of 51 (nasal) to 58 degrees (temporal) it leaves the
+globe along the tangent, which flattens towards the canthi.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Contour(ArrayValue):
         normal: (n, 3) normal of the globe or its continuation.
         away: (n, 3) direction along the globe away from the fissure.
         along_lid: (n, 3) direction towards the nose.
-        openness: 1 for lids as wide open as straight ahead, 0 for closed ones.
+        openness: 1 for lids open as in straight gaze, 0 for closed ones.
     """
 
     angle: Floats
@@ -63,14 +63,14 @@ class Contour(ArrayValue):
 
 
 def step(x: NDArray[Any] | float, low: float, high: float) -> NDArray[Any]:
-    """Smooth step from 0 at `low` to 1 at `high`, in the precision of `x`."""
+    """Compute a smooth step from 0 at `low` to 1 at `high`, in the precision of `x`."""
     s = np.asarray((np.asarray(x) - low) / (high - low))
-    np.minimum(np.maximum(s, 0, out=s), 1, out=s)  # `np.clip` takes longer
+    np.minimum(np.maximum(s, 0, out=s), 1, out=s)  # `np.clip` is slower
     return np.asarray(s * s * (3 - 2 * s))
 
 
 def unit(v: Floats) -> Floats:
-    """Compute unit vectors (..., 3)."""
+    """Normalise vectors (..., 3)."""
     return np.asarray(v / np.maximum(lengths(v)[..., None], 1e-12))
 
 
@@ -100,7 +100,7 @@ def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
 
 @lru_cache(maxsize=4)
 def _columns(count: int) -> tuple[Floats, ...]:
-    """Angle, along, upper of `Contour`, the globe's share in the contour's centre, and the outward directions."""
+    """Compute angle, along and upper of `Contour`, the globe's share in the contour's centre, outward directions."""
     angle = 2 * np.pi * np.arange(count) / count
     a = np.cos(angle)
     upper = np.where(np.sin(angle) >= -1e-12, 1.0, -1.0)
@@ -111,13 +111,13 @@ def _columns(count: int) -> tuple[Floats, ...]:
 
 
 def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floats, float]:
-    """Compute the inner edge (y, z) as seen from the front (n, 2), and the openness."""
+    """Compute the inner edge (y, z) in frontal view (n, 2), and the openness."""
     f, lids = spec.fissure, spec.lids
     middle, half = canthi(spec)
     chord = middle + a[:, None] * half
     middle_z = middle[1] + f.peak * half[1]
     reach = globe.radius_mm + 0.5
-    # The middles of the margins are angles about the globe's centre. Lids never quite touch unless they blink.
+    # The middles of the margins are angles about the globe's centre. Lids touch only in a blink.
     turn = globe.elevation_rad
 
     def height(rest_mm: float, follows: float) -> float:
@@ -144,9 +144,9 @@ def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floa
 
 @lru_cache(maxsize=16)
 def _shapes(columns: int, peak: float) -> tuple[Floats, ...]:
-    """Heights of the upper and the lower lid over the chord, and the share of them that is left beside the caruncle."""
+    """Compute heights of the upper and the lower lid over the chord, and the share of them beside the caruncle."""
     a = _columns(columns)[1]
-    bay = 1 - 0.42 * np.exp(-(((1 - a) / 0.19) ** 2))  # there, the lids run close together
+    bay = 1 - 0.42 * np.exp(-(((1 - a) / 0.19) ** 2))  # the lids are close together there
     return tuple(sealed(v) for v in (_shape(a, peak, 0.98), _shape(a, -0.08, 0.92), bay))
 
 
@@ -157,7 +157,7 @@ def _shape(a: Floats, peak: float, power: float) -> Floats:
 
 
 def _support(globe: Globe, centre: Floats, yz: Floats) -> tuple[Floats, Floats]:
-    """Compute points over (y, z) of the sphere or its softened tangent continuation, and their normals."""
+    """Compute points over (y, z) of the sphere or its flattened tangent continuation, and their normals."""
     d = yz - centre[..., 1:]
     rho = np.maximum(np.hypot(d[..., 0], d[..., 1]), 1e-9)
     e = d / rho[..., None]

@@ -3,7 +3,7 @@
 It is a smooth surface through a table of depths about the corneal apex. The lateral orbital rim lies 16 to 18 mm behind
 it (Hertel's exophthalmometry: means of 15.0 mm, Wu et al. 2015, and 15.7 mm, Karti et al. 2015, with 2 to 3 mm of
 spread). The inner canthus (8 mm behind), nasion (8 to 10 mm in front), supraorbital ridge (5 mm in front), tip of the
-nose (28 mm in front) and everything in between were set by eye. Beyond the middle of the face it is mirrored.
+nose (28 mm in front) and everything in between were set by visual judgement. The face is mirrored at its middle.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _DEPTH = np.array([
 def face_depth(face: Face, y_mm: Floats, z_mm: Floats) -> Floats:
     """Compute the depth x (mm) of the face over points (y, z) of the region's frame."""
     off = MIDDLE_MM - y_mm
-    # The face is mirrored, and rounded where the halves meet. More than a centimetre away the rounding has no effect.
+    # The face is mirrored, and smoothed where the halves meet. More than a centimetre away the smoothing has no effect.
     folded = MIDDLE_MM - (np.sqrt(off * off + 5.5**2) - 5.5 * np.exp(-((off / 9.0) ** 2)))
     spline = _spline(face)
     return np.asarray(spline.ev(np.clip(z_mm, _Z[0], _Z[-1]), np.clip(folded, _Y[0], _Y[-1])))

@@ -1,4 +1,4 @@
-"""The posed globe, as a distance from its centre over direction: the surface on which the lids lie.
+"""The posed globe as a radius over direction from its centre: the surface on which the lids lie.
 
     r(n) = max(R, distance to the front cornea along n where that lies within the limbus)
 
@@ -50,7 +50,7 @@ class Globe(ArrayValue):
 
     @classmethod
     def sphere(cls, radius_mm: float = 12.0, depth_mm: float = 13.0) -> Globe:
-        """Make an average globe at rest, without a cornea."""
+        """Create an average globe at rest, without a cornea."""
         return cls(
             cornea=None,
             limbus_radius_mm=0.0,
@@ -104,13 +104,13 @@ class Globe(ArrayValue):
         return np.asarray((1 - column) * before + column * after)
 
     def clearance(self, points: Floats) -> Floats:
-        """Find the distance (n,) mm of points (n, 3) from the globe along the line from its centre; negative inside."""
+        """Compute the distance (n,) mm of points (n, 3) from the globe along lines from its centre; negative inside."""
         away = points - self.centre
         distance = np.maximum(lengths(away), 1e-9)
         return np.asarray(distance - self.radial(away / distance[..., None]))
 
     def pushed_out(self, points: Floats, clearance_mm: Floats | float) -> Floats:
-        """Move points that are closer to the globe than `clearance_mm` outwards along the line from its centre."""
+        """Move points closer to the globe than `clearance_mm` outwards along the line from its centre."""
         posed = _posed(self)
         out = points - posed.centre
         distance = np.maximum(lengths(out), 1e-9)
@@ -130,7 +130,7 @@ class Globe(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Posed:
-    """What many points ask of a globe: centre and axes (columns) in the region's frame, and the cornea's height."""
+    """Precomputed numbers of a posed globe: centre and axes (columns) in the region's frame, the cornea's height."""
 
     centre: Floats
     axes: Floats
@@ -150,7 +150,7 @@ def _posed(globe: Globe) -> _Posed:
 
 @lru_cache(maxsize=32)
 def _table(cornea: Surface, limbus_mm: float, centre: tuple[float, ...], radius_mm: float) -> Floats:
-    """Height of the cornea above the sphere over (polar angle, turn about x), mm; the last column equals the first."""
+    """Compute the cornea's height (mm) above the sphere over (polar angle, turn about x), closed in the turn."""
     polar = np.linspace(0, _WIDEST, _POLAR)[:, None]
     turn = (2 * np.pi * np.arange(_TURNS + 1) / _TURNS)[None, :]
     n = np.stack(

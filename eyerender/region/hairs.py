@@ -1,9 +1,9 @@
 """Hairs as curves, and curves as tapered three-sided tubes.
 
-A hair is a polyline with a radius at each point, which decreases towards the tip. Its tube does without one side: a
-line that goes in or out through it crosses another one, so all outlines and shadows stay. The side that is left out is
-the one that cameras see least: towards the skin if hairs lie on it, else the inner side of the hair's bend. Where that
-one is seen, the sides behind it are shaded much as it would be, because normals are turned to the viewer.
+A hair is a polyline with a radius at each point, which decreases towards the tip. One side of its tube is omitted: a
+line through the missing side crosses another one, so outlines and shadows do not change. The omitted side is the one
+that cameras see least: towards the skin if hairs lie on it, else the inner side of the hair's bend. If a camera sees
+it, the sides behind it are shaded similarly, because normals are turned to the viewer.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class Hairs(ArrayValue):
     radii: Floats
 
     def tubes(self, out: Floats | None = None) -> tuple[Floats, Floats]:
-        """Vertices (n * k * 3, 3) of three-sided tubes about the curves, and their normals; `tube_faces` joins them.
+        """Compute vertices (n * k * 3, 3) of three-sided tubes around the curves, and normals; `tube_faces` joins them.
 
-        The first corner of a ring, opposite to the side that is left out, is the one towards `out` (3,), or towards the
-        outer side of the hair's bend.
+        The first corner of a ring, opposite to the omitted side, points towards `out` (3,), or towards the outer side
+        of the hair's bend.
         """
         p = self.points
         if len(p) == 0:
@@ -59,7 +59,7 @@ class Hairs(ArrayValue):
 
 @lru_cache(maxsize=8)
 def tube_faces(count: int, points: int, sides: tuple[int, ...] = (0, 2), pointed: bool = False) -> Ints:
-    """Compute triangles (m, 3) of `count` tubes of `points` rings.
+    """Return triangles (m, 3) of `count` tubes of `points` rings.
 
     The sides of a tube follow its corners, so the side 1 is opposite to the first corner. Tubes that are `pointed` end
     in the first corner of their last ring.
@@ -75,5 +75,5 @@ def tube_faces(count: int, points: int, sides: tuple[int, ...] = (0, 2), pointed
 
 
 def taper(count: int, root_mm: float, s: Floats, tip: float = 0.1) -> Floats:
-    """Radii (count, k) at places s (k,), which decrease from the root (0) to the share `tip` of it at the tip (1)."""
+    """Compute radii (count, k) at positions s (k,): from the root's radius at 0 to the share `tip` of it at 1."""
     return np.asarray(np.broadcast_to(root_mm / 2 * (1 - (1 - tip) * s**1.4), (count, len(s))))

@@ -1,4 +1,4 @@
-"""A user's own head mesh: reading, checks, placement about an eye, and its appearance as a map.
+"""A user's head mesh: reading, checks, placement around an eye, and its appearance as a map.
 
 The mesh is fixed: neither gaze nor blink moves it. With the files' coordinates q, unit s, axes R (rows forward, left,
 up) and the globe's centre c there, its place in the frame of the unrotated eye is
@@ -47,17 +47,17 @@ _HAIR_GLOSS = 0.12
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class HeadMesh(ArrayValue):
-    """A head about its own origin, mm, +x where the face looks, +y to its left, +z up.
+    """A head about its own origin, mm, with +x in the direction of the face, +y to its left, +z up.
 
     Attributes:
-        vertices: (n, 3).
+        vertices: (n, 3) positions, mm.
         normals: (n, 3) unit normals.
-        faces: (m, 3).
-        uv: (n, 2); NaN where the file has none.
-        vertex_ends: where the vertices of each part end, in the order of `HEAD_PARTS`.
-        face_ends: where the faces of each part end.
-        right_eye: (3,) centre of the globe; NaN where it is not given.
-        left_eye: (3,) likewise.
+        faces: (m, 3) indices of vertices.
+        uv: (n, 2) texture coordinates; NaN if the file has none.
+        vertex_ends: end index of each part's vertices, in the order of `HEAD_PARTS`.
+        face_ends: end index of each part's faces.
+        right_eye: (3,) centre of the right globe; NaN if not given.
+        left_eye: (3,) centre of the left globe; NaN if not given.
     """
 
     vertices: Floats
@@ -73,7 +73,7 @@ class HeadMesh(ArrayValue):
 def load_head(spec: Head) -> HeadMesh:
     """Read and check the files of a spec with absolute paths (`Head.resolved`).
 
-    The result is kept until a file changes.
+    The result is cached until a file changes.
 
     Raises:
         InputError: a file is missing, unreadable or has another checksum; a part does not exist; numbers are not
@@ -85,7 +85,7 @@ def load_head(spec: Head) -> HeadMesh:
 
 
 def file_states(spec: Head) -> tuple[tuple[int, int], ...]:
-    """Compute the time of change and size of each file of a spec with absolute paths.
+    """Return modification time and size of each file of a spec with absolute paths.
 
     Raises:
         InputError: a file is missing.
@@ -99,7 +99,7 @@ def file_states(spec: Head) -> tuple[tuple[int, int], ...]:
 
 
 def _all_objects(spec: Head) -> dict[str, list[trimesh.Trimesh]]:
-    """Compute meshes of all files by their names.
+    """Read the meshes of all files, by name.
 
     Raises:
         InputError: a checksum is wrong.
@@ -157,9 +157,9 @@ def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
 
 
 def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
-    """Place the head about an eye at rest, in the form of the procedural region; it has no lid margins.
+    """Place the head around an eye at rest, in the form of the procedural region; it has no lid margins.
 
-    `texture` is the number of rows of its texture, 0 without one.
+    `texture` is the number of rows of its texture, 0 without a texture.
     """
     eyes = (head.left_eye, head.right_eye) if globe.mirrored else (head.right_eye, head.left_eye)
     flipped = not bool(np.all(np.isfinite(eyes[0])))
@@ -181,7 +181,7 @@ def placed(head: HeadMesh, globe: Globe, texture: int = 0) -> RegionMesh:
 
 
 def head_map(spec: Region, head: HeadMesh) -> Singles:
-    """Map (rows, columns, 4) of a head: albedo, two slopes (0), gloss.
+    """Compute the map (rows, columns, 4) of a head: albedo, two slopes (0), gloss.
 
     The texture comes first, then a band for each part. The texture's red channel is used, made linear and relative to
     its mean over the skin's vertices. `skin.albedo` sets the level.
@@ -218,7 +218,7 @@ def _rows(texture_rows: int) -> int:
 
 
 def _map_uv(head: HeadMesh, texture: int) -> Floats:
-    """Compute places in the map; `texture` is the number of the texture's rows, 0 without one."""
+    """Compute coordinates in the map; `texture` is the number of the texture's rows, 0 without a texture."""
     h = texture or _PLAIN
     rows = _rows(h)
     part = np.searchsorted(head.vertex_ends, np.arange(len(head.vertices)), side="right")
@@ -230,13 +230,13 @@ def _map_uv(head: HeadMesh, texture: int) -> Floats:
 
 
 def texture_rows(spec: Head) -> int:
-    """Compute the number of rows of the texture in the map, 0 without one."""
+    """Return the number of rows of the texture in the map, 0 without a texture."""
     return 0 if spec.texture is None else len(_picture(Path(spec.texture), Path(spec.texture).stat().st_mtime_ns))
 
 
 @lru_cache(maxsize=2)
 def _picture(path: Path, changed_ns: int) -> Floats:
-    """Compute the red channel of an image, linear, 0 to 1, at most 2048 rows and columns."""
+    """Read the red channel of an image, linear, 0 to 1, with at most 2048 rows and columns."""
     del changed_ns
     try:
         with opened(path) as stream, Image.open(stream, formats=_PICTURES) as file:
@@ -245,7 +245,7 @@ def _picture(path: Path, changed_ns: int) -> Floats:
     except InputError:
         raise
     except Exception as error:
-        # For a damaged file Pillow's decoders may raise any exception.
+        # Pillow's decoders may raise any exception for a damaged file.
         raise InputError(f"is not a readable picture ({error})", source=str(path)) from None
     values = (data[..., 0] if data.ndim == 3 else data).astype(float)
     if data.dtype != np.uint8:
@@ -256,8 +256,8 @@ def _picture(path: Path, changed_ns: int) -> Floats:
 
 
 def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
-    """Return named objects of a file: an OBJ's objects, or its groups where it has none; a PLY under its stem."""
-    import trimesh  # which takes a quarter of a second, and few processes need it
+    """Read the named objects of a file: an OBJ's objects, or its groups if it has none; a PLY under its stem."""
+    import trimesh  # its import takes a quarter of a second, and few processes need it
 
     source, kind = str(path), path.suffix.lower()
     if kind not in (".obj", ".ply"):
@@ -275,7 +275,7 @@ def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
         scene = trimesh.load_scene(BytesIO(data), file_type=kind[1:], process=False, **options)
         found = {name: g for name, g in scene.geometry.items() if isinstance(g, trimesh.Trimesh) and len(g.faces)}
     except Exception as error:
-        # For a broken file, mesh readers may raise any exception.
+        # Mesh readers may raise any exception for a broken file.
         detail = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"is not a readable mesh ({detail})", source=source) from None
     if not found:
@@ -319,7 +319,7 @@ def _axes(spec: Head, source: str) -> Floats:
 
 
 def _smooth(vertices: Floats, faces: Ints) -> Floats:
-    """Compute unit normals of the vertices, equal for vertices at one place, so that seams of a texture do not show."""
+    """Compute unit normals of the vertices, equal for vertices at one position, so that texture seams do not show."""
     import trimesh
 
     _, first, same = np.unique(np.round(vertices, 6), axis=0, return_index=True, return_inverse=True)

@@ -1,7 +1,7 @@
-"""Specification of a user's own head mesh.
+"""Specification of a user's head mesh.
 
-It names the files, their unit and frame, what their parts are, and where the eyes are. It is part of the scene, or of a
-manifest beside the mesh that the scene names (docs/formats.md).
+It states the files, their unit and frame, the parts of the mesh, and the positions of the eyes. It is part of the
+scene, or of a manifest beside the mesh that the scene names (docs/formats.md).
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Sum = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 class HeadParts(Spec):
-    """Which objects of the mesh are which parts.
+    """Assignment of the mesh's objects to parts.
 
-    Objects are named as in an OBJ (or its groups, where it has no objects), and by the file's stem for a PLY. Objects
-    in no list are left out, for example the head's own eyeballs.
+    Objects are named as in an OBJ (or its groups, if it has no objects), and by the file's stem for a PLY. Objects in
+    no list are ignored, for example the head's own eyeballs.
     """
 
     skin: Names = Field(default=(), description="lids and face: 'occluded by lid'")
@@ -38,7 +38,7 @@ class HeadParts(Spec):
 
 
 class Head(Spec):
-    """A head mesh in place of the procedural lids, lashes, brow and skin. It does not move with the eye."""
+    """A head mesh that replaces the procedural lids, lashes, brow and skin. It does not move with the eye."""
 
     file: Name | Annotated[tuple[Name, ...], Field(min_length=1)] = Field(
         description="an .obj or .ply file, several of them, or a .json manifest that holds all of these keys"
@@ -58,7 +58,7 @@ class Head(Spec):
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Files as they are written in the spec."""
+        """File names as written in the spec."""
         return (self.file,) if isinstance(self.file, str) else self.file
 
     @property
@@ -84,7 +84,7 @@ class Head(Spec):
 
     @property
     def sums(self) -> tuple[str, ...]:
-        """Checksums that are given."""
+        """Return the given checksums."""
         return () if self.sha256 is None else (self.sha256,) if isinstance(self.sha256, str) else self.sha256
 
     def resolved(self, base: Path | None) -> Head:
@@ -99,15 +99,15 @@ class Head(Spec):
 
 
 def is_manifest(name: str) -> bool:
-    """Return whether a file name is that of a manifest, not of a mesh."""
+    """Return whether a file name is that of a manifest rather than a mesh."""
     return name.lower().endswith(".json")
 
 
 def read_manifest(path: Path) -> Head:
-    """Read a manifest, whose paths are relative to it; it is read again when the file has changed.
+    """Read a manifest, whose paths are relative to it; read it again if the file has changed.
 
     Raises:
-        InputError: it is missing, not readable, or not a manifest of a head.
+        InputError: the file is missing, not readable, or not a manifest of a head.
     """
     with opened(path) as stream:
         state = os.fstat(stream.fileno())

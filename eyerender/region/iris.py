@@ -5,7 +5,7 @@ pupillary zone, a thinner part with fine radial fibres; the collarette, a wavy r
 ciliary zone with coarser, wavy fibres; Fuchs' crypts (gaps of the front layer with a paler rim), mostly along the
 collarette; and concentric contraction furrows. People differ in how much of each they have: the front layer may be
 closed and nearly featureless, or open with deep crypts. At 850 nm melanin hardly absorbs, so relief is visible in every
-eye colour. Albedo varies little; where light does not leave (crypts), the map is darker.
+eye colour. Albedo varies little; the map is darker where light is trapped (crypts).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from .contour import step
 from .noise import band_noise, nearest_two
 
 RADIAL, ANGULAR = 256, 1024
-WIDTH_MM, MARGIN_MM = 3.8, 2.0  # of the iris that strengths and means refer to: from margin to root, and the margin
+WIDTH_MM, MARGIN_MM = 3.8, 2.0  # width and margin radius of the iris that strengths and means refer to
 _SOFT = (1.5, 1.5)  # standard deviation of the smoothing of heights, rows and columns
 _Strength = Annotated[float, Field(ge=0, le=1.5)]
 
 
 class IrisPattern(Spec):
-    """What the front of the iris looks like; strengths that are not given follow from `look.iris_seed`."""
+    """Appearance of the front of the iris; strengths that are not given follow from `look.iris_seed`."""
 
     crypts: _Strength | None = Field(default=None, description="depth and number of the crypts")
     furrows: _Strength | None = Field(default=None, description="depth of the contraction furrows")
@@ -46,7 +46,7 @@ class IrisPattern(Spec):
 
 
 class DrawnPattern(Spec):
-    """One iris: its seed and all its strengths, which determine its maps."""
+    """A drawn iris: the seed and all strengths, which determine its maps."""
 
     seed: int
     crypts: float
@@ -58,8 +58,8 @@ class DrawnPattern(Spec):
     def of(cls, seed: int, pattern: IrisPattern) -> DrawnPattern:
         """Draw the strengths that a pattern leaves open.
 
-        Four kinds of irises are equally frequent: closed ones with little but furrows, fibrous ones, ones with crypts,
-        and mixtures.
+        Four kinds of irises are equally frequent: closed ones with few features except furrows, fibrous ones, ones with
+        crypts, and mixtures.
         """
         rng = np.random.default_rng((0x1125, seed))
         ranges = (
@@ -77,7 +77,7 @@ def _noise(
     rng: np.random.Generator, shape: tuple[int, int], rows: tuple[float, float], columns: tuple[float, float],
     periodic_rows: bool = False,
 ) -> Singles:  # fmt: skip
-    """Gaussian noise of unit variance, band-passed: `rows`, `columns` are (low, high) cycles over the whole extent."""
+    """Compute band-passed Gaussian noise of unit variance; `rows`, `columns` are (low, high) cycles over the extent."""
     h, w = shape
     if periodic_rows:
         return band_noise(rng, shape, columns, rows)
@@ -91,7 +91,7 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     Rows run from the pupil's margin (0) to the root (1), columns once around. The mean albedo over the iris' area is 1;
     heights are above the plane of the iris, 0 at margin and root.
     """
-    # Every part has its own numbers, so that it stays when the strength of another changes.
+    # Every part has its own random numbers, so that it does not change with the strength of another.
     rng, fibrous, furrowed, holed, grained = (np.random.default_rng((0x1815, k, iris.seed)) for k in range(5))
     shape = (RADIAL, ANGULAR)
     s = ((np.arange(RADIAL, dtype=np.float32) + 0.5) / RADIAL)[:, None]
@@ -129,7 +129,7 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     albedo = np.clip(albedo * (1 - 0.45 * np.exp(-((s / beads) ** 2))), 0.30, 1.9)
     area = (MARGIN_MM + s * WIDTH_MM).astype(float)
     albedo /= np.sum(albedo * area) / np.sum(np.broadcast_to(area, shape))
-    # Tissue has no edges as sharp as those between cells of the lattice.
+    # Tissue has no edges as sharp as those between the lattice's cells.
     height = ndimage.gaussian_filter(height, _SOFT, mode=("nearest", "wrap"))
     height *= step(s, 0.0, 0.10) * (1 - step(s, 0.90, 1.0))
     return np.stack([albedo, height]).astype(np.float32)
@@ -199,7 +199,7 @@ def _crypts(
     deep, pale = deep.astype(np.float32), pale.astype(np.float32)
     rows = np.flatnonzero((s[:, 0] > 0.12) & (s[:, 0] < 0.88))
     # Trabeculae bend like the fibres beside them.
-    some = slice(rows[0], rows[0] + -(-len(rows) // 8) * 8)  # a few rows more, as `nearest_two` requires
+    some = slice(rows[0], rows[0] + -(-len(rows) // 8) * 8)  # a few more rows, as `nearest_two` requires
     x = (turn + 0.0035 * warp[some]) * around
     y = np.broadcast_to(s[some] * along, x.shape) + 0.02 * np.roll(warp[some], 97, axis=1)
     first, second, one, two = (v[: len(rows)] for v in nearest_two(copies, x, y, which=True))

@@ -1,12 +1,12 @@
-"""Lashes: curves that grow from the outer edge of the lids' margins and move with them.
+"""Lashes: curves that grow from the outer edge of the lid margins and move with them.
 
 A lash starts in the lash line and turns in the plane of the lid's normal n and the direction m away from the fissure:
 
     d(s) = cos(f) (cos(b) n + sin(b) m) + sin(f) t,   b(s) = b0 + curl s,
 
-where b0 < 0 points towards the fissure. The fan f varies along the lid from one canthus to the other. Lashes stand in
-tufts with gaps between them; those of a tuft have much in common, and their tips lean together by `clumping`. A lash
-that would enter the skin is lifted out of it.
+where b0 < 0 points towards the fissure. The fan f varies along the lid from one canthus to the other. Lashes grow in
+tufts with gaps between them; those of a tuft are similar, and their tips converge by `clumping`. A lash that would
+enter the skin is lifted out of it.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
 from .lids import CONJUNCTIVA, EDGE_MM, FINE, LID, MARGIN, Sheet
 
-_ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # of the points after the root, which is on the skin
-_REACH_ROWS = 12  # beyond the crease, about a centimetre, where lashes may meet skin
+_ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # height of the points after the root, which is on the skin
+_REACH_ROWS = 12  # rows beyond the crease, about a centimetre, where lashes may meet skin
 _CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
 _NEAR_COLUMNS = 6
 _SEARCH_MM = 1.5  # distance up to which skin lifts a lash
@@ -37,10 +37,10 @@ _KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LashPlan(ArrayValue):
-    """Properties of the lashes that do not change with the pose.
+    """Properties of the lashes that do not depend on the pose.
 
-    Each lash has the angle of its column, its place across the margin (0 to 1), length, fan, start, curl, thickness (1
-    for a full-grown upper lash), and the turn sideways of its outer part.
+    Each lash has the angle of its column, its position across the margin (0 to 1), length, fan, start, curl, thickness
+    (1 for a full-grown upper lash), and the sideways turn of its outer part.
     """
 
     angle: Floats
@@ -55,7 +55,7 @@ class LashPlan(ArrayValue):
 
 @lru_cache(maxsize=16)
 def plan(spec: Lashes, seed: int, left: bool = False) -> LashPlan:
-    """Plan the lashes of a subject's right or left eye, each drawn on its own; upper ones first."""
+    """Draw the lashes of a subject's right or left eye, independently; upper ones first."""
     parts = [_lid(spec, (seed, int(upper), *([1] if left else [])), upper) for upper in (True, False)]
     return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(8)))
 
@@ -108,7 +108,7 @@ def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
 
 
 def _tufts(rng: np.random.Generator, count: int) -> Ints:
-    """Compute the number of the tuft of each lash; a tuft has one to six."""
+    """Return the number of each lash's tuft; a tuft has one to six lashes."""
     sizes = rng.choice([1, 2, 3, 4, 5, 6], max(count, 1), p=[0.24, 0.2, 0.2, 0.17, 0.12, 0.07])
     return np.repeat(np.arange(len(sizes)), sizes)[:count].astype(np.int64)
 
@@ -120,13 +120,13 @@ def _shared(values: Floats, tuft: Ints) -> Floats:
 
 
 def _means(values: Floats, tuft: Ints) -> Floats:
-    """Compute the mean over the tuft of each lash."""
+    """Average values over the tuft of each lash."""
     total, number = np.bincount(tuft, values, 1), np.bincount(tuft, minlength=1)
     return np.asarray((total / np.maximum(number, 1))[tuft])
 
 
 def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
-    """Make the lashes of a posed sheet."""
+    """Compute the lashes of a posed sheet."""
     p = plan(spec.lashes, spec.seed, globe.mirrored)
     c = sheet.contour
     frames = np.concatenate([c.point, sheet.lash_line, c.normal, c.away, c.along_lid], axis=1)
@@ -138,7 +138,7 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     # There is less room between closed lids.
     fold_back = step(1 - c.openness, 0.5, 1.0)
     start = p.start * (1 - 0.6 * fold_back)
-    # Beyond the other lid's edge they hang down over it.
+    # Beyond the edge of the other lid they hang down over it.
     hang = np.where(p.angle < np.pi, -np.radians(44.0), -np.radians(6.0)) * fold_back
     hang = hang * step(np.abs(np.sin(p.angle)), 0.3, 0.8)  # there is no room for that at the corners
     k = SEGMENTS + 1
@@ -156,8 +156,8 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     straight = root[:, None] + (p.length_mm[:, None] * ends)[..., None] * ahead[:, None]
     points[:, 1:] = _out_of_skin(globe, sheet, points, straight)
     if fold_back > 0.2:
-        # In the corners of closed lids the nearest skin is a poor guide. A lash that still crosses it is reduced to its
-        # root.
+        # In the corners of closed lids the nearest skin is a poor guide. A lash that still crosses it is collapsed to
+        # its root.
         corner = np.flatnonzero(np.abs(np.sin(p.angle)) < 0.75)
         stuck = corner[_through_skin(sheet, p.angle[corner], points[corner, 1:])] if len(corner) else corner
         points[stuck, 1:] = points[stuck, :1] + 0.0005 * (straight[stuck, 1:] - points[stuck, :1])
@@ -195,7 +195,7 @@ def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
 
 
 def _at(angle: Floats, values: Floats) -> Floats:
-    """Return values (columns, k) at column angles, interpolated linearly."""
+    """Interpolate values (columns, k) linearly at column angles."""
     n = len(values)
     place = angle / (2 * np.pi) * n
     i = np.floor(place).astype(int)
@@ -204,9 +204,9 @@ def _at(angle: Floats, values: Floats) -> Floats:
 
 
 def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -> Floats:
-    """Move the points (n, k, 3) after the roots off the globe and out of the skin, to the height `_ABOVE_MM`.
+    """Move the points (n, k, 3) beyond the roots off the globe and out of the skin, to the height `_ABOVE_MM`.
 
-    They move along the normal of the nearest skin. Places between points are moved too, because a straight piece must
+    They move along the normal of the nearest skin. Points between them are checked too, because a straight piece must
     not cut through a fold. A lash that stays caught is moved towards `straight`, which points away from the lid.
     """
     if not points.size:
@@ -218,7 +218,7 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     )
     tree = cKDTree(skin, balanced_tree=False, compact_nodes=False)  # it is built in half the time
     heights = np.append(dots(skin, normals), 0)
-    normals = np.concatenate([normals, np.zeros((1, 3))])  # the last is found where nothing is
+    normals = np.concatenate([normals, np.zeros((1, 3))])  # the last index means that nothing was found
     out, k = points.copy(), points.shape[1]
 
     def lift(at: Floats, within: float, least: Floats) -> tuple[Floats, Floats]:
@@ -230,7 +230,7 @@ def _out_of_skin(globe: Globe, sheet: Sheet, points: Floats, straight: Floats) -
     push, distance = lift(out, 2 * _SEARCH_MM, _ABOVE_MM)
     everywhere = np.concatenate([_ABOVE_MM, _ABOVE_MM[:-1], _ABOVE_MM[1:]])
     out += push / np.maximum(lengths(push)[..., None] / 1.2, 1.0)
-    # What was not moved, and what is farther from the skin than the search goes, needs no second search.
+    # Points that were not moved, and points beyond the reach of the search, need no second search.
     moved = push.any(axis=-1)
     piece = lengths(out[:, 1:] - out[:, :-1])
     free = np.where(moved, 0, distance / (1 + _NEARLY))

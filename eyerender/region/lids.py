@@ -2,7 +2,7 @@
 
 The sheet is a grid of `ROWS` rows by columns once around the fissure (see `contour`). Its topology never changes.
 Beyond the margin's inner edge, where rows are smooth, every second column lies halfway between its neighbours, and the
-mesh does without it. From inside out the rows are:
+mesh omits it. From inside out the rows are:
 
     conjunctiva   from the globe (just below its surface, so that no gap shows) to the margin's inner edge; off the
                   globe, beside the nose, it carries the plica and the caruncle
@@ -31,7 +31,7 @@ from .globe import Globe
 CONJUNCTIVA, MARGIN, LID, FACE = 7, 7, 12, 20
 _HELD = step(np.arange(LID + FACE, dtype=float), LID + 0.19 * FACE, LID + 0.68 * FACE)[:, None]  # share of rest
 ROWS = CONJUNCTIVA + MARGIN + LID + FACE
-FINE = CONJUNCTIVA + 1  # rows that have their own place in every column; the others have it in every second one
+FINE = CONJUNCTIVA + 1  # rows with a position in every column; the others have one in every second column
 _DIP_MM = 0.031
 EDGE_MM = 0.26  # depth of the margin's rounded edges
 _FAR_MM = (66.0, 58.0)
@@ -48,10 +48,10 @@ class Sheet(ArrayValue):
     """The posed sheet.
 
     Attributes:
-        fine: (FINE + 1, columns, 3) the first rows.
-        fine_normals: (FINE + 1, columns, 3).
-        coarse: (ROWS - FINE - 1, columns / 2, 3) the other rows, in every second column.
-        coarse_normals: (ROWS - FINE - 1, columns / 2, 3).
+        fine: (FINE + 1, columns, 3) points of the first rows, mm.
+        fine_normals: (FINE + 1, columns, 3) their unit normals.
+        coarse: (ROWS - FINE - 1, columns / 2, 3) points of the other rows, in every second column.
+        coarse_normals: (ROWS - FINE - 1, columns / 2, 3) their unit normals.
         contour: frame of the lash line.
         lash_line: (columns, 3) outer edge of the margin.
     """
@@ -65,17 +65,17 @@ class Sheet(ArrayValue):
 
     @property
     def vertices(self) -> Floats:
-        """All rows in all columns, (ROWS, columns, 3)."""
+        """Return all rows in all columns, (ROWS, columns, 3) mm."""
         return np.concatenate([self.fine, halved(self.coarse)])
 
     @property
     def normals(self) -> Floats:
-        """Normals of all rows in all columns, (ROWS, columns, 3)."""
+        """Return the normals of all rows in all columns, (ROWS, columns, 3)."""
         return np.concatenate([self.fine_normals, unit(halved(self.coarse_normals))])
 
 
 def sheet(spec: Region, globe: Globe) -> Sheet:
-    """Make the sheet for a posed globe, in the region's frame."""
+    """Compute the sheet for a posed globe, in the region's frame."""
     c = contour(spec, globe)
     margin, lash_line = _margin(spec, globe, c)
     skin = _skin(spec, globe, c.every(2), lash_line[::2])
@@ -98,7 +98,7 @@ def sheet(spec: Region, globe: Globe) -> Sheet:
 
 
 def halved(grid: Floats) -> Floats:
-    """Compute the grid (rows, 2 n, 3) with a column halfway between each two of a closed one (rows, n, 3)."""
+    """Insert a column halfway between each two of a closed grid (rows, n, 3), giving (rows, 2 n, 3)."""
     rows, columns, _ = grid.shape
     out = np.empty((rows, 2 * columns, 3))
     out[:, ::2] = grid
@@ -122,7 +122,7 @@ def grid_normals(vertices: Floats) -> Floats:
 
 
 def margin_width(spec: Region, c: Contour) -> Floats:
-    """Compute the thickness of the margin (columns,); the lower one is thinner (Zhu et al. 2022).
+    """Compute the thickness (columns,) mm of the margin; the lower one is thinner (Zhu et al. 2022).
 
     It decreases towards the canthi. The margins of closed lids are equally thick, so that neither overhangs the other's
     lashes.
@@ -134,7 +134,7 @@ def margin_width(spec: Region, c: Contour) -> Floats:
 
 
 def _across() -> tuple[Floats, Floats]:
-    """Compute places of the margin's rows, from its inner edge (0) to the outer one (1), and their rounding (mm)."""
+    """Return positions of the margin's rows, from its inner edge (0) to the outer one (1), and their rounding (mm)."""
     turn = np.cos(np.pi * np.linspace(0, 1, MARGIN)[:, None, None])
     u = 0.5 - 0.5 * turn * (0.6 + 0.4 * turn**2)
     return u, EDGE_MM * (2 * u - 1) ** 4
@@ -157,7 +157,7 @@ def _margin(spec: Region, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
 
 
 def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
-    """List rows from below the globe's surface to the inner edge (exclusive)."""
+    """Compute the rows from below the globe's surface to the inner edge (exclusive)."""
     away = c.point - globe.centre
     distance = lengths(away)
     on_globe = step(distance - globe.radial(unit(away)), 0.6, 0.05)
@@ -165,7 +165,7 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     # about the cornea, the plica; at the temple where the globe's tangent leads to the canthus, so that the white
     # continues without an edge.
     y, z = (c.point[:, 1:] - globe.centre[1:]).T
-    y_fold = 9.5 + 2.5 * max(float(globe.axis[1]), 0.0)  # an eye that turns inwards flattens the fold
+    y_fold = 9.5 + 2.5 * max(float(globe.axis[1]), 0.0)  # an eye that turns nasally flattens the fold
     y_temple = globe.radius_mm * np.sin(LATERAL)
     line = np.where(y > 0, y_fold, y_temple)
     t = np.abs(y) / line
@@ -186,7 +186,7 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     caruncle = 1.2 * np.exp(-(((s - 0.6) / 0.2) ** 2)) * step(c.along, 0.86, 0.99)[None, :] * (1 - 0.6 * spec.blink)
     rows = rows + (plica + caruncle)[..., None] * c.normal
     # Long pieces are chords of the globe (0.7 of its radius for the cornea), so the points are raised until their
-    # middles are outside, too.
+    # midpoints are outside too.
     sag = dots(c.point - reach, c.point - reach) / CONJUNCTIVA**2 / (8 * 0.7 * globe.radius_mm)
     film = spec.lids.film_mm * on_globe + 0.05 * (1 - on_globe) + sag
     clear = globe.pushed_out(rows, np.where(u[..., 0] > 0, film, -_DIP_MM))
@@ -194,10 +194,10 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
 
 
 def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Floats:
-    """Find the coordinate z (columns,) on a line across the corner of the fissure, evenly between the lids' crossings.
+    """Compute the coordinate z (columns,) on a line across the fissure's corner, evenly between the lids' crossings.
 
-    Near the canthus, where the contour's own z crowd, the distances h from the canthus grow as the square root of
-    theirs.
+    Near the canthus, where the contour's z values crowd, the distances h from the canthus grow as the square root of
+    the contour's.
     """
     corner = 0 if nasal else len(z) // 2
     h = np.abs(z - z[corner])
@@ -211,7 +211,7 @@ def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Flo
 
 
 def _skin(spec: Region, globe: Globe, c: Contour, lash_line: Floats) -> Floats:
-    """List rows from the lash line (exclusive) outwards, in the columns of a contour."""
+    """Compute the rows from the lash line (exclusive) outwards, in the columns of a contour."""
     crease = _crease(spec, c)
     v, y, z = _spokes(c, crease, lash_line)
     # Lids move their own skin, and move that of the brow and the cheek less the farther away it is.
@@ -235,7 +235,7 @@ def _skin(spec: Region, globe: Globe, c: Contour, lash_line: Floats) -> Floats:
 
 
 def _spokes(c: Contour, crease: Floats, lash_line: Floats) -> tuple[Floats, Floats, Floats]:
-    """Find the distance from the lash line, y and z (rows, columns) of places on straight lines out to the border."""
+    """Compute the distance from the lash line, y and z (rows, columns) on straight lines out to the border."""
     y0, z0 = lash_line[:, 1], lash_line[:, 2]
     border_y, border_z = _border(c)
     dy, dz = border_y - y0, border_z - z0
@@ -266,7 +266,7 @@ def _border(c: Contour) -> tuple[Floats, Floats]:
 
 
 def _crease(spec: Region, c: Contour) -> Floats:
-    """Distance (columns,) of the crease from the lash line, mm; below the lower lid that of its own faint crease."""
+    """Compute the distance (columns,) mm of the crease (for the lower lid, of its faint crease) from the lash line."""
     lids = spec.lids
     openness = min(c.openness, 1.2)
     middle = lids.crease_mm + (min(lids.show_mm, lids.crease_mm - 1.0) - lids.crease_mm) * openness
@@ -276,7 +276,7 @@ def _crease(spec: Region, c: Contour) -> Floats:
 
 
 def _distances(crease: Floats, length: Floats) -> Floats:
-    """Compute the distances v (LID + FACE, columns) from the lash line: dense at the lash line and about the crease."""
+    """Compute the distances v (LID + FACE, columns) mm from the lash line: dense there and around the crease."""
     turn = np.cos(np.pi * _LID_ROWS)
     lid = (0.5 - 0.5 * turn * (0.55 + 0.45 * turn**2))[:, None] * crease
     k = np.arange(1, FACE + 1) / FACE
@@ -312,7 +312,7 @@ def _fold(spec: Region, c: Contour, v: Floats, crease: Floats, strength: Floats)
 
 
 def _epicanthus(spec: Region, c: Contour, v: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
-    """Skin drawn from the upper lid and the nose over the medial canthus, as a fold in front of the caruncle."""
+    """Draw skin from the upper lid and the nose over the medial canthus, as a fold in front of the caruncle."""
     reach = spec.fissure.epicanthus_mm * (1 - 0.5 * spec.blink)
     along = np.where(c.upper > 0, step(c.along, 0.55, 0.97), step(c.along, 0.86, 1.0))
     fold = along * step(v, 0.1, 1.5) * np.exp(-(np.maximum(v - 1.5, 0) ** 2) / 16.0)
@@ -321,13 +321,13 @@ def _epicanthus(spec: Region, c: Contour, v: Floats, x: Floats, y: Floats, z: Fl
 
 
 def _fullness(spec: Region, c: Contour, y: Floats, z: Floats) -> Floats:
-    """Compute the filling (mm) of the hollow above the lid as the lid comes down and brings its skin and fat along."""
+    """Compute how much (mm) the hollow above the lid fills as the lid comes down with its skin and fat."""
     shut = 1 - min(c.openness, 1.0)
     return np.asarray(spec.lids.fill_mm * shut * np.exp(-(((z - 10.5) / 6.0) ** 2) - np.square((y - 1.0) / 18.0) ** 2))
 
 
 def skin_depth(spec: Region, globe: Globe, y: Floats, z: Floats) -> Floats:
-    """Depth x (mm) of the skin over (y, z) without margins and folds: the lids' shell and the face, joined smoothly."""
+    """Compute the depth x (mm) of the skin over (y, z) without margins and folds: lids' shell and face, blended."""
     centre = 0.5 * (globe.centre + globe.rest)
     dy, dz = y - centre[1], z - centre[2]
     outer = globe.radius_mm + spec.lids.thickness_mm
@@ -349,7 +349,7 @@ def skin_depth(spec: Region, globe: Globe, y: Floats, z: Floats) -> Floats:
 
 
 def _canthal_hollow(spec: Region, y: Floats, z: Floats) -> Floats:
-    """Compute the depth by which the canthal tendons hold back the skin about either canthus, mm."""
+    """Compute the depth (mm) by which the canthal tendons hold back the skin around either canthus."""
     middle, half = canthi(spec)
     out = np.zeros_like(y)
     for end, depth, wide in ((middle - half, 2.2, 4.2), (middle + half, 1.4, 3.5)):
@@ -358,7 +358,7 @@ def _canthal_hollow(spec: Region, y: Floats, z: Floats) -> Floats:
 
 
 def _bulge(globe: Globe, y: Floats, z: Floats, outer: float) -> Floats:
-    """Compute the lift of a lid by the cornea below it: a soft hill about the optic axis."""
+    """Compute the lift (mm) of a lid by the cornea below it: a soft hill around the optic axis."""
     axis, centre = globe.axis, globe.centre
     apex = centre + outer * axis
     d2 = (y - apex[1]) ** 2 + (z - apex[2]) ** 2

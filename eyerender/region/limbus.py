@@ -1,4 +1,4 @@
-"""The visible limbus: sclera and conjunctiva cover more of the cornea above and below than at its sides.
+"""The visible limbus: sclera and conjunctiva cover more of the cornea above and below than at the sides.
 
 In 88 people the limbus itself is round (13.64 x 13.65 mm), but the clear cornea is lower than wide (11.74 x 11.52 mm;
 Abass et al. 2018, PLoS ONE 13(11), e0207710). So the optical surfaces stay round here, and only the opaque tissue on
@@ -14,7 +14,7 @@ from ..geometry.surfaces import Surface
 
 
 def upwards(front: Surface) -> Floats:
-    """Compute the direction (2,) in the y, z plane of the front cornea's own frame that is up in the eye frame."""
+    """Compute the direction (2,), in the front cornea's y, z plane, that is up in the eye frame."""
     up = np.asarray(front.rotation)[2, 1:]
     return np.asarray(up / np.hypot(*up))
 

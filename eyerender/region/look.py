@@ -1,12 +1,11 @@
-"""Appearance of the eye and its surround at 850 nm: diffuse albedos and the contrast of their textures.
+"""Appearance of the eye and its background at 850 nm: diffuse albedos and texture contrasts.
 
 Values without a source are chosen. Spectra of skin are published (Cooksey, Allen and Tsai 2017, J. Res. NIST 122, 26:
-forearms). The backdrop is darker than that, because a surround without lids would otherwise outshine the eye. The
-sclera is a scattering slab over dark uvea. No measured diffuse albedo of the iris at 850 nm was available. Its value
-gives the ratios of near-infrared photographs, in which the iris has two thirds to nine tenths of the sclera's level.
-The cornea transmits (1 - F)^2 / n^2, about 0.53, of an iris' albedo to the camera. The grey of a pupil, a fifth to a
-half of the iris in photographs, is for the most part light that strays in the camera (`lens.glare`) and the sensor's
-black level.
+forearms). The background is darker than that, because without lids it would otherwise outshine the eye. The sclera is a
+scattering slab over dark uvea. No measured diffuse albedo of the iris at 850 nm was available; its value reproduces
+near-infrared photographs, in which the iris has two thirds to nine tenths of the sclera's level. The cornea transmits
+(1 - F)^2 / n^2, about 0.53, of an iris' albedo to the camera. The grey of a pupil, a fifth to a half of the iris in
+photographs, is mostly stray light in the camera (`lens.glare`) and the sensor's black level.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from .iris import IrisPattern
 Albedo = Annotated[float, Field(ge=0, le=0.95)]
 Contrast = Annotated[float, Field(ge=0, le=1.5)]
 LIMBAL_RING = (0.62, 0.95)
-"""Share of the way from the pupil to the root over which a limbal ring grows dark."""
+"""Share of the way from pupil to root over which a limbal ring darkens."""
 
 
 class Fundus(Spec):
-    """Light that comes back from the fundus through the pupil; a lamp near the camera's axis makes the pupil bright."""
+    """Light returned by the fundus through the pupil; a lamp near the camera's axis makes the pupil bright."""
 
     reflectance: Annotated[float, Field(ge=0, le=0.5)] = Field(
         default=0.115,
@@ -54,9 +53,9 @@ class Fundus(Spec):
 
 
 class Scattering(Spec):
-    """Light inside skin and sclera: it enters at one point and leaves around it, so shadows have soft edges.
+    """Subsurface scattering in skin and sclera: light leaves around its point of entry, so shadows have soft edges.
 
-    The albedos stand for absorption, and for the thickness of the sclera before the dark uvea.
+    The albedos determine the absorption, and the thickness of the sclera over the dark uvea.
     """
 
     skin_per_mm: Annotated[float, Field(ge=0.5, le=10)] = Field(

@@ -1,9 +1,9 @@
-"""The maps of subjects on disk: what takes a second to make is read in milliseconds the next time.
+"""Disk cache of subjects' maps: computed in a second, read in milliseconds.
 
-A file is named by the digest of everything that determines its content: the maker, its argument, the code of this
-package's regions, and the versions of NumPy and SciPy. It is written under another name and renamed when complete, so
-several processes may use the folder at once. Nothing in it is trusted: a file whose header, size or checksum is wrong
-is removed and made again. Where the folder cannot be used, maps are made every time.
+A file is named by the digest of everything that determines its content: the function, its argument, the source code of
+`region`, and the versions of NumPy and SciPy. It is written under another name and renamed when complete, so several
+processes may use the folder at once. Files are not trusted: one whose header, size or checksum is wrong is removed and
+computed again. If the folder cannot be used, maps are computed every time.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from .anatomy import Region
 from .iris import DrawnPattern
 
 LIMIT = "EYERENDER_MAP_CACHE_MB"
-"""Environment variable: megabytes of maps that are kept; 0 keeps none and reads none."""
+"""Environment variable: size of the map cache in megabytes; 0 disables it."""
 DEFAULT_MB = 1000
 SCHEMA = "eyerender/map/1"
 _ENDING = ".map"
 _DTYPES = ("float16", "float32")
 _LARGEST_HEADER, _ALIGNMENT = 4096, 64
 _STALE_S = 3600.0  # a temporary file of this age was left by a process that ended
-_KEPT_SHARE = 0.9  # of the limit, after files were removed
+_KEPT_SHARE = 0.9  # share of the limit that remains after files were removed
 _Argument = TypeVar("_Argument", int, Region, DrawnPattern)
 
 
 @contextmanager
 def without_cache() -> Iterator[None]:
-    """Neither read nor keep maps while the block runs, in this process and those that it starts."""
+    """Disable the cache during the block, in this process and in processes that it starts."""
     before = os.environ.get(LIMIT)
     os.environ[LIMIT] = "0"
     try:
@@ -56,7 +56,7 @@ def without_cache() -> Iterator[None]:
 
 
 def kept(make: Callable[[_Argument], NDArray[Any]], argument: _Argument) -> NDArray[Any]:
-    """Compute the read-only array that `make(argument)` gives, float16 or float32; from disk where it is known.
+    """Return the read-only array `make(argument)`, float16 or float32, from the cache if it is there.
 
     Args:
         make: a function of the module's top level that depends on its argument alone.
@@ -75,7 +75,7 @@ def kept(make: Callable[[_Argument], NDArray[Any]], argument: _Argument) -> NDAr
 
 
 def folder() -> Path | None:
-    """Return the folder of the maps; None where none are kept."""
+    """Return the folder of the maps; None if maps are not cached."""
     place = cache_folder()
     return place / "maps" if place is not None and _limit_bytes() > 0 else None
 
@@ -99,7 +99,7 @@ def _place(name: str, argument: int | Region | DrawnPattern) -> Path | None:
 
 @lru_cache(maxsize=1)
 def _code() -> list[str]:
-    """Say what makes the maps: the package's version, a digest of this folder's sources, NumPy and SciPy."""
+    """Describe what determines the maps: the package's version, a digest of this folder's sources, NumPy and SciPy."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
@@ -115,14 +115,14 @@ def _write(file: Path, values: NDArray[Any]) -> None:
     data = np.ascontiguousarray(values)
     header = {"schema": SCHEMA, "dtype": str(data.dtype), "shape": data.shape, "blake2b": _checksum(data.data)}
     file.parent.mkdir(parents=True, exist_ok=True)
-    with written(file, sync=False) as out:  # the checksum finds what a power cut leaves
+    with written(file, sync=False) as out:  # the checksum detects the damage of a power cut
         line = json.dumps(header).encode()
         out.write(line + b" " * (-(len(line) + 1) % _ALIGNMENT) + b"\n")
         out.write(data.data)
 
 
 def _read(file: Path) -> NDArray[Any] | None:
-    """Map of a file; None where there is none. A damaged file is removed."""
+    """Read the map of a file; None if there is none. A damaged file is removed."""
     try:
         if not file.is_file():
             return None
@@ -150,7 +150,7 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
 
 
 def _trim(place: Path, limit: float) -> None:
-    """Remove what was not used for longest where the maps take more than `limit` bytes, and stale temporary files."""
+    """Remove the least recently used maps above a total of `limit` bytes, and stale temporary files."""
     now = time.time()
     files = []
     for path in list(place.iterdir()):

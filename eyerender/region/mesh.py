@@ -34,7 +34,7 @@ HAIRS = 2  # the first of a mesh's strands, which are hairs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegionLayout(ArrayValue):
-    """What never moves: `faces` (m, 3), `uv` (n, 2), and where each part's vertices and faces end."""
+    """Constant parts of a region's mesh: `faces` (m, 3), `uv` (n, 2), and the end of each part's vertices and faces."""
 
     faces: Ints
     uv: Floats
@@ -46,12 +46,12 @@ class RegionLayout(ArrayValue):
 class RegionMesh(ArrayValue):
     """A posed region in the scene's frame (mm).
 
-    A mesh whose margins, border or strands are unknown has none of them.
+    If margins, border or strands are unknown, they are empty.
 
     Attributes:
-        vertices: (n, 3).
+        vertices: (n, 3) positions, mm.
         normals: (n, 3) unit normals.
-        layout: what never moves.
+        layout: the constant parts.
         upper_margin: (k, 3) landmarks along the upper lid's inner edge, from the temple to the nose.
         lower_margin: (k, 3) the same for the lower lid.
         border: (k, 3) outer end of the skin, closed.
@@ -70,7 +70,7 @@ class RegionMesh(ArrayValue):
 
     def part(self, name: str) -> trimesh.Trimesh:
         """Return one part as a trimesh: skin, lashes, tears or brow."""
-        import trimesh  # which takes a quarter of a second, and few processes need it
+        import trimesh  # its import takes a quarter of a second, and few processes need it
 
         i = PARTS.index(name)
         v0, f0 = (0, 0) if i == 0 else (int(self.layout.vertex_ends[i - 1]), int(self.layout.face_ends[i - 1]))
@@ -87,14 +87,14 @@ class LidMargins(ArrayValue):
 
 
 def lid_margins(spec: Region, globe: Globe) -> LidMargins:
-    """Compute the lids' inner edges alone, without the mesh around them."""
+    """Compute only the lids' inner edges, without the surrounding mesh."""
     mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
     upper, lower = (frozen(edge * mirror) for edge in _margins(contour(spec, globe)))
     return LidMargins(upper, lower)
 
 
 def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
-    """Make the region of a subject around a posed globe."""
+    """Compute the region of a subject around a posed globe."""
     s = sheet(spec, globe)
     tears = meniscus(spec, globe, s)
     lash = lashes(spec, globe, s)
@@ -122,19 +122,19 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
 
 
 def _closed(grid: Floats) -> Floats:
-    """Compute the grid with its first column repeated at the end, where the map's u is 1."""
+    """Repeat the first column of a grid at the end, where the map's u is 1."""
     return np.concatenate([grid, grid[:, :1]], axis=1)
 
 
 def _joined(fine: Floats, coarse: Floats, lash_tubes: Floats, hair_tubes: Floats, film: Floats) -> Floats:
-    """Return all vertices (n, 3), or their normals; `sheet_vertices` numbers those of the sheet."""
+    """Concatenate all vertices (n, 3), or their normals; `sheet_vertices` numbers those of the sheet."""
     parts = (_closed(fine), _closed(coarse), lash_tubes, hair_tubes, film)
     return np.concatenate([p.reshape(-1, 3) for p in parts])
 
 
 @lru_cache(maxsize=16)
 def _brow(spec: Region) -> tuple[Hairs, Floats, Floats]:
-    """Compute the brow, its tubes and their normals; it does not blink."""
+    """Compute the brow, its tubes and their normals; a blink does not move it."""
     hairs = brow(spec)
     tubes, normals = hairs.tubes(np.array([1.0, 0.0, 0.0]))
     return hairs, sealed(tubes), sealed(normals)
@@ -173,7 +173,7 @@ def _layout(upper_count: int, lash_count: int, brow_count: int, mirrored: bool) 
 
 
 def _tear_faces() -> Ints:
-    """Compute triangles (m, 3) of the menisci, where they have any height."""
+    """Return triangles (m, 3) of the menisci where they have any height."""
     n = COLUMNS + 1
     high = on_globe(2 * np.pi * np.arange(n) / COLUMNS) > 0
     i, j = np.meshgrid(np.arange(TEAR_ROWS - 1), np.flatnonzero(high[:-1] | high[1:]), indexing="ij")
@@ -184,7 +184,7 @@ def _tear_faces() -> Ints:
 
 @lru_cache(maxsize=1)
 def sheet_faces() -> Ints:
-    """Compute triangles (m, 3) of the sheet, from row to row.
+    """Return triangles (m, 3) of the sheet, row by row.
 
     From the row `FINE` on, cells are two columns wide. That row itself has a vertex in every column for the cells
     before it. Every second one lies on an edge of the cells after it, which is divided there, so that no gap opens.
@@ -201,7 +201,7 @@ def sheet_faces() -> Ints:
 
 
 def sheet_vertices(row: Ints | int, column: Ints | int) -> Ints:
-    """Numbers of the sheet's vertices in rows and columns of its grid; rows beyond `FINE` have the even columns."""
+    """Return vertex numbers at rows and columns of the sheet's grid; rows beyond `FINE` have even columns only."""
     half = COLUMNS // 2
     coarse = half * (FINE + 1) + (half + 1) * row + column // 2
     return np.where(np.greater(row, FINE), coarse, (COLUMNS + 1) * row + column)
@@ -216,7 +216,7 @@ def sheet_ends() -> Bools:
 
 @lru_cache(maxsize=1)
 def sheet_neighbours() -> Ints:
-    """List numbers (2, ROWS, COLUMNS) of the vertices at each place of the sheet's grid, or before and after it."""
+    """Return the numbers (2, ROWS, COLUMNS) of the vertices at each grid position, or before and after it."""
     i, j = np.meshgrid(np.arange(ROWS), np.arange(COLUMNS), indexing="ij")
     odd = np.where(i > FINE, j % 2, 0)
     return frozen(np.stack([sheet_vertices(i, j - odd), sheet_vertices(i, j + odd)]), np.int64)
@@ -234,7 +234,7 @@ def _grid_uv(u: Floats, v: Floats) -> Floats:
 
 
 def _lash_uv(upper_count: int, count: int) -> Floats:
-    """Compute coordinates of lashes, upper ones first: u runs from root to tip in the half of the band of its lid."""
+    """Compute map coordinates of lashes, upper ones first: u runs from root to tip in its lid's half of the band."""
     along = LASH_U[0] + LASH_U[1] * np.arange(SEGMENTS + 1) / SEGMENTS
     lower = np.where(np.arange(count) < upper_count, 0.0, 0.5)
     u = np.repeat((lower[:, None] + along).reshape(-1), 3)

@@ -1,4 +1,4 @@
-"""Seeded, periodic fields for textures: band-passed noise and the net of furrows between cells, in single precision."""
+"""Seeded periodic fields for textures, in single precision: band-passed noise, and furrows between cells."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..arrays import Floats, Singles
 
 _NEGLIGIBLE = 3.0  # times a band's upper end, where its gain is 1e-4
 _TOGETHER = 640  # blocks of points, which stay in the processor's cache
-_BLOCK, _CANDIDATES = 8, 12  # one place in twenty thousand would need more candidates
+_BLOCK, _CANDIDATES = 8, 12  # one position in twenty thousand would need more candidates
 
 
 def gain(f: Floats, low: float, high: float) -> Floats:
-    """Compute the gain of a band-pass from `low` to `high` at the frequencies f."""
+    """Compute the gain of a band-pass from `low` to `high` at frequencies f."""
     out = np.exp(-((f / high) ** 2))
     return np.asarray(out * (1 - np.exp(-((f / low) ** 2))) if low > 0 else out)
 
@@ -25,11 +25,11 @@ def gain(f: Floats, low: float, high: float) -> Floats:
 def band_noise(
     rng: np.random.Generator, shape: tuple[int, int], across: tuple[float, float], up: tuple[float, float]
 ) -> Singles:
-    """Gaussian noise (h, w) of unit variance that is periodic both ways; `(low, high)` cycles over width and height.
+    """Compute periodic Gaussian noise (h, w) of unit variance with `(low, high)` cycles over width and height.
 
-    A wave is kept if its frequencies are within an ellipse of the `high` ones and outside of one of the `low` ones.
-    Bands of width and height by themselves would leave diagonal waves alone, which look like a weave. Only the waves
-    that the band keeps are drawn.
+    A wave is kept if its frequencies lie inside the ellipse of the `high` ones and outside that of the `low` ones.
+    Separate bands of width and height would leave only diagonal waves, which look like a weave. Only the kept waves are
+    drawn.
     """
     h, w = shape
     kept = min(w // 2 + 1, int(_NEGLIGIBLE * across[1]) + 2)
@@ -55,14 +55,14 @@ def band_noise(
 
 
 def band(seed: int, size: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
-    """Gaussian noise of unit variance on a periodic square (rows: up), `(low, high)` cycles over the square."""
+    """Compute Gaussian noise of unit variance on a periodic square (rows: up), `(low, high)` cycles over the square."""
     return band_noise(np.random.default_rng((0xBA4D, seed)), (size, size), across, up)
 
 
 def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Singles:
     """Compute the height 0 (furrow) to about 1 (plateau) over a periodic square of `cells` cells.
 
-    The height is the distance to the border between the nearest two seeds. `stretch` > 1 draws cells out across.
+    The height is the distance to the border between the nearest two seeds. `stretch` > 1 stretches cells horizontally.
     """
     rng = np.random.default_rng((0xF0, seed))
     # Vertical distances count `stretch` times as much.
@@ -78,7 +78,7 @@ def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Singles:
 
 
 def nearest_two(seeds: Floats, x: Floats, y: Floats, which: bool = False) -> tuple[Singles, Singles, Singles, Singles]:
-    """Distances of points (h, w) to the nearest and the second nearest seed (n, 2), and the numbers of these seeds.
+    """Compute distances of points (h, w) to the nearest and second nearest seed (n, 2), and the numbers of these seeds.
 
     The sides must be multiples of 8. Neighbouring points share a short list of candidates, which is much faster than a
     search for each of them. The numbers are floats, and zero without `which`.
@@ -119,10 +119,9 @@ def nearest_two(seeds: Floats, x: Floats, y: Floats, which: bool = False) -> tup
 
 
 class Padded:
-    """A square tile made ready for `Places`: every value with its difference to the next one in its row.
+    """A square tile prepared for `Places`: every value with its difference to the next one in its row.
 
-    Both are whole numbers in `unit` and share the two halves of one: reading from many places takes as long as the
-    memory does.
+    Both are integers in `unit`, packed into the halves of one number, because memory limits the speed of random reads.
     """
 
     def __init__(self, tile: Singles) -> None:
@@ -136,7 +135,7 @@ class Padded:
 
 
 class Places:
-    """Places (x, y) mm on a periodic square, at which any tiles of one size are sampled by linear interpolation."""
+    """Positions (x, y) mm on a periodic square, at which tiles of one size are sampled by linear interpolation."""
 
     def __init__(self, size: int, x: NDArray[Any], y: NDArray[Any], period_mm: float) -> None:
         self.size = size
@@ -145,7 +144,7 @@ class Places:
 
     @staticmethod
     def _split(turns: Singles, size: int) -> tuple[Any, Singles]:
-        """Compute the whole and fractional part of coordinates in texels, the whole ones from 0 to `size`."""
+        """Split coordinates in texels into whole parts, from 0 to `size`, and fractions."""
         turns -= np.floor(turns)
         turns *= np.float32(size)
         whole = turns.astype(np.int32)
@@ -153,13 +152,13 @@ class Places:
         return whole, turns
 
     def sample(self, tile: Padded) -> Singles:
-        """Return values of one tile, in the shape of the places."""
+        """Return the values of a tile at the positions."""
         rows = []
         for pairs in (tile.pairs, tile.pairs[self._width :]):
             both = pairs.take(self._at)
             row: Singles = (both >> 16).astype(np.float32)
             row *= self._du
-            row += both.astype(np.int16).astype(np.float32)  # adding whole numbers to others takes longer
+            row += both.astype(np.int16).astype(np.float32)  # integer addition with other types takes longer
             rows.append(row)
         out, below = rows
         below -= out

@@ -1,12 +1,12 @@
 """Appearance of the sheet: albedo, slope of the fine relief and gloss over the sheet's own coordinates.
 
 The map is fixed to the tissue: columns run once around the fissure, rows from the conjunctiva outwards (see `lids`), so
-a moving lid takes its skin along. The last rows hold the constant values of lashes, brow and tears, so that the whole
-region is one mesh with one map. The map has four channels:
+skin moves with its lid. The last rows hold the constant values of lashes, brow and tears, so that the whole region is
+one mesh with one map. The map has four channels:
 
     albedo        diffuse reflectance; its mean over the skin about the eye is `skin.albedo`
     slope y, z    d(height)/dy and d(height)/dz of the relief, over the region's frame
-    gloss         weight of the mirror-like part: below 0.5 skin's sheen (rougher the less oil), above it wet tissue
+    gloss         weight of the specular part: below 0.5 sheen of skin (rougher with less oil), above it wet tissue
 """
 
 from __future__ import annotations
@@ -40,32 +40,32 @@ _COARSE = 8
 _SLOW, _SLOW_TILE = 4, 320  # rows and columns of the map from one place of a slow field to the next; side of its tiles
 _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STEEPEST = 2.0  # slope of the map, over the region's frame; margins are seen from their edges
-_STRIP = 32  # rows of the map that are made together, so that they stay in the processor's cache
+_STRIP = 32  # number of map rows computed together, so that they stay in the processor's cache
 _HAIR_GLOSS = 0.2
 _MASCARA = 0.03  # albedo of lashes with mascara (chosen)
 _WET, _WET_ROOT = 0.97, 0.06  # gloss of wet tissue, and the share of a lash that is wet
-_SHOWN_MM = 25.0  # about the middle of the fissure: the skin whose mean albedo is that of the spec
-_REFERENCE_BLINK = 0.3  # at which the tissue is laid out: neither stretched nor hidden in the fold
+_SHOWN_MM = 25.0  # radius about the middle of the fissure: the skin whose mean albedo is that of the spec
+_REFERENCE_BLINK = 0.3  # blink at which the tissue is laid out: neither stretched nor hidden in the fold
 
 
 def band_row(which: int) -> float:
-    """Coordinate v of the middle of a constant band, 0 to 1 over the whole map."""
+    """Return the coordinate v of the middle of a constant band, 0 to 1 over the whole map."""
     return (SHEET_ROWS + BANDS * (which + 1) / 4) / (SHEET_ROWS + BANDS)
 
 
 def sheet_v(row: Floats) -> Floats:
-    """Coordinate v of the sheet's rows, given as 0 (first) to 1 (last)."""
+    """Convert rows of the sheet, from 0 (first) to 1 (last), to the map's coordinate v."""
     return np.asarray((0.5 + np.interp(row * (ROWS - 1), np.arange(ROWS), _texels())) / (SHEET_ROWS + BANDS))
 
 
 def sheet_place(texel: Floats) -> Floats:
-    """Row of the sheet, 0 to ROWS - 1, at rows of the map in texels: the inverse of `sheet_v`."""
+    """Convert rows of the map in texels to rows of the sheet, 0 to ROWS - 1; the inverse of `sheet_v`."""
     return np.asarray(np.interp(texel, _texels(), np.arange(ROWS)))
 
 
 @lru_cache(maxsize=1)
 def _texels() -> Floats:
-    """Row of the map, in texels, for each row of the sheet; wider rows of the sheet get more texels."""
+    """Return the map row, in texels, of each row of the sheet; wider rows of the sheet get more texels."""
     rest = sheet(Region(blink=_REFERENCE_BLINK), Globe.sphere()).vertices
     width = np.linalg.norm(np.diff(rest, axis=0), axis=-1).mean(axis=1) ** 0.6
     place = np.concatenate([[0.0], np.cumsum(width)])
@@ -74,7 +74,7 @@ def _texels() -> Floats:
 
 @lru_cache(maxsize=4)
 def skin_map(spec: Region) -> Singles:
-    """Map (rows, columns, 4) of a subject; it does not depend on the blink."""
+    """Compute the map (rows, columns, 4) of a subject; it does not depend on the blink."""
     reference = spec.model_copy(update={"blink": _REFERENCE_BLINK})
     rest = sheet(reference, Globe.sphere()).vertices
     rows = np.interp(np.arange(SHEET_ROWS), _texels(), np.arange(ROWS))
@@ -123,7 +123,7 @@ def _draw_sheet(spec: Region, rest: Floats, rows: Floats, columns: Floats, out: 
 
 
 def _along_lids(rest: Floats) -> Singles:
-    """Unit directions (columns, 2) over (y, z) along the margin's inner edge, counted with the columns."""
+    """Compute unit directions (columns, 2) over (y, z) along the margin's inner edge, in the order of the columns."""
     edge = np.concatenate([rest[CONJUNCTIVA], rest[CONJUNCTIVA, :1]])[:, 1:]
     way = np.diff(edge, axis=0)
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
@@ -131,10 +131,10 @@ def _along_lids(rest: Floats) -> Singles:
 
 
 def lash_band(spec: Region) -> tuple[Singles, Singles]:
-    """Albedo and gloss (columns,) of lashes: upper ones in the first half, lower ones in the second, root to tip.
+    """Compute albedo and gloss (columns,) of lashes, root to tip: upper ones in the first half, then lower ones.
 
-    Thin tips let light through, so they are paler; hairs much thinner than a pixel would be stippled. Tears
-    creep up the roots.
+    Tips are paler, because they transmit light and because hairs much thinner than a pixel would look stippled. Roots
+    are wet with tears.
     """
     s = np.clip((np.arange(_COLUMNS) + 0.5) / _COLUMNS % 0.5 - LASH_U[0], 0, LASH_U[1]) / LASH_U[1]
     lower = np.arange(_COLUMNS) >= _COLUMNS // 2
@@ -148,9 +148,9 @@ def lash_band(spec: Region) -> tuple[Singles, Singles]:
 
 
 def _normalise(albedo: Singles, y: Singles, z: Singles, rows: Floats, wanted: float) -> None:
-    """Give the skin about the eye its mean albedo, each texel weighted by its area as seen from the front.
+    """Scale the skin around the eye to its mean albedo, weighting each texel by its area in frontal view.
 
-    A window of one eye shows this skin. Farther out the tone is up to 7 % lighter. Wet tissue stays as it is.
+    This is the skin in a window of one eye; farther out the tone is up to 7 % lighter. Wet tissue is not changed.
     """
     some = np.flatnonzero(rows > _LINE)[:: _COARSE // 2]  # enough of the map, whose columns are fewer still
     y, z, seen = (v[some, ::_COARSE] for v in (y, z, albedo))
@@ -163,12 +163,12 @@ def _normalise(albedo: Singles, y: Singles, z: Singles, rows: Floats, wanted: fl
 
 
 def skin_texels(spec: Region) -> NDArray[np.float16]:
-    """Map of `skin_map` in half precision, which is what is rendered: albedo and slope need no more digits."""
+    """Compute `skin_map` in half precision for rendering; albedo and slope need no more digits."""
     return skin_map(spec).astype(np.float16)
 
 
 def _over_grid(values: Floats, rows: Floats, columns: Floats) -> Singles:
-    """Values (r, c) of a grid at all fractional rows (m,) and columns (n,), interpolated linearly: (m, n)."""
+    """Interpolate values (r, c) of a grid linearly at fractional rows (m,) and columns (n,): (m, n)."""
     i, j = np.minimum(rows.astype(int), len(values) - 2), np.minimum(columns.astype(int), values.shape[1] - 2)
     u, v = (rows - i)[:, None], columns - j
     along = values[i] + u * (values[i + 1] - values[i])
@@ -180,35 +180,35 @@ def _over_grid(values: Floats, rows: Floats, columns: Floats) -> Singles:
 
 
 def _from_line(rest: Floats) -> Floats:
-    """Distance (mm) over the sheet from the lash line along each column, with the first column repeated at the end."""
+    """Compute the distance (mm) over the sheet from the lash line along each column; the first column is repeated."""
     way = np.linalg.norm(np.diff(rest, axis=0, prepend=rest[:1]), axis=-1).cumsum(axis=0)
     way = way - way[_LINE]
     return np.concatenate([way, way[:, :1]], axis=1)
 
 
 def _hill(y: Singles, z: Singles, wide: float, high: float) -> Singles:
-    """Hill exp(-((y / wide)^2 + (z / high)^2)^2) with a flat top about the middle of the fissure."""
+    """Compute a hill exp(-((y / wide)^2 + (z / high)^2)^2) with a flat top, about the middle of the fissure."""
     return np.asarray(np.exp(-np.square(np.square(y * (1 / wide)) + np.square(z * (1 / high)))))
 
 
 def _bell(x: Singles, middle: float, width: float) -> Singles:
-    """Bell exp(-((x - middle) / width)^2)."""
+    """Compute a bell exp(-((x - middle) / width)^2)."""
     return np.asarray(np.exp(-np.square((x - middle) * (1 / width))))
 
 
 class _Tiles:
-    """The noise of a subject, each tile made when it is first needed."""
+    """Noise of a subject; each tile is computed on first use."""
 
     def __init__(self, spec: Region) -> None:
         self.spec = spec
         self._made: dict[object, Padded] = {}
 
     def at(self, number: int, places: Places, across: tuple[float, float], up: tuple[float, float]) -> Singles:
-        """Values of a band of noise (see `noise.band`) at places."""
+        """Sample a band of noise (see `noise.band`) at positions."""
         return self.mixed(places, (1.0, number, across, up))
 
     def mixed(self, places: Places, *parts: tuple[float, int, tuple[float, float], tuple[float, float]]) -> Singles:
-        """Values of a sum of bands of noise at places, each with a factor."""
+        """Sample a weighted sum of bands of noise at positions."""
         key = places.size, *parts
         if key not in self._made:
             bands = [factor * band(self.spec.seed + number, places.size, *ends) for factor, number, *ends in parts]
@@ -217,17 +217,17 @@ class _Tiles:
 
     @cached_property
     def net(self) -> Padded:
-        """Furrows of the face."""
+        """Return the furrows of the face."""
         return Padded(furrows(self.spec.seed, _TILE, 1700))
 
     @cached_property
     def drawn(self) -> Padded:
-        """Furrows of the lids, which are drawn out across."""
+        """Return the furrows of the lids, stretched horizontally."""
         return Padded(furrows(self.spec.seed + 7, _TILE, 1500, 2.5))
 
     @cached_property
     def hollows(self) -> Padded:
-        """Depth of the face behind its own surroundings (mm), by mm from (-76, -76)."""
+        """Return the depth (mm) of the face behind its surroundings, on a grid of 1 mm from (-76, -76)."""
         at = np.arange(-76.0, 76.5)
         depth = skin_depth(self.spec, Globe.sphere(), *np.meshgrid(at, at))
         behind = ndimage.gaussian_filter(depth, 4.5, mode="nearest") - depth
@@ -235,7 +235,7 @@ class _Tiles:
 
     @cached_property
     def brow(self) -> tuple[Singles, Singles]:
-        """Lower z of the brow's band and its width (mm), at `_BROW_STEPS` places from -0.25 to 1.1 along it."""
+        """Return lower z and width (mm) of the brow's band, at `_BROW_STEPS` positions from -0.25 to 1.1 along it."""
         _, low, high = brow_band(self.spec, np.clip(np.linspace(*_BROW_ENDS, _BROW_STEPS), -0.1, 1.1))
         return low.astype(np.float32), (high - low).astype(np.float32)
 
@@ -245,12 +245,12 @@ def _places(y: NDArray[Any], z: NDArray[Any], size: int = _TILE) -> Places:
 
 
 class _Slow:
-    """Fields that change slowly, made at every fourth row and column of the map, and interpolated linearly between.
+    """Slowly varying fields, computed at every fourth row and column of the map and interpolated linearly.
 
     Args:
         tiles: the subject's noise.
-        y: place in the region's frame, mm, at these rows and columns.
-        z: the same.
+        y: position in the region's frame, mm, at these rows and columns.
+        z: position in the region's frame, mm.
         out_mm: distance over the sheet from the lash line.
         upper: whether a column is above the fissure.
     """
@@ -259,7 +259,7 @@ class _Slow:
         skin, places = tiles.spec.skin, _places(y, z, _SLOW_TILE)
 
         def of_lids(number: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
-            """Noise over the lids, of its own on each."""
+            """Compute noise over the lids, independent on each lid."""
             out = np.empty_like(y)
             for side, mine in enumerate((upper, ~upper)):
                 at = _places(y[:, mine], out_mm[:, mine], _SLOW_TILE)
@@ -291,7 +291,7 @@ class _Slow:
         }
 
     def at(self, name: str, rows: slice) -> Singles:
-        """Values of a field in rows of the map, from a multiple of `_SLOW` to another one."""
+        """Return a field in some rows of the map; start and end are multiples of `_SLOW`."""
         known = self._fields[name][rows.start // _SLOW : rows.stop // _SLOW + 1]
         part = (np.arange(_SLOW, dtype=np.float32) / _SLOW)[:, None]
         down = (known[:-1, None] + part * np.diff(known, axis=0)[:, None]).reshape(-1, known.shape[1])
@@ -303,23 +303,23 @@ class _Slow:
 
 
 def _hollows(behind: Padded, y: Singles, z: Singles) -> Singles:
-    """Loss of light, -0.05 to 0.25, where the face is hollow."""
+    """Compute the loss of light, -0.05 to 0.25, in hollows of the face."""
     y, z = (np.clip(v + 76.0, 0, 151.999) for v in (y, z))
     return np.asarray(np.clip(0.05 * Places(153, y, z, 153.0).sample(behind), -0.05, 0.25))
 
 
 @dataclass(kw_only=True)
 class _Strip:
-    """Some rows of the map: all of it is made for them, except the slopes.
+    """Some rows of the map; computes all channels for them except the slopes.
 
     Attributes:
         tiles: the subject's noise.
-        y: place in the region's frame, mm.
-        z: the same.
+        y: position in the region's frame, mm.
+        z: position in the region's frame, mm.
         out_mm: distance over the sheet from the lash line.
         rows: row of the sheet, (rows, 1).
         turn: angle about the fissure, (1, columns).
-        slow: the fields that change slowly.
+        slow: the slowly varying fields.
         strip: the rows of the map.
     """
 
@@ -342,21 +342,21 @@ class _Strip:
         self.level = z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z * 0.25)
         self.places, self.along = _places(y, z), _places(y, self.level)
         self.within = 1 - step(rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
-        # The plica darkens the conjunctiva little by little towards the caruncle.
+        # The plica gradually darkens the conjunctiva towards the caruncle.
         self.flesh = step(np.cos(self.turn).astype(np.float32), 0.55, 0.95) * self.within * step(rows, 0.0, 5.0)
         self.lids = _hill(y, z, 19.0, 13.0) * self.near
-        self.roots = _bell(self.out_mm, 0.9, 2.4)  # of the lashes
+        self.roots = _bell(self.out_mm, 0.9, 2.4)  # roots of the lashes
 
     def field(self, number: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
-        """Band of noise at the places of the strip."""
+        """Sample a band of noise at the positions of the strip."""
         return self.tiles.at(number, self.places, across, up)
 
     def slowly(self, name: str) -> Singles:
-        """Values of a slow field."""
+        """Return a slowly varying field."""
         return self.slow.at(name, self.strip)
 
     def look(self, spots: Singles) -> tuple[Singles, Singles, Singles]:
-        """Albedo, gloss and height (mm) of the relief; `spots` is the light that the freckles leave."""
+        """Compute albedo, gloss and height (mm) of the relief; `spots` is the share of light left by freckles."""
         spec = self.spec
         cells, creases, pores, wet = self.cells(), self.creases(), self.pores(), self.wet()
         height = self.relief(cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases
@@ -375,20 +375,20 @@ class _Strip:
         return self.albedo(open_, spots), gloss, height
 
     def wet(self) -> Singles:
-        """Gloss of the film of tears, which ends in tongues between the roots of the lashes; 0 beyond it.
+        """Compute the gloss of the tear film, which ends in tongues between the roots of the lashes; 0 beyond it.
 
-        More than `_WET` stands for the oil on it.
+        Values above `_WET` mean oil on the film.
         """
         out: Singles = np.zeros_like(self.y)
         if np.min(self.out_mm) < 4:
             tongues = self.tiles.at(43, _places(self.y, self.out_mm / 3), (10, 60), (10, 60))
-            reach = np.where(self.upper > 0, 0.5, 0.25)  # the upper lashes hold more of it
+            reach = np.where(self.upper > 0, 0.5, 0.25)  # the upper lashes hold more water
             film = 1 - step(self.out_mm - reach - 0.35 * tongues, -0.15, 0.15)
             out = film * np.clip(0.95 - 0.03 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
         return out
 
     def lumps(self) -> Singles:
-        """Height (mm) of the lumps of the wet margins: mouths of glands, and water between the lashes."""
+        """Compute the height (mm) of the lumps of the wet margins: mouths of glands, and water between the lashes."""
         at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
         at = at * (1 - step(self.out_mm - np.where(self.upper > 0, 0.5, 0.0), 1.0, 2.5))
         out: Singles = np.zeros_like(self.y)
@@ -400,9 +400,9 @@ class _Strip:
         return out
 
     def cells(self) -> Singles:
-        """Plateaus (about 1) separated by furrows (0), which are deep in patches and hardly there between them.
+        """Compute plateaus (about 1) separated by furrows (0), which are deep in some patches and faint elsewhere.
 
-        The fields are wide on the face. On the lids they are drawn out along the margin, as its creases are.
+        The cells are wide on the face. On the lids they are stretched along the margin, like its creases.
         """
         y, z, tiles = self.y, self.z, self.tiles
         cells = Places(_TILE, y, z, 0.72 * _TILE_MM).sample(tiles.net)
@@ -413,7 +413,7 @@ class _Strip:
         return np.asarray(1 - (0.2 + 0.8 * self.slowly("patch")) * (1 - cells))
 
     def relief(self, cells: Singles) -> Singles:
-        """Height (mm) of the relief: cells separated by furrows, swellings, and lines.
+        """Compute the height (mm) of the relief: cells separated by furrows, swellings, and lines.
 
         The lines run along the lids and, at the temple, away from the canthus.
         """
@@ -426,7 +426,7 @@ class _Strip:
         return np.asarray(height - self.slowly("lines") * np.abs(lines))
 
     def creases(self) -> Singles:
-        """Depth, 0 to about 1, of the creases of the lids' thin skin.
+        """Compute the depth, 0 to about 1, of the creases in the thin skin of the lids.
 
         The creases run along the margin, begin and end, and branch: fine ones all over the lid, wider ones where it
         folds.
@@ -451,13 +451,13 @@ class _Strip:
         return depth
 
     def pores(self) -> Singles:
-        """Pits, 0 to 1, a third of a millimetre wide, on cheek, nose and forehead; the lids have almost none."""
+        """Compute pits, 0 to 1, a third of a millimetre wide, on cheek, nose and forehead; lids have almost none."""
         spots = np.maximum(self.field(41, (20, 42), (20, 42)) - 1.25, 0.0)
         much = np.maximum(self.slowly("pores") * (1 - 0.9 * self.lids), 0.1)
         return np.asarray(self.spec.skin.pores * np.clip(1.7 * spots * much, 0, 1))
 
     def under_brow(self) -> Singles:
-        """Loss of light between the brow's hairs, and in the points of short ones below it and between the brows."""
+        """Compute the loss of light between the brow's hairs, and at short hairs below it and between the brows."""
         low, width = self.tiles.brow
         out = np.zeros_like(self.y)
         inside = (self.z > np.min(low - width)) & (self.z < np.max(low + 2 * width))
@@ -479,7 +479,7 @@ class _Strip:
         return out
 
     def veins(self) -> Singles:
-        """Loss of light, 0 to about 0.2, over the veins under the lids' skin: broad, blurred and scattered."""
+        """Compute the loss of light, 0 to about 0.2, over veins in the skin of the lids: broad and blurred."""
         tiles, where = self.tiles, self.slowly("veins")
         out: Singles = np.zeros_like(self.y)
         some = where > 1e-3
@@ -494,7 +494,7 @@ class _Strip:
         return out
 
     def albedo(self, open_: Singles, spots: Singles) -> Singles:
-        """Diffuse reflectance; `open_` is the light that leaves the furrows."""
+        """Compute the diffuse reflectance; `open_` is the share of light that leaves the furrows."""
         skin, rows, upper = self.spec.skin, self.rows, self.upper
         # Finer mottling than half a millimetre would show the lattice of the map as a weave.
         slow, blotch, fine = ((c, c) for c in ((0, 4), (3, 22), (25, 85)))
@@ -519,7 +519,7 @@ class _Strip:
 
 
 def _spots(seed: int, y: Singles, z: Singles) -> Singles:
-    """Light that some freckles leave, 1 elsewhere."""
+    """Compute the share of light left by some freckles, 1 elsewhere."""
     rng = np.random.default_rng((0x5407, seed))
     left = np.ones_like(y)
     coarse = _COARSE
@@ -535,7 +535,7 @@ def _spots(seed: int, y: Singles, z: Singles) -> Singles:
 
 
 def _parts_near(marked: Bools) -> Iterator[tuple[slice, slice]]:
-    """Rectangle of the map that contains the marked places of every `_COARSE`-th row and column, if there are any."""
+    """Return the map's rectangle with the marked points of every `_COARSE`-th row and column, if there are any."""
     if np.any(marked):
         ends = [np.flatnonzero(np.any(marked, axis=axis))[[0, -1]] for axis in (1, 0)]
         rows, columns = (slice(max(a - 1, 0) * _COARSE, (b + 2) * _COARSE) for a, b in ends)
@@ -557,6 +557,6 @@ def _slopes(height: Singles, y: Singles, z: Singles, out: Singles) -> None:
 
 
 def _along_columns(v: Singles) -> Singles:
-    """Half the difference of both neighbours in the row, which is closed."""
+    """Compute half the difference of both neighbours in the row, which is a closed ring."""
     wide = np.concatenate([v[:, -1:], v, v[:, :1]], axis=1)
     return np.asarray((wide[:, 2:] - wide[:, :-2]) * 0.5)

@@ -12,7 +12,7 @@ from .noise import band_noise, gain
 
 
 def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) -> Floats:
-    """Compute the isotropic Gaussian noise of unit variance on a periodic square, `low` to `high` cycles."""
+    """Compute isotropic Gaussian noise of unit variance on a periodic square, `low` to `high` cycles."""
     f = np.hypot((np.fft.fftfreq(size) * size)[:, None], (np.fft.rfftfreq(size) * size)[None, :])
     keep = gain(f, low, high)
     keep[0, 0] = 0
@@ -22,10 +22,10 @@ def _even_noise(rng: np.random.Generator, size: int, low: float, high: float) ->
 
 @lru_cache(maxsize=4)
 def sclera_texture(seed: int, size: int = 768) -> Singles:
-    """Find the relative albedo (size, size) of the globe's front, azimuthal equidistant to 108 degrees from the pole.
+    """Compute the relative albedo (size, size) of the globe's front, azimuthal equidistant to 108 degrees.
 
-    It has slow unevenness and conjunctival vessels, which are faint at 850 nm. The vessels run in from the fornices,
-    branch and end before the limbus.
+    It contains slow variation and conjunctival vessels, which are faint at 850 nm. The vessels start at the fornices,
+    branch, and end before the limbus.
     """
     rng = np.random.default_rng((0x5C1E, seed))
     shade = (
@@ -88,7 +88,7 @@ def _vessels(rng: np.random.Generator, size: int) -> Singles:
 
 @lru_cache(maxsize=4)
 def skin_texture(seed: int, size: int = 768) -> Singles:
-    """Find the relative albedo (size, size) of a periodic tile of skin: slow unevenness, the net of furrows, pores."""
+    """Compute the relative albedo (size, size) of a periodic tile of skin: slow variation, furrows and pores."""
     rng = np.random.default_rng((0x5817, seed))
     slow = 0.025 * _even_noise(rng, size, 0, 3)
     net = np.abs(_even_noise(rng, size, 45, 70))  # zero crossings: a net of furrows about a millimetre wide

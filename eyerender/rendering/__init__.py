@@ -1,1 +1,1 @@
-"""Rendering with Mitsuba 3. `backends.choose.choose_backend` must run before a module of this package is imported."""
+"""Rendering with Mitsuba 3. Call `backends.choose.choose_backend` before importing a module of this package."""

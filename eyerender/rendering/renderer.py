@@ -1,4 +1,4 @@
-"""The renderer turns jobs into windows of the sensor, with NumPy on both sides."""
+"""Render jobs as windows of the sensor, with NumPy on both sides."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ __all__ = ["BACKGROUND", "FRAME", "IRIS", "PUPIL", "SCLERA", "PartLabels", "Rend
 
 
 class Renderer:
-    """Renders jobs on one backend, which `choose_backend` must have set up before this module is imported.
+    """Renderer of jobs on one backend; call `choose_backend` before importing this module.
 
-    Kernels are compiled once per kind of eye; every number may change between jobs.
+    Kernels are compiled once per structure of the eye; all numbers may change between jobs.
 
     Args:
         backend: the backend.
@@ -51,10 +51,10 @@ class Renderer:
         """Render one window.
 
         Args:
-            job: what to render.
-            spp: samples per pixel; None: those of the renderer.
-            moments: sub-frames of an exposure with motion. The image is their mean, and they share the samples;
-                labels, glints and margins are those of `job`, at mid-exposure.
+            job: the job to render.
+            spp: samples per pixel; None: the renderer's default.
+            moments: sub-frames of an exposure with motion. The image is their mean, and they share the samples; labels,
+                glints and margins are those of `job`, at mid-exposure.
 
         Raises:
             InputError: numbers so extreme that the image is not finite.
@@ -69,16 +69,16 @@ class Renderer:
         moments: Sequence[RenderJob] = (),
         after: RenderJob | None = None,
     ) -> Future[RenderedWindow]:
-        """Trace one window now, and apply lens and sensor in a second thread while the next window is traced.
+        """Trace a window now; lens and sensor run in a second thread while the next window is traced.
 
-        The result is that of `render`, whatever comes next.
+        The result equals that of `render`, whatever comes next.
 
         Args:
-            job: what to render.
+            job: the job to render.
             spp: as in `render`.
             moments: as in `render`.
-            after: the next job, if it is known. Its host data are then computed in the second thread, too. It must be
-                passed next as the same object.
+            after: the next job, if known; its host data are then computed in the second thread too. The next call must
+                pass the same object.
         """
         return self._beside.submit(self._traced(job, spp, moments, after).develop)
 
@@ -101,7 +101,7 @@ class Renderer:
             film = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
             if shot is shots[len(shots) // 2]:
                 around = CoarseSensor.begin(bound)
-            # The device works until something is read, so host work comes first.
+            # The device is busy until something is read, so host work comes first.
             found = _marks(bound, job) if shot.M is job.M and shot.t is job.t else None
             self._builder.prepare()
             mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / len(shots))
@@ -123,31 +123,31 @@ class Renderer:
         )  # fmt: skip
 
     def _mirror_images(self, host: HostData) -> MirrorImages:
-        """Find the lamps' mirror images, in the closed form of the cornea or in a mesh of it."""
+        """Compute the lamps' mirror images, in the closed-form cornea or its mesh."""
         job = host.job
         if job.mesh_edge_mm is None:
             return host.mirror_images
         return MirrorImages.of(job, self._builder.meshes.of(job.eye, job.mesh_edge_mm)[0])
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
-        """Compute the mean radiance of each pixel times cos^4(theta) / D (mW/mm^2/sr), before lens and glints."""
+        """Render the mean of radiance times cos^4(theta) / D (mW/mm^2/sr) per pixel, before lens and glints."""
         bound, _ = self.bind(job)
         return mean_radiance(bound, job.window, spp or self.spp, job.seed)[0].astype(float)
 
     def labels(self, job: RenderJob) -> PartLabels:
-        """Compute the labels of a window alone."""
+        """Compute only the labels of a window."""
         return part_labels(self.bind(job, lit=False)[0], job.window)()
 
     def bind(self, job: RenderJob, *, lit: bool = True) -> tuple[BoundFrame, Background | RegionScene]:
         """Set up a job's frame on the device, with the surroundings of its eye; both are valid until the next call.
 
-        lit: whether radiance is wanted, not only geometry.
+        lit: whether to compute light, not only geometry.
         """
         return self._builder.set(job, lit=lit)
 
 
 def _marks(bound: BoundFrame, job: RenderJob) -> Callable[[], tuple[PartLabels | None, Any, Bools | None]]:
-    """Start computing labels, margins of the lids (px) and highlights, as far as the job wants them."""
+    """Start computing the labels, lid margins (px) and highlights that the job requests."""
     labels = part_labels(bound, job.window) if job.labels else lambda: None
     return lambda: (
         labels(), bound.host.lid_margins_px, highlights(bound, job.window) if job.highlights else None

@@ -1,4 +1,4 @@
-"""The report of a bench of extractors from its JSON and rows: table, error plots, breakdowns, reasons."""
+"""The report of an extractor benchmark, from its JSON and rows: table, error plots, breakdowns, reasons."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MOST = 24  # thumbnails of an extractor
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Thumbnail:
-    """A failure: the extractor, what failed, the image (h, w), the true pupil and the reported one."""
+    """A failure: the extractor, the kind of failure, the image (h, w), the true pupil and the reported one."""
 
     extractor: str
     text: str
@@ -41,7 +41,7 @@ class Thumbnail:
 
 
 def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: Sequence[Thumbnail] = ()) -> None:
-    """Write one self-contained HTML file from the bench's JSON, its rows (per extractor and image), and thumbnails."""
+    """Write one self-contained HTML file from the benchmark's JSON, its rows (extractor and image), and thumbnails."""
     entries, cards = data["extractors"], _cards(data)
     varying = [name for name in data["factors"] if any(e["breakdown"].get(name) for e in entries)]
     lead = [
@@ -104,7 +104,7 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
 
 
 def _cards(data: Row) -> list[Card]:
-    """The figures at the top of the report."""
+    """Return the cards at the top of the report."""
     entries, edge = data["extractors"], data["edge"]
     best = [e for e in entries if e["summary"]["right"]]
     cards = [Card(f"{data['with_pupil']} of {data['images']}", "images that show a pupil")]
@@ -134,7 +134,7 @@ def _thumbnail_figures(thumbnails: Sequence[Thumbnail]) -> list[Figure]:
 
 
 def thumbnail_figure(thumbnails: Sequence[Thumbnail]) -> str:
-    """Draw failures side by side, each cut to a few sizes of the pupil."""
+    """Draw failures side by side, each cropped to a few pupil sizes."""
     columns = min(len(thumbnails), _PANELS)
     rows = math.ceil(len(thumbnails) / columns)
     with figure(11.0, 3.2 * rows, columns, rows) as (fig, axes):
@@ -159,12 +159,12 @@ def thumbnail_figure(thumbnails: Sequence[Thumbnail]) -> str:
 
 
 def look(names: Sequence[str], name: str) -> tuple[str, str]:
-    """Choose colour and marker of an extractor among those of the bench."""
+    """Return colour and marker of an extractor."""
     return _LOOK[list(names).index(name) % len(_LOOK)]
 
 
 def cumulative_figure(data: Row, rows: Sequence[Row]) -> str:
-    """Draw the share of the images with a pupil whose centre error is below x; failures never are."""
+    """Draw the share of images with a pupil whose centre error is below x; failures count as infinite errors."""
     names = [e["name"] for e in data["extractors"]]
     with figure(9.0, 4.2) as (fig, ax):
         for name in names:
@@ -204,7 +204,7 @@ def outcome_figure(entries: Sequence[Row]) -> str:
 
 
 def curve_figure(entries: Sequence[Row]) -> str:
-    """Draw the share of right pupils over the overlap and the centre error, and over the confidence asked for."""
+    """Draw the share of right pupils over overlap, centre error and required confidence."""
     names = [e["name"] for e in entries]
     with figure(11.0, 3.6, 3) as (fig, axes):
         for e in entries:
@@ -246,7 +246,7 @@ def vector_figure(names: Sequence[str], everyone: Sequence[str], rows: Sequence[
             )  # fmt: skip
             ax.locator_params(nbins=4)
         for ax in axes[len(names) :]:
-            ax.axis("off")  # invisible axes would be excluded from the layout
+            ax.axis("off")  # the layout would ignore invisible axes
         return svg(fig)
 
 
@@ -279,7 +279,7 @@ def factor_figure(data: Row, name: str) -> str:
 
 
 def _bounds(entries: Sequence[Row], name: str) -> list[float | None]:
-    """Compute the median bound in each bin, from what each extractor states for the pupils it found right."""
+    """Compute the median bound in each bin, from the bounds that each extractor states for its right pupils."""
     columns = [[b["efficiency"]["bound_median_px"] for b in e["breakdown"].get(name, [])] for e in entries]
     return [next((v for v in column if v is not None), None) for column in zip(*columns, strict=True)]
 
@@ -329,7 +329,7 @@ def _pupil_table(entries: Sequence[Row]) -> Table:
 
 
 def _condition_table(data: Row) -> Table:
-    """One row per condition that occurs: its images, and the share of right answers of every extractor."""
+    """Return one row per condition that occurs: its images, and each extractor's share of right answers."""
     rows = []
     for name, condition in data["conditions"].items():
         if condition["images"]:
@@ -420,7 +420,7 @@ def _glint_table(entries: Sequence[Row]) -> Table:
 
 
 def _recall_table(entries: Sequence[Row]) -> Table:
-    """Recall of glints by saturation, visible share and place."""
+    """Return the recall of glints by saturation, visible share and position."""
     rows = []
     for e in entries:
         groups = (e["summary"]["glints"] or {}).get("recall_by", {})

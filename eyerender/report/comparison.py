@@ -20,7 +20,7 @@ from .style import ANALYTIC, IMAGE, TARGET, figure, svg
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Time of a step of the job, s."""
+    """Duration of a step of the job, s."""
 
     step: str
     seconds: float
@@ -100,7 +100,7 @@ def gaze_figure(scene: Scene, comparison: Comparison) -> str | None:
 
 def _pictures(scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry]) -> dict[str, list[dict[str, Any]]]:
     out: dict[str, list[dict[str, Any]]] = {}
-    # Matte parts are well below full scale, so that glints have room. This level is white enough for viewing.
+    # Matte parts are well below full scale, to leave headroom for glints. This level is white enough for viewing.
     full = 0.7 * scene.spec.sensor.full_scale_dn
     truth, found = comparison.truth, comparison.found
     for row, entry in enumerate(entries):

@@ -1,4 +1,4 @@
-"""Drawing of an eye's section: surfaces, stop, fovea, axes and centres of rotation."""
+"""Draw an eye's section: surfaces, stop, fovea, axes and centres of rotation."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _axis_distance(surface: Surface, x: Floats, s: Floats, across: int) -> Float
 
 
 def _iris_x(eye: EyeModel, s: Floats, across: int) -> Floats:
-    """Compute x of the iris' plane over the coordinate across."""
+    """Compute x of the iris' plane at the coordinate across."""
     normal, centre = eye.stop.normal, eye.stop.centre_mm
     return np.asarray(centre[0] - (s - centre[across]) * normal[across] / normal[0])
 

@@ -1,4 +1,4 @@
-"""Images of an eye with the features of both observers drawn over them, as SVG around an embedded PNG."""
+"""Images of an eye with the features of both observers, as SVG around an embedded PNG."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def eye_picture(
     Args:
         image: (h, w) linear counts of a window.
         origin_px: the window's first pixel on the full sensor.
-        full_scale: the counts that become white.
-        truth: what the analytic observer reports.
-        found: what the image observer reports.
+        full_scale: counts that are drawn white.
+        truth: observations of the analytic observer.
+        found: observations of the image observer.
         row: this image's row in both.
-        crop_px: width and height that are shown, centred on the iris (or the window).
+        crop_px: width and height of the crop, centred on the iris (or the window).
         scale: screen pixels per sensor pixel.
         title: text alternative.
     """
@@ -67,11 +67,11 @@ def feature_marks(seen: Observations, row: int, shift: Floats, *, analytic: bool
     """Draw the pupil and the glints of one observer as an SVG group.
 
     Args:
-        seen: what the observer reports.
+        seen: observations of the observer.
         row: the row to draw.
         shift: (2,) full-sensor pixel that lies at the origin of the drawing.
         analytic: draw blue upright crosses and a solid outline, else orange diagonal crosses and a dashed outline.
-        scale: size of crosses and lines relative to those of a small picture.
+        scale: size of crosses and lines, relative to those of a small image.
     """
     name, colour = ("analytic", ANALYTIC_ON_DARK) if analytic else ("found", IMAGE_ON_DARK)
     parts = [f'<g class="{name}" fill="none" stroke="{colour}" vector-effect="non-scaling-stroke">']

@@ -1,6 +1,6 @@
-"""Pages: cards, sections of text, figures and tables, in one self-contained HTML file.
+"""Self-contained HTML pages: cards, and sections with text, figures and tables.
 
-A page is a `Page`, or a template of its own that extends `page.html.j2` and fills its blocks with the macros of
+A page is a `Page`, or a separate template that extends `page.html.j2` and fills its blocks with the macros of
 `parts.html.j2`.
 """
 
@@ -65,12 +65,12 @@ class Page:
 
 
 def write_page(path: Path, page: Page) -> None:
-    """Write one self-contained HTML file, completely or not at all."""
+    """Write one self-contained HTML file; on an error, nothing is left."""
     write_template(path, "page.html.j2", {"page": page})
 
 
 def write_template(path: Path, template: str, values: Mapping[str, Any], package: str = "eyerender.report") -> None:
-    """Write a template of a package, filled with values, as one self-contained HTML file, completely or not at all."""
+    """Fill a template of a package and write it as a self-contained HTML file; on an error, nothing is left."""
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package), PackageLoader("eyerender.report")]),
         autoescape=True,

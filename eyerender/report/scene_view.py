@@ -1,4 +1,4 @@
-"""Drawing of a scene's rig in three dimensions, with the traced rays of one fixation."""
+"""Draw a scene's rig in three dimensions, with the traced rays of one fixation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..scene import Scene
 from .style import ANALYTIC, IMAGE, TARGET, figure
 
 MAX_NOTES = 4
-"""Reasons for missing rays that a figure names."""
+"""Largest number of reasons for missing rays that a figure lists."""
 _LIGHT, _SIGHT, _SCREEN = "#E69F00", "#CC79A7", "#777777"
 
 
@@ -45,7 +45,7 @@ def scene_view(scene: Scene) -> Any:
 
 
 def _notes(scene: Scene, seen: Observations) -> list[str]:
-    """Say which pose is shown, and which rays are missing for what reason."""
+    """Describe which pose is shown, and why some rays are missing."""
     index, pose = seen.index, seen.pose
     fixations = int(scene.index().fixation.max()) + 1
     heads = len(scene.spec.subject.head_positions_mm)
@@ -127,7 +127,7 @@ def _eye(ax: Any, scene: Scene, seen: Observations, row: int, *, first: bool) ->
 def _ray(
     ax: Any, camera: PinholeCamera, pixel: Floats, apex: Floats, style: str, colour: str, name: str | None
 ) -> Floats:
-    """Draw the ray of a camera's pixel up to the plane of the eye's apex across it; returns its end."""
+    """Draw the ray of a camera's pixel up to the depth of the eye's apex; return its end."""
     origin, direction = camera.nodal_point_mm, camera.rays(pixel)
     end = origin + direction * float((apex - origin) @ direction)
     ax.plot(*np.stack([origin, end]).T, color=colour, lw=1.0, ls=style, label=name)

@@ -1,4 +1,4 @@
-"""The style of all figures and reports; the colours after Okabe and Ito are distinct with any colour vision."""
+"""The style of all figures and reports; its colours (Okabe and Ito) are distinct for every kind of colour vision."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _RC: dict[Any, Any] = {
 
 @contextmanager
 def figure(width: float, height: float, columns: int = 1, rows: int = 1) -> Iterator[tuple[Any, Any]]:
-    """Make a matplotlib figure (inches) with `columns` by `rows` axes, in the shared style, never on a display."""
+    """Create a matplotlib figure (inches) with `columns` by `rows` axes, in the shared style, never on a display."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -41,7 +41,7 @@ def figure(width: float, height: float, columns: int = 1, rows: int = 1) -> Iter
 
 
 def legend_above(fig: Any, panel: Any, columns: int) -> None:
-    """Put the legend of one panel, which is that of all, above the panels."""
+    """Put the legend of one panel above all panels, which share it."""
     handles, labels = panel.get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False)
 

@@ -40,7 +40,7 @@ _REST = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class CameraCalibration(Spec):
-    """OpenCV's calibration of a camera: x_cam = R x_world + t."""
+    """Calibration of a camera in OpenCV's form: x_cam = R x_world + t."""
 
     K: Matrix3 = Field(description="camera matrix, px")
     R: Matrix3 = Field(description="rotation, world to camera")
@@ -61,7 +61,7 @@ class CameraCalibration(Spec):
 
 
 class CalibrationFile(Spec):
-    """A calibration in a file of OpenCV (`cv2.FileStorage`: YAML, XML or JSON) or of ROS (`camera_info`)."""
+    """Path of a calibration file of OpenCV (`cv2.FileStorage`: YAML, XML or JSON) or of ROS (`camera_info`)."""
 
     file: Annotated[str, Field(min_length=1)] = Field(description="path, relative to the scene")
     unit_mm: Positive = Field(default=1.0, description="length of the file's unit of translation")
@@ -79,7 +79,7 @@ AnyCalibration = Annotated[
 
 
 class Mirror(Spec):
-    """A plane mirror through which a camera sees the eyes; it has no edges, and it mirrors no LEDs."""
+    """A plane mirror through which a camera sees the eyes. It has no edges and shows no LEDs."""
 
     point_mm: Vec3 = Field(description="a point of the plane, in the world")
     normal: Vec3 = Field(description="vector across the plane, of any length and either sign")
@@ -92,19 +92,19 @@ class Mirror(Spec):
 
     @property
     def plane(self) -> tuple[Floats, float]:
-        """Unit normal n (3,) and offset d: n . x = d on the plane."""
+        """Return the plane n . x = d as its unit normal n (3,) and its offset d in mm."""
         normal = np.array(self.normal, dtype=float)
         normal /= np.linalg.norm(normal)
         return normal, float(normal @ np.array(self.point_mm, dtype=float))
 
     def image_of(self, points_mm: ArrayLike) -> Floats:
-        """Mirror images (..., 3) of points (..., 3) in the world."""
+        """Reflect world points (..., 3) in the mirror's plane."""
         points, (normal, offset) = np.asarray(points_mm, dtype=float), self.plane
         return np.asarray(points - 2.0 * (points @ normal - offset)[..., None] * normal)
 
 
 class Camera(Spec):
-    """A camera, given by place, direction and focal length, or by `calibration`."""
+    """A camera, given by position, direction and focal length, or by `calibration`."""
 
     name: str = Field(default="camera", description="name of the camera, for records and reports")
     resolution_px: tuple[Pixels, Pixels] = Field(description="sensor width and height")
@@ -135,19 +135,19 @@ class Camera(Spec):
     def from_opencv(
         cls, path: str | Path, *, size_px: tuple[int, int] | None = None, unit_mm: float = 1.0, **fields: Any
     ) -> Self:
-        """A camera from a calibration file of OpenCV (`cv2.FileStorage`: YAML, XML or JSON) or of ROS (`camera_info`).
+        """Read a camera from a calibration file of OpenCV (`cv2.FileStorage`: YAML, XML, JSON) or ROS (`camera_info`).
 
         The file holds a camera matrix, distortion coefficients and, optionally, the image size and the pose (R and T,
         or rvec and tvec) in the world of this package: x_cam = R x_world + t.
 
         Args:
             path: the file.
-            size_px: width and height of the image, if the file does not say.
-            unit_mm: length of the file's unit of translation.
+            size_px: width and height of the image, if the file does not state them.
+            unit_mm: the file's unit of length in mm.
             fields: `name`; instead of the file's pose, `position_mm`, `look_at_mm`, `pan_deg`, `tilt_deg`, `roll_deg`.
 
         Raises:
-            InputError: the file cannot be read, has a distortion model that is not supported, or lacks something.
+            InputError: the file cannot be read, lacks a value, or uses an unsupported distortion model.
         """
         size = size_px or read_opencv(path).size_px
         if size is None:
@@ -156,7 +156,7 @@ class Camera(Spec):
         return cls.from_mapping({"resolution_px": size, "calibration": calibration, **fields}).resolved()
 
     def resolved(self, base: Path | None = None) -> Self:
-        """Find the camera with the numbers of its calibration file, which is relative to `base` or the current folder.
+        """Return the camera with its calibration file read in; the path is relative to `base` or the current folder.
 
         Raises:
             InputError: the file cannot be read, or does not fit the camera.
@@ -190,13 +190,13 @@ class Camera(Spec):
         focal_length_px: float | None = None,
         **fields: Any,
     ) -> Self:
-        """Return a camera at a place, turned to a point.
+        """Create a camera at a position, aimed at a point.
 
         Args:
             point_mm: (3,) world point on the optical axis.
             position_mm: (3,) nodal point in the world.
             size_px: width and height of the sensor (`resolution_px`).
-            focal_length_px: focal length in pixels; else give `focal_length_mm` and `sensor_mm`.
+            focal_length_px: focal length in pixels; without it, give `focal_length_mm` and `sensor_mm`.
             fields: further fields of the camera.
 
         Raises:
@@ -236,7 +236,7 @@ class Camera(Spec):
         return self
 
     def build(self) -> PinholeCamera:
-        """Build the numeric camera, which is the virtual one behind a mirror.
+        """Build the numeric camera; for a camera that looks into a mirror, the virtual camera behind it.
 
         Raises:
             InputError: the camera lies in the plane of its mirror, or its calibration file cannot be read.
@@ -245,7 +245,7 @@ class Camera(Spec):
         return camera if self.mirror is None else camera.seen_in(self.mirror)
 
     def unmirrored(self) -> PinholeCamera:
-        """Build the numeric camera as it stands, without its mirror."""
+        """Build the numeric camera at its real position, without the mirror."""
         if isinstance(self.calibration, CalibrationFile):
             return self.resolved().unmirrored()
         if self.calibration is not None:
@@ -304,13 +304,13 @@ class PinholeCamera(ArrayValue):
         distortion: ArrayLike = (0, 0, 0, 0, 0),
         name: str = "camera",
     ) -> PinholeCamera:
-        """Make a camera from array-like values."""
+        """Create a camera from array-like values."""
         return cls(
             K=frozen(K), R=frozen(R), t=frozen(t), distortion=frozen(distortion), resolution_px=resolution_px, name=name
         )
 
     def seen_in(self, mirror: Mirror) -> PinholeCamera:
-        """Compute the virtual camera behind a mirror, which takes the pictures that this camera takes through it.
+        """Return the virtual camera behind a mirror, whose images equal those of this camera through the mirror.
 
         Raises:
             InputError: the camera lies in the plane.
@@ -327,17 +327,17 @@ class PinholeCamera(ArrayValue):
 
     @property
     def across(self) -> float:
-        """-1 where the picture is turned left to right, else 1: the sign of x on the sensor."""
+        """Sign of x on the sensor: -1 if a mirror turns the image left to right, else 1."""
         return -1.0 if self.mirrored else 1.0
 
     @property
     def sensor_axes(self) -> Floats:
-        """Right, down and forward of the picture in the world, rows (3, 3): R, or left-handed behind a mirror."""
+        """Right, down and forward axes of the image in the world, rows (3, 3): R, or left-handed behind a mirror."""
         return np.asarray(self.R * np.array([[self.across], [1.0], [1.0]])) if self.mirrored else self.R
 
     @property
     def sensor_offset(self) -> Floats:
-        """Offset o (3,) of the picture's own frame, x = sensor_axes x_world + o: t, or with the other sign of x."""
+        """Offset o (3,) mm of the image's frame, x = sensor_axes x_world + o: t, or with the other sign of x."""
         return np.asarray(self.t * np.array([self.across, 1.0, 1.0])) if self.mirrored else self.t
 
     @property
@@ -365,19 +365,19 @@ class PinholeCamera(ArrayValue):
         return self.pixels_of(cam[..., 0] / z, cam[..., 1] / z), front
 
     def pixels_of(self, x: Floats, y: Floats) -> Floats:
-        """Compute pixels (..., 2) of undistorted normalised coordinates x = X/Z, y = Y/Z."""
+        """Compute pixels (..., 2) from undistorted normalised coordinates x = X/Z, y = Y/Z."""
         x = self.across * x
         if np.any(self.distortion):
             x, y = distort(x, y, self.distortion)
         return np.stack([self.K[0, 0] * x + self.K[0, 2], self.K[1, 1] * y + self.K[1, 2]], axis=-1)
 
     def scale_at(self, point_mm: ArrayLike) -> float:
-        """Compute pixels per mm across the line of sight at a world point (3,): focal length over distance."""
+        """Compute the image scale at a world point (3,) mm, across the line of sight, in pixels per mm."""
         distance = float(np.linalg.norm(np.asarray(point_mm, dtype=float) - self.nodal_point_mm))
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1])) / distance
 
     def rays(self, pixels: ArrayLike) -> Floats:
-        """Compute unit directions (..., 3) in the world along which the camera sees the pixels (..., 2)."""
+        """Compute unit directions (..., 3) in the world, out of the camera, through pixels (..., 2)."""
         p = np.asarray(pixels, dtype=float)
         x = (p[..., 0] - self.K[0, 2]) / self.K[0, 0]
         y = (p[..., 1] - self.K[1, 2]) / self.K[1, 1]
@@ -387,7 +387,7 @@ class PinholeCamera(ArrayValue):
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
     def ideal(self, pixels: ArrayLike) -> Floats:
-        """Compute pixels (..., 2) with the lens distortion removed."""
+        """Remove the lens distortion from pixels (..., 2)."""
         p = np.asarray(pixels, dtype=float)
         if not np.any(self.distortion):
             return p
@@ -396,23 +396,23 @@ class PinholeCamera(ArrayValue):
         return np.stack([fx * x + cx, fy * y + cy], axis=-1)
 
     def is_imaged(self, x: Floats, y: Floats) -> Bools:
-        """Return whether the distortion has not folded back the picture of normalised coordinates x = X/Z, y = Y/Z."""
+        """Return whether the distortion is invertible at normalised coordinates x = X/Z, y = Y/Z (not folded back)."""
         return np.asarray(is_imaged(self.across * x, y, self.distortion))
 
     def in_image(self, pixels: ArrayLike) -> Bools:
-        """Find whether pixels (..., 2) lie on the sensor; the far edges of its outer pixels are at -0.5 and W - 0.5."""
+        """Return whether pixels (..., 2) lie on the sensor, which ends half a pixel beyond its outer pixel centres."""
         return in_window((0, 0, *self.resolution_px), pixels)
 
 
 def in_window(window: Window, pixels: ArrayLike) -> Bools:
-    """Find whether pixels (..., 2) lie in a window (x0, y0, width, height), whose outer pixels end half a pixel out."""
+    """Return whether pixels (..., 2) lie in a window (x0, y0, width, height), including half a pixel of border."""
     p = np.asarray(pixels, dtype=float)
     x, y, (x0, y0, w, h) = p[..., 0], p[..., 1], window
     return np.asarray((x >= x0 - 0.5) & (x <= x0 + w - 0.5) & (y >= y0 - 0.5) & (y <= y0 + h - 0.5))
 
 
 def distort(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
-    """Distort by Brown & Conrady's model as OpenCV defines it; arrays of NumPy or of Dr.Jit.
+    """Apply the Brown-Conrady distortion as OpenCV defines it; works on arrays of NumPy and of Dr.Jit.
 
     x'' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and alike for y
     """
@@ -426,7 +426,7 @@ def distort(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
 
 
 def distortion_jacobian(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any, Any]:
-    """Compute the jacobian of `distort` at undistorted coordinates: dx''/dx, dx''/dy = dy''/dx, dy''/dy.
+    """Compute the Jacobian of `distort` at undistorted coordinates: dx''/dx, dx''/dy = dy''/dx, dy''/dy.
 
     Like `newton_step`, it takes arrays of NumPy and of Dr.Jit.
     """
@@ -441,19 +441,19 @@ def distortion_jacobian(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any,
 
 
 def distorted_area(x: Any, y: Any, k: Sequence[Any] | Floats) -> Any:
-    """Compute the area on the sensor per area without distortion: the determinant D of `distortion_jacobian`."""
+    """Compute the determinant D of `distortion_jacobian`: area on the sensor per area without distortion."""
     a, b, d = distortion_jacobian(x, y, k)
     return a * d - b * b
 
 
 def is_imaged(x: Any, y: Any, k: Sequence[Any] | Floats) -> Any:
-    """Return whether the distortion has not folded the picture back: its Jacobian is positive definite."""
+    """Return whether the distortion has not folded the image back: its Jacobian is positive definite."""
     a, b, d = distortion_jacobian(x, y, k)
     return (a > 0) & (a * d - b * b > 0)
 
 
 def newton_step(x: Any, y: Any, xd: Any, yd: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
-    """Compute Newton's step from undistorted coordinates to those of (xd, yd), to be subtracted."""
+    """Compute the Newton step of `undistort` from (x, y) towards the distorted (xd, yd); subtract it from (x, y)."""
     fx, fy = distort(x, y, k)
     ex, ey = fx - xd, fy - yd
     a, b, d = distortion_jacobian(x, y, k)
@@ -475,7 +475,7 @@ def undistort(xd: Floats, yd: Floats, k: Floats, iterations: int = 50) -> tuple[
 
 
 def _turned(pan: float, tilt: float) -> Floats:
-    """Compute camera axes as columns: tilted up about its right axis, then panned about the world's vertical."""
+    """Return camera axes as columns: tilted about the right axis, then panned about the world's vertical."""
     ct, st, cp, sp = np.cos(tilt), np.sin(tilt), np.cos(pan), np.sin(pan)
     about_right = np.array([[1.0, 0, 0], [0, ct, -st], [0, st, ct]])
     # The rest direction is -x, so a pan to the subject's left (+y) is a negative turn about +z.
@@ -484,7 +484,7 @@ def _turned(pan: float, tilt: float) -> Floats:
 
 
 def _facing(direction: Floats) -> Floats:
-    """Camera axes as columns, looking along `direction` with the world's z upright (or its y, when looking along z)."""
+    """Return camera axes as columns, looking along `direction` with the world's z up (its y when looking along z)."""
     forward = direction / np.linalg.norm(direction)
     up = np.array([0.0, 0, 1.0]) if abs(forward[2]) < 1 - 1e-9 else np.array([0.0, 1.0, 0.0])
     right = np.cross(forward, up)

@@ -6,15 +6,15 @@ the image of a point at depth z by v q (1/z - 1/s). So the circle of confusion h
 
     c = (f_px^2 p / N) |1/z - 1/s|      (Born & Wolf, section 6.1)
 
-The picture is blurred in layers, from front to back: what lies in front of other things keeps a layer of its own. Every
-pixel of a layer is spread over the disc of its own depth. With the kernels K of the layer's own depths, its radiance R,
-its coverage a, and the share V of each pixel that the layers before it leave open,
+The picture is blurred in layers, from front to back; each foreground object has its own layer. Every pixel of a layer
+is spread over the disc of its own depth. With the kernels K for the layer's depths, its radiance R, its coverage a, and
+the share V of each pixel that the layers in front leave open,
 
     alpha_k = K*a / K*V,   picture = sum_k (prod_{j<k} (1 - alpha_j)) K*R / K*V
 
-Behind an edge, a layer is thus continued by what is seen of it, so nothing bleeds from one depth into another. Where
-all depths have the same kernel, this is the plain convolution. A symmetric kernel does not move centroids, so labels
-need no change. Vignetting multiplies by 1 - v (r / r_corner)^2.
+Behind an edge, a layer is continued from its visible part, so nothing bleeds from one depth into another. Where all
+depths have the same kernel, this is the plain convolution. A symmetric kernel does not move centroids, so labels need
+no change. Vignetting multiplies by 1 - v (r / r_corner)^2.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from .sensor import Sensor
 
 # No eye can be recognised in an image with more blur, and the cost grows with the square.
 MAX_CONFUSION_PX = 400
-_SHARP_PX = 0.1  # a smaller disc changes nothing
+_SHARP_PX = 0.1  # a smaller disc has no effect
 _RIPPLES_PX = 4
-_LARGEST_PX = 64.0  # in a layer: what is blurred more shows no structure
+_LARGEST_PX = 64.0  # largest disc in a layer; stronger blur leaves no structure
 _DISCS = 128  # kernels from one diameter to twice that, for large ones
 _ALIKE = 0.03  # relative difference of blurs' widths that does not matter
 _PIXEL_VARIANCE = 1 / 12
 _LEAST_ROOM = 0.02
-_LEAST_SHARE = 1e-3  # of a pixel: rounding of coverages leaves less
+_LEAST_SHARE = 1e-3  # smallest share of a pixel; rounding of coverages leaves less
 
 
 def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: Floats | float) -> Floats:
-    """Compute diameters (px) of the circles of confusion of points.
+    """Compute the diameters (px) of the circles of confusion of points at given depths.
 
     Args:
-        lens: the lens, which gives the distance in focus.
+        lens: provides the distance in focus.
         camera: the camera.
-        sensor: the sensor, which gives working f-number and pixel pitch.
+        sensor: provides working f-number and pixel pitch.
         depth_mm: depths of the points along the optical axis.
     """
     return confusion_of(lens, camera, sensor, 1 / np.maximum(np.asarray(depth_mm, dtype=float), 1e-3))
 
 
 def confusion_of(lens: Lens, camera: PinholeCamera, sensor: Sensor, nearness: Floats) -> Floats:
-    """Return the same of points whose inverse depths (1/mm) are given."""
+    """Compute the diameters (px) of the circles of confusion from inverse depths (1/mm)."""
     if lens.focus_mm is None:
         return np.zeros(np.shape(nearness))
     strength_px_mm = float(camera.K[0, 0]) ** 2 * sensor.pixel_pitch_um * 1e-3 / sensor.f_number
@@ -65,7 +65,7 @@ def confusion_of(lens: Lens, camera: PinholeCamera, sensor: Sensor, nearness: Fl
 
 
 def checked(diameter_px: float) -> float:
-    """Return the diameter of the circle of confusion of a picture's subject.
+    """Return a diameter (px) of the circle of confusion after checking that it can be rendered.
 
     Raises:
         InputError: it exceeds 400 px.
@@ -79,11 +79,11 @@ def checked(diameter_px: float) -> float:
 
 
 def one_blur(diameters_px: Floats, subject_px: float, sigma_px: float) -> bool:
-    """Return whether a single kernel, that of the subject, serves all diameters within 3 % of the picture's whole blur.
+    """Return whether the subject's kernel serves all depths: the total blur differs by less than 3 %.
 
     Args:
-        diameters_px: of the nearest and farthest things.
-        subject_px: of the subject.
+        diameters_px: circles of confusion of the nearest and farthest objects.
+        subject_px: circle of confusion of the subject.
         sigma_px: standard deviation of the point-spread function.
     """
     own = subject_px**2 / 16 + sigma_px**2 + _PIXEL_VARIANCE
@@ -92,7 +92,7 @@ def one_blur(diameters_px: Floats, subject_px: float, sigma_px: float) -> bool:
 
 
 def disc(diameter_px: float) -> Floats:
-    """Find the kernel of a disc for pictures of pixel means: odd, square, sum 1; a single 1 below a tenth of a pixel.
+    """Compute the convolution kernel of a disc: odd, square, sum 1; a single 1 below a tenth of a pixel.
 
     Its Fourier transform is that of the disc, 2 J1(pi c f) / (pi c f), up to the highest frequency of the pixel grid.
     So a disc of a pixel's size blurs as much as it should. A disc that is integrated over the pixels would blur by
@@ -106,7 +106,7 @@ def disc(diameter_px: float) -> Floats:
 
 
 def _margin(diameter_px: float) -> int:
-    """Compute the reach of the kernel of a disc: beyond it, its ripples are below 1 %."""
+    """Compute the reach (px) of the kernel of a disc; beyond it, its ripples are below 1 %."""
     return int(np.ceil(diameter_px / 2)) + _RIPPLES_PX
 
 
@@ -119,7 +119,7 @@ def _transfer(diameter_px: float, shape: tuple[int, int]) -> Singles:
 
 
 def defocused(picture: Reals, diameter_px: float) -> Reals:
-    """Convolve the image with a disc; the result is smaller by `reach_px` on every side."""
+    """Convolve an image with a disc; the result is smaller by `reach_px` on every side."""
     m = reach_px(diameter_px)
     if m == 0:
         return picture
@@ -130,18 +130,18 @@ def defocused(picture: Reals, diameter_px: float) -> Reals:
 
 
 def reach_px(diameter_px: float) -> int:
-    """Compute pixels that must be rendered beyond a window's border for discs of at most this diameter."""
+    """Compute how many pixels beyond a window's border must be rendered for discs of at most this diameter."""
     return 0 if diameter_px < _SHARP_PX else _margin(min(diameter_px, _LARGEST_PX))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer(ArrayValue):
-    """What a picture shows at one place in the order from front to back, (height, width) each.
+    """One depth layer of an image, with arrays (height, width).
 
     Attributes:
-        radiance: sum over the pixel's samples that show it, over their whole number.
-        coverage: share of these samples.
-        confusion_px: diameter of the circle of confusion; without meaning where the coverage is 0.
+        radiance: sum over the pixel's samples that hit the layer, divided by the number of all samples.
+        coverage: share of the samples that hit the layer.
+        confusion_px: diameter of the circle of confusion; undefined where the coverage is 0.
     """
 
     radiance: Reals
@@ -150,7 +150,7 @@ class Layer(ArrayValue):
 
 
 def blurred(layers: Sequence[Layer], reach: int) -> Singles:
-    """Blur layers, from front to back, each by its own depths; smaller by `reach` pixels on every side."""
+    """Blur layers, from front to back, each by its own depths; the result is smaller by `reach` on every side."""
     height, width = layers[0].radiance.shape
     shape = height - 2 * reach, width - 2 * reach
     out, through = np.zeros(shape, np.float32), np.ones(shape, np.float32)
@@ -168,7 +168,7 @@ def blurred(layers: Sequence[Layer], reach: int) -> Singles:
 
 
 def _spread(layer: Layer, uncovered: Singles | None, reach: int) -> tuple[Singles, Singles, Singles | float]:
-    """Spread a layer's radiance, its coverage and the room for it; all are smaller by `reach` on every side."""
+    """Spread a layer's radiance, its coverage and its open share; each result is smaller by `reach` on every side."""
     # numba is imported only where it is needed.
     from .disc_kernels import LANES, continue_nearest, spread
 
@@ -188,7 +188,7 @@ def _spread(layer: Layer, uncovered: Singles | None, reach: int) -> tuple[Single
 
 
 def _nearest_discs(diameters_px: Singles) -> tuple[Ints, Singles, Ints]:
-    """Find the index of the nearest disc for each pixel, and the discs with their reaches (see `disc_kernels.spread`).
+    """Return each pixel's disc by index, and the discs with their reaches (see `disc_kernels.spread`).
 
     Disc k has the diameter 2^(k/128) - 1 pixels: small ones differ by 0.005 pixels, large ones by 0.5 % of their size.
     """
@@ -199,7 +199,7 @@ def _nearest_discs(diameters_px: Singles) -> tuple[Ints, Singles, Ints]:
 
 @lru_cache(maxsize=4)
 def _discs(reach: int) -> tuple[Singles, Ints]:
-    """Return the discs that reach at most so far, and their reaches."""
+    """Return the discs with at most the given reach, and their reaches."""
     from .disc_kernels import LANES
 
     count = 1 + int(_DISCS * np.log2(1 + 2 * max(reach - _RIPPLES_PX, 0)))

@@ -1,4 +1,4 @@
-"""Compiled loops of the blur by depth."""
+"""Compiled loops for depth-dependent blur."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 from ..arrays import Ints, Singles
 from ..jit import compiled
 
-LANES = 8  # numbers that are added at once; rows of discs are padded with zeros to a multiple of it
+LANES = 8  # numbers added at once; rows of discs are padded with zeros to a multiple of it
 
 
 @compiled()
 def spread(pictures: Singles, index: Ints, discs: Singles, reaches: Ints, sums: Singles) -> None:
-    """Spread every pixel of some pictures over a disc of its diameter.
+    """Spread every pixel of some images over the disc with its index, in place in `sums`.
 
     Args:
         pictures: (m, height, width).
-        index: (height, width) disc of each pixel.
+        index: (height, width) index of each pixel's disc.
         discs: (n, rows, columns) kernels, each in the corner of its array.
         reaches: (n,) pixels from a disc's middle to its edge; the largest disc has as many rows as the array.
         sums: (m, height + rows - 1, width + columns), to which the discs are added. Pixel (0, 0) lies as far inside as
@@ -43,7 +43,7 @@ def spread(pictures: Singles, index: Ints, discs: Singles, reaches: Ints, sums: 
 
 @compiled()
 def continue_nearest(values: Singles, steps: NDArray[np.int32]) -> None:
-    """Give unknown pixels the value of the nearest known one, counted in steps along rows and columns, in place.
+    """Fill unknown pixels, in place, with the nearest known value, counting steps along rows and columns.
 
     Args:
         values: (height, width).

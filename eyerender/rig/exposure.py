@@ -23,7 +23,7 @@ FEW = 12.0  # below this mean the expansion of a Poisson quantile is too inaccur
 
 
 def radiance_to_irradiance(sensor: Sensor) -> float:
-    """Compute the irradiance (W/m^2) of a pixel per radiance times cos^4(theta) / D (mW/mm^2/sr).
+    """Compute irradiance (W/m^2) per radiance (mW/mm^2/sr), for a pixel with cos^4(theta) / D = 1.
 
     E = pi tau L cos^4(theta) / (4 N^2 D), N the working f-number, D the area per area without lens distortion.
     """
@@ -31,7 +31,7 @@ def radiance_to_irradiance(sensor: Sensor) -> float:
 
 
 def electrons(sensor: Sensor, irradiance: Floats, wavelength_nm: float) -> Floats:
-    """Compute mean photo-electrons of a pixel: eta E A t lambda / (h c)."""
+    """Compute the mean number of photo-electrons of a pixel: eta E A t lambda / (h c)."""
     energy_j = (sensor.pixel_pitch_um * 1e-6) ** 2 * sensor.exposure_ms * 1e-3
     photon_j = _PLANCK_J_S * _LIGHT_M_S / (wavelength_nm * 1e-9)
     return np.asarray(irradiance * (sensor.quantum_efficiency * energy_j / photon_j))
@@ -40,19 +40,18 @@ def electrons(sensor: Sensor, irradiance: Floats, wavelength_nm: float) -> Float
 def expose(
     sensor: Sensor, irradiance: Reals, wavelength_nm: float, seed: int, corner_px: tuple[int, int] = (0, 0)
 ) -> NDArray[np.uint16]:
-    """Compute stored codes of an exposure.
+    """Compute the stored codes of an exposure.
 
-    The noise of a pixel is a pure function of `seed`, its place and its mean. Scenes that differ little therefore have
-    the same noise where they agree. A rounding difference in the last digit of an irradiance, as between processors,
-    does not change the noise of other pixels. The fixed pattern belongs to the sensor's pixels, so it stays where it is
-    while a window moves.
+    The noise of a pixel is a pure function of `seed`, position and mean. So two scenes have the same noise wherever
+    their irradiance agrees, and a rounding difference in one pixel does not change the noise of others. The fixed
+    pattern belongs to the sensor's pixels, so it stays where it is while a window moves.
 
     Args:
         sensor: the sensor.
         irradiance: (h, w) irradiance of the sensor, W/m^2.
         wavelength_nm: wavelength of the light.
         seed: seed of the noise.
-        corner_px: the sensor's pixel at the first row and column.
+        corner_px: sensor coordinates (x, y) of the array's first pixel.
 
     Returns:
         (h, w) codes.
@@ -72,15 +71,15 @@ def expose(
 def expose_again(
     sensor: Sensor, codes: NDArray[np.uint16], seed: int, corner_px: tuple[int, int] = (0, 0)
 ) -> NDArray[np.uint16]:
-    """Expose a picture that was stored without noise once more, with noise.
+    """Add noise to an image that was stored without noise.
 
-    A code gives the pixel's mean charge, except at full scale; pixels there stay saturated.
+    The codes determine each pixel's mean charge, except at full scale, where pixels stay saturated.
 
     Args:
-        sensor: the sensor; its `noise` does not matter.
+        sensor: the sensor; its switch `noise` is ignored.
         codes: (h, w) codes of an exposure without noise.
         seed: seed of the noise.
-        corner_px: the sensor's pixel at the first row and column.
+        corner_px: sensor coordinates (x, y) of the array's first pixel.
     """
     full = sensor.full_scale_dn
     linear = full * (codes / full) ** sensor.gamma
@@ -91,9 +90,9 @@ def expose_again(
 
 @dataclass(frozen=True, slots=True)
 class _Noise:
-    """Noise of a window: 16 bits for the shot noise and for the read noise of each pixel (2, h, w), and what is fixed.
+    """Noise of a window: 16 random bits each for shot and read noise of every pixel (2, h, w), and the fixed pattern.
 
-    `sensitivity` is relative, `offset` in electrons, (h, w); None where all pixels are alike.
+    `sensitivity` (h, w) is relative, `offset` (h, w) in electrons; None if all pixels are alike.
     """
 
     bits: NDArray[np.uint16]
@@ -115,13 +114,13 @@ class _Noise:
         return cls(bits, sensitivity, offset)
 
     def of_rows(self, rows: slice) -> _Noise:
-        """Return the noise of some rows."""
+        """Select rows of the noise."""
         fixed = (None if v is None else v[rows] for v in (self.sensitivity, self.offset))
         return _Noise(self.bits[:, rows], *fixed)
 
 
 def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
-    """Compute codes (h, w), whole numbers, of mean electrons, which are overwritten."""
+    """Compute codes (h, w), whole numbers, from mean electrons, which are overwritten."""
     charge: Reals = mean
     read: Any = 0.0
     if noise is not None:
@@ -148,7 +147,7 @@ def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
 def recorded(
     sensor: Sensor, camera: PinholeCamera, window: Window, irradiance: Reals, wavelength_nm: float, seed: int
 ) -> NDArray[np.uint16]:
-    """Compute stored codes (h, w) of a window of a camera's sensor, with the sensor's border; see `expose`."""
+    """Compute the stored codes (h, w) of a window of a camera's sensor, including the sensor's border; see `expose`."""
     codes = expose(sensor, irradiance, wavelength_nm, seed, window[:2])
     if any(sensor.border_px):
         codes[border(sensor, camera, window)] = round(sensor.border_dn)
@@ -157,9 +156,10 @@ def recorded(
 
 @lru_cache(maxsize=8)
 def normals(sigma: float = 1.0) -> Singles:
-    """List normal numbers (65536,), each the mean over its share of the distribution: 16 bits choose one.
+    """Return normal variates (65536,) in ascending order, a lookup table for 16 random bits.
 
-    Their variance is that of `sigma` to 3e-6, and the farthest is 4.35 sigma, which one pixel in 30,000 has.
+    Each value is the mean over its share of the distribution. The variance agrees with `sigma`^2 to 3e-6; the extreme
+    values are +-4.35 sigma, which one pixel in 30,000 takes.
     """
     edges = special.ndtri(np.arange(2**16 + 1) / 2**16)
     means = -np.diff(np.exp(-0.5 * edges**2)) * 2**16 / np.sqrt(2 * np.pi)
@@ -168,9 +168,9 @@ def normals(sigma: float = 1.0) -> Singles:
 
 @lru_cache(maxsize=8)
 def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int, ...]) -> Singles:
-    """List standard normal numbers of a sensor's pixels (h, w), each a pure function of seed, `which` and its place.
+    """Compute standard normal variates (h, w) of a sensor's pixels, each a pure function of seed, `which` and position.
 
-    The bits below are those of SplitMix64 (Steele, Lea, Flood 2014), which maps counters to numbers.
+    The bits come from SplitMix64 (Steele, Lea, Flood 2014), which maps counters to pseudo-random numbers.
     """
     x, y = (np.arange(n, dtype=np.int64) + start for n, start in zip(shape[::-1], corner_px, strict=True))
     start = np.uint64(np.random.SeedSequence([0xF1C5, seed, which]).generate_state(1, np.uint64)[0])
@@ -184,10 +184,10 @@ def pattern(seed: int, which: int, corner_px: tuple[int, int], shape: tuple[int,
 
 
 def bloomed(charge: Reals, full_well: float, share: float, along: str = "columns") -> Reals:
-    """Compute the charge (h, w) of the pixels, at most the full well; what exceeds it spills.
+    """Compute the charge (h, w) of the pixels after blooming, at most the full well.
 
-    Of the excess, `share` spills, half of it to either side along the columns (or rows), into the nearest pixels that
-    have room. What reaches the border is lost, and the rest of the excess is drained.
+    The `share` of the excess charge spills, half to either side along the columns (or rows), into the nearest pixels
+    with room. Charge that reaches the border is lost; the remaining excess is drained.
     """
     held = np.minimum(charge, full_well)
     if share == 0:
@@ -242,7 +242,7 @@ def photon_counts(mean: Reals, normal: Reals) -> Reals:
 
 
 def _few_counts(mean: Reals, probability: Reals) -> Reals:
-    """Compute the smallest k whose cumulative probability reaches the given one."""
+    """Return the smallest k whose cumulative Poisson probability reaches the given one."""
     count = np.zeros_like(mean)
     term = np.exp(-mean)
     reached = term.copy()

@@ -12,7 +12,7 @@ from ..spec import NonNegative, Positive, Spec, Vec2, Vec3
 
 
 class Opening(Spec):
-    """An opening that the camera looks through: a lens barrel, an aperture, a hot mirror in its holder.
+    """An opening through which the camera looks: a lens barrel, an aperture, a hot mirror in its holder.
 
     It stands near the lens, so it is out of focus: its edge is blurred. Its shape is a superellipse in the picture,
     (abs(x) / a)^p + (abs(y) / b)^p = 1. A straight edge is a rectangle whose other edges lie far outside the picture.
@@ -38,10 +38,10 @@ class Opening(Spec):
 
 
 class Star(Spec):
-    """The star about bright points: light that the straight edges of the aperture's blades diffract.
+    """The star around bright points: light diffracted at the straight edges of the aperture's blades.
 
-    Across every edge there is an arm on both sides of the point, whose light falls as 1 / r^2 (Fraunhofer diffraction
-    at a straight edge). An even number of blades makes as many arms, an odd number twice as many.
+    Each edge causes an arm on both sides of the point, whose light falls as 1 / r^2 (Fraunhofer diffraction at a
+    straight edge). An even number of blades makes as many arms, an odd number twice as many.
     """
 
     blades: Annotated[int, Field(ge=3, le=12)] = Field(default=6, description="number of the aperture's blades")
@@ -53,9 +53,9 @@ class Star(Spec):
 
 
 class Lens(Spec):
-    """A thin lens out of focus, vignetting beyond cos^4, light that the lens scatters, and what frames its view.
+    """Lens effects: defocus, vignetting beyond cos^4, scattered light, and openings that frame the view.
 
-    Scattered light keeps its energy: `glare` and `ghost` are shares that leave their place and arrive elsewhere.
+    Scattering conserves energy: `glare` and `ghost` are shares of the light that arrive elsewhere in the image.
     """
 
     focus_mm: Positive | None = Field(
@@ -118,7 +118,7 @@ class Panel(Spec):
         return self
 
     def axes(self) -> tuple[Floats, Floats, Floats]:
-        """Unit vectors (3,) of the world: normal of its front, and along its width and height; its width is level."""
+        """Return unit vectors (3,) in the world: the front's normal, along the level width, and along the height."""
         normal = np.subtract(self.aim_mm, self.centre_mm)
         normal /= np.linalg.norm(normal)
         right = np.cross((0.0, 0.0, 1.0), normal)
@@ -128,7 +128,7 @@ class Panel(Spec):
 
 
 class RadianceMap(Spec):
-    """Surroundings infinitely far away, as a picture over all directions.
+    """Surroundings infinitely far away, as an image over all directions.
 
     The picture's axes are latitude and longitude, and it is twice as wide as high. Its upper edge is straight up, its
     middle the forward direction, and it continues to the subject's right.
@@ -190,7 +190,7 @@ class Sun(Spec):
 
 
 class Ambient(Spec):
-    """Light other than that of the lamps: even light, surroundings, the sun, and panels."""
+    """Light other than that of the lamps: uniform light, surroundings, the sun, and panels."""
 
     irradiance_w_m2: NonNegative = Field(
         default=0.0, description="even light from all sides: irradiance of a matte surface, within the camera's filter"

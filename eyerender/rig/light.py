@@ -1,4 +1,4 @@
-"""Infrared LEDs: their places, sizes and radiation.
+"""Infrared LEDs: positions, sizes and radiation patterns.
 
 Radiant intensity in direction w: I(w) = I0 max(0, cos(angle to the axis))^m (m = 0: the same everywhere).
 """
@@ -136,7 +136,7 @@ class Lamp(ArrayValue):
         intensity_mw_sr: radiant intensity on the axis.
         lobe_exponent: m of cos^m.
         inner_radius_mm: radius of the hole of a ring-shaped emitter.
-        duty_cycle: share of the time in which it is on, for eye safety alone.
+        duty_cycle: share of the time in which it is on; used for eye safety only.
     """
 
     position_mm: Floats

@@ -23,7 +23,7 @@ class Mount(Spec):
     about_mm: Vec3 = Field(default=(0, 0, 0), description="the point that the turn leaves where it is")
 
     def _motion(self) -> tuple[Floats, Floats]:
-        """Compute the rotation R and offset d of x' = R x + d."""
+        """Return the rotation R and offset d (mm) of x' = R x + d."""
         rotation = np.eye(3)
         for axis, angle in enumerate(np.radians(np.array(self.rotation_deg, dtype=float))):
             i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -35,13 +35,13 @@ class Mount(Spec):
         return rotation, centre - rotation @ centre + np.array(self.translation_mm, dtype=float)
 
     def camera(self, camera: PinholeCamera) -> PinholeCamera:
-        """Move a camera: R x + t of the moved world point is what it was of the point."""
+        """Move a camera, so that a moved world point has the same camera coordinates as before."""
         rotation, offset = self._motion()
         turned = camera.R @ rotation.T
         return replace(camera, R=frozen(turned), t=frozen(camera.t - turned @ offset))
 
     def lamp(self, lamp: Lamp) -> Lamp:
-        """Move a light with its axis."""
+        """Move a light and turn its axis."""
         rotation, offset = self._motion()
         return replace(
             lamp, position_mm=frozen(rotation @ lamp.position_mm + offset), axis=frozen(rotation @ lamp.axis)

@@ -1,7 +1,7 @@
-"""Camera calibrations as OpenCV and ROS write them.
+"""Read camera calibrations written by OpenCV and ROS.
 
-OpenCV's `cv2.FileStorage` writes YAML (with a header and tags of its own), XML or JSON. ROS writes `camera_info` in
-YAML. All of them are read as plain data, without OpenCV.
+OpenCV's `cv2.FileStorage` writes YAML (with a special header and tags), XML or JSON. ROS writes `camera_info` in YAML.
+All of them are read as plain data, without OpenCV.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..storage.files import parse_json, read_text, shown
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 _SUPPORTED = 5
-# Names in lower case, without underscores.
+# Names are compared in lower case, without underscores.
 _MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx")
 _DISTORTION = ("distortioncoefficients", "distcoeffs", "distortion", "dist", "d")
 _ROTATION = ("r", "rotation", "rotationmatrix", "rvec", "rotationvector")
@@ -34,14 +34,14 @@ _MODELS = ("plumb_bob", "rational_polynomial", "pinhole", "", None)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenCvCalibration:
-    """What a calibration file says.
+    """Content of a calibration file.
 
     Attributes:
         K: (3, 3) camera matrix, px.
         distortion: (5,) k1, k2, p1, p2, k3.
         R: (3, 3) rotation, world to camera; None if the file has no pose.
         t: (3,) translation, world to camera, in the file's unit of length; None if the file has no pose.
-        size_px: width and height of the image; None if the file does not say.
+        size_px: width and height of the image; None if the file does not state them.
     """
 
     K: Floats
@@ -55,7 +55,7 @@ def read_opencv(path: str | Path) -> OpenCvCalibration:
     """Read the calibration of one camera.
 
     Raises:
-        InputError: it cannot be read, or uses a model that is not supported; naming the key.
+        InputError: the file cannot be read, or uses an unsupported model; the message names the key.
     """
     source = str(path)
     text = read_text(path, limit=MAX_YAML_BYTES)
@@ -86,7 +86,7 @@ def _mapping(text: str, source: str) -> dict[str, Any]:
     elif start.startswith("{"):
         found = parse_json(start, source=source)
     else:
-        # OpenCV's header is no valid directive of YAML.
+        # OpenCV's header is not a valid YAML directive.
         plain = re.sub(r"\A%YAML:[^\n]*", "", start)
         found = parse_yaml(plain, source, mapping_tags=("opencv-matrix", "opencv-nd-matrix"))
     if not isinstance(found, dict):
@@ -96,8 +96,8 @@ def _mapping(text: str, source: str) -> dict[str, Any]:
 
 def _xml(text: str, source: str) -> dict[str, Any]:
     if text.count("<!") != text.count("<!--"):
-        # Neither OpenCV nor ROS writes any; entities could stand for gigabytes. Within comments they are refused too,
-        # because only a parser can tell whether something is a comment.
+        # Neither OpenCV nor ROS writes entities, and they could expand to gigabytes. They are refused even inside
+        # comments, because only a parser can tell whether something is a comment.
         raise InputError("holds a document type or entities, which are not read", source=source)
     try:
         root = ElementTree.fromstring(text)
@@ -113,7 +113,7 @@ def _xml(text: str, source: str) -> dict[str, Any]:
 
 
 def _numbers(text: str | None) -> Any:
-    """List numbers of an element's text: one number, or a list; the text itself if it holds anything else."""
+    """Parse an element's text as a number or a list of numbers; return the text itself if it holds anything else."""
     words = (text or "").split()
     try:
         found = [float(word) for word in words]
@@ -123,7 +123,7 @@ def _numbers(text: str | None) -> Any:
 
 
 def _array(value: Any, source: str, key: str) -> Floats:
-    """Return a matrix of OpenCV, or nested lists, as an array of finite numbers."""
+    """Convert an OpenCV matrix, or nested lists, to an array of finite numbers."""
     shape = None
     if isinstance(value, dict):
         shape, value = (value.get("rows"), value.get("cols")), value.get("data")
@@ -181,7 +181,7 @@ def _pose(
 
 
 def rotation_of(rvec: Floats) -> Floats:
-    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues): I + sin a [k] + (1 - cos a) [k]^2."""
+    """Convert a rotation vector (3,) in radians to a matrix (3, 3) (Rodrigues): I + sin a [k] + (1 - cos a) [k]^2."""
     angle = float(np.linalg.norm(rvec))
     x, y, z = rvec / angle if angle > 0 else np.zeros(3)
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -1,8 +1,8 @@
 """The point-spread function: a Gaussian, on the pixel grid and integrated over pixels.
 
 On the grid the kernel is the discrete Gaussian T(n) = exp(-s^2) I_n(s^2) (Lindeberg 1990), whose variance is exactly
-s^2. A sampled Gaussian has a smaller variance below one pixel. Glints (integrated exactly) and edges (blurred on the
-grid) would then have different lenses.
+s^2. A sampled Gaussian of less than one pixel has too small a variance, so edges (blurred on the grid) would be sharper
+than glints (integrated exactly).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _AT_ONCE = 16  # rows or columns of a blurred picture
 
 
 def margin(sigma_px: float) -> int:
-    """Compute the number of pixels that must be rendered beyond a window's border so that the blur inside is right."""
+    """Compute how many pixels beyond a window's border must be rendered to blur its inside correctly."""
     return 0 if sigma_px == 0 else int(np.ceil(4 * sigma_px)) + 2
 
 
@@ -38,7 +38,7 @@ def blur(image: Reals, sigma_px: float) -> Reals:
         return image
     m, band = margin(sigma_px), _band(sigma_px, image.dtype)
     height, width = (n - 2 * m for n in image.shape)
-    # A product of matrices takes a fifth of the time of adding shifted pictures.
+    # A matrix product takes a fifth of the time of adding shifted images.
     down, out = np.empty((height, width + 2 * m), image.dtype), np.empty((height, width), image.dtype)
     for of, near, part in _parts(height, m, band):
         np.matmul(part, image[near], out=down[of])
@@ -49,7 +49,7 @@ def blur(image: Reals, sigma_px: float) -> Reals:
 
 @lru_cache(maxsize=8)
 def _band(sigma_px: float, dtype: np.dtype[Any]) -> Reals:
-    """Compute weights of rows in the blurred rows that lie in their middle."""
+    """Compute the weights of source rows in the blurred rows of one block."""
     k = kernel(sigma_px)
     band = np.zeros((_AT_ONCE, _AT_ONCE + len(k) - 1), dtype)
     for row in range(_AT_ONCE):
@@ -58,7 +58,7 @@ def _band(sigma_px: float, dtype: np.dtype[Any]) -> Reals:
 
 
 def _parts(count: int, m: int, band: Reals) -> Iterator[tuple[slice, slice, Reals]]:
-    """Return a few blurred rows of `count` at a time, the rows of the picture about them, and these rows' weights."""
+    """Yield blocks of rows: the slice of blurred rows, the slice of source rows around it, and their weights."""
     for first in range(0, count, _AT_ONCE):
         end = min(first + _AT_ONCE, count)
         yield slice(first, end), slice(first, end + 2 * m), band[: end - first, : end - first + 2 * m]
@@ -67,14 +67,14 @@ def _parts(count: int, m: int, band: Reals) -> Iterator[tuple[slice, slice, Real
 def splat(
     xy_px: Floats, energy: Floats, sigma_px: float, window: Window, spread: Floats | None = None
 ) -> tuple[Floats, slice, slice]:
-    """Draw spots of given energies, the Gaussian integrated over each pixel, on the part of a window that they reach.
+    """Draw spots of given energies, as Gaussians integrated over each pixel, on the part of a window that they reach.
 
     Args:
-        xy_px: (n, 2) places in full-sensor pixels, centres at integers.
-        energy: (n,) sums over the pixels.
+        xy_px: (n, 2) positions in full-sensor pixels, with pixel centres at integers.
+        energy: (n,) sum of each spot over the pixels.
         sigma_px: standard deviation; 0 is a point in one pixel.
         window: x0, y0, width, height in full-sensor pixels.
-        spread: a further kernel, odd and square, with which the spots are convolved.
+        spread: an additional kernel, odd and square, with which the spots are convolved.
 
     Returns:
         The patch and its rows and columns in the window (empty where no spot reaches it).
@@ -100,7 +100,7 @@ def _spread(
     """Draw spots and convolve them."""
     x0, y0, width, height = window
     m = len(kernel) // 2
-    # The window is wider by the kernel on both sides, and the patch again: nothing is cut off before the convolution.
+    # Window and patch are enlarged by the kernel on both sides, so that nothing is cut off before the convolution.
     patch, rows, columns = splat(xy_px, energy, sigma_px, (x0 - m, y0 - m, width + 2 * m, height + 2 * m))
     if not patch.size:
         return patch, rows, columns
@@ -116,7 +116,7 @@ def _spread(
 
 
 def _convolved(a: Floats, b: Floats) -> Floats:
-    """Compute the full convolution of two pictures. SciPy's own takes a second to import."""
+    """Compute the full convolution of two images, without SciPy, whose import takes a second."""
     shape = tuple(m + n - 1 for m, n in zip(a.shape, b.shape, strict=True))
     size = [fft.next_fast_len(n, real=True) for n in shape]
     both = fft.irfft2(fft.rfft2(a, size) * fft.rfft2(b, size), size)
@@ -124,7 +124,7 @@ def _convolved(a: Floats, b: Floats) -> Floats:
 
 
 def _integrals(first: int, count: int, centres: Floats, sigma: float) -> Floats:
-    """Find the share (n, count) of each Gaussian that falls into each pixel [k - 1/2, k + 1/2], from the first on."""
+    """Compute the share (n, count) of each Gaussian that falls into each of `count` pixels [k - 1/2, k + 1/2]."""
     edges = np.arange(first - 0.5, first + count)[None, :] - centres[:, None]
     cumulative = (edges >= 0).astype(float) if sigma == 0 else special.ndtr(edges / sigma)
     return np.asarray(cumulative[:, 1:] - cumulative[:, :-1])

@@ -53,12 +53,12 @@ class Rig(Spec):
     def with_light(self, number: int, **changes: Any) -> Self:
         """Change one light of the rig.
 
-        Changing an LED of a ring makes all LEDs of that ring single ones, at their places. Places are those
-        before the mount moves the rig.
+        Changing an LED of a ring replaces the ring by single LEDs at the same positions. Positions are those before the
+        mount moves the rig.
 
         Args:
-            number: which light, from 0, each LED of a ring counted.
-            changes: new values of the fields of `Led`; `moved_mm` (3,) is added to the LED's place instead.
+            number: number of the light, from 0, counting each LED of a ring.
+            changes: new values of the fields of `Led`; or `moved_mm` (3,), a shift of the LED.
 
         Raises:
             InputError: there is no such light, or a value does not fit.
@@ -70,11 +70,11 @@ class Rig(Spec):
         return self._with_leds(leds)
 
     def with_light_copied(self, number: int, moved_mm: ArrayLike) -> Self:
-        """Add a copy of a light beside it, as the last one; LEDs of rings become LEDs of their own.
+        """Append a copy of a light at a shifted position; rings are replaced by single LEDs.
 
         Args:
-            number: which light, from 0, each LED of a ring counted.
-            moved_mm: (3,) from that light to the copy.
+            number: number of the light, from 0, counting each LED of a ring.
+            moved_mm: (3,) shift of the copy from that light.
 
         Raises:
             InputError: there is no such light, or there are too many.
@@ -84,19 +84,19 @@ class Rig(Spec):
         return self._with_leds([*leds, {**leds[number], "position_mm": place.tolist()}])
 
     def without_light(self, number: int) -> Self:
-        """Remove a light; LEDs of rings become LEDs of their own.
+        """Remove a light; rings are replaced by single LEDs.
 
         Raises:
-            InputError: there is no such light, or no other.
+            InputError: there is no such light, or it is the only one.
         """
         leds = self._single_leds(number)
         return self._with_leds([*leds[:number], *leds[number + 1 :]])
 
     def without_camera(self, number: int) -> Self:
-        """Remove a camera; LEDs of rings become LEDs of their own, and stay.
+        """Remove a camera; rings are replaced by single LEDs, which stay.
 
         Raises:
-            InputError: there is no such camera, or no other.
+            InputError: there is no such camera, or it is the only one.
         """
         if not 0 <= number < len(self.cameras):
             raise InputError(f"there is no camera {number}, only {len(self.cameras)}", path="cameras")
@@ -104,7 +104,7 @@ class Rig(Spec):
         return self._with_leds(self._single_leds(0), cameras=cameras)
 
     def _single_leds(self, number: int) -> list[dict[str, Any]]:
-        """Compute fields of all LEDs, those of rings one by one, after a look whether there is light `number`."""
+        """Return the fields of all LEDs, with rings split into single ones; check that light `number` exists."""
         if not 0 <= number < self.light_count:
             raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
         geometry, leds = self.model_copy(update={"mount": None}).build(), []
@@ -122,7 +122,7 @@ class Rig(Spec):
         return type(self).from_mapping({**kept, **fields})
 
     def resolved(self, base: Path | None = None) -> Self:
-        """Return the rig with the numbers of its cameras' calibration files, which are relative to `base`.
+        """Return the rig with its cameras' calibration files read in; paths are relative to `base`.
 
         Raises:
             InputError: a file cannot be read, or does not fit its camera.
@@ -134,7 +134,7 @@ class Rig(Spec):
     def build(self) -> RigGeometry:
         """Build the numeric rig."""
         cameras = tuple(camera.build() for camera in self.cameras)
-        # A ring of LEDs surrounds the camera itself, not its mirror image.
+        # A ring of LEDs surrounds the real camera, not its mirror image.
         places = tuple(camera.unmirrored() for camera in self.cameras)
         lights = tuple(light for spec in self.lights for light in spec.build(places))
         if self.mount is not None:
@@ -144,7 +144,10 @@ class Rig(Spec):
 
 
 class RigLike(Protocol):
-    """An authored `Rig` or a computed `RigGeometry`; functions that accept one begin with `rig = rig.build()`."""
+    """An authored `Rig` or a computed `RigGeometry`.
+
+    Functions that accept either begin with `rig = rig.build()`.
+    """
 
     def build(self) -> RigGeometry:
         """Build the numeric rig."""
@@ -164,7 +167,7 @@ class RigGeometry(ArrayValue):
         return self
 
     def to_mapping(self) -> dict[str, Any]:
-        """Convert to the mapping that `features --json` writes (docs/formats.md)."""
+        """Convert to the mapping that `features --json` writes (see docs/formats.md)."""
         screen = self.screen
         return {
             "cameras": [

@@ -26,7 +26,7 @@ class Screen(Spec):
     tilt_deg: float = Field(default=0.0, gt=-90, lt=90, description="upward tilt of the face, from facing -x")
 
     def grid(self, columns: int, rows: int) -> Floats:
-        """World points (columns * rows, 3) of a grid out to the screen's edges, as `ScreenPlane.grid` orders them."""
+        """Compute world points (columns * rows, 3) mm up to the screen's edges, ordered as in `ScreenPlane.grid`."""
         return self.build().grid(columns, rows)
 
     def build(self) -> ScreenPlane:
@@ -63,24 +63,24 @@ class ScreenPlane(ArrayValue):
         return np.cross(self.up, self.right) * -1.0
 
     def world(self, on_screen_mm: ArrayLike) -> Floats:
-        """World points (..., 3) of screen points (..., 2), in mm to the subject's right of the centre and above it."""
+        """Convert screen points (..., 2) mm, right of the centre and above it, to world points (..., 3) mm."""
         p = np.asarray(on_screen_mm, dtype=float)
         return np.asarray(self.centre_mm + p[..., :1] * self.right + p[..., 1:] * self.up)
 
     def flat(self, world_mm: ArrayLike) -> Floats:
-        """Find screen points (..., 2) mm of world points (..., 3), by orthogonal projection; the inverse of `world`."""
+        """Project world points (..., 3) orthogonally to screen points (..., 2) mm; the inverse of `world`."""
         p = np.asarray(world_mm, dtype=float) - self.centre_mm
         return np.stack([p @ self.right, p @ self.up], axis=-1)
 
     def grid(self, columns: int, rows: int) -> Floats:
-        """Targets (columns * rows, 3) up to the screen's edges, from the subject's left, each column from the top."""
+        """Compute targets (columns * rows, 3) mm up to the edges, from the subject's left, each column from the top."""
         w, h = self.size_mm
         u = np.linspace(-w / 2, w / 2, columns) if columns > 1 else np.zeros(1)
         v = np.linspace(h / 2, -h / 2, rows) if rows > 1 else np.zeros(1)
         return self.world(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
 
     def intersect(self, origin_mm: ArrayLike, direction: ArrayLike) -> tuple[Floats, Bools]:
-        """Find where rays meet the screen's plane: screen points (..., 2) mm, and whether the plane is ahead (...)."""
+        """Intersect rays with the screen's plane: screen points (..., 2) mm, and whether the plane is ahead (...)."""
         o, d = np.asarray(origin_mm, dtype=float), np.asarray(direction, dtype=float)
         along = d @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):

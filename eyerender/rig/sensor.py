@@ -26,7 +26,7 @@ Border = Annotated[int, Field(ge=0, le=4096)]
 
 
 class Sensor(Spec):
-    """Lens aperture, exposure and sensor of a camera; `gain_dn_per_e` defaults to full scale at 98 % of the well."""
+    """Sensor, exposure and lens aperture of a camera; `gain_dn_per_e` defaults to full scale at 98 % of the well."""
 
     f_number: Positive = Field(default=2.0, description="working f-number: image distance over aperture diameter")
     pixel_pitch_um: Positive = Field(default=2.8, description="side of a square pixel")
@@ -107,7 +107,7 @@ class Sensor(Spec):
 
     @property
     def saturation_dn(self) -> float:
-        """Level from which a pixel counts as saturated: full scale, or the full well minus three read noises."""
+        """Level (DN) from which a pixel counts as saturated: full scale, or the full well minus three read noises."""
         level = min(self.full_scale_dn, self.black_dn + self.gain * (self.full_well_e - 3 * self.read_noise_e))
         return float(self.full_scale_dn * (level / self.full_scale_dn) ** (1 / self.gamma))
 

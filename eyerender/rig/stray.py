@@ -1,14 +1,14 @@
-"""Light that goes astray between lens and sensor: stars about points, openings that cut it off, ghosts, veiling glare.
+"""Stray light between lens and sensor: stars around points, openings that block light, ghosts, and veiling glare.
 
-They change the finished picture in this order. With the shares g of the glare and s of the ghost,
+These effects are applied to the rendered image in this order. With the shares g of the glare and s of the ghost,
 
     I1 = T I + (1 - T) rim,   I2 = (1 - s) I1 + s ghost(I1),   I3 = (1 - g) I2 + g K * I2,
 
-where T is the share that the openings let through, and K the glare's kernel r0 / (2 pi (r^2 + r0^2)^(3/2)), whose sum
-is 1 and whose Fourier transform is exp(-r0 k). The picture is continued by its mirror image, so it keeps its energy:
-what glare carries over the border comes back from the continuation.
+where T is the transmittance of the openings, and K the glare's kernel r0 / (2 pi (r^2 + r0^2)^(3/2)), whose sum is 1
+and whose Fourier transform is exp(-r0 k). The image is mirrored at its borders, which conserves energy: light that
+glare carries over the border comes back from the mirrored part.
 
-Scattered light belongs to the whole sensor. Where a window shows a part of it, the rest is a coarse picture.
+Light scatters over the whole sensor. If only a window is rendered, a coarse image stands for the rest.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _SUMMED = 128  # terms of a sum at a time
 
 
 def starred(picture: Reals, star: Star | None) -> Reals:
-    """Picture (h, w) with the star of the aperture about every point, continued by its mirror image at the borders.
+    """Add the star of the aperture around every point of an image (h, w), mirrored at the borders.
 
-    Light from outside of a window of the sensor has no arms in it.
+    Light from outside a window casts no arms into it.
     """
     if star is None or star.share == 0:
         return picture
     kernel = star_kernel(star).astype(picture.dtype)
-    from scipy.signal import oaconvolve  # which takes a second, and few lenses have a star
+    from scipy.signal import oaconvolve  # SciPy's import takes a second, and few lenses have a star
 
     arms = oaconvolve(np.pad(picture, star.reach_px, mode="symmetric"), kernel, mode="valid")
     return np.asarray((1 - star.share) * picture + star.share * np.maximum(arms, 0), dtype=picture.dtype)
@@ -46,7 +46,7 @@ def starred(picture: Reals, star: Star | None) -> Reals:
 
 @lru_cache(maxsize=8)
 def star_kernel(star: Star) -> Reals:
-    """Compute the light (2 n + 1, 2 n + 1) of a point in the arms, n = `reach_px`; its sum is 1."""
+    """Compute the kernel (2 n + 1, 2 n + 1) of the star's arms, n = `reach_px`; its sum is 1."""
     n, arms = star.reach_px, star.blades * (1 if star.blades % 2 == 0 else 2)
     angle = np.radians(star.turn_deg) + 2 * np.pi * np.arange(arms)[:, None] / arms
     r = np.arange(1.0, n + 1e-9, 0.25)
@@ -62,7 +62,7 @@ def star_kernel(star: Star) -> Reals:
 
 
 def framed(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """Compute the picture (h, w) behind the lens' openings, in its own precision; radiances in mW/mm^2/sr."""
+    """Compute the image (h, w) behind the lens' openings, in its own precision; radiances in mW/mm^2/sr."""
     for opening in lens.openings:
         rim = 1e-3 * opening.radiance_w_m2_sr
         picture = (picture - rim if rim else picture) * transmission(opening, camera, window)
@@ -72,20 +72,20 @@ def framed(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) ->
 
 
 def misses_light(lens: Lens, camera: PinholeCamera, window: Window) -> bool:
-    """Return whether a lens scatters light into a window of the sensor from outside of it."""
+    """Return whether the lens scatters light from outside a window into it."""
     (x0, y0, width, height), (w, h) = window, camera.resolution_px
     part = x0 >= 0 and y0 >= 0 and x0 + width <= w and y0 + height <= h and (width, height) != (w, h)
     return part and (lens.ghost > 0 or lens.glare > 0)
 
 
 def block_px(lens: Lens) -> int:
-    """Compute the side of the largest pixels in which a lens' scattered light is smooth."""
+    """Compute the side of the largest blocks of pixels over which a lens' scattered light is smooth."""
     sizes = [lens.glare_radius_px / 12] * (lens.glare > 0) + [lens.ghost_blur_px / 3] * (lens.ghost > 0)
     return max(int(min(*sizes, _LARGEST_BLOCK)), 1)
 
 
 def in_blocks(lens: Lens, camera: PinholeCamera, side: int) -> tuple[Lens, PinholeCamera]:
-    """Compute the lens and camera in pixels that are larger by a whole factor."""
+    """Convert lens and camera to pixels that are larger by the whole factor `side`."""
     width, height = (-(-n // side) for n in camera.resolution_px)
     K = np.array(camera.K)
     K[:2, 2] += 0.5
@@ -98,11 +98,11 @@ def in_blocks(lens: Lens, camera: PinholeCamera, side: int) -> tuple[Lens, Pinho
 
 
 def scattered_around(picture: Reals, around: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """Compute the picture (h, w) of a window with ghost and glare of the light of the whole sensor.
+    """Add ghost and glare to the image (h, w) of a window, with light from the whole sensor.
 
     Args:
         picture: the window.
-        around: the whole sensor in blocks of `block_px`, without what the window shows, which takes its place.
+        around: the whole sensor in blocks of `block_px`; the part inside the window is replaced by `picture`.
         lens: the lens.
         camera: the camera.
         window: the window, inside the sensor.
@@ -121,7 +121,7 @@ def scattered_around(picture: Reals, around: Reals, lens: Lens, camera: PinholeC
 
 
 def _enlarged(values: Reals, side: int, first: int, count: int) -> Reals:
-    """List rows (count, k) of pixels from `first` on, interpolated between rows (n, k) of blocks."""
+    """Interpolate rows of pixels (count, k), beginning with row `first`, from rows of blocks (n, k)."""
     place = np.clip((np.arange(first, first + count) + 0.5) / side - 0.5, 0, len(values) - 1)
     low = np.minimum(place.astype(int), max(len(values) - 2, 0))
     share = (place - low)[:, None].astype(values.dtype)
@@ -129,7 +129,7 @@ def _enlarged(values: Reals, side: int, first: int, count: int) -> Reals:
 
 
 def scattered(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """Compute the picture (h, w) with ghost and glare, in its own precision."""
+    """Add ghost and glare to an image (h, w), in its own precision."""
     if lens.ghost > 0:
         picture = (1 - lens.ghost) * picture + lens.ghost * ghost(picture, lens, camera, window)
     if lens.glare > 0:
@@ -141,7 +141,7 @@ def scattered(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window)
 
 
 def transmission(opening: Opening, camera: PinholeCamera, window: Window) -> Singles:
-    """Compute the share (h, w) of the light that an opening lets through to each pixel of a window."""
+    """Compute the share (h, w) of light that an opening transmits to each pixel of a window."""
     return _transmission(opening, tuple(camera.resolution_px), tuple(window))
 
 
@@ -167,22 +167,22 @@ def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Wind
 
 
 def ghost(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """Return the picture turned by 180 degrees about the optical axis, scaled by m and blurred.
+    """Compute the ghost of an image: turned by 180 degrees about the optical axis, scaled by m and blurred.
 
     G(x) = I(c + (c - x) / m) / m^2, from the light of the window alone; see `scattered_around`.
     """
     m = lens.ghost_scale
     cx, cy = camera.K[0, 2] - window[0], camera.K[1, 2] - window[1]
     offset = np.array([cy + cy / m, cx + cx / m])
-    # A ghost of another size would skip parts of single bright pixels, so these are spread first.
+    # A ghost of another size would miss parts of single bright pixels, so these are spread first.
     source = picture if m == 1 else ndimage.gaussian_filter(picture, 0.7 * max(1, 1 / m), mode="constant")
     turned = ndimage.affine_transform(source, np.array([-1 / m, -1 / m]), offset, order=1) / m**2
     return np.asarray(ndimage.gaussian_filter(turned, lens.ghost_blur_px, mode="constant"))
 
 
 def veil(picture: Reals, radius_px: float) -> Reals:
-    """Return the picture (h, w) convolved with the glare's kernel, continued by its mirror image."""
-    # Products of matrices find the long waves that a wide glare leaves in less time than a fast transform takes.
+    """Convolve an image (h, w), mirrored at its borders, with the glare's kernel."""
+    # For the few long waves that pass a wide glare, matrix products are faster than a fast Fourier transform.
     if is_wide(radius_px):
         down, across, damping = long_waves(picture.shape, radius_px, picture.dtype)
         waves = _product(_product(down, picture), across.T)
@@ -196,12 +196,12 @@ def veil(picture: Reals, radius_px: float) -> Reals:
 
 
 def is_wide(radius_px: float) -> bool:
-    """Return whether a glare leaves few waves of a picture."""
+    """Return whether a glare is so wide that only few cosine waves of an image pass it."""
     return _FADED / (np.pi * radius_px) < _FEW
 
 
 def long_waves(shape: tuple[int, ...], radius_px: float, dtype: np.dtype[Any]) -> tuple[Reals, Reals, Singles]:
-    """The waves that a wide glare leaves of a picture (h, w): down (m, h), across (n, w), and their factors (m, n)."""
+    """Compute the cosine waves that pass a wide glare: down (m, h), across (n, w), and their damping factors (m, n)."""
     share = _FADED / (np.pi * radius_px)
     counts = tuple(int(share * n) + 1 for n in shape)
     down, across = (_cosines(n, count, dtype) for n, count in zip(shape, counts, strict=True))
@@ -209,7 +209,7 @@ def long_waves(shape: tuple[int, ...], radius_px: float, dtype: np.dtype[Any]) -
 
 
 def _product(a: Reals, b: Reals) -> Reals:
-    """Product of matrices. Long sums are made in parts, else their last digits depend on the number of threads."""
+    """Multiply matrices, splitting long sums so that their last digits do not depend on the number of threads."""
     out = a[:, :_SUMMED] @ b[:_SUMMED]
     for k in range(_SUMMED, len(b), _SUMMED):
         out += a[:, k : k + _SUMMED] @ b[k : k + _SUMMED]
@@ -218,23 +218,23 @@ def _product(a: Reals, b: Reals) -> Reals:
 
 @lru_cache(maxsize=8)
 def _damping(shape: tuple[int, ...], counts: tuple[int, ...], radius_px: float) -> Singles:
-    """Compute the factors of the longest waves of a picture, for given numbers down and across."""
+    """Compute the damping factors of the longest cosine waves of an image, for given numbers down and across."""
     rows, columns = (np.pi * np.arange(count) / n for count, n in zip(counts, shape, strict=True))
     return frozen(np.exp(-radius_px * np.hypot(rows[:, None], columns[None, :])), np.float32)
 
 
 @lru_cache(maxsize=8)
 def _cosines(n: int, count: int, dtype: np.dtype[Any]) -> Reals:
-    """Return the longest waves (count, n) of n pixels, which are mirrored at both ends; orthonormal."""
+    """Return the longest cosine waves (count, n) over n pixels, mirrored at both ends; orthonormal."""
     waves = np.cos(np.pi / n * np.outer(np.arange(count), np.arange(n) + 0.5)) * np.sqrt(2 / n)
     waves[0] = np.sqrt(1 / n)
     return frozen(waves, dtype)
 
 
 def covered(lens: Lens, sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools | None:
-    """Pixels (h, w) of a window that show no eye: less than half of their light passes the openings, or the border.
+    """Return which pixels (h, w) of a window show no eye: those that openings cover by more than half, and the border.
 
-    None where there are neither openings nor a border.
+    None if there are neither openings nor a border.
     """
     if not lens.openings and not any(sensor.border_px):
         return None
@@ -252,7 +252,7 @@ def _covered(
 
 
 def border(sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools:
-    """Compute pixels (h, w) of a window in the sensor's border, which holds no picture."""
+    """Return which pixels (h, w) of a window lie in the sensor's border, which holds no image."""
     return _border(sensor.border_px, tuple(camera.resolution_px), window)
 
 

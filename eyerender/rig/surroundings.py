@@ -1,10 +1,10 @@
 """Painted surroundings of the head: radiance over all directions of an office, a car, or a place outdoors.
 
-The values are chosen, in W/m^2/sr within a filter of about 50 nm around 850 nm. The sun gives some 40 W/m^2 there
-(0.85 W/m^2/nm, ASTM G173), which a white surface in it returns as 13 W/m^2/sr. Leaves reflect about half of the near
+The values are chosen, in W/m^2/sr within a filter of about 50 nm around 850 nm. The sun gives some 40 W/m^2 there (0.85
+W/m^2/nm, ASTM G173), which a white surface in it returns as 13 W/m^2/sr. Leaves reflect about half of the near
 infrared, so trees and grass are brighter than asphalt. An overcast sky gives 1.5, a clear one much less, because the
-near infrared is hardly scattered. Walls indoors have a few hundredths in the light of windows. LED lamps and
-displays emit nearly nothing. There is no disc of the sun: the head is in the shade.
+near infrared is hardly scattered. Indoor walls lit by windows have a few hundredths. LED lamps and displays emit nearly
+nothing. There is no disc of the sun: the head is in the shade.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ _OVERCAST, _GROUND, _INTERIOR = 1.5, 0.45, 0.012
 
 
 def paint(place: str, seed: int, rows: int = 256) -> Floats:
-    """Radiance (rows, 2 rows): up at the upper edge, straight ahead (+x) in the middle, on to the subject's right.
+    """Paint surroundings as radiance (rows, 2 rows), W/m^2/sr, by latitude and longitude.
+
+    The first row is up, +x is in the middle of a row, and the row continues to the subject's right.
 
     Args:
         place: office, car or outdoors.
@@ -36,7 +38,7 @@ def paint(place: str, seed: int, rows: int = 256) -> Floats:
 
 
 def _outside(way: Floats, rng: np.random.Generator) -> Floats:
-    """Compute the sky with clouds, a row of trees or houses along the horizon, and ground."""
+    """Paint the outdoors: sky with clouds, trees or houses along the horizon, and ground."""
     rows = way.shape[0]
     elevation = np.degrees(np.arcsin(np.clip(way[..., 2], -1, 1)))
     cover = rng.uniform(0.3, 1.0)
@@ -54,7 +56,7 @@ def _outside(way: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _office(way: Floats, rng: np.random.Generator) -> Floats:
-    """Return a room with windows on the left or the right, a screen on a desk ahead, and a lamp above."""
+    """Paint a room: windows on the left or the right, a screen on a desk ahead, and a lamp above."""
     room = np.array([[-2200.0, 1600.0], [-2600.0, 1900.0], [-1200.0, 1500.0]]) * rng.uniform(0.8, 1.3, (3, 1))
     if rng.uniform() < 0.5:
         way = way * [1.0, -1.0, 1.0]
@@ -86,7 +88,7 @@ def _office(way: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _car(way: Floats, rng: np.random.Generator) -> Floats:
-    """Find the view of a driver: the outside through windscreen, side windows and rear window, and a dark interior."""
+    """Paint a driver's view: the outside through windscreen, side and rear windows, and a dark interior."""
     outside = _outside(way, rng) * rng.uniform(0.5, 0.9)  # transmittance of tinted panes
     azimuth = np.degrees(np.arctan2(way[..., 1], way[..., 0]))
     elevation = np.degrees(np.arcsin(np.clip(way[..., 2], -1, 1)))
@@ -104,7 +106,7 @@ def _car(way: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _clouds(rows: int, rng: np.random.Generator, size_deg: float) -> Floats:
-    """Uneven values (rows, 2 rows) with mean 0 and standard deviation about .4; their grains have a size in degrees."""
+    """Compute smooth noise (rows, 2 rows): mean 0, standard deviation about .4, grains of the given size in degrees."""
     total = np.zeros((rows, 2 * rows))
     for octave in range(4):
         sigma = size_deg / 2**octave * rows / 180

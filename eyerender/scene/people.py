@@ -27,7 +27,7 @@ class Population(PopulationSpec):
         def __init__(self, preset: str = "adults", **fields: Any) -> None: ...
 
     def draw(self, n: int, seed: int = 0, *, first: int = 0) -> People:
-        """Draw subjects `first` to `first + n - 1`; a subject depends on (this population, seed, subject) alone.
+        """Draw subjects `first` to `first + n - 1`; each depends only on (this population, seed, subject).
 
         Raises:
             InputError: n < 1, or hardly anybody meets the conditions.
@@ -52,7 +52,7 @@ class People:
     Attributes:
         population: the population from which they are drawn.
         seed: the seed.
-        number: (n,) their numbers as subjects.
+        number: (n,) number of each subject.
         values: name -> (n,) or (n, 2); see `PopulationSpec.numbers`.
     """
 
@@ -65,7 +65,7 @@ class People:
         return len(self.number)
 
     def __getitem__(self, name: str) -> Floats:
-        """Look up one quantity.
+        """Return one quantity, (n,) or (n, 2).
 
         Raises:
             InputError: there is no such quantity.
@@ -75,13 +75,13 @@ class People:
         return self.values[name]
 
     def person(self, row: int) -> Person:
-        """Make the person of a row."""
+        """Create the person of a row."""
         row = range(len(self))[row]
         numbers = {name: column[row] for name, column in self.values.items()}
         return Person.of(self.population.preset, self.seed, int(self.number[row]), numbers)
 
     def subject(self, row: int, **fields: Any) -> Subject:
-        """Make the subject of a scene from a row, with lids, a face, and a separate eye for each side.
+        """Create the subject of a scene from a row, with lids, a face, and a separate eye for each side.
 
         Args:
             row: the row.
@@ -90,7 +90,7 @@ class People:
         return Subject.of(self.person(row), **fields)
 
     def columns(self) -> dict[str, Floats]:
-        """List every number as a column (n,) for a table; those of an eye end with `.right` and `.left`."""
+        """Return every number as a column (n,) for a table; columns of an eye end with `.right` and `.left`."""
         out: dict[str, Floats] = {}
         for name, column in self.values.items():
             if column.ndim == 1:

@@ -50,19 +50,19 @@ from ..spec import Spec, file_digest
 from ..status import Status
 from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
 
-# Things fixed to a face may press the skin a little. Farther than 45 mm from an eye the face is only a guess.
+# Parts worn on a face may press the skin a little. Farther than 45 mm from an eye, the face is only a guess.
 _BELOW_SKIN_MM, _FACE_MM = 2.0, 45.0
 
 EYE_WINDOW_MM = (32.0, 24.0)
-"""Default size (mm) of a window about each of two eyes: it shows both lids and the corners."""
+"""Default size (mm) of a window around each of two eyes: both lids and the corners are inside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames(ArrayValue):
     """The frames of a scene with the pose of each eye: the input of every observer.
 
-    A row is one eye in one frame (an exposure of one camera). `index` (n) gives its eye, camera and target, and `pose`
-    (n) the pose of the eye.
+    A row is one eye in one frame (an exposure of one camera). `index` (n rows) gives its eye, camera and target, and
+    `pose` (n rows) the pose of the eye.
     """
 
     scene: Scene
@@ -91,7 +91,7 @@ class Frames(ArrayValue):
         return Frames(self.scene, self.index.take(rows), self.pose.take(rows))
 
     def seen_by(self, rig: RigLike | None) -> Self:
-        """Place the same eyes in front of another rig with the same number of cameras; None changes nothing.
+        """Observe the same eyes with another rig that has as many cameras; None changes nothing.
 
         Raises:
             InputError: the rig has another number of cameras.
@@ -106,15 +106,15 @@ class Frames(ArrayValue):
         return self.of_scene(self.scene.replaced(rig=built))
 
     def of_scene(self, scene: Scene) -> Self:
-        """Move the same eyes in the same poses to a scene with another rig or other pictures."""
+        """Keep the eyes and poses, but replace the scene by one with another rig or other image settings."""
         return replace(self, scene=scene)
 
 
 def as_frames(frames: Frames | Scene) -> Frames:
-    """Return frames as they are, or make those of a scene.
+    """Convert a scene to its frames; return frames as they are.
 
     Raises:
-        TypeError: it is something else.
+        TypeError: the argument is neither.
     """
     if isinstance(frames, Scene):
         return frames.frames()
@@ -153,7 +153,7 @@ class Scene:
         """Build a scene from objects.
 
         Args:
-            subject: who looks, with the eye model.
+            subject: the subject, with the eye model.
             rig: cameras, lights and screen.
             name: name of the scene in reports.
             fields: the other fields of `SceneSpec`: `targets` or `poses`, `region`, `look`, `sensor`, `lens`,
@@ -177,13 +177,13 @@ class Scene:
         base: Path | None = None,
         source: str = "",
     ) -> Scene:
-        """Make a scene from parts that are known to fit; without a `rig`, that of the spec.
+        """Create a scene from validated parts; without a `rig`, that of the spec is built.
 
-        The numbers of calibration files become part of the spec. Without an `eye_spec` the eye is the
-        spec's; a drawn person always has its own.
+        The numbers of calibration files become part of the spec. Without an `eye_spec`, the eye is that of the spec; a
+        drawn person always has individual eyes.
 
         Raises:
-            InputError: an eye of the person cannot exist.
+            InputError: an eye of the person is physically impossible.
         """
         if (authored := spec.rig.resolved(base)) is not spec.rig:
             spec = spec.model_copy(update={"rig": authored})
@@ -201,7 +201,7 @@ class Scene:
     def replaced(
         self, spec: SceneSpec | None = None, *, eye_spec: EyeSpec | None = None, rig: RigGeometry | None = None
     ) -> Scene:
-        """Replace the spec (and its rig), the eye or the rig."""
+        """Copy with another spec (and its rig), another eye or another rig."""
         return Scene.compiled(
             spec or self.spec,
             eye_spec or (None if isinstance(self._eyes, _DrawnEyes) else self._eyes),
@@ -229,7 +229,7 @@ class Scene:
         return cls.compiled(spec, eye_spec, base=base, source=source)._checked()
 
     def _checked(self) -> Scene:
-        """Check that the eye can be built and that all files exist; return the scene."""
+        """Check that the eye can be built and that all files exist; return the scene itself."""
         try:
             for side in EYES if self.spec.person is not None else EYES[:1]:
                 self.eye(side)
@@ -250,10 +250,10 @@ class Scene:
         spp: int | None = None,
         **fields: Any,
     ) -> Scene:
-        """Make a scene with other values.
+        """Copy the scene with other values.
 
         Args:
-            changes: values by the path that error messages name, such as `{"rig.lights.1.radius_mm": 2.5}`; a None
+            changes: new values by dotted path, as in error messages, such as `{"rig.lights.1.radius_mm": 2.5}`; a None
                 removes a key.
             pupil_diameter_mm: diameter of the anatomical pupil.
             gaze_deg: azimuth and elevation of the optic axis, (2,) or (n, 2), instead of the targets.
@@ -282,7 +282,8 @@ class Scene:
         for path, value in paths.items():
             _put(data, path, value)
         spec = SceneSpec.from_mapping(data)
-        # The eye of a scene may be another than its file names: one given instead, or one with drawn parameters.
+        # The eye may differ from the one that the scene's file names: one passed in Python, or one with drawn
+        # parameters.
         same = spec.eye.model == self.spec.eye.model
         return self.replaced(spec, eye_spec=None if same else spec.eye.spec(self.base))._checked()
 
@@ -304,9 +305,9 @@ class Scene:
         return self.eye_file(side).stop.diameter_mm if given is None else given
 
     def person_numbers(self, side: str) -> dict[str, dict[str, float | int | str]]:
-        """Describe the person as images record it: who it is, and the numbers of the person and of this eye.
+        """Return the person's identity and the numbers of the person and this eye, as metadata of images.
 
-        It is {} where no person is drawn. Dots in the names of numbers become underscores, as names of columns need it.
+        Empty if no person is drawn. Dots in names become underscores, because the names serve as column names.
         """
         person = self.spec.person
         if person is None:
@@ -338,14 +339,14 @@ class Scene:
         """Return the eye file of one side, written as a right eye.
 
         Raises:
-            InputError: a drawn eye that is not observed cannot exist.
+            InputError: a drawn eye, which is not observed, is physically impossible.
         """
         return self._eyes if isinstance(self._eyes, EyeSpec) else self._eyes.of("left" if side == "left" else "right")
 
     def warnings(self) -> list[InputWarning]:
-        """List probable mistakes in the scene: a pupil of 0.4 mm, lengths in metres, a lamp in the head, ...
+        """Return warnings of probable mistakes: a pupil of 0.4 mm, lengths in metres, a lamp in the head, ...
 
-        Nothing is traced or rendered for this. An empty list does not mean that the scene is good.
+        Nothing is traced or rendered. An empty list does not mean that the scene is good.
         """
         spec, rig = self.spec, self.rig
         positions = [np.array(head) for head in spec.subject.head_positions_mm]
@@ -383,7 +384,7 @@ class Scene:
     def _face_warnings(
         self, cameras: list[tuple[str, PinholeCamera]], lights: list[tuple[str, Lamp]]
     ) -> list[InputWarning]:
-        """Warn of cameras and lamps, with their paths, that are below the skin of the first head position."""
+        """Warn of cameras and lamps, given with their paths, below the skin at the first head position."""
         region, found = self.spec.region, dict[str, InputWarning]()
         if region is None or region.head is not None:
             return []
@@ -425,7 +426,7 @@ class Scene:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files on which images depend, besides the eye's."""
+        """Files on which the images depend, besides the eye's."""
         ambient, region = self.ambient, self.region
         named = [] if ambient.map is None or ambient.map.file is None else [ambient.map.file]
         if self.spec.region is not None and self.spec.region.head is not None and self.spec.region.head.manifest:
@@ -435,7 +436,7 @@ class Scene:
         return tuple(Path(name) for name in named)
 
     def located(self) -> SceneSpec:
-        """Make the spec independent of its folder: absolute paths, and the manifest of a head read in."""
+        """Return a spec that does not depend on its folder: absolute paths, and the manifest of a head included."""
         return self.spec.model_copy(update={"ambient": self.ambient, "region": self.region})
 
     def eye(self, side: Literal["right", "left"] | str) -> EyeModel:
@@ -446,36 +447,36 @@ class Scene:
         return _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
 
     def eyes_of(self, index: Index) -> tuple[list[EyeModel], Indices]:
-        """Build the numeric eyes of an index, and say which of them each row is; only observed eyes are built."""
+        """Build the numeric eyes of an index, and return which of them each row uses; only observed eyes are built."""
         sides, which = np.unique(index.eye, return_inverse=True)
         return [self.eye(EYES[side]) for side in sides], which
 
     @property
     def accommodation_d(self) -> float | None:
-        """Accommodation of the eyes (D); None where each eye focuses on its target, as far as it can."""
+        """Accommodation of the eyes (D); None if each eye focuses on its target as far as it can."""
         person, state = self.spec.person, _state_of(self.spec, self.rig)
         if person is not None:
             return person.accommodation_d(demand_d(self.spec, self.targets_mm))
         return None if state is None or self.spec.subject.accommodation_d is None else state.accommodation_d
 
     def refraction_d(self, side: str) -> float:
-        """Return the spectacle refraction of one eye, for its focus: the look's, or that of a drawn person; else 0."""
+        """Return the spectacle refraction (D) that one eye focuses with: the look's, or a drawn person's, else 0."""
         given, person = self.spec.look.fundus.refraction_d, self.spec.person
         if given is None and person is not None:
             return person.number("refraction_d", "left" if side == "left" else "right")
         return given or 0.0
 
     def eye_position_mm(self, side: str) -> Floats:
-        """Compute the apex of the unrotated eye in the world, (3,) mm, head at its reference position."""
+        """Compute the apex of the unrotated eye in the world, (3,) mm, with the head at its reference position."""
         return np.array([0.0, self.spec.subject.ipd_mm / 2 * (1 if side == "left" else -1), 0.0])
 
     @property
     def targets_mm(self) -> Floats | None:
-        """Targets (f, 3) in the world, in fixation order; None where the scene gives poses."""
+        """Targets (f, 3) mm in the world, in fixation order; None if the scene gives poses."""
         return targets_of(self.spec, self.rig)
 
     def index(self) -> Index:
-        """Make the index of all (frame, eye) of the scene, in order; n rows."""
+        """Return the index of all (frame, eye) of the scene, in order; n rows."""
         spec = self.spec
         targets = self.targets_mm
         fixations = len(targets) if targets is not None else len(spec.poses or ())
@@ -505,10 +506,10 @@ class Scene:
         )
 
     def frames(self) -> Frames:
-        """Make every (frame, eye) of the scene with its pose: the given one, or the one that fixates the target.
+        """Compute the pose of every (frame, eye) of the scene: the given one, or the one that fixates the target.
 
         Raises:
-            InputError: no pose of an eye fixates a target; the message names it and the reason.
+            InputError: no pose of an eye fixates a target; the message names the target and the reason.
         """
         index = self.index()
         if self.spec.poses is None:
@@ -553,7 +554,7 @@ class Scene:
         )
 
     def windows(self) -> dict[tuple[int, int, int], Window]:
-        """Place the window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
+        """Compute the image window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
 
         A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze; it is kept on
         the sensor. Without `image.window_px` it is the whole sensor for one eye, and `EYE_WINDOW_MM` for two.
@@ -566,12 +567,12 @@ class Scene:
         }
 
     def window(self, camera: int, head: int, eye: int) -> Window:
-        """Look up one of the `windows`: that of a camera, a head position and an eye (0 right, 1 left)."""
+        """Return one of the `windows`: that of a camera, a head position and an eye (0 right, 1 left)."""
         view = self.rig.cameras[camera]
         (w, h), (ww, wh) = view.resolution_px, self.window_size_px(camera)
         position = self.eye_position_mm(EYES[eye]) + np.array(self.spec.subject.head_positions_mm[head])
         (u, v), front = view.project(position)
-        front = front and np.isfinite(u) and np.isfinite(v)  # beside the camera distortion can overflow
+        front = front and np.isfinite(u) and np.isfinite(v)  # far outside the field of view the distortion may overflow
         x0 = int(np.floor((u if front else (w - 1) / 2) - (ww - 1) / 2 + 0.5))
         y0 = int(np.floor((v if front else (h - 1) / 2) - (wh - 1) / 2 + 0.5))
         return min(max(x0, 0), w - ww), min(max(y0, 0), h - wh), ww, wh
@@ -583,7 +584,7 @@ class Scene:
         view = self.rig.cameras[camera]
         w, h = view.resolution_px
         positions = [self.eye_position_mm(side) for side in self.spec.subject.eyes]
-        # A camera inside an eye has no defined scale.
+        # A camera inside an eye has no defined image scale.
         if len(positions) == 1 or any(np.array_equal(position, view.nodal_point_mm) for position in positions):
             return w, h
         scale = max(map(view.scale_at, positions))
@@ -595,12 +596,12 @@ def _refuse_change(_scene: Scene, name: str, _value: object) -> None:
     raise AttributeError(f"a Scene cannot be changed; scene.with_({name}=...) gives a changed one")
 
 
-# A frozen dataclass cannot define this method itself, and with slots its own fails for names that are no fields.
+# A frozen dataclass cannot define this method itself, and its default with slots fails for names that are no fields.
 Scene.__setattr__ = _refuse_change  # type: ignore[method-assign,assignment]
 
 
 def _put(data: dict[str, Any], path: str, value: Any) -> None:
-    """Set the value at a dotted path of a mapping, making the mappings on the way."""
+    """Set the value at a dotted path of a mapping, creating the mappings on the way."""
     keys = path.split(".")
     here: Any = data
     try:
@@ -620,7 +621,8 @@ def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
     """Compute the accommodation (D) of a scene's eyes: as given, or what its targets demand without glasses.
 
     The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position. The
-    mean refraction of a drawn person's eyes is added: hyperopes accommodate more, myopes less, and nobody below 0.
+    mean refractive error of a drawn person's eyes is added: hyperopes accommodate more, myopes less, and nobody less
+    than 0.
     """
     given = spec.subject.accommodation_d
     if given is not None and given != "targets":
@@ -636,7 +638,7 @@ def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """What eyes that are not drawn respond to."""
+    """Conditions to which eyes of the catalogue respond: light and accommodation."""
 
     age_years: float
     luminance_cd_m2: float | None
@@ -645,7 +647,7 @@ class _State:
 
 
 def _state_of(spec: SceneSpec, rig: RigGeometry) -> _State | None:
-    """Collect what the eyes of a scene respond to; None for an eye as its file has it."""
+    """Return the conditions to which the eyes of a scene respond; None if the eye file is used as it is."""
     subject = spec.subject
     if subject.luminance_cd_m2 is None and subject.accommodation_d is None:
         return None
@@ -656,7 +658,7 @@ def _state_of(spec: SceneSpec, rig: RigGeometry) -> _State | None:
 
 
 def targets_of(spec: SceneSpec, rig: RigGeometry) -> Floats | None:
-    """List the targets (f, 3) in the world, in fixation order; None where the scene gives poses."""
+    """Return the targets (f, 3) mm in the world, in fixation order; None if the scene gives poses."""
     targets, screen = spec.targets, rig.screen
     if targets is None:
         return None
@@ -671,7 +673,7 @@ def targets_of(spec: SceneSpec, rig: RigGeometry) -> Floats | None:
 
 @dataclass(frozen=True, slots=True)
 class _DrawnEyes:
-    """The eyes of a person (JSON) in the light and at the distance of a scene; each is drawn when it is asked for."""
+    """Eyes of a drawn person (JSON) in the light and at the distance of a scene; each is built on first use."""
 
     person: str
     luminance_cd_m2: float | None
@@ -684,7 +686,7 @@ class _DrawnEyes:
 
 
 def _drawn_eyes(spec: SceneSpec, person: Person, rig: RigGeometry) -> _DrawnEyes:
-    """The eyes of a person in the light and at the distance of a scene, of which those that are observed exist."""
+    """Create the eyes of a person in a scene's light and at its distance; check that the observed ones can exist."""
     subject = spec.subject
     eyes = _DrawnEyes(
         person.to_json(), subject.luminance_cd_m2, subject.field_deg, demand_d(spec, targets_of(spec, rig))
@@ -699,14 +701,14 @@ def _drawn_eyes(spec: SceneSpec, person: Person, rig: RigGeometry) -> _DrawnEyes
 
 @lru_cache(maxsize=128)
 def _drawn_eye(eyes: _DrawnEyes, side: Side) -> EyeSpec:
-    """Make an eye of a person; cached, because this takes longer than the remaining work on a scene."""
+    """Build an eye of a person; cached, because this takes longer than everything else in a scene."""
     return Person.from_mapping(json.loads(eyes.person)).eye(
         side, luminance_cd_m2=eyes.luminance_cd_m2, field_deg=eyes.field_deg, demand_d=eyes.demand_d
     )
 
 
 def _without_person(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Remove the person from a scene's mapping, and what the person may have brought."""
+    """Remove the person from a scene's mapping, and every value that came from the person."""
     rest = {key: value for key, value in data.items() if key not in ("person", "look", "region")}
     rest["eye"] = {key: value for key, value in data["eye"].items() if key != "model"}
     rest["subject"] = {key: value for key, value in data["subject"].items() if key != "ipd_mm"}
@@ -715,7 +717,7 @@ def _without_person(data: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Same:
-    """A spec that equals only itself: comparing the object costs nothing, comparing its content a millisecond."""
+    """Wrapper of a spec, compared by identity: comparing the content would take a millisecond."""
 
     spec: EyeSpec
 
@@ -730,7 +732,7 @@ class _Same:
 def _responded(
     eye: _Same, state: _State, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMargin | None
 ) -> _Same:
-    """Adapt an eye file to the light and the distance of a scene."""
+    """Adapt an eye file to the light and the viewing distance of a scene."""
     spec = eye.spec if margin is None else margin.applied(eye.spec)
     try:
         found = responding(

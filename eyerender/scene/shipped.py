@@ -1,4 +1,4 @@
-"""Scene files: those that come with the package, and loading one by path or by name."""
+"""Load scene files by path, or by the name of one that comes with the package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .spec import DATASET_KIND, NOT_A_SCENE, SceneSpec, Surfaces
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Map the names of the scenes that come with the package to their files."""
+    """Return the scenes that come with the package, as a mapping from name to file."""
     return {name: path for name, path in shipped_files().items() if not is_shipped_dataset(path)}
 
 
@@ -24,7 +24,7 @@ def is_shipped_dataset(path: Path) -> bool:
 
 
 def shipped_files() -> dict[str, Path]:
-    """Map the names of the scenes and dataset specs that come with the package to their files."""
+    """Return the scenes and dataset specs that come with the package, as a mapping from name to file."""
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "data" / "scenes", package.parent / "scenes"):
         if folder.is_dir():
@@ -33,7 +33,7 @@ def shipped_files() -> dict[str, Path]:
 
 
 def is_dataset(path: Path) -> bool:
-    """Return whether a YAML file declares itself the spec of a dataset (`kind: dataset`) instead of a scene."""
+    """Return whether a YAML file declares itself a dataset spec (`kind: dataset`) rather than a scene."""
     try:
         return read_yaml(path).get("kind") == DATASET_KIND
     except InputError:
@@ -41,7 +41,7 @@ def is_dataset(path: Path) -> bool:
 
 
 def refuse_folder(path: Path, wanted: str) -> None:
-    """Raise an `InputError` for a folder given instead of a file, which names the file that was probably meant."""
+    """Raise an `InputError` if a folder is given instead of a file; the message names the file probably meant."""
     if not os.path.isdir(path):
         return
     hint = ""
@@ -67,10 +67,10 @@ def load_scene(
         eye: replaces the scene's eye model (a catalogue name or an eye file).
         spp: replaces the samples per pixel.
         seed: replaces the seed.
-        surfaces: replaces how the cornea is rendered.
+        surfaces: replaces the rendering method of the cornea.
 
     Raises:
-        InputError: one line that names the file and the key, or the option whose value does not fit.
+        InputError: one line that names the file and the key, or the wrong option.
     """
     path = Path(scene)
     shipped = shipped_scenes()

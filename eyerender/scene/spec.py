@@ -1,4 +1,4 @@
-"""The content of a scene file: the eye, the subject, the rig, what is looked at, and how images are taken."""
+"""The content of a scene file: eye, subject, rig, targets, and how images are taken."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Eye(Spec):
 
     @classmethod
     def load(cls, model: str | EyeSpec, **fields: Any) -> Self:
-        """Make an eye and check that it is possible.
+        """Create an eye and check that it is physically possible.
 
         Args:
             model: a name of the catalogue ("E1" to "E5"), an eye file, or the eye's own record.
@@ -156,7 +156,7 @@ class Targets(Spec):
 
     @classmethod
     def at(cls, points_mm: ArrayLike) -> Self:
-        """Make targets from world points, (3,) or (n, 3) mm."""
+        """Create targets from world points, (3,) or (n, 3) mm."""
         return cls.from_mapping({"world_mm": np.asarray(points_mm, dtype=float).reshape(-1, 3)})
 
     @model_validator(mode="after")
@@ -178,7 +178,7 @@ class EyeDirection(Spec):
 
     @classmethod
     def listed(cls, angles_deg: ArrayLike) -> list[Self]:
-        """Make directions from azimuths and elevations, (2,) or (n, 2) degrees."""
+        """Create directions from azimuths and elevations, (2,) or (n, 2) degrees."""
         angles = np.asarray(angles_deg, dtype=float).reshape(-1, 2)
         return [cls(azimuth_deg=azimuth, elevation_deg=elevation) for azimuth, elevation in angles]
 
@@ -187,7 +187,7 @@ Surfaces = Literal["exact", "mesh"]
 
 
 class Picture(Spec):
-    """The part of the sensor that is rendered, and the number of samples."""
+    """The rendered part of the sensor, and the number of samples."""
 
     window_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = Field(
         default=None, description="width and height of one window per eye, centred on it; default: the whole sensor"
@@ -218,7 +218,7 @@ NOT_A_DATASET = (
 
 
 LIFTED = ("eye", "person", "look", "region")
-"""Keys of a scene that a subject in Python code may bring."""
+"""Keys of a scene that a subject in Python code may provide."""
 
 
 class SceneSpec(FileSpec):
@@ -307,7 +307,7 @@ class SceneSpec(FileSpec):
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
-        """Refuse a mapping of a dataset or an eye, with a hint how to use it.
+        """Raise an error for a mapping of a dataset or an eye, with a hint how to use it.
 
         Raises:
             InputError: the mapping is of another kind.
@@ -341,7 +341,7 @@ class SceneSpec(FileSpec):
             )
 
     def with_image(self, **changes: Any) -> Self:
-        """Copy with other values of `image`; a None changes nothing.
+        """Copy with other values of `image`; a None leaves a value unchanged.
 
         Raises:
             InputError: naming the option, such as --spp.
@@ -354,7 +354,7 @@ class SceneSpec(FileSpec):
 
 
 def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Add the person of its population to a scene's mapping; what the scene itself says stays."""
+    """Add the person drawn from the population to a scene's mapping; keys of the scene take precedence."""
     eye = data.get("eye")
     if isinstance(eye, Spec) or (isinstance(eye, Mapping) and "model" in eye):
         raise InputError("cannot stand beside a population, which gives the eyes", path="eye.model")
@@ -369,7 +369,7 @@ def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_person(data: Mapping[str, Any], person: Person) -> dict[str, Any]:
-    """Add a person to a scene's mapping; its pupil distance, look and region hold where the scene has none."""
+    """Add a person to a scene's mapping; its pupil distance, look and region apply where the scene has none."""
     subject = data.get("subject") or {}
     subject = subject.to_mapping() if isinstance(subject, Spec) else subject
     if "ipd_mm" not in subject:

@@ -1,4 +1,4 @@
-"""A subject in Python code: eyes that look at something, and the frames that result."""
+"""The subject in Python code, and the frames in which it fixates targets or looks in given directions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .spec import Eye, EyeDirection, SubjectSpec, Targets
 
 
 class Subject(SubjectSpec):
-    """The subject with its eye model. A scene file gives the eye under a key of its own."""
+    """The subject with its eye model. In a scene file, the eye has its own key."""
 
     POSITIONAL: ClassVar[tuple[str, ...]] = ("eye",)
     if TYPE_CHECKING:
@@ -31,14 +31,14 @@ class Subject(SubjectSpec):
 
     @classmethod
     def of(cls, person: Person, **fields: Any) -> Self:
-        """Make the subject of a drawn person.
+        """Create the subject of a drawn person.
 
         Args:
             person: the person.
             fields: further fields, such as `eyes` or `luminance_cd_m2`.
 
         Raises:
-            InputError: an eye cannot exist, or a value does not fit.
+            InputError: an eye is physically impossible, or a value does not fit.
         """
         own: dict[str, Any] = {"look": person.look(), "region": person.region()}
         if "ipd_mm" not in fields:
@@ -54,13 +54,13 @@ class Subject(SubjectSpec):
         at_mm: ArrayLike = (0.0, 0.0, 0.0),
         **fields: Any,
     ) -> Self:
-        """Make a subject of whom one eye is observed.
+        """Create a subject of whom one eye is observed.
 
         The head is placed so that the apex of this eye, unrotated, lies at `at_mm`.
 
         Args:
             eye: the eye model; default: E2.
-            side: the eye.
+            side: "right" or "left".
             at_mm: (3,) world point of the eye's apex, or (n, 3) for n positions of the head.
             fields: further fields, such as `look`, `region` or `ipd_mm`.
 
@@ -74,11 +74,11 @@ class Subject(SubjectSpec):
         return cls(**{**subject.to_mapping(), "head_positions_mm": heads})
 
     def fixating(self, targets_mm: ArrayLike, rig: Rig, **scene: Any) -> Frames:
-        """Make the frames in which the subject fixates targets, one after the other.
+        """Compute the frames in which the subject fixates targets, one after the other.
 
         Args:
             targets_mm: (n, 3) or (3,) world points.
-            rig: what observes the eyes.
+            rig: the cameras, lights and screen that observe the eyes.
             scene: further fields of `Scene`: `region`, `look`, `sensor`, `seed`, ...
 
         Raises:
@@ -87,11 +87,11 @@ class Subject(SubjectSpec):
         return Scene(self, rig, targets=Targets.at(targets_mm), **scene).frames()
 
     def looking(self, directions_deg: ArrayLike, rig: Rig, **scene: Any) -> Frames:
-        """Make the frames in which the optic axes of the eyes have directions, one after the other.
+        """Compute the frames in which the eyes' optic axes take given directions, one after the other.
 
         Args:
             directions_deg: (n, 2) or (2,) azimuth (positive to the subject's left) and elevation (positive up).
-            rig: what observes the eyes.
+            rig: the cameras, lights and screen that observe the eyes.
             scene: further fields of `Scene`.
 
         Raises:

@@ -1,1 +1,1 @@
-"""Files: durable writes, limited reads, JSON lines, locks, and the private folder of caches."""
+"""Files: durable writes, limited reads, JSON lines, locks, and the private cache folder."""

@@ -1,8 +1,8 @@
-"""The private folder of caches: `$XDG_CACHE_HOME/eyerender`, by default `~/.cache/eyerender`.
+"""The private cache folder: `$XDG_CACHE_HOME/eyerender`, by default `~/.cache/eyerender`.
 
-Caches hold code that runs (compiled kernels, a libLLVM, numba's index, which is a pickle), so a folder is used only if
-nobody but this user and root can have put anything into it. The rule covers every part of its path, because a user who
-can write to a parent can put another folder in its place:
+Caches contain executable code (compiled kernels, a libLLVM, numba's index, which is a pickle), so a folder is used only
+if nobody but this user and root can have written to it. The rule covers every part of its path, because a user who can
+write to a parent can put another folder in its place:
 
 - It belongs to this user or to root, and so does a symbolic link on the way.
 - Nobody else can write to it. A parent with the sticky bit, such as `/tmp`, may be open to all, because there only
@@ -25,7 +25,7 @@ _PRIVATE = 0o700
 _MAX_LINKS = 40  # on one path, as in Linux
 # Owner of everything outside a user namespace, as seen from inside: a container without root sees root's folders so.
 _UNMAPPED = 65534
-_WARNED = "EYERENDER_CACHE_WARNED"  # tells processes that this one starts
+_WARNED = "EYERENDER_CACHE_WARNED"  # informs processes that this one starts
 
 
 class _Refused(Exception):
@@ -33,11 +33,11 @@ class _Refused(Exception):
 
 
 def cache_folder() -> Path | None:
-    """Find or make the private folder for what this package compiled, fetched or computed.
+    """Return the private folder for compiled, fetched and computed files; create it if it is missing.
 
     Returns:
-        The folder; None where the user has no home folder, where the folder cannot be made, and, with one warning on
-        stderr, where somebody else may have written to it.
+        The folder. None if the user has no home folder, if the folder cannot be created, and, with one warning on
+        stderr, if somebody else may have written to it.
     """
     given = os.environ.get("XDG_CACHE_HOME", "")
     if os.path.isabs(given):
@@ -51,13 +51,13 @@ def cache_folder() -> Path | None:
 
 
 def private_folder(path: Path) -> Path | None:
-    """Make a folder if it is missing, and make sure that nobody else can write to it.
+    """Create a folder if it is missing, and make sure that nobody else can write to it.
 
     Args:
         path: an absolute path.
 
     Returns:
-        The path; None where the folder cannot be made and, with one warning on stderr, where it is not safe.
+        The path. None if the folder cannot be created and, with one warning on stderr, if it is not safe.
     """
     try:
         if hasattr(os, "geteuid"):
@@ -74,7 +74,7 @@ def private_folder(path: Path) -> Path | None:
 
 
 def _follow(path: Path) -> None:
-    """Check every folder and link that a path leads through, and make the folders that are missing.
+    """Check every folder and link on a path, and create the missing folders.
 
     Each part is checked before anything is made in it, and what was just made is checked like everything else, so a
     folder or a link that somebody puts there in the meantime is found.
@@ -135,7 +135,7 @@ def _others_write(state: os.stat_result) -> bool:
 
 
 def _is_private_group(group: int) -> bool:
-    """Return whether a group is root's, or the private one of the user's name that many Linux systems make."""
+    """Return whether a group is root's, or the private group of the user that many Linux systems create."""
     import grp
     import pwd
 
@@ -149,7 +149,7 @@ def _is_private_group(group: int) -> bool:
 
 
 def _warn(path: Path, reason: str) -> None:
-    """Print a warning, once for this process and those that it starts."""
+    """Print a warning once for this process and the processes that it starts."""
     known = os.environ.get(_WARNED, "").split(os.pathsep)
     if reason in known:
         return

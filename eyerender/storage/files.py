@@ -1,8 +1,8 @@
-"""Files: durable, atomic writes; reads that trust nothing; strict JSON.
+"""Files: durable, atomic writes; reads of untrusted files; strict JSON.
 
-A file is published in four steps: it is written under a temporary name beside its place, synced, renamed, and the
-folder is synced. After a power cut its place then holds the old content or the new one, never a part of either. Files
-may come from other people, so only regular files within a size limit are read.
+A file is published in four steps: it is written under a temporary name in the same folder, synced, renamed, and the
+folder is synced. After a power cut, the path holds the old content or the new one, never a part of either. Files may
+come from other people, so only regular files within a size limit are read.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ _PLAIN = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
 
 @contextmanager
 def written(path: str | Path, *, sync: bool = True, ending: str = PART) -> Iterator[BinaryIO]:
-    """Open a new file for writing; it takes its place if the block succeeds, and leaves nothing if it fails.
+    """Open a new file for writing; it replaces `path` if the block succeeds, and leaves nothing if it fails.
 
     Args:
         path: the file to write; an old one is replaced.
         sync: make it durable before the block's end: the file is synced before the rename, its folder after it. Without
-            it a power cut may leave an empty file, so use it only for what is synced later as a whole.
-        ending: end of the temporary name, for libraries that write to a name (`name` of the file) and choose the format
-            by its end.
+            it a power cut may leave an empty file, so use False only for files that are synced later as a whole.
+        ending: suffix of the temporary name, for libraries that open the file by `name` and choose the format by its
+            suffix.
 
     Raises:
-        InputError: a folder, pipe, device or socket is in its place.
+        InputError: the path is a folder, pipe, device or socket.
         EyerenderError: the disk is full or not writable.
     """
     path = Path(path)
@@ -77,20 +77,19 @@ def written(path: str | Path, *, sync: bool = True, ending: str = PART) -> Itera
 
 
 def refuse_special(path: str | Path) -> None:
-    """Check that a file may be written, so that replacing it cannot harm a device, and nothing waits for a pipe.
+    """Check that a file may be written, so that no device is harmed and no pipe blocks.
 
-    A link may be replaced, unless it leads to something else than a file.
+    A link may be replaced unless it leads to something other than a file.
 
     Raises:
-        InputError: the path is an address; or a folder, pipe, device or socket is in its place; or it is in a folder of
-            devices.
+        InputError: the path is an address, a folder, a pipe, a device or a socket, or lies in a folder of devices.
     """
     refuse_address(path)
     path = Path(path)
     try:
         state = path.stat()
         folder = path.parent.resolve()
-    except (OSError, ValueError, RuntimeError):  # missing, or refused when it is made
+    except (OSError, ValueError, RuntimeError):  # missing, or refused when it is created
         return
     if not stat.S_ISREG(state.st_mode):
         raise InputError(f"is {_kind(state.st_mode)}, so it is not written to", source=str(path))
@@ -99,10 +98,10 @@ def refuse_special(path: str | Path) -> None:
 
 
 def refuse_address(path: str | Path) -> None:
-    """Check that a path to write to is not an address such as `s3://bucket/x`, of which a path keeps one slash.
+    """Check that an output path is not an address such as `s3://bucket/x`, of which a path keeps one slash.
 
     Raises:
-        InputError: it is an address.
+        InputError: the path is an address.
     """
     address = _ADDRESS.match(str(path))
     if address is not None:
@@ -111,18 +110,18 @@ def refuse_address(path: str | Path) -> None:
 
 
 def write_bytes(path: str | Path, data: bytes, *, sync: bool = True) -> None:
-    """Write a file, completely or not at all; raises as `written` does."""
+    """Write a file atomically; raises like `written`."""
     with written(path, sync=sync) as file:
         file.write(data)
 
 
 def write_text(path: str | Path, text: str, *, sync: bool = True) -> None:
-    """Write UTF-8 text, completely or not at all; raises as `written` does."""
+    """Write UTF-8 text atomically; raises like `written`."""
     write_bytes(path, text.encode(), sync=sync)
 
 
 def write_json(path: str | Path, data: Any, *, sync: bool = True) -> None:
-    """Write JSON, completely or not at all; raises as `written` does, and `ValueError` for NaN and infinity."""
+    """Write JSON atomically; raises like `written`, and `ValueError` for NaN and infinity."""
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n", sync=sync)
 
 
@@ -130,19 +129,18 @@ def sync_file(path: str | Path) -> None:
     """Make a file's content durable.
 
     Raises:
-        OSError: it cannot be synced.
+        OSError: the file cannot be synced.
     """
     _sync(path, os.O_RDONLY)
 
 
 def sync_folder(path: str | Path) -> None:
-    """Make the names in a folder durable.
+    """Make the file names in a folder durable.
 
-    Nothing happens where folders cannot be opened (Windows) or the file system does not sync folders (some network
-    ones).
+    Does nothing if folders cannot be opened (Windows) or the file system cannot sync them (some network file systems).
 
     Raises:
-        OSError: it cannot be synced.
+        OSError: the folder cannot be synced.
     """
     if hasattr(os, "O_DIRECTORY"):
         try:
@@ -153,11 +151,11 @@ def sync_folder(path: str | Path) -> None:
 
 
 def make_folder(path: str | Path) -> bool:
-    """Make a folder and its missing parents, durably; returns whether it is new.
+    """Create a folder and its missing parents, durably; return whether it is new.
 
     Raises:
         InputError: the path is an address.
-        OSError: it cannot be made.
+        OSError: the folder cannot be created.
     """
     refuse_address(path)
     path = Path(path)
@@ -172,7 +170,7 @@ def remove_file(path: str | Path) -> None:
     """Remove a file durably, if there is one.
 
     Raises:
-        OSError: it cannot be removed.
+        OSError: the file cannot be removed.
     """
     path = Path(path)
     try:
@@ -183,10 +181,10 @@ def remove_file(path: str | Path) -> None:
 
 
 def remove_parts(path: str | Path) -> None:
-    """Remove the temporary files that killed writers of a file left beside it.
+    """Remove temporary files that killed writers of a file left beside it.
 
     Raises:
-        OSError: one cannot be removed.
+        OSError: a file cannot be removed.
     """
     path = Path(path)
     for part in path.parent.glob(f".{glob.escape(path.name)}.*{PART}"):
@@ -194,10 +192,10 @@ def remove_parts(path: str | Path) -> None:
 
 
 def sync_files(paths: Sequence[Path]) -> None:
-    """Make the content of files durable; several threads sync them, as in `sync_tree`.
+    """Make the content of files durable, in several threads as in `sync_tree`.
 
     Raises:
-        OSError: one cannot be synced.
+        OSError: a file cannot be synced.
     """
     with ThreadPoolExecutor(8) as threads:
         for _ in threads.map(sync_file, paths):
@@ -207,7 +205,7 @@ def sync_files(paths: Sequence[Path]) -> None:
 def sync_tree(path: str | Path) -> None:
     """Make a folder durable with everything in it; links are not followed.
 
-    Several threads sync files, because a file system writes one journal entry for all that wait: 0.4 ms per file
+    Several threads sync files, because a file system writes one journal entry for all waiting threads: 0.4 ms per file
     instead of 4 on ext4.
 
     Raises:
@@ -230,11 +228,11 @@ def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True
 
     Args:
         path: the file.
-        limit: the largest size that is opened, in bytes.
+        limit: largest accepted size in bytes.
         follow: whether the file may be a symbolic link.
 
     Raises:
-        InputError: it is missing, not a regular file (a pipe, a device, a folder), too large, or may not be read.
+        InputError: the file is missing, not regular (a pipe, a device, a folder), too large, or not readable.
     """
     source = str(path)
     try:
@@ -256,12 +254,12 @@ def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True
 
 
 def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> bytes:
-    """Read a regular file; raises `InputError` as `opened` does."""
+    """Read a regular file; raises `InputError` like `opened`."""
     source = str(path)
     with opened(path, limit=limit, follow=follow) as file:
         try:
             size = os.fstat(file.fileno()).st_size
-            data = file.read(size + 1)  # Python takes memory for all that it is asked to read
+            data = file.read(size + 1)  # Python allocates memory for everything that it is asked to read
             if len(data) > size:  # the file has grown
                 data += file.read(limit + 1 - len(data))
         except OSError as error:
@@ -272,7 +270,7 @@ def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = 
 
 
 def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = True) -> str:
-    """Read a UTF-8 text file; raises `InputError` as `read_bytes` does, and for other encodings."""
+    """Read a UTF-8 text file; raises `InputError` like `read_bytes`, and for other encodings."""
     try:
         return read_bytes(path, limit=limit, follow=follow).decode()
     except UnicodeDecodeError:
@@ -283,11 +281,11 @@ def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:
     """Parse a JSON value: finite numbers only, integers of at most 300 digits.
 
     Raises:
-        InputError: it is not valid.
+        InputError: the text is not valid.
     """
     try:
         data, text = (text, text.decode()) if isinstance(text, bytes) else (text.encode(errors="replace"), text)
-        # A check of each number takes longer than everything else, so it is made only if a number is long enough to
+        # Checking each number takes longer than everything else, so it is done only if a number is long enough to
         # matter.
         zeros = data.translate(_TO_ZEROS)
         hooks: dict[str, Any] = {}
@@ -306,10 +304,10 @@ def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:
 
 
 def read_json(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = True) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
+    """Read a JSON file that contains an object.
 
     Raises:
-        InputError: it cannot be read, or is not an object.
+        InputError: the file cannot be read, or does not contain an object.
     """
     data = parse_json(read_bytes(path, limit=limit, follow=follow), source=str(path))
     if not isinstance(data, dict):
@@ -318,12 +316,12 @@ def read_json(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = T
 
 
 def inside(folder: Path, name: object, *, source: str = "", path: str = "") -> Path:
-    """Resolve the path of the regular file `name` in a folder that somebody else may have made.
+    """Resolve the path of the regular file `name` in a folder that is not trusted.
 
     The name must be relative, with plain parts (no `..`, no control characters), and no part of it may be a link.
 
     Raises:
-        InputError: the name leads out of the folder, or is not a regular file there.
+        InputError: the name leads out of the folder, or is not a regular file in it.
     """
     if not is_plain(name):
         raise InputError(f"must be a path inside the folder, not {shown(name)}", source=source, path=path)
@@ -351,7 +349,7 @@ def is_plain(name: object) -> bool:
 
 
 def shown(value: object, limit: int = 80) -> str:
-    """Format a value from a file for a message: one line of printable characters, not too long."""
+    """Format a value from a file for a message: one line of printable characters, shortened to `limit`."""
     text = repr(value) if not isinstance(value, int) or abs(value) < 10**limit else "a huge number"
     text = "".join(c if c.isprintable() else "?" for c in text)
     return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,4 +1,4 @@
-"""Files with one JSON object per line. Only the offset of each line stays in memory, not its content."""
+"""Files with one JSON object per line; only the offset of each line is kept in memory."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class JsonLines:
 
     @classmethod
     def index(cls, path: Path, *, limit: int = MAX_LINE_BYTES) -> JsonLines:
-        """Find the lines of a file in one pass, with 8 bytes of memory per line.
+        """Index the lines of a file in one pass, with 8 bytes of memory per line.
 
         Args:
             path: a regular file, not a link.
-            limit: the longest line, in bytes.
+            limit: longest accepted line, in bytes.
 
         Raises:
             InputError: the file cannot be read, or one of its lines is too long or blank.
@@ -90,7 +90,7 @@ class JsonLines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineFiles:
-    """Several files of JSON lines, read as one; `ends` (n,) counts the lines up to the end of each file."""
+    """Several files of JSON lines, read as one; `ends` (n,) is the number of lines up to the end of each file."""
 
     files: tuple[JsonLines, ...]
     ends: Ints
@@ -105,9 +105,9 @@ class LineFiles:
         return int(self.ends[-1]) if len(self.ends) else 0
 
     def read(self, rows: range) -> Iterator[tuple[Path, int, dict[str, Any]]]:
-        """Read the objects of some lines, counted from 0 over all files: the file, the line's number in it, the object.
+        """Read some lines, counted from 0 over all files: the file, the line's number in it, the object.
 
-        `rows` may have any step; lines in increasing order are read fastest. Numbers of lines count from 1.
+        `rows` may have any step; lines in increasing order are read fastest. Line numbers count from 1.
 
         Raises:
             InputError: as `JsonLines.read`.

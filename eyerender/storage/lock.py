@@ -3,8 +3,8 @@
 The locks are kernel locks (flock) on an open file, so a process that dies in any way releases them.
 
 Why not filelock: its kernel locks are exclusive only, and runs over parts of a folder share the folder's lock. Its
-read-write locks are a SQLite database, or files that outlive a dead process until they expire. The rest of its features
-would replace one call of flock.
+read-write locks are a SQLite database, or files that outlive a dead process until they expire. Its other features would
+replace a single call of flock.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _UNSUPPORTED = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
 
 @contextmanager
 def writer_lock(folder: Path, warn: Say = lambda _text: None) -> Iterator[None]:
-    """Hold a whole folder while the block runs; the file of the lock is removed afterwards.
+    """Hold a whole folder during the block; the lock file is removed afterwards.
 
     Raises:
-        InputError: another writer holds it.
-        EyerenderError: it cannot be written.
+        InputError: another writer holds the folder.
+        EyerenderError: the folder cannot be written.
     """
     with contextlib.ExitStack() as stack:
         _take(stack, folder / LOCK, shared=False, folder=folder, warn=warn)
@@ -48,11 +48,11 @@ def writer_lock(folder: Path, warn: Say = lambda _text: None) -> Iterator[None]:
 
 @contextmanager
 def run_lock(folder: Path, part: tuple[int, int], warn: Say) -> Iterator[None]:
-    """Hold a folder while the block runs; `part` = (K, N) of --shard K/N, (1, 1) for all of it.
+    """Hold a folder during the block; `part` = (K, N) of --shard K/N, (1, 1) for the whole.
 
     Raises:
-        InputError: another run holds it, or a part of it that overlaps.
-        EyerenderError: it cannot be written.
+        InputError: another run holds the folder, or an overlapping part of it.
+        EyerenderError: the folder cannot be written.
     """
     k, n = part
     with contextlib.ExitStack() as stack:
@@ -61,7 +61,7 @@ def run_lock(folder: Path, part: tuple[int, int], warn: Say) -> Iterator[None]:
         if not whole:
             for other in folder.glob(f"{LOCK}-*-of-*"):
                 if not other.name.endswith(f"-of-{n}"):
-                    # Parts of another division overlap with ours, so none of them may be held.
+                    # Parts of another division overlap with this one, so none of them may be held.
                     with contextlib.ExitStack() as brief:
                         _take(brief, other, shared=True, folder=folder, warn=warn)
             _take(stack, folder / f"{LOCK}-{k}-of-{n}", shared=False, folder=folder, warn=warn)
@@ -70,7 +70,7 @@ def run_lock(folder: Path, part: tuple[int, int], warn: Say) -> Iterator[None]:
 
 @contextmanager
 def final_lock(folder: Path, warn: Say) -> Iterator[None]:
-    """Wait for and hold the right to assemble the finished dataset."""
+    """Wait for and hold the lock for assembling the finished dataset."""
     with contextlib.ExitStack() as stack:
         _take(stack, folder / f"{LOCK}-final", shared=False, folder=folder, warn=warn, wait=True)
         yield

@@ -1,10 +1,11 @@
-"""JSON objects that repeat each other: what several of them share is written once, and each holds the rest.
+"""Factor JSON objects into a common part, which is written once, and the rest of each.
 
     common([{"a": 1, "b": 2}, {"a": 1, "b": 3}])  ->  {"a": 1}
     rest({"a": 1, "b": 3}, {"a": 1})              ->  {"b": 3}
     merged({"a": 1}, {"b": 3})                    ->  {"a": 1, "b": 3}
 
-Lists of objects take part as mappings from their places, "[0]", "[1]", ... (`places`, and `lists` for the way back).
+Lists of objects are treated as mappings from their indices, "[0]", "[1]", ... (`places` converts, `lists` converts
+back).
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ _PLACE = re.compile(r"\[\d+\]")
 
 
 def common(objects: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """What all objects hold with the same value, as deep as mappings go."""
+    """Return the part that all objects hold with equal values, recursively in mappings."""
     return reduce(_common, objects)
 
 
 def rest(whole: Mapping[str, Any], shared: Mapping[str, Any]) -> dict[str, Any]:
-    """What an object holds beyond what it shares; `shared` must be a part of it."""
+    """Return the part of an object that is not shared; `shared` must be a part of it."""
     out = {}
     for key, value in whole.items():
         if key not in shared:
@@ -35,7 +36,7 @@ def rest(whole: Mapping[str, Any], shared: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """The object of which `own` is the rest."""
+    """Merge a shared part with an object's rest, the inverse of `rest`."""
     out = {**shared, **own}
     for key, value in own.items():
         other = shared.get(key)
@@ -45,7 +46,7 @@ def merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def places(node: Any) -> Any:
-    """A JSON value whose lists of mappings or lists became mappings from their places."""
+    """Convert lists of mappings or lists in a JSON value to mappings from their indices."""
     if isinstance(node, dict):
         return {key: places(value) for key, value in node.items()}
     if isinstance(node, list) and any(isinstance(value, dict) for value in node):
@@ -54,7 +55,7 @@ def places(node: Any) -> Any:
 
 
 def lists(node: Any) -> Any:
-    """The value of which `places` made this one."""
+    """Convert a value from `places` back."""
     if not isinstance(node, dict):
         return node
     if node and all(map(_PLACE.fullmatch, node)):
@@ -67,7 +68,7 @@ def _common(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     for key in a.keys() & b.keys():
         x, y = a[key], b[key]
         if isinstance(x, dict) and isinstance(y, dict):
-            # Mappings of different lengths may be lists, whose places belong together.
+            # Mappings of different lengths may be lists, whose indices belong together.
             if (own := _common(x, y)) or x == y:
                 out[key] = own
         elif _same(x, y):
@@ -76,5 +77,5 @@ def _common(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
 
 
 def _same(x: Any, y: Any) -> bool:
-    """Whether two values are written alike; 1 equals 1.0, but is not written so."""
+    """Return whether two values are written identically; 1 equals 1.0, but is written differently."""
     return type(x) is type(y) and x == y and (not isinstance(x, list) or json.dumps(x) == json.dumps(y))

@@ -1,1 +1,1 @@
-"""The replications of two comparative studies, the comparison of observers on them, and conditions beyond the paper."""
+"""Replications of two comparative studies, comparison of the observers on them, and further conditions."""

@@ -1,4 +1,4 @@
-"""Estimators of the authors' software where they differ from the text: visual axis, objective, solution."""
+"""Estimators as the authors' software implements them, where it differs from the text."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ class AuthorsGuestrinEizenman(GuestrinEizenman):
     """Guestrin & Eizenman's method with the departures of the authors' software, each selectable.
 
     Args:
-        visual_axis: "rotation" turns the optic axis by a rotation that is fixed in the world (beta about y, then alpha
-            about z); "angles" is the method's own, which adds them to azimuth and elevation.
+        visual_axis: "rotation" turns the optic axis by a rotation fixed in the world (beta about y, then alpha about
+            z); "angles" adds them to azimuth and elevation, as in the method.
         objective: "sum_of_errors" minimises the sum of the angles atan(distance / viewing_distance_mm) in degrees by
-            sequential quadratic programming (Kraft 1988; scipy `minimize`, SLSQP); "least_squares" is the method's own.
+            sequential quadratic programming (Kraft 1988; scipy `minimize`, SLSQP); "least_squares" is that of the
+            method.
         viewing_distance_mm: distance of the screen that the software assumes.
     """
 
@@ -45,7 +46,7 @@ class AuthorsGuestrinEizenman(GuestrinEizenman):
         return np.stack([ca * x - sa * w[..., 1], sa * x + ca * w[..., 1], z], axis=-1)
 
     def search(self, misses: Misses, start: EyeParameters) -> Calibration:
-        """Find one eye's parameters that minimise the objective, from `start`."""
+        """Minimise the objective over one eye's parameters, from `start`."""
         if self.objective == "least_squares":
             return GuestrinEizenman.search(self, misses, start)
         space = FreeParameters(start, self.bounds, self.free)
@@ -68,7 +69,7 @@ class AuthorsGuestrinEizenman(GuestrinEizenman):
 
 @dataclass(frozen=True, slots=True)
 class MinimumNormRegression(Regression):
-    """Regression with the minimum-norm solution where the targets do not determine the coefficients."""
+    """Regression with the minimum-norm solution if the targets do not determine the coefficients."""
 
     def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> EyeFit:
         """Fit the coefficients of one eye.

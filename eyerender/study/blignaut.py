@@ -74,12 +74,12 @@ class Outcome:
 
     @property
     def mean_deg(self) -> float | None:
-        """Mean over the targets with an estimate."""
+        """Mean over the targets with an estimate, in degrees."""
         return known_mean(self.error_deg)
 
 
 def scene(eye: str, departures: Collection[str]) -> Scene:
-    """Make the scene of one eye model."""
+    """Build the scene of one eye model."""
     loaded = load_scene(SCENE, eye=eye)
     data = loaded.spec.to_mapping()
     if "focal" in departures:
@@ -92,7 +92,7 @@ def scene(eye: str, departures: Collection[str]) -> Scene:
 
 
 def scene_key(departures: Collection[str]) -> frozenset[str]:
-    """List the departures that change the observations."""
+    """Return the departures that change the observations."""
     return frozenset(departures) & {"focal", "screen"}
 
 
@@ -112,7 +112,7 @@ def terms(function: str, departures: Collection[str]) -> tuple[str, str]:
 def run(
     observations: Observations, rig: RigGeometry, departures: Collection[str], *, centred: bool = False
 ) -> list[Outcome]:
-    """Calibrate every function on every set and test it on all targets; `centred` as in `Regression`."""
+    """Calibrate every function on every set and test it on all targets; `centred` is as in `Regression`."""
     out = []
     fixation = observations.index.fixation
     for name, targets in CALIBRATION_SETS.items():
@@ -140,13 +140,13 @@ def run(
 
 
 def best(outcomes: list[Outcome], calibration: str) -> Outcome | None:
-    """Find the function with the smallest mean error for a set; None if there is none."""
+    """Return the function with the smallest mean error for a set; None if there is none."""
     some = [o for o in outcomes if o.calibration == calibration and o.mean_deg is not None]
     return min(some, key=lambda o: o.mean_deg or 0.0) if some else None
 
 
 def rows_of(outcomes: list[Outcome], **keys: Any) -> list[Row]:
-    """Make one row per function and set."""
+    """Return one row per function and set."""
     keys["eye"] = "both"
     return [
         mean_row(

@@ -1,4 +1,4 @@
-"""Values for the report of the replication of Blignaut (2014)."""
+"""Report of the replication of Blignaut (2014)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def page(
     apart: Apart = ((), ()),
     made_of: Sequence[Budget] = (),
 ) -> Report:
-    """Make the report of the replication of [29]."""
+    """Compose the report of the replication of Blignaut (2014)."""
     best = _best_by_key(parts)
     cells = {
         key: {m: f"{v[0]:.2f}/{v[1]:.2f}/{v[-1]:.3f}" for m, v in by_model.items()} for key, by_model in best.items()
@@ -74,7 +74,7 @@ def _best_by_key(parts: Sequence[BlignautPart]) -> dict[tuple[str, str], dict[st
 def _clouds(parts: Sequence[BlignautPart]) -> list[tuple[str, str, str]]:
     """Draw the clouds of pupils and glints: (scene, observer, figure)."""
     observers = list(dict.fromkeys(key for part in parts for key in part.clouds))
-    # One reading of the scene suffices for the clouds: the corrected one where there is a choice.
+    # One reading of the scene suffices for the clouds: the corrected one if available.
     keys = [k for k in observers if k[0] == "corrected"] or observers
     # The sensor's noise is invisible at this scale.
     keys = [k for k in keys if k[1] != "image-noiseless" or (k[0], "image") not in keys]

@@ -2,15 +2,16 @@
 
     error from noisy images of eye M = A + (E - A) + (I - E) + (N - I)
     A   the algorithm's own: exact features of the simplest eye of the run (E1 where it is there)
-    E   exact features of eye M:                               E - A is what the eye model adds
-    I   features of M's images exposed without noise:          I - E is what forming and reading an image adds
-    N   features of the same images with the sensor's noise:   N - I is what the noise adds
+    E   exact features of eye M:                               E - A: added by the eye model
+    I   features of M's images exposed without noise:          I - E: added by image formation and extraction
+    N   features of the same images with the sensor's noise:   N - I: added by the noise
 
 Each is a mean over the frames for which all four have an estimate, so the terms add up exactly. These are net effects:
-a cause that moves gaze across the existing error has nearly none. The rms angle between the paired estimates shows
-how far it moves gaze; its square is that of the shift (the mean of each eye) plus that of the pattern over the frames.
-Where the images are exposed several times, these three are means over the noise seeds, and the scatter between seeds is
-split from the pattern: rms^2 = shift^2 + pattern^2 + scatter^2. The net effect is that of the stored exposure.
+a cause that moves gaze perpendicular to the existing error has nearly none. The rms angle between the paired estimates
+measures the total effect; its square is that of the shift (the mean of each eye) plus that of the pattern over the
+frames. If the images are exposed several times, these three are means over the noise seeds, and the scatter between
+seeds is separated from the pattern: rms^2 = shift^2 + pattern^2 + scatter^2. The net effect is that of the stored
+exposure.
 
 A difference has a 95 % interval (Student's t of the paired differences). The frames are a design, not a sample, and a
 symmetric rig shows each with its mirror image. The interval of E - A is therefore narrower than for independent frames,
@@ -45,10 +46,11 @@ class Term:
         low_deg: lower end of the 95 % interval, if it is a difference.
         high_deg: upper end.
         rms_deg: rms angle between the paired estimates; of the algorithm, between estimate and truth.
-        shift_deg: what is common to all frames of an eye.
-        pattern_deg: what differs between the frames and repeats with every seed; with one exposure its noise too.
-        scatter_deg: what differs between noise seeds; None without several.
-        seeds: number of exposures with other noise; None where there is one.
+        shift_deg: part common to all frames of an eye.
+        pattern_deg: part that differs between the frames and repeats with every seed; with one exposure it includes
+            noise.
+        scatter_deg: part that differs between noise seeds; None for one seed.
+        seeds: number of exposures with other noise; None for one exposure.
     """
 
     name: str
@@ -75,7 +77,7 @@ class Budget:
     total_deg: float
 
     def term(self, name: str) -> Term | None:
-        """Find a term by its name."""
+        """Return a term by its name."""
         return next((term for term in self.terms if term.name == name), None)
 
 
@@ -123,7 +125,7 @@ class _Step:
 
 
 def _by_key(parts: Sequence[ModelResults], kind: str) -> dict[tuple[str, str, str, str], Floats]:
-    """Arrange arrays by (protocol, estimator, eye model, observer)."""
+    """Group arrays by (protocol, estimator, eye model, observer)."""
     return {
         (protocol, name, part.eye_model, observer): found
         for part in parts

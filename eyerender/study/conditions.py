@@ -1,4 +1,4 @@
-"""Conditions beyond the paper: the errors over gaze direction, head position, pupil size and parameters of the eye.
+"""Conditions beyond the paper: errors over gaze direction, head position, pupil size and eye parameters.
 
 Two trackers are calibrated at the central head position with a 4 mm pupil, on analytic features of both studies'
 corrected scenes: the model-based one of [28] (nine targets, index fixed) and the interpolation-based one of [29] (R8 on
@@ -44,12 +44,12 @@ DRAWN_PEOPLE = "drawn people"
 PEOPLE_PRESET, PEOPLE_SEED, PEOPLE = "adults", 0, 4
 FIXED, SHIFTED = "centre fixed", "centre shifts"
 CENTRES: dict[str, dict[str, Any]] = {FIXED: {}, SHIFTED: {"margin": {}}}
-"""How the pupil widens -> keys of the scene's eye."""
+"""Ways in which the pupil widens -> keys of the scene's eye."""
 QUALITY = tuple(field.name for field in fields(Quality))
 
 
 def _with_lens(axis: int) -> str:
-    """List the paths of the stop's place and of the lens' place, if there is a lens.
+    """Return the paths of the positions of the stop and, if there is one, the lens.
 
     Both move together, so that the lens does not cross the stop.
     """
@@ -89,7 +89,7 @@ class ConditionsPart:
     screen_maps: dict[str, Floats] = field(default_factory=dict)
     head_maps: dict[str, Floats] = field(default_factory=dict)
     diameters: dict[str, list[float]] = field(default_factory=dict)
-    """Mean errors over `DIAMETERS_MM` by the name of the curve: tracker, whose errors, how the pupil widens."""
+    """Mean errors over `DIAMETERS_MM`, by name of the curve: tracker, eyes, and how the pupil widens."""
     sensitivity: list[dict[str, Any]] = field(default_factory=list)
     precision: dict[str, dict[str, float]] = field(default_factory=dict)
     rows: list[Row] = field(default_factory=list)
@@ -97,7 +97,7 @@ class ConditionsPart:
 
 @dataclass(slots=True)
 class PeoplePart:
-    """Mean errors (deg) over `DIAMETERS_MM` of drawn people, by subject and curve as in `ConditionsPart.diameters`."""
+    """Mean errors (deg) of drawn people over `DIAMETERS_MM`, by subject and curve as in `ConditionsPart.diameters`."""
 
     diameters: dict[int, dict[str, list[float]]] = field(default_factory=dict)
     rows: list[Row] = field(default_factory=list)
@@ -124,7 +124,7 @@ class _Tracker:
         return place if self.name == "interpolation" else place + seen.index.eye_position_mm
 
     def errors_by_eye_deg(self, seen: Observations) -> dict[str, Floats]:
-        """Compute the errors (n,) of what the tracker reports, and of each single eye where it averages both."""
+        """Compute the errors (n,) of the tracker's gaze, and of each single eye if the tracker averages both."""
         index = seen.index
         if self.name == "model-based":
             return {EYES[0]: self.errors_deg(seen)}
@@ -133,7 +133,7 @@ class _Tracker:
         return {"both": self.errors_deg(seen)} | {side: single[index.eye == k] for k, side in enumerate(EYES)}
 
     def errors_deg(self, seen: Observations) -> Floats:
-        """Compute the errors (n,) by frame."""
+        """Compute the errors (n,) deg by frame."""
         frames, points = self.points(seen)
         return angular_error_deg(points, frames.index.target_mm, self.from_mm(frames))
 
@@ -171,7 +171,7 @@ def conditions_part(eye: str) -> ConditionsPart:
             try:
                 up, down = (_mean(_scene(name, eye).replaced(eye_spec=spec)) for spec in (more, less))
             except InputError as error:
-                # A changed eye may let no ray through. That is a result for this parameter alone.
+                # A changed eye may transmit no ray. That is a result for this parameter only.
                 entry[name]["reason"] = str(error)
                 continue
             entry[name] |= {"at_plus": up, "at_minus": down, "per_step": 0.5 * (up - down)}
@@ -180,7 +180,7 @@ def conditions_part(eye: str) -> ConditionsPart:
 
 
 def people_part() -> PeoplePart:
-    """Compute the errors over the pupil's diameter of a few drawn people."""
+    """Compute the errors over the pupil's diameter for a few drawn people."""
     out = PeoplePart()
     for subject in range(PEOPLE):
         out.diameters[subject] = {}
@@ -203,7 +203,7 @@ def people_part() -> PeoplePart:
 def _over_diameters(
     tracker: _Tracker, eye: str, *, sides: Sequence[str], centres: dict[str, dict[str, Any]] | None = None
 ) -> tuple[dict[str, list[float]], list[Row]]:
-    """Compute mean errors over the diameters by curve, and their rows."""
+    """Compute mean errors over the diameters by curve, with their rows."""
     curves: dict[str, list[float]] = {}
     rows = []
     for centre, keys in (CENTRES if centres is None else centres).items():
@@ -224,12 +224,12 @@ def _over_diameters(
 
 
 def curve(tracker: str, side: str, centre: str) -> str:
-    """Name a curve of errors over the pupil's diameter."""
+    """Return the name of a curve of errors over the pupil's diameter."""
     return f"{tracker}, {side} {'eyes' if side == 'both' else 'eye'}, {centre}"
 
 
 def _scene(tracker: str, eye: str) -> Scene:
-    """Make the scene in which a tracker is calibrated: one head position."""
+    """Build the scene in which a tracker is calibrated: one head position."""
     if tracker == "interpolation":
         return blignaut.scene(eye, blignaut.CORRECTED)
     scene = guestrin.scene(eye, guestrin.CORRECTED)
@@ -246,7 +246,7 @@ def _changed(scene: Scene, changes: dict[str, dict[str, Any]]) -> Scene:
 
 
 def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:
-    """Calibrate the scene's tracker in it; also returns the observations used."""
+    """Calibrate the scene's tracker in it; also return the observations used."""
     seen = trace(scene)
     if len(scene.rig.lights) > 1:
         fitted = guestrin.estimator(guestrin.CORRECTED).fit(seen, scene.rig)
@@ -257,7 +257,7 @@ def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:
 
 
 def _mean(scene: Scene) -> float:
-    """Compute the mean error of the scene's tracker, calibrated on this very eye."""
+    """Compute the mean error of the scene's tracker, calibrated on the scene's own eye."""
     tracker, seen = _calibrated(scene)
     return float(np.nanmean(tracker.errors_deg(seen)))
 
@@ -276,7 +276,7 @@ def _over_heads(tracker: _Tracker, keys: dict[str, Any]) -> tuple[Floats, list[R
 
 
 def _precision(tracker: _Tracker, seen: Observations) -> dict[str, float]:
-    """Compute accuracy and precision with Gaussian noise on the features; means over the fixations."""
+    """Compute accuracy and precision with Gaussian noise on the features, averaged over the fixations."""
     rng = np.random.default_rng(SEED)
     samples = []
     for _ in range(SAMPLES):
@@ -287,7 +287,7 @@ def _precision(tracker: _Tracker, seen: Observations) -> dict[str, float]:
 
 
 def _noisy(seen: Observations, rng: np.random.Generator) -> Observations:
-    """Add independent Gaussian noise of `NOISE_PX` in x and y to features."""
+    """Add independent Gaussian noise of `NOISE_PX` to x and y of features."""
     pupil = seen.pupil.centre_px + rng.normal(0.0, NOISE_PX, seen.pupil.centre_px.shape)
     glints = seen.glints.xy_px + rng.normal(0.0, NOISE_PX, seen.glints.xy_px.shape)
     return replace(
@@ -296,7 +296,7 @@ def _noisy(seen: Observations, rng: np.random.Generator) -> Observations:
 
 
 def _eye_with(spec: EyeSpec, paths: str, change: float) -> EyeSpec | None:
-    """Change a parameter of an eye; None where it has no such parameter.
+    """Change a parameter of an eye; return None if it has no such parameter.
 
     `paths` names alternatives (|), each of one or more (&) dotted paths; a list is changed in all its numbers.
     """
@@ -311,7 +311,7 @@ def _eye_with(spec: EyeSpec, paths: str, change: float) -> EyeSpec | None:
 
 
 def _add(node: Any, path: Sequence[str], change: float) -> bool:
-    """Add to the number at a path, in place; False where there is none."""
+    """Add to the number at a path, in place; return False if there is none."""
     for k, key in enumerate(path):
         index: Any = int(key) if isinstance(node, list) else key
         if isinstance(node, list) and not 0 <= index < len(node):

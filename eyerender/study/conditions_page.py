@@ -26,7 +26,7 @@ _D3 = "largest change of the mean error over pupils of 2 to 8 mm (deg)"
 
 
 def findings(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> list[Finding]:
-    """State the effects of the conditions as values; there is no published claim to compare them with."""
+    """Return the effects of the conditions as findings without a published claim."""
     out = []
 
     def add(name: str, rule: str, value: float, detail: str) -> None:
@@ -58,7 +58,7 @@ def findings(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ())
 
 
 def more(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> dict[str, Any]:
-    """Make the content of the summary besides its rows."""
+    """Return the content of the summary besides its rows."""
     return {
         "trackers": _WHO,
         "noise": {"sigma_px": c.NOISE_PX, "samples": c.SAMPLES, "seed": c.SEED},
@@ -84,7 +84,7 @@ def more(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> 
 
 
 def page(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found: Sequence[Finding]) -> Report:
-    """Make the report."""
+    """Compose the report."""
     head = np.array(c.HEAD_MM)
     moved = ("to the subject's left (mm)", "towards the screen (mm)", "mean error (deg)", [(0.0, 0.0)])
     across = ("to the subject's right (mm)", "up (mm)", "error (deg)")

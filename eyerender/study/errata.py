@@ -9,9 +9,9 @@ from .results import Erratum
 
 
 def guestrin(misprints: Mapping[str, Mapping[str, Any]]) -> list[Erratum]:
-    """List the errata for the replication of [28].
+    """Return the errata for the replication of Guestrin & Eizenman (2006).
 
-    The effects come from the models' own runs (eye model -> case -> H1, H2, counts).
+    `misprints` holds the effects: eye model -> case -> H1, H2, counts.
     """
     return [
         Erratum(
@@ -52,7 +52,7 @@ def guestrin(misprints: Mapping[str, Mapping[str, Any]]) -> list[Erratum]:
 
 
 def blignaut() -> list[Erratum]:
-    """List the errata for the replication of [29]."""
+    """Return the errata for the replication of Blignaut (2014)."""
     return [
         Erratum(
             where="Table 5, best functions",

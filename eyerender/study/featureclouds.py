@@ -24,27 +24,27 @@ class Cloud:
 
     @classmethod
     def of(cls, observations: Observations) -> Cloud:
-        """Take the right eye's features; NaN where one is missing."""
+        """Create the cloud of the right eye's features; NaN if one is missing."""
         seen = observations.take(observations.index.eye == 0)
         glint, _ = seen.glints.of_light(0)
         return cls(np.asarray(seen.pupil.centre_px), glint)
 
 
 def extent_px(points: Floats) -> float:
-    """Measure the largest distance of a point from the cloud's mean."""
+    """Compute the largest distance (px) of a point from the cloud's mean."""
     good = points[np.isfinite(points).all(axis=1)]
     return float(np.linalg.norm(good - good.mean(axis=0), axis=1).max()) if len(good) else float("nan")
 
 
 def aspect(points: Floats) -> float:
-    """Compute the spread across over the spread along the cloud's long axis (ratio of singular values)."""
+    """Compute the ratio of the spreads across and along the cloud's long axis (singular values)."""
     good = points[np.isfinite(points).all(axis=1)]
     values = np.linalg.svd(good - good.mean(axis=0), compute_uv=False)
     return float(values[1] / values[0]) if values[0] > 0 else float("nan")
 
 
 def bow(points: Floats) -> float:
-    """Measure how rows of targets bend: largest distance from the chord over its length, mean over the rows."""
+    """Compute how rows of targets bend: largest distance from the chord over its length, averaged over the rows."""
     grid = points.reshape(COLUMNS, ROWS, 2)
     out = []
     for row in range(ROWS):
@@ -57,7 +57,7 @@ def bow(points: Floats) -> float:
 
 
 def findings(clouds: Mapping[str, Cloud], protocol: str, observer: str) -> list[Finding]:
-    """Test F1 to F4, as far as their models were run."""
+    """Test F1 to F4 for the models that were run."""
     out = []
 
     def add(name: str, rule: str, value: float, threshold: str, verdict: bool, detail: str) -> None:

@@ -21,11 +21,11 @@ _LOOK = {
 _OTHER = (("#D55E00", "P"), ("#777777", "X"), ("#F0E442", "h"), ("#000000", "*"))
 _MEASURED = "#222222"
 STYLES = (("o", "#0072B2"), ("D", "#D55E00"), ("s", "#009E73"), ("^", "#CC79A7"), ("v", "#56B4E9"), ("P", "#777777"))
-"""Marker and colour of readings and observers, in their order."""
+"""Marker and colour of protocols and observers, in their order."""
 
 
 def look(model: str, others: Sequence[str] = ()) -> tuple[str, str]:
-    """Choose colour and marker of an eye model."""
+    """Return colour and marker of an eye model."""
     if model in _LOOK:
         return _LOOK[model]
     rest = [m for m in others if m not in _LOOK]
@@ -123,7 +123,7 @@ def sets_figure(
 def waterfall_figure(labels: Sequence[str], panels: Mapping[str, Mapping[str, Sequence[float | None]]]) -> str:
     """Draw the mean error after each correction, from published to corrected, by eye model; one panel per measure."""
     with figure(max(7.0, 2.6 + 3.2 * len(panels)), 1.6 + 0.36 * len(labels), len(panels)) as (fig, axes):
-        fig.get_layout_engine().set(wspace=0.06)  # the last number of one panel is next to the first of the next
+        fig.get_layout_engine().set(wspace=0.06)  # the last tick label of one panel is next to the first of the next
         y = np.arange(len(labels))
         for k, (ax, (name, by_model)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
             for model, values in by_model.items():

@@ -1,4 +1,4 @@
-"""Statements that a replication must test, each true or false from its own data: G1 to G3, B1 to B11."""
+"""Statements that a replication tests, each true or false from its own data: G1 to G3, B1 to B11."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def t_tests(means: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
 def guestrin(
     means: Mapping[str, Mapping[str, float]], errors: Mapping[str, Floats], protocol: str, observer: str
 ) -> list[Finding]:
-    """Test findings G1 to G3, and how close the paper's own figures are.
+    """Test findings G1 to G3, and compare with the paper's own figures.
 
     Args:
         means: mean (deg) by eye model and head.
@@ -140,14 +140,14 @@ class _Blignaut:
         self.error = {m: {c: _mean(b) for c, b in found.items()} for m, found in self.best.items()}
 
     def determined(self) -> dict[str, dict[str, float]]:
-        """Compute mean errors of the best among the functions whose terms do not outnumber the targets."""
+        """Compute mean errors of the best function among those with at most as many terms as targets."""
         return {
             m: {c: _mean(best([o for o in some if _terms(o.function) <= len(t)], c)) for c, t in _SETS}
             for m, some in self.outcomes.items()
         }
 
     def models(self, wanted: Sequence[str]) -> list[str]:
-        """Select those of the given eye models that were run."""
+        """Return those of the given eye models that were run."""
         return [m for m in wanted if m in self.error]
 
 
@@ -165,7 +165,7 @@ class _Test:
 
 
 _SETS = tuple(lit.CALIBRATION_SETS.items())
-# What "negligible" and "acceptable" mean is not said; these levels are chosen.
+# The paper does not define "negligible" and "acceptable"; these levels are chosen.
 NEGLIGIBLE_DEG, ALIKE_DEG, ACCEPTABLE_DEG = 0.01, 0.05, 1.0
 
 
@@ -191,7 +191,7 @@ def _terms(function: str) -> int:
 
 
 def _best_functions(b: _Blignaut) -> Iterator[_Test]:
-    """Test B1: C5 has a sentence of its own; for C9 the function that the paper names is tested."""
+    """Test B1; C5 has a separate sentence, and for C9 the function that the paper names is tested."""
     for c in lit.CALIBRATION_SETS:
         named, (measured, _) = lit.PAPER_BEST[c], lit.blignaut_best(c)
         ties = {m: _ties(b.outcomes[m], c) for m in b.outcomes}
@@ -209,7 +209,7 @@ def _best_functions(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _drops(b: _Blignaut) -> Iterator[_Test]:
-    """Test B2 and B3: what more targets bring."""
+    """Test B2 and B3: the gain by more targets."""
     drop = {m: 1 - e["C9"] / e["C5"] for m, e in b.error.items()}
     least = min(drop.values())
     rule = "errors decrease markedly from C5 to C9: smallest relative decrease"
@@ -234,7 +234,7 @@ def _spherical(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _shares(b: _Blignaut) -> Iterator[_Test]:
-    """Test B5: simulated over measured errors."""
+    """Test B5: the ratio of simulated to measured errors."""
     for c in lit.CALIBRATION_SETS:
         measured_deg = lit.blignaut_best(c)[1]
         share_of = {m: e[c] / measured_deg for m, e in b.error.items()}
@@ -245,7 +245,7 @@ def _shares(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _five_targets(b: _Blignaut) -> Iterator[_Test]:
-    """Test B6 and B7: what five targets give."""
+    """Test B6 and B7: the errors with five targets."""
     errors = {m: e["C5"] for m, e in b.error.items()}
     least = min(errors.values())
     rule = (
@@ -258,7 +258,7 @@ def _five_targets(b: _Blignaut) -> Iterator[_Test]:
 
 
 def _alike(b: _Blignaut) -> Iterator[_Test]:
-    """Test B8 to B10: models that err alike."""
+    """Test B8 to B10: models with similar errors."""
     sets = tuple(lit.CALIBRATION_SETS)
     pairs = [(m, n) for m, n in (("E1", "E3"), ("E2", "E4")) if {m, n} <= set(b.error)]
     if pairs:
@@ -298,7 +298,7 @@ def _p(one: Outcome | None, other: Outcome | None) -> float:
 
 
 def _ties(outcomes: Sequence[Outcome], calibration: str) -> list[str]:
-    """List the functions that are as good as the best one for a set, the best first."""
+    """Return the functions that are as good as the best one for a set, the best first."""
     some = sorted((o.mean_deg, o.function) for o in outcomes if o.calibration == calibration and o.mean_deg is not None)
     return [name for mean, name in some if mean - some[0][0] < _TIE_DEG]
 

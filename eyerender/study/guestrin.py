@@ -1,6 +1,6 @@
 """The replication of Guestrin & Eizenman (2006): scene, estimator and error of each protocol.
 
-`published` is every departure of the authors' software at once, `corrected` none; any set of them can be run.
+`published` includes all departures of the authors' software, `corrected` none; any subset can be run.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ PUBLISHED = frozenset(d.id for d in DEPARTURES)
 CORRECTED: frozenset[str] = frozenset()
 
 SOFTWARE_START = EyeParameters(cornea_radius_mm=7.8, pupil_distance_mm=4.2, index=1.376, alpha_deg=5.0, beta_deg=1.5)
-# The index is fixed in the software, so its bounds never act.
+# The index is fixed in the software, so its bounds have no effect.
 SOFTWARE_BOUNDS = ParameterBounds(
     EyeParameters(cornea_radius_mm=3.0, pupil_distance_mm=2.0, index=1.30, alpha_deg=-10.0, beta_deg=-5.0),
     EyeParameters(cornea_radius_mm=20.0, pupil_distance_mm=15.0, index=1.45, alpha_deg=10.0, beta_deg=5.0),
@@ -121,7 +121,7 @@ class Outcome:
 
     @property
     def means(self) -> dict[str, float | None]:
-        """Means of H1 and H2."""
+        """Return the means of H1 and H2."""
         return {head: self.mean_deg(head) for head in HEADS}
 
     def rows(self, head: str) -> Any:
@@ -131,7 +131,7 @@ class Outcome:
 
 
 def scene(eye: str, departures: Collection[str], changes: dict[str, Any] | None = None) -> Scene:
-    """Make the scene of one eye model; `changes` replaces further keys of the camera or the head positions."""
+    """Build the scene of one eye model; `changes` replaces further keys of the camera or the head positions."""
     loaded = load_scene(SCENE, eye=eye)
     data = loaded.spec.to_mapping()
     camera = data["rig"]["cameras"][0]
@@ -152,12 +152,12 @@ def scene(eye: str, departures: Collection[str], changes: dict[str, Any] | None 
 
 
 def scene_key(departures: Collection[str]) -> frozenset[str]:
-    """List the departures that change the observations."""
+    """Return the departures that change the observations."""
     return frozenset(departures) & {"eyes", "lights", "heads"}
 
 
 def estimator(departures: Collection[str], *, free_index: bool = False) -> AuthorsGuestrinEizenman:
-    """Make the estimator of a set of departures."""
+    """Create the estimator for a set of departures."""
     index = 1.376 if "index" in departures else 1.3375
     software = "objective" in departures
     return AuthorsGuestrinEizenman(
@@ -167,14 +167,14 @@ def estimator(departures: Collection[str], *, free_index: bool = False) -> Autho
         free_index=free_index and "index" not in departures,
         visual_axis="rotation" if "visual_axis" in departures else "angles",
         objective="sum_of_errors" if software else "least_squares",
-        # A sum of distances has a kink where one of them vanishes, and the last digits would cost hundreds of steps
+        # A sum of distances has a kink where one of them vanishes, and the last digits would take hundreds of steps
         # there.
         tolerance=1e-10 if software else 1e-12,
     )
 
 
 def estimation_rig(rig: RigGeometry, departures: Collection[str]) -> RigGeometry:
-    """Make the rig given to the estimator; in the authors' software its screen is 1 mm too far."""
+    """Return the rig given to the estimator; in the authors' software its screen is 1 mm too far."""
     if "plane" not in departures or rig.screen is None:
         return rig
     centre = frozen(rig.screen.centre_mm + np.array([1.0, 0.0, 0.0]))
@@ -193,7 +193,7 @@ def errors_deg(observations: Observations, gaze: GazePoints, departures: Collect
 def run(
     observations: Observations, rig: RigGeometry, departures: Collection[str], *, free_index: bool = False
 ) -> Outcome:
-    """Calibrate at H1 and estimate everywhere."""
+    """Calibrate at H1 and estimate at all head positions."""
     told = estimation_rig(rig, departures)
     central = observations.take(observations.index.head == 0)
     fitted = estimator(departures, free_index=free_index).fit(central, told)
@@ -205,7 +205,7 @@ def run(
 
 
 def rows_of(outcome: Outcome, **keys: Any) -> list[Row]:
-    """Make rows of H1 and H2 for each eye, and pooled where there are two."""
+    """Return rows of H1 and H2 for each eye, and pooled if there are two."""
     index, pupil, glints = outcome.observations.index, outcome.observations.pupil, outcome.observations.glints
     inside = pupil.in_image & glints.in_image.all(axis=1)
     out = []
@@ -224,8 +224,7 @@ def restarts(
     """Calibrate the right eye from random starts within the bounds.
 
     Returns:
-        A mapping for JSON: the calibration that is reported, and the spread over the starts; errors are the means at
-        H1 (deg).
+        A mapping for JSON: the reported calibration, and the spread over the starts; errors are means at H1 (deg).
     """
     told, seen = estimation_rig(rig, departures), outcome.observations
     central = outcome.rows("H1") & (seen.index.eye == 0)
@@ -258,7 +257,7 @@ def restarts(
 
 
 def optimiser_settings(protocols: Sequence[str]) -> dict[str, Any]:
-    """List the settings of each protocol's calibration: method, start, bounds, tolerance."""
+    """Return the settings of each protocol's calibration: method, start, bounds, tolerance."""
     out = {}
     for protocol in protocols:
         e = estimator(PUBLISHED if protocol == "published" else CORRECTED)

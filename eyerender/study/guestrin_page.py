@@ -1,4 +1,4 @@
-"""Values for the report of the replication of Guestrin & Eizenman (2006)."""
+"""Report of the replication of Guestrin & Eizenman (2006)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def page(
     apart: Apart = ((), ()),
     made_of: Sequence[Budget] = (),
 ) -> Report:
-    """Make the report of the replication of [28]."""
+    """Compose the report of the replication of Guestrin & Eizenman (2006)."""
     values: Values = {
         "overview": overview(_cells(parts)),
         "budget": budget_values(made_of, SHOWN),
@@ -55,7 +55,7 @@ def page(
 
 
 def _by_key(parts: Sequence[GuestrinPart]) -> dict[tuple[str, str], dict[str, dict[str, float]]]:
-    """Arrange means (deg): (protocol, observer) -> eye model -> head."""
+    """Group means (deg): (protocol, observer) -> eye model -> head."""
     keys = dict.fromkeys(key for part in parts for key in part.means)
     return {key: {p.eye_model: p.means[key] for p in parts if key in p.means} for key in keys}
 
@@ -69,8 +69,8 @@ def _cells(parts: Sequence[GuestrinPart]) -> dict[tuple[str, str], dict[str, str
 
 
 def _heads_figure(parts: Sequence[GuestrinPart]) -> str | None:
-    """Draw Figure 4 of the paper; None where every error is too large for it."""
-    # A variant with errors above 11 deg would flatten everything else.
+    """Draw Figure 4 of the paper; None if every error is too large for it."""
+    # A variant with errors above 11 deg would flatten the other curves.
     shown = {
         f"{protocol}, {observer}": {m: v for m, v in means.items() if max(v.values()) < 3}
         for (protocol, observer), means in _by_key(parts).items()
@@ -84,7 +84,7 @@ def _heads_figure(parts: Sequence[GuestrinPart]) -> str | None:
 
 
 def _about_e5(parts: Sequence[GuestrinPart]) -> dict[str, str] | None:
-    """Explain the paper's 'errors exceeding 11 deg': E5 and its variants, if all of them were run."""
+    """Explain the paper's 'errors exceeding 11 deg' with E5 and its variants, if all of them were run."""
     means = {p.eye_model: p.means["published", "analytic"] for p in parts if ("published", "analytic") in p.means}
     told = {m: f"{v['H1']:.2f}/{v['H2']:.2f} deg" for m, v in means.items() if m.startswith("E5")}
     return told if {"E5", *lit.VARIANTS} <= set(told) else None

@@ -1,12 +1,12 @@
-"""Both observers on a head-mounted rig: features of 25 directions of one eye, and the direction estimated from them.
+"""Both observers on a head-mounted rig: features of 25 directions of one eye, and directions estimated from them.
 
 The direction of the optic axis, in degrees, is a polynomial of second order of a feature (x, y) in px,
 
     azimuth = sum_k a_k m_k(x, y),   elevation = sum_k b_k m_k(x, y),   m = 1, x, y, x^2, xy, y^2
 
 fitted by least squares on the nine directions of the shipped scene and tested on the sixteen between them. The feature
-is the pupil's centre, or its vector from the mean of all glints. There are no targets. The error is the angle between
-the given direction and the estimated one.
+is the pupil's centre, or the vector from the mean of all glints to it. There are no targets. The error is the angle
+between the true direction and the estimated one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FEATURES: dict[str, Feature] = {"pupil-glint vector": "pupil-glint", "pupil cent
 
 
 def scene(eye: str) -> Scene:
-    """Make the shipped scene with more directions: 5 x 5 over the range of its own 3 x 3."""
+    """Build the shipped scene with more directions: 5 x 5 over the range of its 3 x 3."""
     loaded = load_scene(SCENE, eye=eye)
     data = loaded.spec.to_mapping()
     data["poses"] = [{"azimuth_deg": a, "elevation_deg": e} for e in ELEVATIONS_DEG for a in AZIMUTHS_DEG]
@@ -77,16 +77,16 @@ def head_mounted_part(eye: str, observings: Sequence[Observing]) -> ModelResults
 
 
 def directions_deg() -> Floats:
-    """Compute azimuth and elevation (25, 2) of the optic axis."""
+    """Return azimuth and elevation (25, 2) deg of the optic axis."""
     return np.array([(a, e) for e in ELEVATIONS_DEG for a in AZIMUTHS_DEG])
 
 
 def direction_errors_deg(seen: Observations, rig: RigGeometry, name: str) -> Floats:
-    """Compute errors (25, 2) of estimated directions, to the right and up, deg; NaN where learnt or not estimated.
+    """Compute errors (25, 2) of estimated directions, to the right and up, deg; NaN for calibration and failures.
 
     Args:
         seen: observations of the 25 directions.
-        rig: their rig.
+        rig: the rig that observed them.
         name: the feature, one of `FEATURES`.
     """
     learnt = calibration_rows()
@@ -103,7 +103,7 @@ def direction_errors_deg(seen: Observations, rig: RigGeometry, name: str) -> Flo
 
 
 def findings(features: Sequence[FeatureDifference], gaze: Sequence[GazeDifference]) -> list[Finding]:
-    """State the effects of images on features and directions; there is no published claim to compare them with."""
+    """Return the effects of images on features and directions as findings without a published claim."""
     out = []
     for f in features:
         if f.feature in ("pupil centre", ALL_GLINTS):
@@ -119,7 +119,7 @@ def findings(features: Sequence[FeatureDifference], gaze: Sequence[GazeDifferenc
 
 
 def more() -> dict[str, Any]:
-    """Make the content of the summary besides its rows."""
+    """Return the content of the summary besides its rows."""
     return {
         "scene": SCENE,
         "directions_deg": {"azimuth": list(AZIMUTHS_DEG), "elevation": list(ELEVATIONS_DEG)},

@@ -1,4 +1,4 @@
-"""Values for the report of the observers on the head-mounted rig."""
+"""Report of the observers on the head-mounted rig."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .results import Finding, ModelResults
 def page(
     parts: Sequence[ModelResults], found: Sequence[Finding], apart: Apart, made_of: Sequence[Budget] = ()
 ) -> Report:
-    """Make the report."""
+    """Compose the report."""
     values: Values = {
         "reach": {"azimuth_deg": f"{max(h.AZIMUTHS_DEG):g}", "elevation_deg": f"{max(h.ELEVATIONS_DEG):g}"},
         "centres": _centres(apart[0]),

@@ -1,10 +1,10 @@
-"""A study's images: one dataset run, in which a subject is an eye model and a sample is one eye at one head position.
+"""A study's images as a dataset: a subject is an eye model, and a sample is one eye at one head position.
 
-A camera that the eye leaves is turned about its nodal point to face it, in a sample of its own. Everything that differs
-between samples is a `sequence` of the dataset's spec. A study's images are therefore a dataset like any other: made by
-several workers, shard by shard, resumed after a kill, and valid (`eyerender validate`). Images are identified by what
-they show (the scene and the eye file), so a finished dataset also serves a study that needs a part of it. Rendering is
-the expensive step: a scene that is needed with the sensor's noise and without it is rendered once and exposed twice.
+If an eye leaves the camera's image, the camera is turned about its nodal point to face it, in a separate sample.
+Everything that differs between samples is a `sequence` of the dataset's spec. A study's images are therefore a dataset
+like any other: made by several workers, shard by shard, resumed after a kill, and valid (`eyerender validate`). Images
+are identified by their scene and eye file, so a finished dataset also serves a study that needs a part of it. Rendering
+is the expensive step: a scene that is needed with and without sensor noise is rendered once and exposed twice.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _PATIENCE_S = 60.0  # per image, after which a silent worker counts as dead
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """A scene whose images form one sample, and the rows (n,) of the study's own scene that they show."""
+    """A scene whose images form one sample, and the rows (n,) of the study's scene that they show."""
 
     scene: Scene
     rows: Ints
@@ -46,14 +46,14 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class StudyImages:
-    """Images of a finished dataset, in frame order, by a digest of what they show."""
+    """Images of a finished dataset, in frame order, by the digest of their scene."""
 
     entries: Mapping[str, tuple[ImageEntry, ...]]
     spp: int | None = None
     auto_exposure: float | None = None
 
     def of(self, scene: Scene) -> tuple[ImageEntry, ...]:
-        """Look up the images of a shot's scene, in frame order; empty where they were not made."""
+        """Return the images of a shot's scene, in frame order; empty if they were not made."""
         return self.entries.get(_digest(scene, self.auto_exposure is not None), ())
 
     def holds(self, scene: Scene) -> bool:
@@ -65,7 +65,7 @@ class StudyImages:
         """Extract the features of a shot's images, or of other exposures of them with the noise of a seed.
 
         Raises:
-            InputError: they do not exist.
+            InputError: the images do not exist.
         """
         from ..imaging.imageobserver import ImageObserver
 
@@ -83,7 +83,7 @@ class StudyImages:
 
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:
-    """Make one shot per eye; with `facing` one per eye and head position, the cameras turned to the eye."""
+    """Create one shot per eye; with `facing`, one per eye and head position, with the cameras turned to the eye."""
     data = scene.spec.with_image(spp=spp).to_mapping()
     data["sensor"]["noise"] = noise
     index, out = scene.index(), []
@@ -101,7 +101,7 @@ def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = 
 
 
 def facing_scene(scene: Scene, head_mm: tuple[float, float, float], side: str) -> Scene:
-    """Make the scene of one head position and one eye, with every camera turned on the spot to face that eye."""
+    """Create the scene of one head position and one eye, with every camera turned on the spot to face it."""
     data = scene.spec.to_mapping()
     apex = scene.eye_position_mm(side) + np.array(head_mm)
     data["subject"]["eyes"] = [side]
@@ -124,14 +124,14 @@ def make_images(
     progress: Progress | None = None,
     say: Say | None = None,
 ) -> StudyImages:
-    """Get the images of all shots' scenes from the folder's dataset; missing ones are made.
+    """Return the images of all shots' scenes from the folder's dataset; make the missing ones.
 
     The folder belongs to the study: a dataset of other settings or of another version of the package is replaced. With
-    `options.auto_exposure` the images of each eye model have one exposure of their own (see `DatasetSpec`).
+    `options.auto_exposure`, each eye model has its own exposure (see `DatasetSpec`).
 
     Raises:
-        BackendError: there is nothing to render with.
-        EyerenderError: the disk is full, or a worker died again and again.
+        BackendError: no backend can render.
+        EyerenderError: the disk is full, or a worker died repeatedly.
     """
     from ..dataset.plan import Plan
     from ..dataset.run import generate
@@ -158,7 +158,7 @@ def make_images(
 
 
 def dataset_spec(study: str, scenes: Sequence[Scene], auto_exposure: float | None = None) -> Any:
-    """Make the spec of a dataset of scenes, the same ones for each eye model: a grid of models, a sequence of scenes.
+    """Create the dataset spec of scenes, the same for each eye model: a grid of models, a sequence of scenes.
 
     If a scene is needed with and without noise, one sample holds both kinds of images.
     """
@@ -197,7 +197,7 @@ def dataset_spec(study: str, scenes: Sequence[Scene], auto_exposure: float | Non
 
 
 def in_sequence(values: Sequence[Any]) -> Any:
-    """Make a template that yields the values in order: plain where they agree, else a `sequence`, leaf by leaf."""
+    """Create a template that yields the values in order: plain where they agree, else a `sequence`, leaf by leaf."""
     first = values[0]
     if all(json.dumps(v) == json.dumps(first) for v in values):
         return first
@@ -209,7 +209,7 @@ def in_sequence(values: Sequence[Any]) -> Any:
 
 
 def read_images(folder: Path) -> StudyImages | None:
-    """Read the images of a finished dataset that this version made; None where there is none."""
+    """Open the images of a finished dataset that this version made; None if there is none."""
     from ..dataset.done import run_versions
 
     try:
@@ -221,7 +221,7 @@ def read_images(folder: Path) -> StudyImages | None:
         lines = JsonLines.index(folder / METADATA)
         for line in lines.read(range(len(lines))):
             eye, frame = line["parameters"]["eye_json"], line["records"][0]["frame"]
-            # Only the keys that extraction reads are kept; a line's labels take many times as much memory.
+            # Only the keys that extraction needs are kept; a line's labels take many times as much memory.
             kept = {key: line[key] for key in ("window_px", "bit_depth")} | {"records": [{}]}
             for scene, name in _exposures(line):
                 entry = ImageEntry(folder, {"file_name": name, **kept})
@@ -235,7 +235,7 @@ def read_images(folder: Path) -> StudyImages | None:
 
 
 def _begun(folder: Path, plan: Any) -> bool:
-    """Return whether a folder holds a run of this very plan and version, or nothing yet."""
+    """Return whether a folder holds a run of this plan and version, or nothing yet."""
     from ..dataset.done import run_versions
 
     if not folder.exists():
@@ -254,7 +254,7 @@ def without_noise(scene: Scene) -> Scene:
 
 
 def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Yield the scenes, as JSON, that the images of a line of metadata show, each with the image's name."""
+    """Yield the scenes, as JSON, that the images in a line of metadata show, each with the image's name."""
     scene = line["parameters"]["scene_json"]
     out = [(scene, line["file_name"])]
     if line.get("noiseless_file_name"):
@@ -265,7 +265,7 @@ def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _digest(scene: Scene, auto: bool = False) -> str:
-    """Compute the digest of what a scene's images show, as metadata has it; `auto` leaves out the exposure."""
+    """Compute the digest of a scene's images, as in metadata; with `auto`, without the exposure."""
     eye = {key: value for key, value in scene.eye_spec.to_mapping().items() if key != "sources"}
     return _digest_of(json.dumps(scene.spec.to_mapping(), sort_keys=True), json.dumps(eye, sort_keys=True), auto)
 

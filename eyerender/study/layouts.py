@@ -3,8 +3,8 @@
 Sources: the remote ones are shipped scenes (the replicated studies). The headsets follow public pictures and data sets:
 a frame with a camera below the eye and two LEDs at it (Pupil Labs Core; Kassner et al. 2014), four LEDs behind a
 display lens with a camera below (NVGaze; Kim et al. 2019), six LEDs around a lens with a camera at its temporal rim
-(OpenEDS; Garbin et al. 2019), and a camera at the temple that sees the eye in a hot mirror between eye and lens. Their
-places in millimetres were chosen to give such pictures; the makers publish none.
+(OpenEDS; Garbin et al. 2019), and a camera at the temple that sees the eye in a hot mirror between eye and lens.
+Positions in millimetres were chosen to reproduce such pictures; the makers publish none.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class KnownLayout:
     """A layout of the study.
 
     Attributes:
-        name: its name.
-        text: what it is, in a few words.
-        headset: whether it moves with the head.
+        name: name of the layout.
+        text: short description.
+        headset: whether the rig moves with the head.
         scene: mapping of its scene.
     """
 
@@ -38,7 +38,7 @@ class KnownLayout:
 
     @property
     def slippage_mm(self) -> float:
-        """Standard deviation of the eye's place per axis: slippage of a headset, or a head that moves (chosen)."""
+        """Standard deviation of the eye's position per axis: slippage of a headset, or head motion (chosen)."""
         return 1.5 if self.headset else 15.0
 
     @property
@@ -48,7 +48,7 @@ class KnownLayout:
 
 
 def known_layouts() -> tuple[KnownLayout, ...]:
-    """The six layouts."""
+    """Return the six layouts."""
     return (
         _remote("guestrin2006", "remote, one camera, two LEDs beside the screen"),
         _remote("blignaut2014", "remote, one camera, one LED above it"),
@@ -66,13 +66,13 @@ def known_layouts() -> tuple[KnownLayout, ...]:
 
 
 def _ring(away_mm: float, radius_mm: float, count: int) -> list[list[float]]:
-    """Places on a circle about the eye's axis, the first one above it."""
+    """Return positions on a circle around the eye's axis, the first one above it."""
     angles = 2.0 * np.pi * np.arange(count) / count
     return [[away_mm, -31.5 + radius_mm * float(np.sin(a)), radius_mm * float(np.cos(a))] for a in angles]
 
 
 def _remote(name: str, text: str) -> KnownLayout:
-    """A shipped scene with its first eye at its first head position."""
+    """Create a layout from a shipped scene's first eye and first head position."""
     data = load_scene(name).spec.to_mapping()
     subject = {**data["subject"], "eyes": ["right"], "head_positions_mm": [[0.0, 0.0, 0.0]]}
     return KnownLayout(name=name, text=text, headset=False, scene={**data, "subject": subject})
@@ -87,7 +87,7 @@ def _headset(
     intensity_mw_sr: float,
     more: dict[str, Any] | None = None,
 ) -> KnownLayout:
-    """A camera and LEDs before the right eye; `picture` is focal length and size in pixels."""
+    """Create a layout of one camera and LEDs before the right eye; `picture` is focal length and size in pixels."""
     focal, size = picture
     camera = {
         "position_mm": camera_mm, "look_at_mm": _AIM, "focal_length_px": focal, "resolution_px": size, **(more or {})

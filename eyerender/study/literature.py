@@ -1,4 +1,4 @@
-"""Published numbers: the measurements of the experiments and the results of the comparative study of eye models.
+"""Published numbers: measurements of the experiments, and results of the comparative study of eye models.
 
 "The paper" is the comparative study (ACM Transactions on Applied Perception 22(1), 2025, doi 10.1145/3660637); [28] is
 Guestrin & Eizenman, IEEE TBME 53(6), 2006, and [29] Blignaut, Journal of Eye Movement Research 7(1), 2014.
@@ -63,7 +63,7 @@ BLIGNAUT_DEG: Final = MappingProxyType(
 PAPER_BEST: Final = MappingProxyType({"C5": "R2", "C9": "R5", "C14": "R8", "C18": "R8", "C23": "R8", "C135": "R8"})
 
 
-# What the paper says, by finding. A finding tests this sentence and no other one. (G3 has none: it follows from G1.)
+# Statements of the paper, by finding. A finding tests exactly this sentence. (G3 has none: it follows from G1.)
 SENTENCES: Final = MappingProxyType(
     {
         "G1 differs": "The reduced (E1) and four-surface (E3) eye models predicted outcomes that are significantly "
@@ -114,6 +114,6 @@ def guestrin_deg(head: str) -> Floats:
 
 
 def blignaut_best(calibration: str) -> tuple[str, float]:
-    """Look up the best function of [29] for a calibration set, and its error (deg)."""
+    """Return the best function of [29] for a calibration set, and its error (deg)."""
     column = list(CALIBRATION_SETS).index(calibration)
     return min(((name, row[column]) for name, row in BLIGNAUT_DEG.items()), key=lambda p: p[1])

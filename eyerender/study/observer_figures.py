@@ -1,4 +1,4 @@
-"""Figures of the comparison of observers: one panel per feature or estimator, one colour per reading and observer."""
+"""Figures of the comparison of observers: a panel per feature or estimator, a colour per protocol and observer."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def budget_figure(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float, f
 
 
 def _width(panels: Mapping[str, object]) -> float:
-    """Choose the width of a figure, inches."""
+    """Return the width of a figure, inches."""
     return max(5.4, min(4.4 * len(panels), 13.0))
 
 

@@ -1,4 +1,4 @@
-"""Comparison of the two observers on a study's own frames: errors of image-derived features, and their effect on gaze.
+"""Compare the two observers on a study's frames: errors of image-derived features, and their effect on gaze.
 
 bias = mean(image - analytic),  spread = SD;      in mm at the eye: px times distance over focal length
 paired difference = mean(error from images - error from rays) with its 95 % confidence interval (Student's t)
@@ -58,14 +58,14 @@ class GazeDifference:
 def features(
     truth: Observations, found: Observations, rig: RigGeometry, protocol: str, observer: str, eye_model: str
 ) -> list[FeatureDifference]:
-    """Compare the pupil's centre, its semi-axes (where both have them) and each light's glint."""
+    """Compare the pupil's centre, its semi-axes (if both have them) and each light's glint."""
     errors = feature_errors(truth, found)
     index = truth.index
     place = index.eye_position_mm + index.head_mm
     mm_per_px = np.array(
         [1.0 / rig.cameras[max(int(c), 0)].scale_at(p) for c, p in zip(index.camera, place, strict=True)]
     )
-    # Features outside the image of the study's camera were seen by the same camera, turned. They count too.
+    # Features outside the image of the study's camera were observed by the same camera, turned. They count too.
     moved = ~truth.pupil.in_image[:, None]
     centre = np.where(moved, found.pupil.centre_px - truth.pupil.centre_px, errors.centre_px)
     axes = np.where(moved, found.pupil.semi_axes_px - truth.pupil.semi_axes_px, errors.semi_axes_px)
@@ -74,7 +74,7 @@ def features(
     for light in range(len(rig.lights)):
         (a, seen), (b, got) = found.glints.of_light(light), truth.glints.of_light(light)
         vectors = np.where((seen & got)[:, None], a - b, np.nan)
-        # A glint that ray optics does not have either is not missing.
+        # A glint that ray optics lacks too is not missing.
         every.append((vectors[got], mm_per_px[got]))
         compared.append((f"glint of light {light}", *every[-1]))
     if len(every) > 1:
@@ -106,7 +106,7 @@ def gaze(
 
 
 def _difference(vectors: Floats, mm_per_px: Floats) -> dict[str, Any]:
-    """Compute the numbers of a `FeatureDifference`; too few vectors have no mean and no scatter."""
+    """Compute the numbers of a `FeatureDifference`; with too few vectors, mean and scatter are missing."""
     good = np.isfinite(vectors).all(axis=1)
     v = vectors[good]
     counts = {"n": len(v), "missing": int((~good).sum())}

@@ -1,7 +1,7 @@
-"""Observation of a study's scenes: by ray optics, or in the images of a dataset (see `images`).
+"""Observe a study's scenes by ray optics, or in the images of a dataset (see `images`).
 
-A camera that does not see an eye is turned about its nodal point until it faces it. That changes no ray. Its features
-are transferred to the study's own camera along their rays,
+A camera that does not see an eye is turned about its nodal point until it faces it. This changes no ray. Its features
+are transferred to the study's camera along their rays,
 
     x_cam = R R_turned^T ray,    pixel = K x_cam / z
 
@@ -31,10 +31,10 @@ ObserverKind = Literal["analytic", "image", "image-noiseless"]
 
 @dataclass(frozen=True, slots=True)
 class Observing:
-    """One of the observers for a study's scenes: ray optics, or images with the sensor's noise or without it.
+    """Observer of a study's scenes: ray optics, or images with or without the sensor's noise.
 
-    Only the image observers need images. Images without noise may be exposed again with the noise of `noise_seed`, and
-    `noise_seeds` is the number of such exposures that a study compares.
+    Images without noise may be exposed again with the noise of `noise_seed`; `noise_seeds` is the number of such
+    exposures that a study compares.
     """
 
     kind: ObserverKind = "analytic"
@@ -43,11 +43,11 @@ class Observing:
     noise_seed: int | None = None
 
     def exposures(self) -> list[Observing]:
-        """Make observers of the same images, exposed again with the noise of one seed each."""
+        """Return observers of the same images, exposed again with the noise of one seed each."""
         return [replace(self, noise_seed=seed) for seed in range(self.noise_seeds)]
 
     def observe(self, scene: Scene, *, facing: bool = False) -> Observations:
-        """Observe every (frame, eye) of a scene; with `facing` the cameras are turned to the eyes.
+        """Observe every (frame, eye) of a scene; with `facing`, the cameras are turned to the eyes.
 
         Raises:
             InputError: no pose of an eye fixates a target, or images do not exist.
@@ -66,12 +66,12 @@ class Observing:
         return concatenate(parts).take(np.argsort(np.concatenate(order)))
 
     def shots(self, scene: Scene, *, facing: bool = False, spp: int | None = None) -> list[Shot]:
-        """List the shots that this observer needs of a scene; none for ray optics."""
+        """Return the shots that this observer needs of a scene; none for ray optics."""
         return [] if self.kind == "analytic" else shots(scene, noise=self.kind == "image", facing=facing, spp=spp)
 
 
 def moved(observations: Observations, seen_by: PinholeCamera, told: PinholeCamera) -> Observations:
-    """Transfer pupil ellipses and glints to another camera with the same nodal point; covariances are left out."""
+    """Transfer pupil ellipses and glints to another camera with the same nodal point; covariances are dropped."""
 
     def pixels(places: Floats) -> Floats:
         cam = seen_by.rays(places) @ told.R.T
@@ -105,5 +105,5 @@ def moved(observations: Observations, seen_by: PinholeCamera, told: PinholeCamer
 
 
 def with_index_of(observations: Observations, scene: Scene, rows: Ints) -> Observations:
-    """Make observations rows of a scene's own index."""
+    """Attach rows of a scene's index to observations."""
     return replace(observations, index=scene.index().take(rows))

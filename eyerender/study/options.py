@@ -14,17 +14,17 @@ class StudyOptions:
     """Options of a study.
 
     Attributes:
-        protocol: guestrin2006 and blignaut2014: what the authors' software computes (published), what the paper says
+        protocol: guestrin2006 and blignaut2014: as the authors' software computes (published), as the paper describes
             (corrected), or both.
         observer: Features from ray optics (analytic), from rendered images (image), or both for comparison (default:
             analytic; both for observers, which supports nothing else).
         workers: Number of worker processes (default: one per processor).
         spp: Samples per pixel of the images (default: the scene's value).
         noise: Images with sensor noise (on), without it (off), or both.
-        noise_seeds: With both: exposures of each image with other noise, for the shift and scatter in the error budget;
-            0 leaves them out.
-        auto_exposure: Choose one exposure time for the images of each eye model, so that 98 % of the pixels are at most
-            at this share of full scale.
+        noise_seeds: With both: number of exposures of each image with other noise, for shift and scatter in the error
+            budget; 0 omits them.
+        auto_exposure: Choose one exposure time for the images of each eye model, so that 98 % of the pixels do not
+            exceed this share of full scale.
         backend: The render backend.
         threads: Total number of CPU threads (default: all).
         overwrite: Replace the contents of the folder.

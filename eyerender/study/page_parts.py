@@ -1,4 +1,4 @@
-"""Values of the sections that several studies' reports share, in `templates/sections.html.j2`."""
+"""Sections shared by several studies' reports, in `templates/sections.html.j2`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .results import Departure, Erratum, Finding, WaterfallStep
 
 Apart = tuple[Sequence[FeatureDifference], Sequence[GazeDifference]]
 Values = dict[str, Any]
-"""What a template shows: text, numbers as text, rows of a table, <svg> elements."""
+"""Values of a template: text, numbers as text, rows of a table, <svg> elements."""
 T = TypeVar("T")
 _Key = tuple[str, str, str, str]  # panel, protocol, observer, eye model
 _Panels = dict[str, dict[str, dict[str, T]]]
@@ -32,12 +32,12 @@ class Report:
     values: Values
 
     def write(self, path: Path) -> None:
-        """Write one self-contained HTML file, completely or not at all."""
+        """Write one self-contained HTML file; on an error, nothing is left."""
         write_template(path, self.template, self.values, package="eyerender.study")
 
 
 def overview(cells: Mapping[tuple[str, str], Mapping[str, str]]) -> Values:
-    """Make the first values of a page, by (protocol, observer) and eye model: cards, or a table for more than four."""
+    """Return a page's first values, by (protocol, observer) and eye model: cards, or a table for more than four."""
     models = list(dict.fromkeys(m for by_model in cells.values() for m in by_model))
     if len(cells) <= 4:
         cards = [
@@ -49,7 +49,7 @@ def overview(cells: Mapping[tuple[str, str], Mapping[str, str]]) -> Values:
 
 
 def budget_values(made_of: Sequence[Budget], shown: Sequence[str]) -> Values | None:
-    """Describe the composition of the gaze error; `shown` names the estimators drawn. None for a single term."""
+    """Return the values of the error budget's section; `shown` names the estimators drawn. None for a single term."""
     if not any(len(b.terms) > 1 for b in made_of):
         return None
     protocols = list(dict.fromkeys(b.protocol for b in made_of))
@@ -108,12 +108,12 @@ def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> Val
 
 
 def observers_values(apart: Apart, shown: Sequence[str] = ()) -> Values | None:
-    """Describe how the observers differ; None where there is only one. `shown` names the estimators drawn."""
+    """Return the values of the observers' section; None for a single observer. `shown` names the estimators drawn."""
     features, gaze = apart
     if not features:
         return None
     series = list(dict.fromkeys((f.protocol, f.observer) for f in features))
-    # The glint of a single light is drawn itself; those of several lights are drawn together.
+    # For a single light its glint is drawn; the glints of several lights are drawn together.
     drawn = list(dict.fromkeys(f.feature for f in features))
     if ALL_GLINTS in drawn:
         drawn = [name for name in drawn if not name.startswith("glint of light")]
@@ -135,7 +135,7 @@ def observers_values(apart: Apart, shown: Sequence[str] = ()) -> Values | None:
 
 
 def _panels(names: Sequence[str], series: Sequence[tuple[str, str]], values: Mapping[_Key, T]) -> _Panels[T]:
-    """Arrange the values of figures: panel -> series -> eye model."""
+    """Group the values of figures: panel -> series -> eye model."""
     several = len({protocol for protocol, _ in series}) > 1
     models = list(dict.fromkeys(model for *_, model in values))
     return {
@@ -169,7 +169,7 @@ def _micrometres(value: float | None) -> str:
 
 
 def findings_values(found: Sequence[Finding]) -> Values:
-    """List every finding with its details, and one row per statement with one column per observer (`by_statement`)."""
+    """Return every finding with its details, and one row per statement with a column per observer."""
     told = {True: "true", False: "false", None: ""}
     rows = [
         (
@@ -194,7 +194,7 @@ def findings_values(found: Sequence[Finding]) -> Values:
 def waterfall_values(
     steps: Sequence[WaterfallStep], departures: Sequence[Departure], measures: Sequence[str]
 ) -> Values | None:
-    """List the steps from published to corrected; None where only one protocol was run."""
+    """Return the steps from published to corrected; None if only one protocol was run."""
     if not steps:
         return None
     models = list(dict.fromkeys(s.eye_model for s in steps))
@@ -220,7 +220,7 @@ def waterfall_values(
 
 
 def errata_values(departures: Sequence[Departure], faults: Sequence[Erratum]) -> Values:
-    """List the departures of the software, and the misprints of the paper."""
+    """Return the departures of the software, and the misprints of the paper."""
     return {
         "departures": [(d.title, d.paper, d.software, d.corrected) for d in departures],
         "misprints": [(e.where, e.printed, e.used, e.effect) for e in faults],
@@ -228,5 +228,5 @@ def errata_values(departures: Sequence[Departure], faults: Sequence[Erratum]) ->
 
 
 def number(value: float | None, decimals: int = 4) -> str:
-    """Format a number of a table; a dash for none."""
+    """Format a number of a table; a dash for None."""
     return "-" if value is None or not np.isfinite(value) else f"{value:.{decimals}f}"

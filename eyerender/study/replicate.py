@@ -1,4 +1,4 @@
-"""Replication with one eye model: every protocol and variant, the waterfall, the restarts, the misprints."""
+"""Replicate a study with one eye model: every protocol and variant, the waterfall, the restarts, the misprints."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class BlignautPart(ModelResults):
 
 
 class _Scenes:
-    """Scenes and observations of one eye model and study, each made only once."""
+    """Scenes and observations of one eye model and study, each computed only once."""
 
     def __init__(self, module: Any, eye: str, observing: Observing) -> None:
         self.module, self.eye, self.observing = module, eye, observing
@@ -61,7 +61,7 @@ class _Scenes:
 
 
 def departures_of(module: Any, protocol: str) -> frozenset[str]:
-    """List the departures of a protocol, given by name."""
+    """Return the departures of a protocol, given by name."""
     return frozenset(module.PUBLISHED if protocol == "published" else module.CORRECTED)
 
 
@@ -71,7 +71,7 @@ def facing(module: Any) -> bool:
 
 
 def scenes_of(module: Any, eyes: Sequence[str], protocols: Sequence[str]) -> list[Scene]:
-    """List the scenes that a study observes in images."""
+    """Return the scenes that a study observes in images."""
     keys = dict.fromkeys(module.scene_key(departures_of(module, protocol)) for protocol in protocols)
     return [module.scene(eye, key) for eye in eyes for key in keys]
 
@@ -79,7 +79,7 @@ def scenes_of(module: Any, eyes: Sequence[str], protocols: Sequence[str]) -> lis
 def guestrin_part(
     eye: str, protocols: Sequence[str], observing: Observing, *, starts: int = guestrin.STARTS
 ) -> GuestrinPart:
-    """Replicate [28] with one eye model and one observer."""
+    """Replicate Guestrin & Eizenman (2006) with one eye model and one observer."""
     scenes = _Scenes(guestrin, eye, observing)
     analytic = observing.kind == "analytic"
     out = GuestrinPart(eye_model=eye)
@@ -122,7 +122,7 @@ def _guestrin_vectors(scenes: _Scenes, departures: frozenset[str]) -> dict[str, 
 
 
 def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> BlignautPart:
-    """Replicate [29] with one eye model and one observer."""
+    """Replicate Blignaut (2014) with one eye model and one observer."""
     scenes = _Scenes(blignaut, eye, observing)
     out = BlignautPart(eye_model=eye)
     exposures = [_Scenes(blignaut, eye, one) for one in observing.exposures()]
@@ -161,7 +161,7 @@ def _best_means(done: list[blignaut.Outcome]) -> dict[str, float | None]:
 
 
 def _waterfall(eye: str, module: Any, measure: Any) -> list[WaterfallStep]:
-    """Step from `published` to `corrected`, one departure after the other; also correct each of them alone."""
+    """Correct the departures of `published` one after the other; also correct each of them alone."""
     start = measure(module.PUBLISHED)
     steps = [WaterfallStep(eye, "published", start, start)]
     left = set(module.PUBLISHED)

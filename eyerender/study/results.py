@@ -53,10 +53,10 @@ class ModelResults:
     Attributes:
         eye_model: the eye model.
         rows: mean errors.
-        seen: by (protocol, observer) the rig and its observations.
-        errors: by (protocol, observer) and name of the estimator the errors (n,) deg.
-        vectors: the same errors to the right and up (n, 2) deg (`error_vectors_deg`).
-        seed_vectors: the same (s, n, 2) of s further exposures of images without noise, with other noise each.
+        seen: rig and observations, by (protocol, observer).
+        errors: errors (n,) deg, by (protocol, observer) and estimator.
+        vectors: error vectors (n, 2) deg to the right and up (`error_vectors_deg`).
+        seed_vectors: error vectors (s, n, 2) of s further exposures of images without noise, each with other noise.
     """
 
     eye_model: str
@@ -68,7 +68,7 @@ class ModelResults:
 
 
 def over_seeds(found: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
-    """Stack the error vectors (n, 2) of every seed, (s, n, 2) by estimator; one that a seed lacks is left out."""
+    """Stack the error vectors (n, 2) of every seed, (s, n, 2) by estimator; skip estimators that a seed lacks."""
     names = [name for name in (found[0] if found else ()) if all(name in one for one in found)]
     return {name: np.stack([one[name] for one in found]) for name in names}
 
@@ -77,7 +77,7 @@ def over_seeds(found: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
 class Finding:
     """One statement tested on the study's own data; `verdict` is None where it cannot be tested.
 
-    `sentence` is what the paper says, in its own words; empty where there is no published claim.
+    `sentence` quotes the paper; empty if there is no published claim.
     """
 
     id: str
@@ -126,7 +126,7 @@ class WaterfallStep:
 
 
 def mean_row(error_deg: Floats, **keys: Any) -> Row:
-    """Make a row for errors (n,); NaN counts as missing."""
+    """Create a row for errors (n,); NaN counts as missing."""
     good = error_deg[np.isfinite(error_deg)]
     n = len(good)
     return Row(
@@ -147,7 +147,7 @@ def known_mean(errors: Floats) -> float | None:
 def write_results(
     folder: Path, study: str, rows: Sequence[Row], findings: Sequence[Finding], more: dict[str, Any]
 ) -> dict[str, Any]:
-    """Write summary.json, findings.json and the CSV of both, and return the summary."""
+    """Write summary.json, findings.json and both as CSV; return the summary."""
     summary = {
         "schema": SUMMARY_SCHEMA,
         "study": study,
@@ -166,13 +166,13 @@ def write_results(
 
 
 def table(kind: type, items: Sequence[Any]) -> str:
-    """Write dataclasses as CSV; empty cells where there is no value."""
+    """Format dataclasses as CSV; empty cells for None."""
     names = [f.name for f in fields(kind)]
     return csv_text(names, ([getattr(item, name) for name in names] for item in items))
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Write rows as CSV; empty cells for None."""
+    """Format rows as CSV; empty cells for None."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)

@@ -1,8 +1,9 @@
-"""The study of six known rigs over a population: who is lost where, and what each LED buys.
+"""The study of six known rigs over a population: for whom each fails where, and the effect of each LED.
 
-People differ, sit differently before the rig, and look in 81 directions. A person is lost in a direction if less than
-60 % of the outline is visible or fewer than two glints are (one, where the rig has one LED). What a number of LEDs buys
-is told for the best LEDs of that number (greedy exchange, `design/choice.py`), in the nine directions of a calibration.
+People differ, sit differently in front of the rig, and look in 81 directions. A person is lost in a direction if less
+than 60 % of the outline or fewer than two glints are visible (one, if the rig has one LED). The effect of a number of
+LEDs is computed for the best choice of that number (greedy exchange, `design/choice.py`), in the nine directions of a
+calibration.
 """
 
 from __future__ import annotations
@@ -44,13 +45,13 @@ TRAITS = {
     "distance of the pupils": ("ipd_mm",),
     "age": ("age_years",),
 }
-"""Traits by which people are divided into thirds, and the numbers of a person that they add up."""
+"""Traits that divide people into thirds, and the numbers of a person that are summed for each."""
 REGIONS = ("up", "down", "to the left", "to the right", "ahead")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RigResult:
-    """What the study finds about one layout: figures of people, their losses (p, 81), and rows of what LEDs buy."""
+    """Results for one layout: figures of people, their losses (p, 81), and rows with the effect of LEDs."""
 
     layout: KnownLayout
     figures: Figures
@@ -59,7 +60,7 @@ class RigResult:
     cornea_share: float
 
     def to_mapping(self, traits: Mapping[str, Floats]) -> dict[str, Any]:
-        """Convert to plain values; `traits` are those of the figures' people."""
+        """Convert to JSON values; `traits` are those of the figures' people."""
         found = self.figures
         return {
             "layout": self.layout.name,
@@ -136,7 +137,7 @@ def _result(layout: KnownLayout, people: int, workers: int | None, progress: Pro
 
 
 def bought(survey: Survey, scene: Scene, people: int) -> list[dict[str, Any]]:
-    """What the best 1, 2, ... LEDs buy: noise of the optic axis with a known person, and glints."""
+    """Compute the noise of the optic axis for a known person, and the glints, with the best 1, 2, ... LEDs."""
     known_person = replace(survey, unknowns=Unknowns(slippage_mm=max(3.0, survey.slippage_mm)).to_mapping())
     counts = range(1, len(scene.rig.lights) + 1)
     sites = sites_seen(known_person, [noise_of_some(scene, count) for count in counts], people)
@@ -159,9 +160,9 @@ def bought(survey: Survey, scene: Scene, people: int) -> list[dict[str, Any]]:
 
 
 def axis_deg(known: SiteInformation, chosen: Sequence[int]) -> Floats:
-    """Standard deviation (i,) of the optic axis in degrees: azimuth and elevation are the first two unknowns.
+    """Compute the standard deviation (i,) deg of the optic axis: azimuth and elevation are the first two unknowns.
 
-    It is inf where the axis is not seen.
+    It is inf if the axis is undetermined.
     """
     whole = known.base + known.sites[list(chosen)].sum(axis=0)
     scale = 1.0 / np.sqrt(np.einsum("iaa->ia", whole))
@@ -171,7 +172,7 @@ def axis_deg(known: SiteInformation, chosen: Sequence[int]) -> Floats:
 
 
 def regions() -> dict[str, Bools]:
-    """The 81 directions (rows from top to bottom, the subject's right first) in five parts."""
+    """Divide the 81 directions (rows from top to bottom, the subject's right first) into five parts."""
     row, column = np.divmod(np.arange(GRID * GRID), GRID)
     up, side = GRID // 2 - row, column - GRID // 2
     steep = np.abs(up) >= np.abs(side)
@@ -181,7 +182,7 @@ def regions() -> dict[str, Bools]:
 
 
 def traits_of(found: Figures, seed: int = 0) -> dict[str, Floats]:
-    """Traits (p,) of the people of figures."""
+    """Return traits (p,) of the people of figures."""
     last = int(found.subject.max()) + 1
     numbers = Population("adults").numbers(last, seed)
     out = {}
@@ -192,6 +193,6 @@ def traits_of(found: Figures, seed: int = 0) -> dict[str, Floats]:
 
 
 def thirds(lost: Bools, values: Floats) -> list[float]:
-    """Share of lost directions of the third of people with the lowest values, of the middle, and of the highest."""
+    """Compute the share of lost directions in the thirds of people with low, middle and high values."""
     order = np.argsort(values, kind="stable")
     return [float(lost[part].mean()) if len(part) else float("nan") for part in np.array_split(order, 3)]

@@ -15,7 +15,7 @@ from ..report.style import figure, svg
 
 
 def write_rigs_page(path: Path, data: Mapping[str, Any], maps: Mapping[str, Floats]) -> None:
-    """Write the page; `maps` holds the share of people who are lost in each of the 81 directions."""
+    """Write the page; `maps` holds the share of people lost in each of the 81 directions."""
     rows = data["rows"]
     best = min(rows, key=lambda row: row["lost"])
     worst = max(rows, key=lambda row: row["lost"])

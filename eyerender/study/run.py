@@ -1,4 +1,4 @@
-"""Studies as commands: run, test the findings, write the results and the report."""
+"""Run a study, test its findings, and write the results and the report."""
 
 from __future__ import annotations
 
@@ -50,27 +50,27 @@ def run_study(
     say: Say | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """Run a study and write summary.json, findings.json, CSV of both and report.html into a folder.
+    """Run a study; write summary.json, findings.json, both as CSV, and report.html into a folder.
 
-    A study may be run again in its own folder. Its images are a dataset in `images/`: a stopped run continues there,
-    and a finished one is used again.
+    A study may be run again in its own folder. Its images are a dataset in `images/`: an interrupted run continues, and
+    a finished one is reused.
 
     Args:
-        name: guestrin2006, blignaut2014, observers (both observers on the head-mounted rig), or conditions (what lies
-            beyond the paper; analytic).
-        folder: where the results go.
+        name: guestrin2006, blignaut2014, observers (both observers on the head-mounted rig), or conditions (beyond the
+            paper; analytic).
+        folder: the folder for the results.
         options: protocol, observer, workers and the like.
-        eyes: eye models (catalogue names or files). With E5 and `published`, its two published variants come along.
+        eyes: eye models (catalogue names or files). With E5 and `published`, its two published variants are included.
         progress: called with (done, total, note).
-        say: called with what goes wrong on the way.
+        say: called with a message for each problem that does not end the run.
         changes: fields of `StudyOptions` by name, instead of those of `options`.
 
     Returns:
         The summary that was written.
 
     Raises:
-        InputError: an unknown study, eye or choice, or a folder that holds something else.
-        BackendError: there is nothing to render the images with.
+        InputError: the study, an eye or an option is unknown, or the folder holds something else.
+        BackendError: no backend can render the images.
     """
     if name not in STUDIES:
         raise InputError(f"{name!r} is not a study; choose from {', '.join(STUDIES)}")
@@ -97,7 +97,7 @@ def run_study(
         if any(kind != "analytic" for kind in kinds):
             scenes = _image_scenes(name, eyes, protocols, kinds, options.spp)
             images = make_images(name, scenes, folder / IMAGES, options, _noted(progress), say)
-        # The term of noise, which needs images with it and without it, is the mean of several exposures.
+        # The noise term, which needs images with and without noise, is the mean of several exposures.
         seeds = {"image-noiseless": options.noise_seeds} if "image" in kinds else {}
         observers = [Observing(k, None if k == "analytic" else images, seeds.get(k, 0)) for k in kinds]
         # One job compares all observers, or has one of them.
@@ -131,7 +131,7 @@ def _exposure(level: float | None, observer: str) -> dict[str, float]:
 
 
 def _kinds(observer: str, noise: str) -> list[ObserverKind]:
-    """List the observers of a run."""
+    """Return the observers of a run."""
     kinds: list[ObserverKind] = []
     if observer != "image":
         kinds.append("analytic")
@@ -150,7 +150,7 @@ def _noted(progress: Progress | None) -> Progress | None:
 def _image_scenes(
     name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[ObserverKind], spp: int | None
 ) -> list[Scene]:
-    """List the scenes of every image that a study needs."""
+    """Return the scenes of all images that a study needs."""
     if name == "observers":
         scenes, turned = [head_mounted.scene(eye) for eye in eyes], False
     else:
@@ -163,7 +163,7 @@ def _image_scenes(
 def _models(
     name: str, eyes: Sequence[str], protocols: Sequence[str], observings: Sequence[Observing]
 ) -> list[tuple[str, tuple[str, ...]]]:
-    """List eye models with their protocols; the published variants of E5 have their own names, never E5."""
+    """Return eye models with their protocols; the published variants of E5 have their own names."""
     out = [(eye, tuple(protocols)) for eye in eyes]
     if name == "guestrin2006" and observings[0].kind == "analytic" and "E5" in eyes and "published" in protocols:
         out += [(v, ("published",)) for v in VARIANTS if v not in eyes]
@@ -184,7 +184,7 @@ def _job(name: str, job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> 
 def _collected(
     job: Callable[[Any], Any], items: list[Any], names: Sequence[str], workers: int, progress: Progress | None
 ) -> list[Any]:
-    """Collect the results of a job for each item, in order."""
+    """Run a job on each item and collect the results in order."""
     out = []
     if progress is not None:
         progress(0, len(items), "")
@@ -198,7 +198,7 @@ def _collected(
 
 @contextmanager
 def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterator[None]:
-    """Mark a folder as this study's while it runs; a run that fails before it wrote anything leaves nothing behind.
+    """Mark a folder as this study's during the block; a run that fails before it wrote anything leaves nothing behind.
 
     Raises:
         InputError: the folder holds something else, or another writer uses it.

@@ -99,7 +99,7 @@ def observers_results(parts: Sequence[ModelResults], protocols: Sequence[str] = 
 
 
 def _observers_apart(parts: Sequence[ModelResults]) -> Apart:
-    """Compare the observers on the frames that both have seen."""
+    """Compare the observers on the frames that both have observed."""
     features: list[observers_compared.FeatureDifference] = []
     gaze: list[observers_compared.GazeDifference] = []
     seen = {(p.eye_model, *key): (p, key) for p in parts for key in p.seen}
@@ -119,7 +119,7 @@ def _observers_apart(parts: Sequence[ModelResults]) -> Apart:
 
 
 def _budgets(parts: Sequence[ModelResults]) -> list[Budget]:
-    """Compute error budgets of the eye models; the published variants of E5 are not eyes."""
+    """Compute error budgets of the eye models, without the published variants of E5."""
     return budgets([part for part in parts if part.eye_model not in VARIANTS])
 
 

@@ -140,7 +140,11 @@ TABLE = [
         "--estimator: there is no module 'no_",
     ),
     (["gaze", "fit", "f.json", "--estimator", "json:Nothing", "-o", "c.json"], 2, "--estimator: json has no Nothing"),
-    (["gaze", "fit", "f.json", "--estimator", "json:loads", "-o", "c.json"], 2, "--estimator: json:loads is no class"),
+    (
+        ["gaze", "fit", "f.json", "--estimator", "json:loads", "-o", "c.json"],
+        2,
+        "--estimator: json:loads is not a class",
+    ),
     (
         ["gaze", "fit", "f.json", "--estimator", "json:JSONDecoder", "-o", "c.json"],
         2,

@@ -157,7 +157,7 @@ def test_readers_in_other_processes_open_it_again(packed):
 def test_a_damaged_index_is_refused(packed, tmp_path):
     folder = shutil.copytree(packed, tmp_path / "copy")
     (folder / "index.npy").write_bytes(b"\x93NUMPY")
-    with pytest.raises(InputError, match="is no index of images"):
+    with pytest.raises(InputError, match="is not an index of images"):
         ImageFolder.load(folder)
 
 

@@ -182,7 +182,7 @@ def test_a_file_never_has_its_module_imported(place, tmp_path, capsys):
         ("Listed", "{0}:Listed: to_mapping failed (TypeError: must be a dict, not a list)"),
         ("Demanding", "{0}:Demanding: making one without arguments failed (TypeError: "),
         ("Predictor", "--estimator: {0}:Predictor has no method fit (see er.gaze.GazeEstimator)"),
-        ("function", "--estimator: {0}:function is no class"),
+        ("function", "--estimator: {0}:function is not a class"),
         ("Nothing", "--estimator: {0} has no Nothing"),
     ],
 )

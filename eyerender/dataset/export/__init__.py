@@ -1,7 +1,7 @@
 """Exports of generated datasets in the layouts that existing training code reads.
 
-Places are in pixels of the image (the window), pixel centres at integers. The images have 8 bits and a gamma of 2.2
-with one exposure gain for the whole export, unless requested otherwise (`encoding`); `export.json` and `README.md`
+Positions are in pixels of the image (the window), with pixel centres at integers. The images have 8 bits and a gamma of
+2.2 with one exposure gain for the whole export, unless requested otherwise (`encoding`); `export.json` and `README.md`
 state this.
 """
 
@@ -26,7 +26,7 @@ from .card import export_card
 from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
 from .item import Item, Items
 
-# Returns what README.md begins with, if anything.
+# Returns the head of README.md, or None.
 Writer = Callable[[Items, Path], str | None]
 
 SCHEMA = "eyerender/export/2"
@@ -56,7 +56,7 @@ def export(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Write a generated dataset in another layout, completely or not at all.
+    """Write a generated dataset in another layout; on an error, nothing is left behind.
 
     Args:
         path: the dataset's folder.
@@ -64,14 +64,14 @@ def export(
         out: the folder to write.
         bits: bits of the images, 8 or 16 (webdataset, imagefolder, coco, csv and parquet).
         encoding: `linear` or `gamma`; by default gamma for 8 bits, linear for 16.
-        gain: factor for all values; by default it is measured on a sample of the images, but is 1 for 16 bits, linear.
-        overwrite: replace what `out` holds.
+        gain: factor for all values; by default 1 for 16 bits linear, otherwise measured on a sample of the images.
+        overwrite: replace the contents of `out`.
         progress: called with images done, images in all and "".
 
     Raises:
         InputError: the layout or encoding is unknown, the folder is not a generated dataset, a checksum is wrong,
-            labels are not as this version writes them, or OUT is taken.
-        EyerenderError: OUT cannot be written.
+            labels differ from what this version writes, or `out` is not empty.
+        EyerenderError: `out` cannot be written.
     """
     if format not in FORMATS:
         raise InputError(f"must be one of {', '.join(FORMATS)}, not {format!r}", source="--format")
@@ -123,7 +123,7 @@ def _encoding(items: Items, bits: int, curve: Curve, gain: float | None) -> Enco
 
 @contextmanager
 def _labels_as_made(items: Items) -> Iterator[None]:
-    """Report labels that this package did not write as the user's mistake: a line was changed by hand."""
+    """Turn errors from malformed labels into input errors: somebody changed the metadata."""
     try:
         yield
     except WRONG as error:

@@ -1,4 +1,4 @@
-"""README.md of an export: its content, and how to decode and read its images."""
+"""README.md of an export: its content, and how to read and decode its images."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _GAZE = {
 
 
 def export_card(name: str, done: dict[str, Any], layout: str, encoding: Encoding) -> str:
-    """Make the text of README.md; `layout` describes the files."""
+    """Return the text of README.md; `layout` describes the files."""
     image = encoding.to_mapping()
     splits = "\n".join(f"| {split} | {count} |" for split, count in done["images_by_split"].items())
     depths = " or ".join(str(depth) for depth in done["source_bit_depths"])

@@ -1,7 +1,7 @@
 """COCO: SPLIT/*.png (8 bits) and annotations/instances_SPLIT.json; pupil, iris and sclera as run-length masks.
 
-Each image has its gaze (`line_of_sight`, `optic_axis`, ...) and the diameters of its pupil.
-Glints are instances of their own with one keypoint each: [x, y, v], v 2 visible, 1 hidden.
+Each image has its gaze (`line_of_sight`, `optic_axis`, ...) and the diameters of its pupil. Each glint is a separate
+instance with one keypoint [x, y, v]: v is 2 if visible, 1 if hidden.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def write(items: Items, out: Path) -> None:
 
 
 def _gaze(line: dict[str, Any]) -> dict[str, Any]:
-    """List keys of an image: unit vectors in the camera's frame, their angles, and the diameters of the pupil."""
+    """Return an image's gaze keys: unit vectors in the camera's frame, their angles, and the pupil diameters."""
     space = line["labels"]["space"]["camera"]
     return {**{name: space[name] for name in DIRECTIONS}, **gaze_of(line), **pupil_of(line)}
 

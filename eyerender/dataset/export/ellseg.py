@@ -23,14 +23,14 @@ _MAT_TEXT = b"MATLAB 5.0 MAT-file".ljust(116)
 
 
 class _Archive(io.FileIO):
-    """A file for HDF5, which can neither continue nor close after a failed write; `check` raises the error."""
+    """HDF5 cannot continue or close a file after a failed write; this keeps the error, and `check` raises it."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "w+")
         self._error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        """Write all of the data, or keep the error and pretend."""
+        """Write all data; on failure, keep the error and report success to HDF5."""
         rest = memoryview(data).cast("B")
         count = len(rest)
         try:
@@ -41,7 +41,7 @@ class _Archive(io.FileIO):
         return count
 
     def check(self) -> None:
-        """Raise the error of an earlier write, if there was one."""
+        """Raise the error of an earlier write, if any."""
         if self._error is not None:
             raise self._error
 
@@ -87,7 +87,7 @@ def write(items: Items, out: Path) -> None:
 
 
 def _lay_out(file: Any, shape: tuple[int, int, int], name_bytes: int) -> None:
-    """Make the arrays of an archive."""
+    """Create the arrays of an archive."""
     n = shape[0]
     for name in ("Images", "Masks", "Masks_noSkin"):
         file.create_dataset(name, shape, dtype="u1" if name == "Images" else "i1", chunks=(1, *shape[1:]))
@@ -111,11 +111,11 @@ def _write_key(folder: Path, file: Any, dataset: str, split: str) -> None:
     }
     content = io.BytesIO()
     savemat(content, key)
-    # SciPy's text at the beginning holds the time; the same dataset must give the same bytes.
+    # SciPy writes the time into the header; the same dataset must give the same bytes.
     write_bytes(folder / f"{archive}.mat", _MAT_TEXT + content.getvalue()[len(_MAT_TEXT) :], sync=False)
 
 
 def fit_of(item: Item, part: str) -> Floats:
-    """Return the amodal outline as x, y, a, b, angle, or -1 five times."""
+    """Return the amodal outline as x, y, a, b, angle, or five times -1 if there is none."""
     ellipse = item.ellipse(part)
     return np.full(5, -1.0) if ellipse is None else np.array(ellipse.numbers())

@@ -1,11 +1,11 @@
-"""Encoding of the sensor's counts in an export: bits, curve, and one exposure gain for the whole export.
+"""Encoding of the sensor's counts in an export: bits, tone curve, and one exposure gain for the whole export.
 
 With s = count / (2^source_bit_depth - 1), the share of the source's full scale, and F = 2^bits - 1:
 
     linear:  code = round(F min(1, gain s))              s = code / F / gain
     gamma:   code = round(F min(1, gain s)^(1 / 2.2))    s = (code / F)^2.2 / gain
 
-The inverse is exact to half a code, except for the code F, where the image was clipped.
+The inverse is exact to half a code, except for the code F, at which the image is clipped.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from ...errors import InputError
 
 GAMMA = 2.2
-# A measured gain brings this share of all pixels to at most this part of the full scale. The rest is for brighter
-# subjects, and keeps skin darker than glints. The gain is limited because the black level is 1/256 of the full scale by
+# A measured gain brings this share of all pixels to at most this part of full scale. The rest is headroom for brighter
+# subjects, and keeps skin darker than glints. The gain is limited because the black level is 1/256 of full scale by
 # default, and images without light must stay dark.
 SHARE, LEVEL = 0.995, 0.8
 LARGEST_GAIN = 32.0
@@ -33,7 +33,7 @@ Curve = Literal["linear", "gamma"]
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """Bits (8 or 16), curve and gain of the images of an export; `gain_from` names the source of the gain."""
+    """Bits (8 or 16), tone curve and gain of the exported images; `gain_from` names the source of the gain."""
 
     bits: int
     curve: Curve
@@ -41,15 +41,15 @@ class Encoding:
     gain_from: str
 
     def apply(self, image: NDArray[Any], bit_depth: int, gamma: float = 1.0) -> NDArray[Any]:
-        """Return codes, (h, w) uint8 or uint16, of an image's counts, (h, w) unsigned integers of `bit_depth`.
+        """Encode an image's counts (h, w), unsigned integers of `bit_depth`, as codes (h, w) uint8 or uint16.
 
-        The counts are the linear share of full scale^(1 / gamma).
+        The counts themselves encode the linear share s of full scale as s^(1 / gamma).
         """
         table = _table(self.bits, self.curve, self.gain, 2**bit_depth - 1, gamma)
         return np.asarray(table[np.minimum(image.astype(np.intp), len(table) - 1)])
 
     def keeps(self, bit_depth: int, gamma: float = 1.0) -> bool:
-        """Return whether the codes are the counts themselves."""
+        """Return whether the encoding leaves the counts unchanged."""
         return self.curve == "linear" and self.gain == 1 and self.bits == bit_depth and gamma == 1
 
     def to_mapping(self) -> dict[str, Any]:
@@ -76,7 +76,7 @@ RAW = Encoding(16, "linear", 1.0, "none")
 
 
 def measured_gain(images: Iterable[tuple[NDArray[Any], int, float]]) -> float:
-    """Return the gain that brings the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
+    """Compute the gain that brings the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
 
     Args:
         images: counts (h, w), their bit depths and their gammas.
@@ -108,7 +108,7 @@ def check(bits: int, curve: str | None, gain: float | None) -> None:
 
 @lru_cache(maxsize=4)
 def _table(bits: int, curve: Curve, gain: float, full: int, source_gamma: float) -> NDArray[Any]:
-    """Return the code of each count."""
+    """Return the code of each possible count."""
     value = np.minimum(1.0, gain * (np.arange(full + 1) / full) ** source_gamma)
     if curve == "gamma":
         value = value ** (1 / GAMMA)

@@ -1,4 +1,4 @@
-"""Gaze of an image in the camera's frame, for training on appearance: unit vectors, yaw and pitch.
+"""Gaze in the camera's frame, for appearance-based training: unit vectors, yaw and pitch.
 
     yaw = atan2(-x, -z),   pitch = asin(-y)       x right, y down, z away from the camera
 
@@ -29,13 +29,13 @@ distortion, the position of the eye and the roll of the head are not removed.
 
 
 def yaw_pitch_deg(direction: Sequence[float]) -> tuple[float, float]:
-    """Return the yaw and pitch of a unit vector in the camera's frame."""
+    """Compute yaw and pitch in degrees of a unit vector in the camera's frame."""
     x, y, z = direction
     return float(np.degrees(np.arctan2(-x, -z))), float(np.degrees(np.arcsin(np.clip(-y, -1.0, 1.0))))
 
 
 def gaze_of(line: dict[str, Any]) -> dict[str, float]:
-    """Return the yaw and pitch of both directions, by column."""
+    """Return yaw and pitch in degrees of the line of sight and the optic axis, by column name."""
     space = line["labels"]["space"]["camera"]
     return {
         f"{name}_{angle}_deg": value
@@ -45,6 +45,6 @@ def gaze_of(line: dict[str, Any]) -> dict[str, float]:
 
 
 def pupil_of(line: dict[str, Any]) -> dict[str, float | None]:
-    """Return diameters of the pupil, by column; None in datasets of versions before 4."""
+    """Return the pupil diameters by column name; None in datasets of versions before 4."""
     pupil = line["labels"]["pupil"]
     return {f"pupil_{name}": pupil.get(name) for name in ("entrance_diameter_mm", "stop_diameter_mm")}

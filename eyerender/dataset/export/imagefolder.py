@@ -1,7 +1,7 @@
-"""Image folder: images/*.png, masks/*.png and metadata.jsonl, as loaders of image folders read them.
+"""Image folder: images/*.png, masks/*.png and metadata.jsonl, for loaders of image folders.
 
-Every line has the same keys, and the lines that are the first to fill a column come first. Datasets of files are such a
-folder already; packed ones become one. `datasets.load_dataset("imagefolder", data_dir="OUT")` reads it.
+Every line of metadata has the same keys, and the first lines fill every column. Datasets of files already have this
+layout; packed ones are unpacked. `datasets.load_dataset("imagefolder", data_dir="OUT")` reads it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .item import Items
 
 
 def write(items: Items, out: Path) -> None:
-    """Write the pictures and metadata.jsonl."""
+    """Write the images and metadata.jsonl."""
     unsorted = out / f"{METADATA}.unsorted"
     with open(unsorted, "w", encoding="utf-8") as file:
         for item in items:

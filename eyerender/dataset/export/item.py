@@ -1,4 +1,4 @@
-"""Images of a dataset for exports, with places in pixels of the image."""
+"""Images of a dataset for exports, with positions in pixels of the image."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from .encoding import RAW, Encoding
 
 @dataclass(frozen=True)
 class Item:
-    """An image of a dataset and its labels in the window's pixels; `encoding` is that of the export."""
+    """An image of a dataset, with labels in pixels of the window; `encoding` is that of the export."""
 
     entry: ImageEntry
     encoding: Encoding = RAW
 
     @property
     def line(self) -> dict[str, Any]:
-        """Line of metadata."""
+        """Metadata of the image."""
         return self.entry.line
 
     @property
     def name(self) -> str:
-        """Name of the image without folder and ending."""
+        """Name of the image without folder and suffix."""
         return PurePosixPath(self.entry.name).stem
 
     @property
@@ -47,7 +47,7 @@ class Item:
         """Bit depth of the counts in the dataset.
 
         Raises:
-            InputError: it is not 1 to 16.
+            InputError: the value is not 1 to 16.
         """
         depth = self.line.get("bit_depth")
         if not isinstance(depth, int) or isinstance(depth, bool) or not 1 <= depth <= 16:
@@ -65,17 +65,17 @@ class Item:
 
     @property
     def encoded(self) -> NDArray[Any]:
-        """Image as the export stores it, (h, w) uint8 or uint16."""
+        """Image as stored in the export, (h, w) uint8 or uint16."""
         return self.encoding.apply(self.image, self.bit_depth, self.entry.gamma)
 
     def encode(self, key: str = "file_name") -> bytes | None:
-        """Encode one of the sample's images of counts as the PNG file that the export stores.
+        """Encode one of the sample's images as the PNG file of the export.
 
         Args:
             key: one of `FILE_KEYS`.
 
         Returns:
-            The file, None where the line names none.
+            The bytes of the file; None if the metadata names no such image.
 
         Raises:
             InputError: the file cannot be read.
@@ -88,7 +88,7 @@ class Item:
         return png_bytes(self.encoding.apply(counts, self.bit_depth, self.entry.gamma))
 
     def exported_line(self) -> dict[str, Any]:
-        """Return the line of metadata for the exported image."""
+        """Return the metadata of the exported image."""
         e = self.encoding
         own = {"bit_depth": e.bits, "encoding": e.curve, "gamma": e.to_mapping()["gamma"], "gain": e.gain}
         return {**self.line, **own, "source_bit_depth": self.bit_depth}
@@ -98,13 +98,13 @@ class Item:
 
     @cached_property
     def mask(self) -> Bytes:
-        """Mask (h, w): 0 background, skin or what frames the view, 1 sclera, 2 iris, 3 pupil."""
+        """Mask (h, w): 0 background, skin or frame around the view, 1 sclera, 2 iris, 3 pupil."""
         mask = self.entry.mask()
         return np.zeros(self.image.shape, np.uint8) if mask is None else np.where(mask > PUPIL, BACKGROUND, mask)
 
     @cached_property
     def amodal(self) -> Bytes:
-        """Mask of the eye without occluders: the file, or the mask with both ellipses filled in."""
+        """Mask of the eye without occluders: from its file, or the mask with both ellipses filled in."""
         whole = self.entry.amodal_mask()
         if whole is not None:
             return whole
@@ -117,7 +117,7 @@ class Item:
         return out
 
     def ellipse(self, part: str, kind: str = "amodal") -> Ellipse | None:
-        """Return the ellipse of the pupil or the iris; None where there is none."""
+        """Return the ellipse of the pupil or the iris; None if there is none."""
         found = self.line["labels"][part][kind]
         if found["centre_px"] is None or min(found["semi_axes_px"]) <= 0:
             return None
@@ -126,11 +126,11 @@ class Item:
         return Ellipse(np.array([x - x0, y - y0]), np.array(found["semi_axes_px"]), found["angle_rad"])
 
     def visible(self, part: str) -> bool:
-        """Return whether any of the pupil or the iris is visible."""
+        """Return whether any part of the pupil or the iris is visible."""
         return bool(self.line["labels"][part]["visible"]["pixels"] > 0)
 
     def glints(self) -> list[tuple[int, float, float, bool]]:
-        """List (light, x, y, visible) of each reflection that ray optics finds."""
+        """Return (light, x, y, visible) of each reflection that ray optics predicts."""
         x0, y0 = self.entry.window[:2]
         return [
             (g["light"], g["xy_px"][0] - x0, g["xy_px"][1] - y0, g["visible"])
@@ -139,7 +139,7 @@ class Item:
         ]
 
     def pixel_of(self, point_mm: Any) -> Floats:
-        """Return the pixel of a point of the camera's frame (no lens distortion)."""
+        """Project a point (mm, camera frame) to a pixel, without lens distortion."""
         K = np.array(self.line["labels"]["camera"]["K"])
         x = K @ np.asarray(point_mm, dtype=float)
         return np.asarray(x[:2] / x[2] - self.entry.window[:2])
@@ -152,18 +152,18 @@ def _integers(image: NDArray[Any], path: Path) -> NDArray[Any]:
 
 
 class Items:
-    """The images of a dataset in the order of its samples; iteration reports its progress.
+    """Images of a dataset in sample order; iterating reports progress.
 
-    `survey` reads the lines of metadata once, for what must be known before the first image is written. They are read
-    again with each image. Only a few bytes of each line are kept.
+    `survey` reads all metadata once, for totals that are needed before the first image is written. During iteration
+    each line is read again, so memory stays small.
 
     Attributes:
-        encoding: that of the export.
-        order: (n,) the rows of metadata.jsonl in the order of samples.
+        encoding: encoding of the export.
+        order: (n,) row in metadata.jsonl of each image, in sample order.
         images_by_split: number of images of each split, by name.
-        bit_depths: those of the images.
+        bit_depths: bit depths of the images.
         sizes: (width, height) of the images.
-        lights: the largest number of reflections in a line.
+        lights: largest number of reflections of an image.
         file_name_bytes: length of the longest name of an image, in UTF-8.
         place: file and number of the line that is being read, for messages.
     """
@@ -179,10 +179,10 @@ class Items:
         self.place = folder.path / METADATA, 0
 
     def survey(self) -> None:
-        """Read all lines once.
+        """Read all metadata once.
 
         Raises:
-            InputError: a line is wrong, or two images have one name.
+            InputError: a line is wrong, or two images have the same name.
         """
         splits: Counter[str] = Counter()
         samples = np.empty(len(self), dtype=np.int64)
@@ -205,7 +205,7 @@ class Items:
 
     def __iter__(self) -> Iterator[Item]:
         done = 0
-        # Consecutive rows of the file are read together.
+        # Neighbouring rows of the file are read together.
         for rows in np.split(self.order, np.flatnonzero(np.diff(self.order) != 1) + 1):
             for entry in self.folder.entries[int(rows[0]) : int(rows[-1]) + 1]:
                 self.place = entry.source, entry.number

@@ -24,7 +24,8 @@ def write(items: Items, out: Path) -> None:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["file", "from", "subject"])
         for item in items:
-            # The names have digits only, because readers strip letters of '.png' off both ends of a name.
+            # The names consist of digits only, because some readers strip the letters of '.png' from both ends of a
+            # name.
             name = f"{counts.get(item.split, 0):06d}"
             counts[item.split] = counts.get(item.split, 0) + 1
             write_png(out / item.split / "images" / f"{name}.png", item.encoded)

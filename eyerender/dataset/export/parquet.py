@@ -1,9 +1,9 @@
-"""Parquet: data/SPLIT-00000-of-00001.parquet with one row an image, as the Hugging Face Hub stores datasets.
+"""Parquet: data/SPLIT-00000-of-00001.parquet with one row per image, as the Hugging Face Hub stores datasets.
 
 The columns `image` and `mask` (and `amodal_mask`, `noiseless`, `highlight_mask` where the dataset has them) hold PNG
 files. The labels have the columns of the layout csv, in pixels of the image. `line_json` is the whole line of metadata
-as JSON text. Load the folder with `datasets.load_dataset("OUT")`, or upload it as it is: the head of this file tells
-the Hub's viewer the columns and the splits.
+as JSON text. Load the folder with `datasets.load_dataset("OUT")`, or upload it unchanged: the head of README.md names
+columns and splits for the Hub's viewer.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .item import Item, Items
 from .table import row_of
 
 IMAGES_A_FILE = 2000
-# Readers take whole groups of rows into memory, and so does the writer.
+# Writer and readers hold a whole row group in memory.
 IMAGES_A_GROUP, BYTES_A_GROUP = 100, 32 * 2**20
 _PICTURES = {
     "image": "file_name",
@@ -84,7 +84,7 @@ def _picture(item: Item, name: str) -> dict[str, Any] | None:
 
 
 def _type(name: str) -> str:
-    """Return the type of a column of labels, as `datasets` calls it."""
+    """Return the type of a label column in the notation of `datasets`."""
     if name in _TEXTS:
         return "string"
     if name in _WHOLE:
@@ -100,7 +100,7 @@ def _schema(pa: Any, types: dict[str, str]) -> Any:
         "bool": pa.bool_(),
         "float64": pa.float64(),
     }
-    # `datasets` reads here which columns are pictures.
+    # `datasets` reads from this metadata which columns are images.
     features = {
         name: {"_type": "Image"} if kind == "image" else {"dtype": kind, "_type": "Value"}
         for name, kind in types.items()
@@ -110,7 +110,7 @@ def _schema(pa: Any, types: dict[str, str]) -> Any:
 
 
 class _File:
-    """The files of a split, one after the other."""
+    """Writer of the consecutive files of a split."""
 
     def __init__(self, parquet: Any, pa: Any, schema: Any, out: Path, split: str, images: int) -> None:
         self._parquet, self._pa, self._schema = parquet, pa, schema

@@ -1,4 +1,4 @@
-"""CSV: labels.csv with one row an image, beside the images and masks."""
+"""CSV: labels.csv with one row per image, beside the images and masks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ELLIPSE = ("x_px", "y_px", "a_px", "b_px", "angle_rad")
 
 
 def write(items: Items, out: Path) -> None:
-    """Write images/, masks/ and labels.csv; a place that does not exist is an empty field."""
+    """Write images/, masks/ and labels.csv; a missing position is an empty field."""
     (out / "images").mkdir()
     (out / "masks").mkdir()
     writer = None
@@ -36,7 +36,7 @@ def write(items: Items, out: Path) -> None:
 
 
 def row_of(item: Item, lights: int) -> dict[str, Any]:
-    """Return flat labels of an image."""
+    """Return the labels of an image as one flat row."""
     line = item.exported_line()
     record, labels = line["records"][0], line["labels"]
     x0, y0 = item.entry.window[:2]

@@ -1,4 +1,4 @@
-"""TEyeD: a video for each subject's eye in VIDEOS/, text files of its frames in ANNOTATIONS/.
+"""TEyeD: a video per eye of a subject in VIDEOS/, and text files of its frames in ANNOTATIONS/.
 
     NAME.mp4pupil_eli.txt, iris_eli.txt           FRAME;ANGLE;CENTER X;CENTER Y;WIDTH;HEIGHT;   degrees, full axes
     NAME.mp4pupil_lm_2D.txt, iris_lm_2D.txt       FRAME;AVG INACCURACY;X;Y;...;                 eight boundary points
@@ -8,8 +8,8 @@
     NAME.mp4validity_pupil.txt, iris, lid         FRAME;VALIDITY;
     NAME.mp4pupil_seg_2D.mp4, iris_seg_2D.mp4     white where visible
 
-Frames count from 1, -1 stands where there is nothing. Fuhl, Kasneci and Kasneci (2021), "TEyeD". The videos are
-lossless (FFV1, 8 bits); a frame of odd width or height has its last column or row twice.
+Frames count from 1; -1 marks a missing value. Fuhl, Kasneci and Kasneci (2021), "TEyeD". The videos are lossless (FFV1,
+8 bits); if a frame's width or height is odd, its last column or row is repeated.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def write(items: Items, out: Path) -> None:
 
 
 class _Video:
-    """Files of a video, open until its last frame is added."""
+    """Video files of one eye, open until their last frame is added."""
 
     def __init__(self, name: str, first: Item, out: Path) -> None:
         self.split, self.frames = first.split, 0
@@ -110,7 +110,7 @@ class _Video:
 
 
 def rows_of(item: Item) -> dict[str, list[float]]:
-    """Return annotations of a frame, without its number."""
+    """Return the annotations of a frame, without its number."""
     space = item.line["labels"]["space"]["camera"]
     globe = np.array(space["globe_centre_mm"])
     K = np.array(item.line["labels"]["camera"]["K"])

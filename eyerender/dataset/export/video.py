@@ -1,4 +1,4 @@
-"""Lossless videos: FFV1 (RFC 9043) in MP4, written by OpenCV's FFmpeg, which OpenCV and FFmpeg read.
+"""Lossless videos: FFV1 (RFC 9043) in MP4, written by OpenCV's FFmpeg and read by OpenCV and FFmpeg.
 
 OpenCV is a dependency already, and its FFmpeg is under the LGPL; the wheels of PyAV and imageio-ffmpeg contain x264,
 which is under the GPL. OpenCV's writer has two faults that this module corrects: it cuts off the last column or row of
@@ -19,9 +19,9 @@ FRAMES_PER_SECOND = 25
 
 
 class LosslessVideo:
-    """A file of grey frames (h, w) uint8 of one size.
+    """A video file of grey frames (h, w) uint8 of one size.
 
-    Where a side is odd, its last column or row is repeated once, so that it becomes even.
+    If a side is odd, its last column or row is repeated to make it even.
 
     Raises:
         OSError: OpenCV cannot write the file; `close` checks whether all frames are in it.
@@ -44,7 +44,7 @@ class LosslessVideo:
         self.frames += 1
 
     def close(self) -> None:
-        """Write the index, and read back the number of frames."""
+        """Write the index, then read the file back and check the number of frames."""
         self._writer.release()
         # FFmpeg writes nothing after a failed write, so the index, which comes last, is missing then.
         if int(cv2.VideoCapture(self._path, cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT)) != self.frames:

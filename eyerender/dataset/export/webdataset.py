@@ -1,7 +1,7 @@
-"""WebDataset: tar files of at most 1000 images a split; NAME.png, NAME.mask.png and NAME.json make a sample.
+"""WebDataset: tar files of at most 1000 images per split; NAME.png, NAME.mask.png and NAME.json form a sample.
 
-Where the dataset has amodal masks, masks of highlights or noiseless images, NAME.amodal.png, NAME.highlights.png or
-NAME.noiseless.png too.
+If the dataset has amodal masks, masks of highlights or noiseless images, a sample also has NAME.amodal.png,
+NAME.highlights.png or NAME.noiseless.png.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _MASKS = {"mask": "mask_file_name", "amodal": "amodal_mask_file_name", "highligh
 
 
 def write(items: Items, out: Path) -> None:
-    """Write SPLIT-000000.tar and so on; the line in NAME.json states the encoding of its image."""
+    """Write SPLIT-000000.tar and so on; the metadata in NAME.json states the encoding of its image."""
     counts: dict[str, int] = {}
     tars: dict[str, tarfile.TarFile] = {}
     try:

@@ -1,1 +1,1 @@
-"""The parts of `validate`: checksums of files, lines against shards and plan, recomputed values, masks."""
+"""Parts of `validate`: checksums, metadata against shards and plan, recomputed values, masks."""

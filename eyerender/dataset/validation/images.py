@@ -1,4 +1,4 @@
-"""Checks of the files of one image: their sizes and values, and the masks against the outlines and the labels."""
+"""Checks of an image's files: sizes and values, and masks against outlines and labels."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ Mask = NDArray[Any]
 
 
 class Tally:
-    """Statistics of pixels, stored as sums."""
+    """Running statistics of pixel values."""
 
     def __init__(self) -> None:
         self.images = 0
         self.level = self.saturated = 0.0
 
     def take(self, image: NDArray[Any], full: float) -> None:
-        """Add one image, whose greatest possible value is `full`."""
+        """Add one image, whose largest possible value is `full`."""
         self.images += 1
         self.level += float(image.mean()) / full
         self.saturated += float(np.mean(image >= full))
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return means over all images; empty where there were none."""
+        """Return means over all images; empty if there were none."""
         if not self.images:
             return {}
         return {
@@ -44,7 +44,7 @@ class Tally:
 
 
 def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> Iterator[str]:
-    """List what is wrong with an image's files; `limbus_px` (k, 2) is the iris' outline where it was recomputed.
+    """Describe what is wrong with an image's files; `limbus_px` (k, 2) is the limbus if it was recomputed.
 
     Raises:
         InputError: a file cannot be read.
@@ -77,7 +77,7 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
 
 
 def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats | None) -> Iterator[str]:
-    """Return masks of visible parts and, if there is one, of whole parts."""
+    """Return masks of the visible parts and, if available, of the whole parts."""
     w, h = entry.window[2:]
     for name, picture in (("mask", mask), ("amodal mask", whole)):
         if picture is None:
@@ -92,7 +92,7 @@ def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats 
 
 
 def _iris(mask: Mask) -> Bools:
-    """Return pixels of iris and pupil."""
+    """Return a mask of iris and pupil together."""
     return np.asarray((mask == IRIS) | (mask == PUPIL))
 
 
@@ -101,7 +101,7 @@ def _size(picture: NDArray[Any]) -> str:
 
 
 def _visible(line: dict[str, Any], mask: Mask, window: Window) -> Iterator[str]:
-    """Compare the visible ellipses with those of the mask's own pixels."""
+    """Compare the visible ellipses with ellipses of the mask's own pixels."""
     for name, inside in (("pupil", mask == PUPIL), ("iris", _iris(mask))):
         own = line.get("labels", {}).get(name)
         if isinstance(own, dict):
@@ -116,14 +116,14 @@ def _outlines(
 ) -> Iterator[str]:
     """Compare masks with the apparent outlines of pupil and limbus.
 
-    Pixels within an outline show the part or what hides it. A pixel that shows the eye must therefore show the part
-    exactly where its centre is within the outline, with or without lids. Skin within the outline is right unless the
-    labels say that nothing hides the part.
+    Pixels within an outline show the part or something that hides it. So a pixel of the eye must show the part exactly
+    if its centre lies within the outline, with or without lids. Skin within the outline is correct unless the labels
+    state that nothing hides the part.
     """
     labels = line.get("labels", {})
     pupil, iris = pupil_outline(line), iris_outline(line, limbus_px)
     shares = [_share(labels, name) for name in ("pupil", "iris")]
-    # The iris' share ignores what hides the pupil, so both must be whole.
+    # The iris' visible fraction ignores what hides the pupil, so both must be whole.
     bare = all(share is not None and share >= 1.0 for share in shares)
     within = None if iris is None else iris.inside(window)
     for picture, what, alone in ((mask, "mask", bare), (whole, "amodal mask", True)):
@@ -131,7 +131,7 @@ def _outlines(
             continue
         other = (picture == SKIN) if alone else np.zeros(picture.shape, dtype=bool)
         if pupil is not None:
-            # Where the cornea's rim has turned to sclera it hides the pupil behind it.
+            # Where the rim of the cornea is opaque like sclera, it hides the pupil behind it.
             clear = picture == IRIS if within is None else (picture == IRIS) | ((picture == SCLERA) & within)
             yield from _compare(f"{what} of its pupil", picture == PUPIL, clear | other, pupil, window)
         if iris is not None:
@@ -147,7 +147,7 @@ def _outlines(
 
 
 def _compare(name: str, shown: Bools, not_shown: Bools, outline: Outline, window: Window) -> Iterator[str]:
-    """List pixels that show a part beyond its outline, and pixels within it that show something else."""
+    """Describe pixels that show a part beyond its outline, and pixels within it that show something else."""
     area = outline.inside(window)
     for wrong, words in ((shown & ~area, "leaves its outline"), (not_shown & area, "does not fill its outline")):
         if wrong.any():
@@ -157,7 +157,7 @@ def _compare(name: str, shown: Bools, not_shown: Bools, outline: Outline, window
 
 
 def pupil_outline(line: dict[str, Any]) -> Outline | None:
-    """Return the apparent outline of the pupil in a line's record; None where it is missing or incomplete."""
+    """Return the apparent outline of the pupil from the record; None if it is missing or incomplete."""
     if len(line["records"]) != 1:
         return None
     pupil = line["records"][0]["pupil"]
@@ -170,7 +170,7 @@ def pupil_outline(line: dict[str, Any]) -> Outline | None:
 
 
 def iris_outline(line: dict[str, Any], limbus_px: Floats | None) -> Outline | None:
-    """Return the apparent limbus, recomputed or the ellipse of the labels; None where there is none."""
+    """Return the apparent limbus, recomputed or as the ellipse of the labels; None if there is none."""
     if limbus_px is not None:
         return Outline(limbus_px, EXACT_PX)
     own = line.get("labels", {}).get("iris")
@@ -185,7 +185,7 @@ def _ellipse(values: dict[str, Any], tolerance_px: float) -> Outline:
 
 
 def _share(labels: dict[str, Any], name: str) -> float | None:
-    """Return the visible fraction of a part in the labels of a dataset or of a rendered folder."""
+    """Return the visible fraction of a part from the labels of a dataset or a rendered folder."""
     own = labels.get(name)
     value = own["visible_fraction"] if isinstance(own, dict) else labels.get(f"{name}_visible_fraction")
     return None if value is None else float(value)

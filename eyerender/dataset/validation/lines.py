@@ -1,4 +1,4 @@
-"""Checks of every line of metadata: names, keys, records, labels that must agree with records, subjects and splits.
+"""Checks of every line of metadata: names, keys, records, labels that repeat records, subjects and splits.
 
 Only a few bytes are kept of each line.
 """
@@ -21,7 +21,7 @@ from .problems import WRONG, Problems
 from .shards import hashed
 from .truth import DatasetTruth, SceneTruth
 
-# Labels that every image of a dataset has, whatever it shows.
+# Labels that every image of a dataset has, whatever is visible.
 _ALWAYS = (
     ("labels", "pupil", "amodal"),
     ("labels", "pupil", "visible"),
@@ -37,7 +37,7 @@ _ALWAYS = (
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """Keys of an object, and the shapes of its values that are objects, or lists of objects of one shape."""
+    """Keys of an object and, for nested objects and lists of objects, their shapes."""
 
     keys: frozenset[str]
     objects: tuple[tuple[str, _Shape], ...]
@@ -60,7 +60,7 @@ class _Shape:
 
 
 class Lines:
-    """Checks lines one by one, and at the end what concerns several of them."""
+    """Checker of the metadata, line by line, and finally of properties that concern several lines."""
 
     def __init__(self, folder: ImageFolder, truth: DatasetTruth | SceneTruth | None) -> None:
         self._folder = folder
@@ -73,7 +73,7 @@ class Lines:
         self._shape: _Shape | None = None
 
     def take(self, number: int, entry: ImageEntry) -> Iterator[str]:
-        """List what is wrong with line `number`, counted from 0.
+        """Describe what is wrong with line `number`, counted from 0.
 
         A line that cannot be read raises one of `WRONG`.
         """
@@ -99,7 +99,7 @@ class Lines:
         yield from _agree(line)
 
     def finish(self, problems: Problems) -> None:
-        """Check what concerns several lines: their number, duplicate names, subjects in two splits."""
+        """Check properties of all lines: their number, duplicate names, subjects in two splits."""
         entries = self._folder.entries
         statistics = self._folder.dataset.get("statistics")
         expected = statistics.get("images") if isinstance(statistics, dict) else None
@@ -113,7 +113,7 @@ class Lines:
             problems.add(f"{METADATA} line {k + 1}: subject {self._subjects[k]} is in two splits")
 
     def _moved(self) -> Ints:
-        """List lines whose subject was in another split before."""
+        """Describe lines whose subject was in another split before."""
         order = np.argsort(self._subjects, kind="stable")
         subject, split = self._subjects[order], self._splits[order]
         first = np.concatenate([[True], subject[1:] != subject[:-1]])
@@ -122,13 +122,13 @@ class Lines:
 
 
 def check_records(batch: list[dict[str, Any]]) -> list[list[str]]:
-    """List what is wrong with the records of each line of a batch."""
+    """Describe what is wrong with the records of each line of a batch."""
     problems: list[list[str]] = [[] for _ in batch]
     try:
         rows = [k for k, line in enumerate(batch) for _ in line["records"]]
         found = Observations.from_records([r for line in batch for r in line["records"]], complete=True)
     except (InputError, *WRONG):
-        # One of them is wrong, and separate checks show which.
+        # One of them is wrong, and other checks show which.
         if len(batch) > 1:
             return [check_records([line])[0] for line in batch]
         try:
@@ -161,7 +161,7 @@ def _agree(line: dict[str, Any]) -> Iterator[str]:
     labels = line["labels"]
     own, pupil = labels["pupil"]["amodal"], record["pupil"]
     keys = ("status", "centre_px", "semi_axes_px", "angle_rad") if own["status"] == "ok" else ("status",)
-    # Labels need the whole outline, so a partial pupil is missing there.
+    # These labels need the whole outline, so they are missing for a partial pupil.
     record_pupil = {**pupil, "status": "missing" if pupil["status"] == "partial" else pupil["status"]}
     if any(own[key] != record_pupil[key] for key in keys):
         yield "the pupil of its labels differs from that of its record"
@@ -172,7 +172,7 @@ def _agree(line: dict[str, Any]) -> Iterator[str]:
 
 
 def _other_keys(line: dict[str, Any], first: dict[str, Any]) -> Iterator[str]:
-    """List keys that only one of two lines has; below a null any keys are allowed."""
+    """Return keys that only one of two lines has; below a null any keys are allowed."""
     keys: set[str] = set()
     known: set[str] = set()
     nulls: set[str] = set()

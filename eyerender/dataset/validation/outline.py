@@ -28,10 +28,10 @@ class Outline:
 
     @classmethod
     def through(cls, points_px: Floats) -> Outline:
-        """Return the closed curve through boundary points (k, 2) at equal steps of a parameter, k >= 6.
+        """Interpolate a closed curve through boundary points (k, 2) px at equal parameter steps, k >= 6.
 
-        It is a trigonometric interpolation, which is exact for a curve with fewer than k / 2 harmonics. The outline of
-        a stop has few, so the harmonics above k / 4 give the possible error of the interpolation.
+        The interpolation is trigonometric, which is exact for a curve with fewer than k / 2 harmonics. The outline of a
+        stop has few, so the size of the harmonics above k / 4 estimates the interpolation error.
         """
         k = len(points_px)
         harmonics = np.fft.fft(points_px[:, 0] + 1j * points_px[:, 1]) / k
@@ -47,11 +47,11 @@ class Outline:
 
     @classmethod
     def ellipse(cls, centre_px: Floats, semi_axes_px: Floats, angle_rad: float, tolerance_px: float) -> Outline:
-        """Return the outline where only the best-fitting ellipse is known."""
+        """Create the outline from an ellipse, if only the best-fitting ellipse is known."""
         return cls(points_on_ellipse(centre_px, semi_axes_px, angle_rad, _POINTS), tolerance_px)
 
     def inside(self, window: Window) -> Bools:
-        """Return whether each pixel's centre of a window (x0, y0, width, height) lies inside, (height, width)."""
+        """Return whether each pixel's centre in a window (x0, y0, width, height) lies inside, (height, width)."""
         from skimage.draw import polygon2mask
 
         x0, y0, width, height = window
@@ -59,7 +59,7 @@ class Outline:
         return np.asarray(polygon2mask((height, width), corners))  # type: ignore[no-untyped-call]
 
     def beyond(self, pixels: Bools, window: Window) -> Floats:
-        """Return distances from the outline, px, of those of a window's pixels that exceed the tolerance."""
+        """Return the distances (px) from the outline of those pixels of a window that exceed the tolerance."""
         v, u = np.nonzero(pixels)
         at = np.stack([u + window[0], v + window[1]], axis=1).astype(float)
         p, way = self.curve, np.roll(self.curve, -1, axis=0) - self.curve

@@ -1,4 +1,4 @@
-"""Problems of a folder: their number, and the first ones in words."""
+"""Problems of a folder: how many, and the first ones in words."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Iterable, Iterator
 from math import sin
 from typing import Any
 
-# A damaged folder of a million images has a million problems; the first ones suffice to explain.
+# A damaged folder of a million images has a million problems; the first ones explain enough.
 SHOWN = 50
 MAX_LENGTH = 400
-# Exceptions that code raises when it reads a wrong value.
+# Exceptions that reading a wrong value may raise.
 WRONG = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError)
 
 
 class Problems:
-    """Collects problems in constant memory."""
+    """Collector of problems in constant memory."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -34,10 +34,10 @@ class Problems:
 
 
 def differences(expected: Any, found: Any, tolerance: float, path: str = "") -> Iterator[str]:
-    """List where a JSON value differs from the expected one, as `path is FOUND, not EXPECTED`.
+    """Describe each difference of a JSON value from the expected one as `path is FOUND, not EXPECTED`.
 
     Numbers may differ by `tolerance` (1 + |expected|). Keys of `found` beyond the expected ones are ignored. The angle
-    of an ellipse counts only as far as it moves the ellipse's edge: a circle has none.
+    of an ellipse counts by how far it moves the edge: for a circle, not at all.
     """
     if isinstance(expected, dict) and isinstance(found, dict):
         yield from _differences_of_keys(expected, found, tolerance, path)
@@ -63,7 +63,7 @@ def _differences_of_keys(expected: dict[str, Any], found: dict[str, Any], tolera
 
 
 def _same_angle(expected: dict[str, Any], found: dict[str, Any], tolerance: float) -> bool:
-    """Return whether two ellipses with the same axes are equal within the tolerance, given their angles."""
+    """Return whether two ellipses with equal axes agree within the tolerance, given their angles."""
     axes, a, b = expected.get("semi_axes_px"), expected.get("angle_rad"), found.get("angle_rad")
     if axes is None or not (isinstance(a, float) and isinstance(b, int | float)):
         return False

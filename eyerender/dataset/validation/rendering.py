@@ -1,4 +1,4 @@
-"""Samples rendered again, whose pictures must have the same pixels as those of the folder."""
+"""Render samples again and compare their pixels with those of the folder."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def render_again(
 ) -> list[str]:
     """Render the samples of some rows of a dataset again.
 
-    Differences from pictures that the same versions, backend and kind of processor have made are problems.
+    Differences are problems if the same versions, backend and kind of processor made the images.
 
     Returns:
-        Notes: the number of images, and differences from other pictures with what differs between the two makers.
+        Notes: the number of images, and differences from images of another maker with how the makers differ.
 
     Raises:
-        BackendError: there is nothing to render with.
+        BackendError: no backend can render.
         InputError: a file of the plan is missing, or a picture cannot be read.
     """
     entries: dict[int, list[ImageEntry]] = {}
@@ -77,7 +77,7 @@ def _differences(entry: ImageEntry, made: Mapping[str, NDArray[Any]]) -> Iterato
 
 
 def other_maker(folder: ImageFolder, truth: DatasetTruth, entry: ImageEntry, backend: Mapping[str, Any]) -> str:
-    """What differs between what has made an image and this process; empty if nothing that affects its bytes."""
+    """Describe how the maker of an image differs from this process; empty if nothing affects its bytes."""
     done = read_done(folder.path, truth.plan.spec.selection.shard_of(int(entry.line["sample"])))
     old = {**done["versions"], **{k: v for k, v in done["backend"].items() if k != "threads"}, "cpu": done["cpu"]}
     new = {**run_versions(), **{k: v for k, v in backend.items() if k != "threads"}, "cpu": cpu_family()}

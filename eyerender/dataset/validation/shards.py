@@ -30,21 +30,21 @@ _EXACT_INTEGER = 2**53
 
 
 def check_run(images: ImageFolder, quick: bool, problems: Problems, step: Progress) -> None:
-    """Check the shards of a dataset, and metadata.jsonl against their lines where the run is finished."""
+    """Check the shards of a dataset, and metadata.jsonl against their lines if the run is finished."""
     check_shards(images, quick, problems, step)
     if not images.unfinished and images.dataset.get("schema") != PACKED_SCHEMA:
         compare_lines(images.path, problems)
 
 
 def check_shards(images: ImageFolder, quick: bool, problems: Problems, step: Progress) -> None:
-    """Check every shard that dataset.json lists, and the files that were put together from the shards.
+    """Check every shard that dataset.json lists, and the files assembled from the shards.
 
     A shard must exist, unless the run is unfinished, and belong to the plan. Its files must have the stated sizes and,
     unless `quick`, checksums.
     """
     folder, dataset = images.path, images.dataset
     if not images.unfinished:
-        # Where dataset.json has no checksums, as older versions wrote it, `compare_lines` checks metadata.jsonl.
+        # dataset.json of older versions has no checksums; `compare_lines` then checks metadata.jsonl.
         problems.extend(damage(folder, quick=quick or dataset.get("checksums") is None))
     there = sorted(finished(folder))
     digest = dataset.get("digest")
@@ -67,8 +67,8 @@ def check_shards(images: ImageFolder, quick: bool, problems: Problems, step: Pro
 def compare_lines(folder: Path, problems: Problems) -> None:
     """Compare metadata.jsonl with the shards' lines as values; the order of lines and of keys does not matter.
 
-    Lines whose text is not in both are parsed and compared by their image's name. Whole numbers are equal to their
-    floating-point form. This takes some ten bytes of memory per line.
+    Lines whose text differs are parsed and compared by image name. Whole numbers are equal to their floating-point
+    form. This takes some ten bytes of memory per line.
     """
     mine = [folder / METADATA]
     theirs = [folder / SHARDS / shard_name(shard) / LINES for shard in sorted(finished(folder))]
@@ -94,11 +94,11 @@ def compare_lines(folder: Path, problems: Problems) -> None:
 
 
 def _values(files: Sequence[Path], numbers: Ints) -> NDArray[np.void]:
-    """Return some lines of a few files: their numbers, and hashes of their images' names and of their values."""
+    """Read lines with given numbers: their numbers, and hashes of their images' names and of their values."""
 
     def rows() -> Iterator[tuple[int, int, int]]:
         for number, line in _objects(files, numbers):
-            with suppress(RecursionError):  # nested too deeply for a line; another check reports it
+            with suppress(RecursionError):  # too deeply nested for metadata; another check reports it
                 values = json.dumps(_plain(line), sort_keys=True)
                 yield number, hashed(str(line.get("file_name")).encode()), hashed(values.encode())
 
@@ -106,7 +106,7 @@ def _values(files: Sequence[Path], numbers: Ints) -> NDArray[np.void]:
 
 
 def _objects(files: Sequence[Path], numbers: Ints) -> Iterator[tuple[int, dict[str, Any]]]:
-    """List lines with given numbers, in order, that are objects; other checks report what is not an object."""
+    """Read the lines with given numbers, in order, that are objects; other checks report the rest."""
     if not len(numbers):
         return
     wanted = iter(numbers.tolist())
@@ -123,7 +123,7 @@ def _objects(files: Sequence[Path], numbers: Ints) -> Iterator[tuple[int, dict[s
 
 
 def _lines(files: Sequence[Path]) -> Iterator[tuple[int, bytes]]:
-    """List lines of several files, numbered from 0; a file that cannot be read has none."""
+    """Yield the lines of several files, numbered from 0; an unreadable file has none."""
     number = 0
     for path in files:
         with suppress(InputError, OSError), opened(path, limit=MAX_BYTES, follow=False) as file:
@@ -133,7 +133,7 @@ def _lines(files: Sequence[Path]) -> Iterator[tuple[int, bytes]]:
 
 
 def _plain(node: Any) -> Any:
-    """Return the JSON value with whole numbers in floating-point form where that is exact."""
+    """Convert whole numbers of a JSON value to floating point where that is exact."""
     if isinstance(node, dict):
         return {key: _plain(value) for key, value in node.items()}
     if isinstance(node, list):
@@ -143,5 +143,5 @@ def _plain(node: Any) -> Any:
 
 
 def hashed(data: bytes) -> int:
-    """Return the hash of 64 bits."""
+    """Return a 64-bit hash."""
     return int.from_bytes(hashlib.blake2b(data, digest_size=8).digest(), "big")

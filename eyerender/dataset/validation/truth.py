@@ -1,7 +1,7 @@
-"""Lines of metadata computed again, from the plan of a dataset or from the scene of a rendered folder.
+"""Recompute metadata, from the plan of a dataset or from the scene of a rendered folder.
 
-These are the values of a line that do not depend on its pixels: the image's identity, what was drawn, the names of its
-files, the analytic record, and the labels that follow from pose and parameters.
+This covers the values that do not depend on pixels: the image's identity, what was drawn, the names of its files, the
+analytic record, and the labels that follow from pose and parameters.
 """
 
 from __future__ import annotations
@@ -33,11 +33,10 @@ from ..plan import Plan, mapping_digest, plan_digest
 from ..realise import Realised, frames_of, realise
 from .problems import WRONG, Problems, differences
 
-# Rays are traced to 1e-9 mm, and other machines' mathematical functions change the last digits: 1e-8 px at the sharpest
-# of the shipped cameras. A number may differ by this times 1 + its size.
+# Rays are traced to 1e-9 mm, and mathematical functions of other machines change the last digits: 1e-8 px at the
+# sharpest of the shipped cameras. A number may differ by this times 1 + its size.
 TOLERANCE = 1e-7
-# The centre of a lamp's image, of which hidden points may be missing, is a mean of points that are traced equally
-# exactly.
+# The centre of a lamp's image is a mean of equally exact points; hidden points may be missing.
 SPOT_PX = 1e-3
 # Landmarks of the lids are written with four decimals.
 ROUNDED = 1e-6
@@ -46,12 +45,12 @@ _SHOWN = 2
 
 
 class NoTruth(Exception):
-    """Nothing can be computed again, for a reason that is not a fault of the folder."""
+    """Nothing can be recomputed, for a reason that is not a fault of the folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class Again:
-    """An image computed again: the differences of its line, and its limbus (k, 2) px where it is visible as a whole."""
+    """A recomputed image: the differences of its metadata, and its limbus (k, 2) px if it is visible as a whole."""
 
     problems: tuple[str, ...]
     limbus_px: Floats | None = None
@@ -59,9 +58,9 @@ class Again:
 
 @dataclass
 class DatasetTruth:
-    """Lines of a generated dataset, from its plan; `frames` is the number of frames of each sample.
+    """Reference for the metadata of a generated dataset, from its plan; `frames` is the number of frames per sample.
 
-    `stale` is the reason why records and labels cannot be computed again, None where they can.
+    `stale` is the reason why records and labels cannot be recomputed, None if they can.
     """
 
     plan: Plan
@@ -71,11 +70,11 @@ class DatasetTruth:
 
     @classmethod
     def of(cls, dataset: Mapping[str, Any], problems: Problems) -> DatasetTruth | None:
-        """Read the plan in dataset.json; what is wrong with it is added to the problems."""
+        """Read the plan in dataset.json, and add what is wrong with it to the problems."""
         try:
             plan = Plan.from_mapping(dataset, Path())
             mapping = {k: dataset[k] for k in plan.to_mapping()}
-            # Earlier versions counted the number of samples in the digest, too.
+            # Earlier versions included the number of samples in the digest.
             if dataset["digest"] not in (plan_digest(mapping), mapping_digest(mapping)):
                 problems.add(f"{DATASET}: its digest does not match its spec, eyes and files")
             return cls(plan, frames_of(plan), _other_results(dataset))
@@ -86,7 +85,7 @@ class DatasetTruth:
         return None
 
     def whose(self, line: dict[str, Any]) -> dict[str, Any]:
-        """Return the subject, split and file names that a line must have; raises one of `WRONG`, `InputError`."""
+        """Return the subject, split and file names that a line must have; raise one of `WRONG` or `InputError`."""
         sample, record = line["sample"], line["records"][0]
         subject, sequence = self.plan.subject_of(sample)
         name = image_name(sample, record["frame"] - sample * self.frames, self.frames, record["eye"])
@@ -95,7 +94,7 @@ class DatasetTruth:
         return {**files, "subject": subject, "sequence_index": sequence, "split": self.plan.split_of(subject)}
 
     def again(self, line: dict[str, Any]) -> Again:
-        """Compute a line again; raises one of `WRONG` for what is not a line of a dataset."""
+        """Recompute a line; raise one of `WRONG` if it is not a line of a dataset."""
         number, record = line["sample"], line["records"][0]
         if self._last is None or self._last.index != number:
             self._last = self._exposed(realise(self.plan, number, self.frames), line)
@@ -116,7 +115,7 @@ class DatasetTruth:
         return Again(tuple(problems), _limbus(scene, view))
 
     def _exposed(self, found: Realised, line: dict[str, Any]) -> Realised:
-        """The sample with the exposure of its line, which only its pictures can tell where exposure is automatic."""
+        """Return the sample with the exposure in its line, because automatic exposure depends on the pixels."""
         if self.plan.spec.auto_exposure is None or found.sample is None:
             return found
         return found.exposed(json.loads(line["parameters"]["scene_json"])["sensor"]["exposure_ms"])
@@ -124,7 +123,7 @@ class DatasetTruth:
 
 @dataclass
 class SceneTruth:
-    """Lines of a rendered folder, from its scene."""
+    """Reference for the metadata of a rendered folder, from its scene."""
 
     frames: Frames
     observations: Observations
@@ -149,7 +148,7 @@ class SceneTruth:
         except InputError as error:
             raise NoTruth(str(error)) from None
         if digest != dataset.get("digest"):
-            # Another version of the package may have keys that this digest does not include.
+            # Another version of the package may have keys that this digest lacks.
             made_by = dataset.get("versions")
             if isinstance(made_by, dict) and made_by.get("eyerender") != versions()["eyerender"]:
                 raise NoTruth("another version of the package made it")
@@ -157,12 +156,12 @@ class SceneTruth:
         return cls(frames, trace(frames))
 
     def whose(self, line: dict[str, Any]) -> dict[str, Any]:
-        """List file names that a line must have; raises one of `WRONG`."""
+        """Return the file names that a line must have; raise one of `WRONG`."""
         name = f"{line['records'][0]['frame']:06d}_{line['records'][0]['eye']}"
         return {"file_name": f"images/{name}.png", "mask_file_name": f"masks/{name}.png"}
 
     def again(self, line: dict[str, Any]) -> Again:
-        """Compute a line again; raises one of `WRONG` for what is not a line of a rendered folder."""
+        """Recompute a line; raise one of `WRONG` if it is not a line of a rendered folder."""
         scene, found = self.frames.scene, self.observations
         record = line["records"][0]
         row = _row(found, record["frame"], record["eye"])
@@ -189,14 +188,14 @@ class SceneTruth:
 
 
 def truth_of(folder: ImageFolder, problems: Problems) -> DatasetTruth | SceneTruth | None:
-    """Find what a folder's lines can be compared with; None where dataset.json is damaged; raises `NoTruth`."""
+    """Return the reference for a folder's metadata; None if dataset.json is damaged. Raises `NoTruth`."""
     if folder.dataset.get("kind") == "dataset":
         return DatasetTruth.of(folder.dataset, problems)
     return SceneTruth.of(folder.dataset, problems)
 
 
 def _other_results(dataset: Mapping[str, Any]) -> str | None:
-    """State whether another version of the results made a folder; None if not."""
+    """Return a note if a version with other results made the folder; None otherwise."""
     made_by = dataset.get("versions")
     results = made_by.get("results", RESULTS) if isinstance(made_by, dict) else RESULTS
     return None if str(results) == str(RESULTS) else f"it has results of version {shown(results)}, not {RESULTS}"
@@ -209,7 +208,7 @@ def _row(observations: Observations, frame: int, eye: str) -> int | None:
 
 
 def _open(line: dict[str, Any], texts: tuple[str, ...]) -> dict[str, Any]:
-    """Replace JSON that a line holds as text by its values."""
+    """Parse the JSON texts in a line into values."""
     parameters = line["parameters"]
     return {**line, "parameters": {**parameters, **{key: parse_json(parameters[key]) for key in texts}}}
 
@@ -232,7 +231,7 @@ def _limbus(scene: Scene, view: EyeInWindow) -> Floats | None:
 
 
 def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
-    """Check the spots of the glints: each is the mean of the lamp's image, or within it where a part is hidden."""
+    """Check the spots of the glints: each is the mean of the lamp's image, or lies within it if a part is hidden."""
     eye, camera = view.eye, scene.rig.cameras[view.camera]
     mirror = GlintScene.of(eye, film_index(eye, scene.spec.look), view.M, view.t, camera, None)
     images = mirror.images(scene.rig.lights, scene.spec.sensor.psf_sigma_px)
@@ -257,7 +256,7 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
 
 
 def _lids(scene: Scene, observations: Observations, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
-    """Check the landmarks along the lids; those of a head mesh are unknown and null."""
+    """Check the landmarks along the lids; for a head mesh they are unknown and null."""
     expected = None
     if scene.spec.region is not None and scene.spec.region.head is None:
         index = observations.index

@@ -1,1 +1,1 @@
-"""Glints: detection of bright spots, fits, classification, and assignment to the lights."""
+"""Glints: detection of bright spots, fits, classification, and assignment to lights."""

@@ -1,9 +1,9 @@
-"""Classification of fitted spots: which are glints, and the reasons why other reflections are not.
+"""Classification of fitted spots: which are glints, and why other reflections are not.
 
-A spot's features (what is behind it, how far from the pupil it lies, its shape and height) give a first logit of the
-probability that it is a glint of the cornea. The likeliest one is then what the others are compared with: lamps of one
-rig are reflected about equally high and wide. The weights of both steps are maximum a-posteriori estimates (logistic
-regression) from development images; `scripts/fit_glints.py` makes them.
+A spot's features (background, distance from the pupil, shape and height) give a first logit of the probability that it
+is a glint of the cornea. The others are then compared with the likeliest one: reflections of one rig's lamps are about
+equally high and wide. The weights of both steps are maximum a-posteriori estimates (logistic regression) from
+development images, made by `scripts/fit_glints.py`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from ..settings import ExtractionSettings
 from .detection import optics_sigma
 from .fits import SpotFit
 
-# Steps by which the ground may be brighter than the iris; more is no worse, because the sclera is as bright.
+# Largest counted steps by which the background is brighter than the iris; more is not worse, because the sclera is as
+# bright.
 BRIGHTEST = 1.4
 ROUND = math.log(2.0)  # elongation that LEDs have; it counts twice, so this is an oval of 1.4 : 1
 # A spot is accepted if it is a glint with at least these odds.
@@ -30,7 +31,7 @@ LEAST_ODDS = 2.0
 LIKELIEST = 12.0  # largest logit that counts
 # Glints of one rig are alike: largest differences of the logarithms of light, width and form; how many of them count.
 ALIKE, MOST_ALIKE = (1.0, 0.3, 0.3), 3.0
-# Reasons for which a spot is refused, in the order of the features.
+# Reasons for which a spot is rejected, in the order of the features.
 GROUNDS = (
     "before something brighter than the iris, as highlights of skin are",
     "far from the pupil, as highlights of skin are",
@@ -41,7 +42,7 @@ GROUNDS = (
     "much fainter than the brightest glint, as highlights of skin and lid margins are",
     "not as wide as the likeliest glint",
 )
-# Features of a glint that speaks for itself, in the order of the reasons.
+# Features of an unambiguous glint, in the order of the reasons.
 USUAL = (0.0, 0.0, 0.0, 0.0, math.log(10.0), 1.0)
 
 # Made by scripts/fit_glints.py: weights of the features and 1, and of the comparison.
@@ -53,14 +54,14 @@ _PIXEL = 1.0 / 12.0  # variance of a pixel; without it a spot of one row of pixe
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Eye:
-    """What spots are judged by.
+    """Properties of the eye by which spots are judged.
 
     Attributes:
         ellipse: the pupil.
-        blur_px: blur of its edge.
-        pupil_dn: level inside it.
-        iris_dn: level just outside it.
-        support: share of its boundary that is seen.
+        blur_px: blur of the pupil's edge.
+        pupil_dn: level inside the pupil.
+        iris_dn: level just outside the pupil.
+        support: visible share of its boundary.
         clip_dn: level at which the sensor clips.
     """
 
@@ -108,12 +109,12 @@ def classify_spots(
 
 
 def features(fit: SpotFit, eye: Eye) -> Floats:
-    """Features (n, 8) of spots on which the first logit depends.
+    """Compute the features (n, 8) of spots for the first logit.
 
-    They are: by how much the ground is brighter than the pupil or iris that should be there, in steps from pupil to
-    iris; the distance outside the pupil in semi-axes a; the logarithms of the width over the blur, of the elongation
-    (of the fit and of the bright patch) beyond ROUND and of the height in steps; the fourth power of the peak's level
-    over that at which the sensor clips, which little but lamps reach; the visible share of the pupil boundary; and 1.
+    They are: how much the background is brighter than the pupil or iris expected there, in steps from pupil to iris;
+    the distance outside the pupil in semi-axes a; the logarithms of the width over the blur, of the elongation (of the
+    fit and of the bright patch) beyond ROUND and of the height in steps; the fourth power of the peak's level over the
+    clip level, which hardly anything but lamps reaches; the visible share of the pupil boundary; and 1.
     """
     step, wide2 = abs(eye.iris_dn - eye.pupil_dn), fit.sigma_px**2 + _PIXEL
     width = wide2.prod(axis=1) ** 0.25
@@ -139,14 +140,14 @@ def features(fit: SpotFit, eye: Eye) -> Floats:
 
 
 def compared(fit: SpotFit, logit: Floats, top_dn: float) -> Floats:
-    """Features (n, 6) on which the second logit depends.
+    """Compute the features (n, 6) of spots for the second logit.
 
-    They are the first logit; whether the spot is another one than the likeliest; and for those, the logarithms of its
-    visible light (height times width) over that of the brightest glint and of its visible width over the likeliest
-    one's; how many glints are expected among the other spots like it; and 1.
+    They are the first logit; whether the spot is not the likeliest one, and if so, the logarithms of its visible light
+    (height times width) over that of the brightest glint and of its visible width over the likeliest one's; the
+    expected number of glints among other similar spots; and 1.
 
-    Of a clipped spot, the flanks tell the height badly. So only what is visible counts: the height up to `top_dn`, at
-    which the sensor clips, and the width, from the area above half of that: 2 pi sigma^2 ln(A / (h / 2)) of a Gaussian.
+    The flanks of a clipped spot determine its height badly, so only the visible part counts: the height up to `top_dn`,
+    and the width from the area above half of it, 2 pi sigma^2 ln(A / (h / 2)) for a Gaussian.
 
     Args:
         fit: the n spots.
@@ -174,7 +175,7 @@ def compared(fit: SpotFit, logit: Floats, top_dn: float) -> Floats:
 
 
 def _objections(fit: SpotFit, eye: Eye) -> list[str | None]:
-    """Reasons (n,) why spots are not glints, None for glints."""
+    """Return reasons (n,) why spots are not glints, None for glints."""
     reasons: list[str | None] = ["the spot's fit did not converge"] * fit.converged.size
     index = np.flatnonzero(fit.converged)
     if index.size == 0:

@@ -1,7 +1,7 @@
 """Spots that one Gaussian does not explain: two that overlap, or one beside an edge such as the limbus.
 
-A spot is unexplained if its residual exceeds twice the image's noise, and also exceeds what an extended LED and a
-non-Gaussian blur leave of its height.
+A spot is unexplained if its residual exceeds both twice the image's noise and the share of its height that an extended
+LED and a non-Gaussian blur may leave.
 """
 
 from __future__ import annotations
@@ -71,14 +71,14 @@ def give_edges(fitted: FittedSpots, blur_px: float, widest_px: float, limits: Li
 
 
 def _unexplained(fit: SpotFit, noise_dn: float, most: float) -> Bools:
-    """Compute spots (n,) whose residual is too large for a single glint, but at most `most` of their height."""
+    """Return at most `most` spots (n,) whose residual is too large for a single glint."""
     least = np.maximum(UNEXPLAINED * noise_dn, UNLIKE_BELL * fit.amplitude_dn)
     most_dn = most * np.minimum(fit.amplitude_dn, DN)
     return np.asarray(fit.converged & (fit.residual_dn > least) & (fit.residual_dn < most_dn))
 
 
 def _best_edge(fitted: FittedSpots, blur_px: float) -> tuple[Floats, Floats]:
-    """Find the straight edge that explains most of each spot's residual, among 12 directions and 9 offsets.
+    """Fit the straight edge that explains most of each spot's residual, among 12 directions and 9 offsets.
 
     The part of an edge that the parameters of the spot and its background can explain is removed first.
 
@@ -119,7 +119,7 @@ def split_blends(
     widest_px: float,
     limits: Limits,
 ) -> tuple[Starts, SpotFit]:
-    """Replace every unexplained spot by two if two fit it much better.
+    """Replace each unexplained spot by two if two fit it much better.
 
     Two spots less than 2.5 sigma apart have one maximum. Their patch is elongated, and one Gaussian leaves a residual
     of several times the noise. The two halves start one standard deviation either way along the longer axis. They must
@@ -127,7 +127,7 @@ def split_blends(
 
     Args:
         linear: the image, DN.
-        known: gives the background B at pixels x and y.
+        known: returns the background B at pixels x and y.
         starts: xy (n, 2), width (n,) and height (n,), as given to `fit_spots`.
         fit: their fits.
         widest_px: largest standard deviation of a glint. A patch that two such cannot form is left alone.
@@ -166,7 +166,7 @@ def split_blends(
 
 
 def _long_axis(moments: Floats) -> tuple[Floats, float] | None:
-    """One standard deviation (2,) along a patch's longer axis, and the standard deviation across it; None if round.
+    """Return one standard deviation (2,) along a patch's longer axis, and that across it; None if it is round.
 
     `moments` (2, 2) are the patch's second moments, px^2.
     """

@@ -40,7 +40,7 @@ class Spots:
         height_dn: (n,) height above the surroundings.
         patches_px: (k, 2) peaks of bright patches that are not spots.
         clutter: xy, width and height of spots that are not bell-shaped. They are not fitted, and the pixel model of the
-            pupil boundary leaves their pixels out.
+            pupil boundary ignores their pixels.
     """
 
     xy_px: Floats
@@ -53,11 +53,11 @@ class Spots:
 def detect_spots(
     prepared: Prepared, ellipse: Ellipse, step_dn: float, blur_px: float, settings: ExtractionSettings
 ) -> Spots:
-    """Find local maxima that stand out from their surroundings (white top-hat).
+    """Detect local maxima that stand out from their surroundings (white top-hat).
 
     Args:
         prepared: the image.
-        ellipse: the pupil, around which spots are searched.
+        ellipse: the pupil, around which to search.
         step_dn: step from pupil to iris, DN.
         blur_px: blur of the pupil's edge.
         settings: settings; `glint_reach` limits the search.
@@ -79,7 +79,7 @@ def detect_spots(
     opened = _opening(half, size)
     flat, stands = _maxima(smooth, half, opened, threshold)
     row, column = np.divmod(flat, smooth.shape[1])
-    near = (column + x0 - cx) ** 2 + (row + y0 - cy) ** 2 < reach**2  # the corners of the crop are beyond
+    near = (column + x0 - cx) ** 2 + (row + y0 - cy) ** 2 < reach**2  # the crop's corners are too far away
     flat, stands = flat[near], stands[near]
     if flat.size == 0:
         return _no_spots()
@@ -108,20 +108,20 @@ def detect_spots(
 
 
 def search_reach(ellipse: Ellipse, settings: ExtractionSettings) -> float:
-    """Distance, px, from the pupil's centre within which glints are searched."""
+    """Compute the distance (px) from the pupil's centre within which glints are searched."""
     return float(ellipse.semi_axes_px[0]) * settings.glint_reach + 8.0
 
 
 @inlined
 def _level(image: Image, x: float, y: float) -> float:
-    """Compute the level of the pixel nearest to a point."""
+    """Return the level of the pixel nearest to a point."""
     column = int(np.rint(min(max(x, 0.0), image.shape[1] - 1.0)))
     return image[int(np.rint(min(max(y, 0.0), image.shape[0] - 1.0))), column]
 
 
 @inlined
 def _is_free(xy: Floats, disc: Floats, outer: float, k: int, x: float, y: float) -> bool:
-    """Return whether a point on the ring of spot k lies in the disc of no other spot."""
+    """Return whether a point on the ring of spot k lies in no other spot's disc."""
     for m in range(disc.size):
         apart2 = (xy[m, 0] - xy[k, 0]) ** 2 + (xy[m, 1] - xy[k, 1]) ** 2
         if 0.0 < apart2 < (outer + disc[m]) ** 2 and (x - xy[m, 0]) ** 2 + (y - xy[m, 1]) ** 2 <= disc[m] ** 2:
@@ -131,9 +131,9 @@ def _is_free(xy: Floats, disc: Floats, outer: float, k: int, x: float, y: float)
 
 @compiled("f4[:,::1], f8[:,::1], f8[::1]")
 def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
-    """Height (n,) of each peak above the brightest tenth of a ring around it. Pixels of other spots are left out.
+    """Compute the height (n,) of each peak above the brightest tenth of a ring around it, excluding other spots.
 
-    Skin, lashes and the gaps between lashes have many peaks, with equally bright ones beside them.
+    Peaks on skin, lashes and gaps between lashes have equally bright ones beside them.
     """
     out, level, disc = np.empty(width.size), np.empty(72), np.empty(width.size)
     for k in range(width.size):
@@ -156,12 +156,12 @@ def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
 
 
 def widest(blur_px: float) -> float:
-    """Largest standard deviation of a glint, px: a few pixels for the LED's image, plus the blur of the optics."""
+    """Compute the largest standard deviation of a glint, px: a few pixels for the LED's image plus the optical blur."""
     return min(2.5 * optics_sigma(blur_px) + 2.0, MAX_SIGMA_PX)
 
 
 def optics_sigma(blur_px: float) -> float:
-    """Standard deviation of the optical blur, px: the edge's blur without the variance of a pixel, 1/12 px^2."""
+    """Compute the standard deviation of the optical blur, px: that of the edge without the pixel's 1/12 px^2."""
     return math.sqrt(max(blur_px**2 - 1.0 / 12.0, 0.0))
 
 
@@ -180,7 +180,7 @@ def _compact(smooth: Image, xy: Floats, width: Floats, height: Floats) -> Bools:
 
 @compiled("f4[:,::1], f8[:,::1], i8, f8")
 def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> Indices:
-    """Compute indices of the maxima xy (n, 2) that are spots of their own, in the given order.
+    """Select which of the maxima xy (n, 2), in the given order, are separate spots.
 
     Two maxima count as one spot unless the level between them falls by `dip` below the lower one, or they are farther
     apart than `size`. The flat tops of clipped spots have several maxima, and so have wide spots with noise.
@@ -213,7 +213,7 @@ def _no_spots() -> Spots:
 
 
 def _opening(half: Image, size: int) -> Image:
-    """Compute level around spots: a square morphological opening of `size` px. Half resolution is enough for it."""
+    """Compute the level around spots: a square morphological opening of `size` px, at half resolution."""
     side = 2 * (size // 4) + 1
     return as_image(cv2.morphologyEx(half, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)))
 
@@ -230,7 +230,7 @@ def _highest(image: Image, y: int, x: int) -> bool:
 
 @compiled("f4[:,::1], f4[:,::1], f4[:,::1], f8")
 def _maxima(smooth: Image, half: Image, opened: Image, threshold: float) -> tuple[Indices, Singles]:
-    """Find local maxima that exceed the opened level by the threshold: flat indices (n,), and heights above it (n,)."""
+    """Detect local maxima above the opened level by the threshold: flat indices (n,), and heights above it (n,)."""
     columns, size, n = half.shape[1], smooth.shape[1], 0
     blocks = np.empty(half.size, dtype=np.int64)
     for y in range(half.shape[0]):

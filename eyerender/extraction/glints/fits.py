@@ -41,12 +41,12 @@ class SpotFit:
         return SpotFit(**{one.name: getattr(self, one.name)[index] for one in fields(self)})
 
     def replaced(self, index: Indices, other: SpotFit) -> SpotFit:
-        """Copy in which `other` replaces the spots with these indices."""
+        """Copy, with the spots at these indices replaced by those of `other`."""
         order = np.arange(self.converged.size)
         order[index] = order.size + np.arange(index.size)
         return joined([self, other]).taken(order)
 
 
 def joined(parts: list[SpotFit]) -> SpotFit:
-    """Join several batches."""
+    """Concatenate several batches."""
     return SpotFit(**{one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)})

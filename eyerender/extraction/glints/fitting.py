@@ -1,8 +1,8 @@
 """Censored fits of Gaussian spots on a known background, for all spots of an image at once.
 
 A spot that overlaps others is fitted to the image minus their light, which is updated as their fits change. A spot is
-abandoned if it grows or moves more than a glint can, or if it still moves when the others have settled. The light of an
-abandoned spot is not subtracted from the others' windows.
+abandoned if it grows or moves more than a glint can, or if it still moves after the others have settled. The light of
+an abandoned spot is not subtracted from the others' windows.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from .windows import WINDOWS, SpotPixels, Windows, cut, light_of_others, shining
 TURNS, PATIENCE, WANDERING_PX = (1, 4), (1, 2), 0.3
 FEW_CLIPPED = 2  # a spot with more clipped pixels has a flat top
 SMOOTH_PX = 0.7  # smoothing of the image in which detection estimated the widths
-UNEXPLAINED = 2.0  # with a smaller misfit, in noise standard deviations, the Gaussian explains the pixels
+UNEXPLAINED = 2.0  # misfit in noise standard deviations below which the Gaussian explains the pixels
 NEARLY_STILL_PX = 0.02  # a spot that moves less has settled, even if its neighbour still answers its moves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedSpots:
-    """A fit and its data.
+    """A fit with the pixels it was fitted to.
 
     Attributes:
         fit: the fit.
@@ -55,11 +55,11 @@ def fit_spots(
     height_dn: Floats,
     limits: Limits,
 ) -> FittedSpots:
-    """Fit all spots.
+    """Fit all spots of an image.
 
     Args:
         linear: the image, DN.
-        known: gives the background B at pixels x and y, (k,) each.
+        known: returns the background B at pixels x and y, (k,) each.
         start_px: (n, 2) detected peaks.
         width_px: (n,) their estimated standard deviations.
         height_dn: (n,) their heights.
@@ -111,7 +111,7 @@ def _distance(start: Floats) -> Floats:
 
 
 def _start(pixels: SpotPixels, start: Floats, width: Floats, height: Floats, touching: Bools) -> Floats:
-    """Start (n, PARAMETERS) of the fit, without the background's level."""
+    """Compute the start (n, PARAMETERS) of the fit, without the background's level."""
     theta = np.zeros((width.size, PARAMETERS))
     theta[:, :2] = start
     theta[:, 2] = np.log(1.3 * np.maximum(height, 1.0))
@@ -123,7 +123,7 @@ def _start(pixels: SpotPixels, start: Floats, width: Floats, height: Floats, tou
         top = pixels.clip & (away2 < (3.0 + 2.5 * width[own]) ** 2)
         width_sum = 4.0 + 2.5 * width[:, None] + 1.5 * width
         near = touching & (((start[:, None] - start) ** 2).sum(axis=-1) < width_sum**2)
-        for i, k in zip(*np.nonzero(near), strict=True):  # leave out pixels nearer to another spot
+        for i, k in zip(*np.nonzero(near), strict=True):  # omit pixels nearer to another spot
             part = slice(pixels.first[i], pixels.first[i + 1])
             top[part] &= ((at[part] - start[k]) ** 2).sum(axis=1) >= away2[part]
         area = pixels.total(top)
@@ -150,7 +150,7 @@ def _ring_level(pixels: SpotPixels, rest: Floats) -> Floats:
 
 
 def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blur_px: float | None = None) -> SpotFit:
-    """Convert the end of a descent to a fit; `rest` (P,) is the image minus B and the other spots' light."""
+    """Convert the end of a descent to a fit; `rest` (P,) is the image minus B and the light of other spots."""
     theta, noise = ended.theta, limits.noise_dn
     penalty = prior(limits, blur_px is not None)
     blur = 1.0 if blur_px is None else blur_px
@@ -171,7 +171,7 @@ def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blu
 
 @inlined
 def _bright_moments(plane: Floats, begin: int, end: int, rest: Floats, level: float, out: Floats) -> None:
-    """Write the second moments (2, 2) of the part of a spot's pixels above a third of their height over a level."""
+    """Write the second moments (2, 2) of the part of a spot's pixels above a third of their height over `level`."""
     top = 0.0
     for i in range(begin, end):
         top = max(top, rest[i] - level)

@@ -2,8 +2,8 @@
 
 The level in pixel (x, y) is B(x, y) + b0 + bx (x - xc) + by (y - yc) + A Gx(x) Gy(y). Gx is the mean over the pixel of
 exp(-(x - x0)^2 / (2 sx^2)), and Gy likewise. B is the image expected without spots: pupil, iris and the blurred edge
-between them. A spot beside an edge of its own (limbus, lid) adds h Phi(((x - xc) cos p + (y - yc) sin p - o) / blur).
-A clipped pixel only shows that its intensity is at least the clip level, so it counts only where the model is below.
+between them. A spot beside an additional edge (limbus, lid) adds h Phi(((x - xc) cos p + (y - yc) sin p - o) / blur). A
+clipped pixel only gives a lower bound, so it counts only where the model is below the clip level.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .windows import WINDOWS, SpotPixels, Windows, light_of_others, profile
 PARAMETERS, WITH_EDGE = 8, 11  # x, y, ln A, ln sx, ln sy, b0, bx, by; with an edge also h, p, o
 LOST_PX = 12.0  # a spot that becomes wider or moves farther is not a glint
 ROUND_SD = 0.3  # prior standard deviation of ln sx - ln sy: glints are nearly round
-STEPS = 8  # of Levenberg-Marquardt in one descent
+STEPS = 8  # Levenberg-Marquardt steps in one descent
 # A descent ends when a step gains less, in squared standard deviations of the noise. That is also the squared length of
 # the step in standard deviations of the parameters. The second number is for spots that overlap others.
 SMALL_GAIN = (5e-2, 5e-3)
@@ -41,7 +41,7 @@ ALONE = np.zeros((0, 2), dtype=np.intp)  # no pairs of spots
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Limits:
-    """Properties of the image that limit a fit of spots.
+    """Image properties that limit a fit of spots.
 
     Attributes:
         noise_dn: standard deviation of a pixel's noise.
@@ -77,7 +77,7 @@ class Descent:
 
 @compiled("f8[:,::1], f8[:,::1]")
 def lost(theta: Floats, start: Floats) -> Bools:
-    """Return whether spots (n,) have grown or moved more than a glint can."""
+    """Return which spots (n,) have grown or moved more than a glint can."""
     out = np.empty(theta.shape[0], dtype=np.bool_)
     for s in range(out.size):
         wide = max(theta[s, 3], theta[s, 4]) > math.log(LOST_PX)
@@ -87,7 +87,7 @@ def lost(theta: Floats, start: Floats) -> Bools:
 
 @compiled("f8[:,::1], f8[:,:,::1], f8[::1], f8")
 def promising(theta: Floats, gram: Floats, used: Floats, noise: float) -> Bools:
-    """Return whether the fit roughly explains spots (n,) (see ROUGH and ROUGH_SHARE)."""
+    """Return for which spots (n,) the fit roughly explains the pixels (see ROUGH and ROUGH_SHARE)."""
     out, k = np.empty(theta.shape[0], dtype=np.bool_), theta.shape[1]
     for s in range(out.size):
         misfit = noise * math.sqrt(gram[s, k, k] / max(used[s], 1.0))
@@ -102,7 +102,7 @@ def slopes(pixels: SpotPixels, theta: Floats, rest: Floats, blur_px: float | Non
         pixels: P pixels of n spots.
         theta: (n, K) parameters.
         rest: (P,) image minus everything that is not fitted.
-        blur_px: blur of the edges, if the spots have edges of their own.
+        blur_px: blur of the edges, if the model includes edges beside the spots.
     """
     return _spot_rows(pixels.windows, theta, rest, 1.0 if blur_px is None else blur_px)
 
@@ -135,7 +135,7 @@ def _spot_rows(windows: Windows, theta: Floats, rest: Floats, blur_px: float) ->
 
 @inlined
 def _add_edge(begin: int, end: int, plane: Floats, theta: Floats, blur_px: float, out: Floats) -> None:
-    """Write the derivatives by the parameters of a spot's own edge and subtract the edge from the residual."""
+    """Write the derivatives by the parameters of a spot's edge, and subtract the edge from the residual."""
     height, cos, sin, offset = theta[8], math.cos(theta[9]), math.sin(theta[9]), theta[10]
     for i in range(begin, end):
         dx, dy = plane[1, i], plane[2, i]
@@ -164,7 +164,7 @@ def prior(limits: Limits, edge: bool) -> Floats:
 def _gram(
     first: Indices, clip: Bools, rows: Floats, theta: Floats, noise: float, penalty: Floats
 ) -> tuple[Floats, Floats]:
-    """Compute products of the `slopes`, summed over each spot's pixels, with the priors, in units of the noise.
+    """Compute products of the `slopes`, summed over each spot's pixels and with the priors, in units of the noise.
 
     Returns:
         (n, K + 1, K + 1) products, and (n,) number of pixels that count. A clipped pixel does not count where the model
@@ -197,7 +197,7 @@ def _gram(
 
 @inlined
 def _step(gram: Floats, damping: float, theta: Floats, bounds: Floats, step: Floats, trial: Floats) -> float:
-    """Write the damped step (K,) of a spot and where it leads (K,), both limited; return the gain that it promises."""
+    """Write a spot's damped step (K,) and its end point (K,), both limited; return the predicted gain."""
     k, gain = theta.size, 0.0
     matrix = np.empty((k, k))
     for j in range(k):
@@ -215,7 +215,7 @@ def _step(gram: Floats, damping: float, theta: Floats, bounds: Floats, step: Flo
 
 @inlined
 def _finish(step: Floats, trial: Floats, theta: Floats) -> None:
-    """Take the last steps (n, K) of spots, unless they are large."""
+    """Apply the last steps (n, K) of spots, unless they are large."""
     for s in range(theta.shape[0]):
         if largest_size(step[s]) < 1.0:
             copy(trial[s], theta[s])
@@ -223,7 +223,7 @@ def _finish(step: Floats, trial: Floats, theta: Floats) -> None:
 
 @inlined
 def _progress(theta: Floats, middle: Floats, gram: Floats, cost: Floats) -> tuple[Floats, Bools]:
-    """Say how far each spot (n,) moved since the middle of the steps, and whether its squared misfit halved."""
+    """Compute how far each spot (n,) moved since the middle of the steps, and whether its squared misfit halved."""
     n, k = theta.shape
     moved, falling = np.empty(n), np.empty(n, np.bool_)
     for s in range(n):
@@ -238,7 +238,8 @@ def _dim(
 ) -> None:
     """Update the fit of each spot, in place, for the light (P,) of the other spots.
 
-    A spot that got `better` holds the other spots' light from now on; for the rest, nothing is subtracted.
+    For a spot whose fit is `better`, the other spots' light stays subtracted from now on; for the rest, nothing is
+    subtracted.
     """
     n, k = gram.shape[0], gram.shape[1] - 1
     for s in range(n):
@@ -275,8 +276,8 @@ def descend(
         rest: (P,) image minus B and minus the other spots' light at the start.
         pairs: (m, 2) the spots of a window, and those that shine into it.
         limits: noise, clip level and the prior of the slope.
-        blur_px: blur of the edges, if the spots have edges of their own.
-        steps: how many at most.
+        blur_px: blur of the edges, if the model includes edges beside the spots.
+        steps: largest number of steps.
     """
     edge = blur_px is not None
     clip = pixels.clip if pixels.clipped else pixels.clip[:0]
@@ -289,7 +290,7 @@ def _descended(
     windows: Windows, theta: Floats, rest: Floats, clip: Bools, pairs: Indices,
     optics: tuple[float, float], limits: tuple[Floats, Floats], steps: int,
 ) -> tuple[Floats, Floats, Floats, Bools, Floats, Bools]:  # fmt: skip
-    """Take the steps of `descend`.
+    """Take the steps of `descend`, in compiled code.
 
     Args:
         windows: first, plane, centre and radius of `SpotPixels`.
@@ -299,7 +300,7 @@ def _descended(
         pairs: (m, 2) the spots of a window, and those that shine into it.
         optics: standard deviation of a pixel's noise, DN, and blur of the edges, px.
         limits: normal matrix (K, K) of the priors; (3, K) least and most of the parameters, and their largest steps.
-        steps: how many at most.
+        steps: largest number of steps.
 
     Returns:
         The parts of `Descent`.

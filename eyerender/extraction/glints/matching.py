@@ -1,8 +1,9 @@
-"""Assignment of glints to lights from the geometry of the rig; nothing about the true gaze is used.
+"""Assign glints to lights from the geometry of the rig, without using the true gaze.
 
-The lights are mirrored in a sphere (the cornea) whose centre follows from the image of the pupil and a rough position
-of the eye. That layout may be wrong by a shift (of the eye's position) and a scale (of corneal radius and distance).
-The glints are matched to it with shift and scale free within plausible limits. Missing and surplus glints are allowed.
+The lights are mirrored in a sphere (the cornea) whose centre follows from the pupil's image and an approximate position
+of the eye. The predicted layout may be off by a shift (error of the eye's position) and a scale (error of corneal
+radius and distance). The glints are matched to it with shift and scale free within plausible limits. Missing and
+surplus glints are allowed.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ ROTATION_TO_CORNEA_MM = 5.7
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Assignment:
-    """Which light each glint belongs to.
+    """The light of each glint.
 
     Attributes:
         light: (m,) index of every glint's light, -1 for none.
-        reasons: why a glint has no light; None where it has one.
-        residual_px: (m,) distance to the place expected after shift and scale; 0 where there is no light.
+        reasons: why a glint has no light; None if it has one.
+        residual_px: (m,) distance from the expected position after shift and scale; 0 without a light.
         shift_px: (2,) shift of the layout that fitted.
         scale: scale of the layout that fitted.
     """
@@ -44,7 +45,7 @@ class Assignment:
 
 
 def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLike, lights_mm: ArrayLike) -> Floats:
-    """Compute points (l, 3) of a sphere that mirror the lights to the camera: the normal bisects the two directions.
+    """Compute the points (l, 3) of a sphere that mirror the lights to the camera: the normal bisects both directions.
 
     The fixed-point iteration n <- (unit to camera + unit to light) / |...| from the point centre + radius n contracts
     by about radius / distance.
@@ -78,10 +79,10 @@ def predict_glints(
     eye_mm: ArrayLike,
     radius_mm: float = CORNEA_RADIUS_MM,
 ) -> tuple[Floats, float]:
-    """Predict where the glints should be.
+    """Predict the image positions of the glints.
 
-    The gaze is taken as the direction from the centre of rotation to the point where the pupil's ray meets the sphere
-    on which the entrance pupil turns (its nearest point where it misses). The cornea's centre lies on that direction.
+    The gaze is approximated by the direction from the centre of rotation to the point where the pupil's ray meets the
+    sphere on which the entrance pupil moves (or comes nearest to it). The cornea's centre lies in that direction.
 
     Args:
         pupil_px: (2,) centre of the pupil on the full sensor.
@@ -89,8 +90,8 @@ def predict_glints(
         R: (3, 3) rotation, world to camera.
         t_mm: (3,) translation, world to camera.
         lights_mm: (l, 3) lights.
-        eye_mm: (3,) rough world position of the corneal apex when the eye looks along +x. Where it is not finite, the
-            point where the pupil's ray meets the plane x = 0 is used.
+        eye_mm: (3,) approximate world position of the corneal apex when the eye looks along +x. If it is not finite,
+            the point where the pupil's ray meets the plane x = 0 is used.
         radius_mm: corneal radius.
 
     Returns:
@@ -116,7 +117,7 @@ def predict_glints(
     pupil = nearest - math.sqrt(max(reach2, 0.0)) * ray
     gaze = _unit(pupil - rotation)
     cornea = rotation + ROTATION_TO_CORNEA_MM * gaze
-    # The pupil's own ray is exact. The errors of the model's lengths are removed along it.
+    # The pupil's ray itself is exact. Errors from the model's assumed lengths are removed along it.
     cornea = cornea + (pupil - (rotation + ROTATION_TO_PUPIL_MM * gaze)) if reach2 > 0.0 else cornea
     depth = float((R3 @ cornea + t3)[2])
     scale = float(math.sqrt(abs(K3[0, 0] * K3[1, 1]))) / max(depth, 1e-6)
@@ -133,20 +134,21 @@ def assign_lights(
     tolerance_px: float = 1.5,
     slack: float = 0.08,
 ) -> Assignment:
-    """Assign glints to lights, given where the lights' glints are expected.
+    """Assign glints to lights, given the expected positions of the lights' glints.
 
     A glint fits a light if, after shift and scale, its distance is at most tolerance_px plus `slack` times the light's
     distance from the layout's middle (corneas are not spheres).
 
     Every pairing of one glint with one light, and of two with two, proposes a layout. The other glints are then matched
-    one to one. A layout's merit is the number of matches minus their squared misfits and the improbability of its
-    shift. If another layout that names different lights comes within 0.25 of the best one, neither is chosen.
+    one to one. A layout's merit is the number of matches, minus their squared misfits and a penalty for its shift. If
+    another layout with different lights comes within 0.25 of the best one, neither is chosen.
 
     Args:
         glints_px: (m, 2) glints.
         predicted_px: (l, 2) expected glints of the rig's lights.
         shift_sd_px: standard deviation of the whole layout's shift.
-        scale_range: limits of the layout's scale; the default is a corneal radius of 6.6 to 9.2 mm instead of 7.8.
+        scale_range: limits of the layout's scale; the default corresponds to corneal radii of 6.6 to 9.2 mm instead of
+            7.8.
         tolerance_px: largest distance in the middle of the layout.
         slack: additional distance as a share of the light's distance from the middle.
     """
@@ -189,7 +191,7 @@ def assign_lights(
 
 
 def _unassigned(count: int, reason: str | None) -> Assignment:
-    """Leave all glints without a light, for one reason."""
+    """Leave all glints without a light, for a common reason."""
     light, residual = np.full(count, -1), np.zeros(count)
     return Assignment(light=light, reasons=(reason,) * count, residual_px=residual, shift_px=np.zeros(2), scale=1.0)
 
@@ -205,7 +207,7 @@ def identify(
     eye_mm: ArrayLike,
     position_sd_mm: float = 1.0,
 ) -> Assignment:
-    """Predict the glints, then assign them to the lights; all pixels are those of the full sensor.
+    """Predict the glints and assign them to the lights; all pixels are those of the full sensor.
 
     Args:
         glints_px: (m, 2) glints.
@@ -236,7 +238,7 @@ def _placed(lights: Floats, middle: Floats, shift: Floats, scale: float) -> Floa
 def _promising(
     glints: Floats, *, lights: Floats, middle: Floats, reach: Floats, scale_range: tuple[float, float], sd: float
 ) -> list[tuple[Floats, float]]:
-    """Find the (shift, scale) pairs for which a one-to-one match is worth trying.
+    """Return the (shift, scale) pairs for which a one-to-one match is worth trying.
 
     Every pair puts one light on one glint, or two lights on two glints. Those with the most glints near any light are
     kept; among equals the most likely shift wins.
@@ -263,8 +265,8 @@ def _promising(
 
 
 def _match(glints: Floats, *, lights: Floats, middle: Floats, reach: Floats, shift: Floats, scale: float) -> Indices:
-    """Light (m,) of every glint, one to one, with the least sum of squared misfits within reach; -1 for none."""
-    from scipy.optimize import linear_sum_assignment  # which takes a third of a second
+    """Return each glint's light (m,), one to one, with the least sum of squared misfits within reach; -1 for none."""
+    from scipy.optimize import linear_sum_assignment  # its import takes a third of a second
 
     offset = glints[:, None, :] - _placed(lights, middle, shift, scale)[None]
     misfit = np.hypot(offset[..., 0], offset[..., 1]) / reach[None, :]

@@ -1,4 +1,4 @@
-"""Glints that no Gaussian describes: clipped, oval, streaked or starred ones, and lamps seen as bars or rings.
+"""Glints that no Gaussian describes: clipped, oval, streaked or starred ones, and lamps imaged as bars or rings.
 
 Such a glint is one patch of bright pixels. Its position is the centroid of its light, its size that of the area above
 half its height.
@@ -22,16 +22,16 @@ from .fits import SpotFit, joined
 
 NEARLY = 0.92  # share of the brightest level near the pupil that counts as saturated (compression lowers some pixels)
 LEAST_PX, MOST = 2, 24  # pixels of a saturated patch, since a single one is a Gaussian spot's peak; how many patches
-LONGEST = 1.1  # longest side of a patch in semi-axes b of the pupil; a lid margin's highlight is longer
+LONGEST = 1.1  # longest side of a patch in semi-axes b of the pupil; the highlight of a lid margin is longer
 OUTLINE = (0.5, 0.75)  # shares of the height that outline a patch; the second parts patches that touch
 USUAL_PX = 2  # half the side of a spot whose fit failed
 POOR = 0.1  # residual, as a share of the visible height, with which a Gaussian does not describe a clipped spot
-_AREA = 2.0 * math.pi * math.log(2.0)  # of a Gaussian above half its height, in sigma^2
+_AREA = 2.0 * math.pi * math.log(2.0)  # area of a Gaussian above half its height, in sigma^2
 Box = tuple[int, int, int, int]  # first and last column, first and last row
 
 
 def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, spots: Spots, fit: SpotFit) -> SpotFit:
-    """Replace the fits of spots that are patches by the patches, and append the patches that hold no spot.
+    """Replace the fits of spots that are patches by patch measurements, and append patches without a spot.
 
     Args:
         prepared: the image.
@@ -63,7 +63,7 @@ def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, spots
 
 
 def _saturated(crop: Image, clip_dn: float, middle: Floats) -> list[Box]:
-    """Boxes of the saturated patches nearest to the pupil; some cameras show the middle of a bright glint as dark."""
+    """Return boxes of the saturated patches nearest to the pupil; some cameras show a bright glint's middle dark."""
     if crop.size == 0:
         return []
     bright = (crop >= min(clip_dn, NEARLY * float(crop.max()))).view(np.uint8)
@@ -74,7 +74,7 @@ def _saturated(crop: Image, clip_dn: float, middle: Floats) -> list[Box]:
 
 
 def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -> SpotFit | None:
-    """Measure the patch in a box and write its number to its pixels in `owner`; None if it is not closed or known."""
+    """Measure the patch in a box and mark its pixels with its number in `owner`; None if open or already measured."""
     left, right, top, bottom = box
     margin = max(right - left, bottom - top) // 2 + 4
     rows = slice(max(top - margin, 0), bottom + margin + 1)
@@ -113,7 +113,7 @@ def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -
 
 
 def _outlined(window: Image, level: float, seed: tuple[int, int]) -> Bytes | None:
-    """Mask (h, w) of the pixels above a level about a seed, with its holes; None if it reaches the window's border."""
+    """Compute the mask (h, w) of pixels above a level around a seed, holes filled; None if it reaches the border."""
     labels = cv2.connectedComponents((window >= level).view(np.uint8), connectivity=8)[1]
     core = (labels == labels[seed]).view(np.uint8)
     if core[0].any() or core[-1].any() or core[:, 0].any() or core[:, -1].any():

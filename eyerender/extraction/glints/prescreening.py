@@ -1,4 +1,4 @@
-"""A linear fit of a bell to each spot, which rejects most spots that are not glints before the expensive fits."""
+"""Linear fit of a bell to each spot, which rejects most spots that are not glints before the expensive fits."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def gaussian_like(
     clip_dn: float,
     which: Bools | None = None,
 ) -> Bools:
-    """Return whether the pixels around each spot form a bell (m,). Skin, lashes and the gaps between lashes do not.
+    """Return whether the pixels around each spot form a bell (m,); those of skin, lashes and gaps do not.
 
     The level within 2.2 sigma + 1 px of the peak is fitted by linear least squares. Pixels nearer to another spot are
     left out. The model is
@@ -57,7 +57,7 @@ def gaussian_like(
 
 @inlined
 def _owns(xy: Floats, k: int, reach: float, dx: float, dy: float) -> bool:
-    """Return whether a pixel beside spot k is nearer to it than to any other."""
+    """Return whether a pixel near spot k is nearer to it than to any other spot."""
     for m in range(xy.shape[0]):
         gx, gy = xy[m, 0] - xy[k, 0], xy[m, 1] - xy[k, 1]
         apart2 = gx * gx + gy * gy
@@ -68,7 +68,7 @@ def _owns(xy: Floats, k: int, reach: float, dx: float, dy: float) -> bool:
 
 @inlined
 def _patch(linear: Image, xy: Floats, k: int, reach: float, clip_dn: float, out: Floats) -> int:
-    """Write the offsets and levels of a spot's own pixels; returns how many, -1 for a clipped spot."""
+    """Write the offsets and levels of a spot's own pixels; return their number, -1 for a clipped spot."""
     half, count, clipped = math.ceil(reach), 0, 0
     x, y = int(xy[k, 0]), int(xy[k, 1])
     for dy in range(-half, half + 1):
@@ -120,7 +120,7 @@ def _is_bell(pixels: Floats, sigma: float, tall: float, noise_dn: float) -> bool
     for j in range(7):
         for m in range(j + 1):
             matrix[j, m] = matrix[m, j] = gram[j, m]
-        matrix[j, j] += 1e-6  # it keeps the matrix regular where half of the pixels belong to another spot
+        matrix[j, j] += 1e-6  # keeps the matrix regular if half of the pixels belong to another spot
     found = np.empty(7)
     for j in range(7):
         found[j] = gram[7, j]

@@ -1,4 +1,4 @@
-"""Bright spots near the pupil boundary: their light is subtracted, or their pixels are left out."""
+"""Bright spots near the pupil boundary: subtract their light, or ignore their pixels."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def well_fitted(prepared: Prepared, fit: SpotFit) -> Bools:
 
 
 def part_about(linear: Image, ellipse: Ellipse) -> Part:
-    """Cut out what the pixel model and the spots on the boundary need, even if the boundary is up to 1.4 as large."""
+    """Cut out the part that pixel model and boundary spots need, for boundaries up to 1.4 times as large."""
     columns, rows = around(ellipse, 1.4 * float(ellipse.semi_axes_px[0]) + LARGEST_PX + SPARE_PX, linear.shape)
     return Part(np.ascontiguousarray(linear[rows, columns]), (columns.start, rows.start))
 
 
 def affected_pixels(prepared: Prepared, part: Part, spots: Spots, which: Bools | None = None) -> Bools:
-    """Compute the mask (h, w) of a part's pixels affected by spots (`which` of them, or all), clutter or saturation.
+    """Compute the mask (h, w) of a part's pixels affected by spots (`which`, or all), clutter or saturation.
 
     The extent of a spot follows from its detected height and width.
     """
@@ -45,7 +45,7 @@ def affected_pixels(prepared: Prepared, part: Part, spots: Spots, which: Bools |
 
 
 def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools:
-    """Compute the mask (h, w) of the clipped pixels and those nearer to a place (n, 2) than its radius (n,)."""
+    """Compute the mask (h, w) of clipped pixels and of pixels within a radius (n,) of positions (n, 2)."""
     mask = linear >= clip_dn
     for (x, y), far in zip(xy.tolist(), radius.tolist(), strict=True):
         rows, columns = _window(x, y, far, mask.shape)
@@ -55,10 +55,10 @@ def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools
 
 
 def subtract_spots(part: Part, noise_dn: float, fit: SpotFit, which: Bools, about: Ellipse) -> tuple[Part, Bools]:
-    """Subtract the light of spots from the image where it reaches an ellipse.
+    """Subtract the light of spots from the image in the neighbourhood of an ellipse.
 
-    A fit describes the flanks of a spot far better than the circle of `affected_pixels`. It is not relied on where the
-    light exceeds three standard deviations of the noise.
+    A fit describes the flanks of a spot far better than the circle of `affected_pixels`. Where the light exceeds three
+    standard deviations of the noise, the fit is not trusted.
 
     Args:
         part: a part of the image.
@@ -84,7 +84,7 @@ def _subtracted(linear: Image, spots: Floats, radius: Floats, limit: float) -> t
     """Subtract the light of spots (n, 5: centre, two sigma, amplitude) within radius (n,).
 
     Returns:
-        The image (h, w), and the mask (h, w) of pixels where the light of one exceeds the limit.
+        The image (h, w), and the mask (h, w) of pixels where the light of one spot exceeds the limit.
     """
     height, width = linear.shape
     out, bright = linear.copy(), np.zeros(linear.shape, dtype=np.bool_)
@@ -105,12 +105,12 @@ def _subtracted(linear: Image, spots: Floats, radius: Floats, limit: float) -> t
 
 
 def _reach(sigma: Floats, peak: Floats, noise_dn: float) -> Floats:
-    """Find the distance (n,) from the peak at which a Gaussian spot falls to FAINT standard deviations of the noise."""
+    """Compute the distance (n,) from the peak at which a spot falls to FAINT standard deviations of the noise."""
     return np.asarray(sigma * np.sqrt(2.0 * np.log(np.maximum(peak / (FAINT * noise_dn), math.e))))
 
 
 def _window(x: float, y: float, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """List rows and columns of an image within `radius` of a point, along each axis."""
+    """Return slices of rows and columns of an image within `radius` of a point, along each axis."""
     columns = slice(max(0, math.floor(x - radius)), min(shape[1], math.ceil(x + radius) + 1))
     rows = slice(max(0, math.floor(y - radius)), min(shape[0], math.ceil(y + radius) + 1))
     return slice(rows.start, max(rows.stop, rows.start)), slice(columns.start, max(columns.stop, columns.start))

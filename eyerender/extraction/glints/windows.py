@@ -16,7 +16,7 @@ from ...jit import compiled, inlined
 from ..preprocessing import Image
 
 Windows = tuple[Indices, Floats, Floats, Floats]  # first, plane, centre and radius of SpotPixels
-WINDOWS = "Tuple((i8[::1], f8[:,::1], f8[:,::1], f8[::1]))"  # for `compiled`
+WINDOWS = "Tuple((i8[::1], f8[:,::1], f8[:,::1], f8[::1]))"  # type for `compiled`
 _T = TypeVar("_T", bound=np.generic)
 
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
@@ -34,13 +34,13 @@ class SpotPixels:
 
     Attributes:
         centre: (n, 2) middle pixel of each window, px.
-        radius: (n,) px.
+        radius: (n,) radius of each window, px.
         first: (n + 1,) where each spot's pixels begin, and the end.
         spot: (P,) the spot of each pixel.
-        middle_dn: (n,) B in the middle.
+        middle_dn: (n,) B in the middle of each window.
         plane: (3, P) 1 and the offset from the middle.
-        data: (P,) image.
-        known: (P,) B.
+        data: (P,) levels of the image.
+        known: (P,) background B.
         clip: (P,) whether the sensor clipped the pixel.
         clipped: whether any pixel is clipped.
     """
@@ -77,11 +77,11 @@ class SpotPixels:
         return [values[..., begin:end] for begin, end in pairwise(ends)]
 
     def rows(self, spots: Indices) -> Indices:
-        """Compute indices of the pixels of given spots, in the order of the spots."""
+        """Return indices of the pixels of given spots, in the order of the spots."""
         return _ranges(self.first[spots], self.first[spots + 1] - self.first[spots])
 
     def taken(self, spots: Indices) -> SpotPixels:
-        """Compute windows of the chosen spots."""
+        """Select the windows of given spots."""
         if spots.size == self.radius.size and bool((spots == np.arange(spots.size)).all()):
             return self
         count = self.first[spots + 1] - self.first[spots]
@@ -101,25 +101,25 @@ class SpotPixels:
         )
 
     def total(self, values: NDArray[np.generic]) -> Floats:
-        """Compute the sum (n,) of a value (P,) over each spot's pixels."""
+        """Sum a value (P,) over each spot's pixels, (n,)."""
         return np.asarray(np.bincount(self.spot, weights=values, minlength=self.radius.size), dtype=np.float64)
 
     def most(self, values: Floats) -> Floats:
-        """Compute the largest value (n,) of a value (P,) among each spot's pixels, at least 0."""
+        """Compute the maximum of a value (P,) over each spot's pixels, (n,), at least 0."""
         out = np.zeros(self.radius.size)
         np.maximum.at(out, self.spot, values)
         return out
 
 
 def _starts(count: Indices) -> Indices:
-    """Compute the cumulative sum 0, count[0], count[0] + count[1], ..., with the total at the end."""
+    """Compute the cumulative sums 0, count[0], count[0] + count[1], ..., with the total at the end."""
     out = np.zeros(count.size + 1, dtype=np.intp)
     np.cumsum(count, out=out[1:])
     return out
 
 
 def _ranges(first: Indices, count: Indices) -> Indices:
-    """Compute the concatenated ranges first[0], first[0] + 1, ... (count[0] of them), first[1], ..."""
+    """Concatenate ranges: first[0], first[0] + 1, ... (count[0] of them), first[1], ..."""
     start = _starts(count)
     return np.asarray(np.arange(start[-1]) + np.repeat(first - start[:-1], count), dtype=np.intp)
 
@@ -127,12 +127,12 @@ def _ranges(first: Indices, count: Indices) -> Indices:
 def cut(
     linear: Image, known: Callable[[Floats, Floats], Floats], start: Floats, width: Floats, clip_dn: float
 ) -> SpotPixels:
-    """Cut round windows, each only as wide as its spot needs, so that little of the limbus and other edges is in them.
+    """Cut round windows, each only as wide as its spot needs, so that few other edges are inside.
 
     Args:
         linear: the image, DN.
-        known: gives the background B at pixels (x, y).
-        start: (n, 2) places of the spots.
+        known: returns the background B at pixels (x, y).
+        start: (n, 2) positions of the spots.
         width: (n,) their sigma.
         clip_dn: level at which the sensor clips.
     """
@@ -157,7 +157,7 @@ def cut(
 
 @compiled("f4[:,::1], f8[:,::1], f8[:,::1], f8[::1]")
 def _windows(linear: Image, start: Floats, centre: Floats, radius: Floats) -> tuple[Indices, Indices, Floats, Floats]:
-    """Find the pixels (P,) within `radius` (n,) of `start` (n, 2).
+    """Collect the pixels (P,) within `radius` (n,) of `start` (n, 2).
 
     Returns:
         Where each spot's pixels begin (n + 1,), the spot of each pixel (P,), 1 and the offset from the spot's middle
@@ -187,7 +187,7 @@ def _windows(linear: Image, start: Floats, centre: Floats, radius: Floats) -> tu
 
 
 def shining_pairs(pixels: SpotPixels, theta: Floats, pairs: Bools, noise_dn: float) -> Indices:
-    """Compute pairs (m, 2) of a window and a spot whose light there rises above a small fraction of the noise.
+    """Return pairs (m, 2) of a window and a spot whose light there exceeds a small fraction of the noise.
 
     Args:
         pixels: the pixels of all windows.
@@ -197,14 +197,14 @@ def shining_pairs(pixels: SpotPixels, theta: Floats, pairs: Bools, noise_dn: flo
     """
     to, by = np.nonzero(pairs)
     gap = np.hypot(*(pixels.centre[to] - theta[by, :2]).T) - pixels.radius[to] - 2.0
-    wide2 = np.exp(2.0 * theta[by, 3:5].max(axis=1)) * 1.5 + 0.1  # room for changes during the fit
+    wide2 = np.exp(2.0 * theta[by, 3:5].max(axis=1)) * 1.5 + 0.1  # margin for changes during the fit
     shines = theta[by, 2] - 0.5 * np.maximum(gap, 0.0) ** 2 / wide2 > math.log(1e-3 * noise_dn)
     return np.stack([to[shines], by[shines]], axis=1)
 
 
 @inlined
 def profile(low: float, sigma: float) -> tuple[float, float, float]:
-    """Compute the integral of exp(-x^2 / (2 s^2)) over the pixel from `low` to `low` + 1, relative to the centre.
+    """Integrate exp(-x^2 / (2 s^2)) over the pixel from `low` to `low` + 1, relative to the centre.
 
     Returns:
         The derivative by the centre, the value, and the derivative by ln s.

@@ -1,1 +1,1 @@
-"""The pupil: candidates, edge points, an ellipse by consensus, the maximum-likelihood fit and its confidence."""
+"""The pupil: candidates, edge points, ellipse by consensus, maximum-likelihood fit, and confidence."""

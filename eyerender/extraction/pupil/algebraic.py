@@ -13,9 +13,9 @@ from ..products import solve
 
 @compiled("f8[:,:,::1]")
 def direct_fits(points: Floats) -> Floats:
-    """Compute direct ellipses (m, 5) through points (m, k, 2): centre, semi-axes and angle; NaN where there is none.
+    """Fit direct ellipses (m, 5) to points (m, k, 2): centre, semi-axes and angle; NaN where there is none.
 
-    Source: Halir and Flusser (1998), for points that an affine map has made round.
+    Source: Halir and Flusser (1998), applied after an affine map that whitens the points.
     """
     out = np.empty((points.shape[0], 5))
     for m in range(points.shape[0]):
@@ -27,7 +27,7 @@ def direct_fits(points: Floats) -> Floats:
 
 @inlined
 def _direct_fit(points: Floats, out: Floats) -> None:
-    """Write the direct ellipse through points (k, 2) to out (5,), unless there is none."""
+    """Fit the direct ellipse to points (k, 2) and write it to out (5,), unless there is none."""
     k, mean_x, mean_y = points.shape[0], 0.0, 0.0
     for i in range(k):
         mean_x, mean_y = mean_x + points[i, 0] / k, mean_y + points[i, 1] / k
@@ -37,7 +37,7 @@ def _direct_fit(points: Floats, out: Floats) -> None:
         sxx, sxy, syy = sxx + x * x / k, sxy + x * y / k, syy + y * y / k
     if not sxx > 0.0:
         return
-    # Cholesky's factor of the covariance maps round points (u, v) to these.
+    # The Cholesky factor of the covariance maps whitened points (u, v) to these.
     l11 = math.sqrt(sxx)
     l21 = sxy / l11
     rest = syy - l21 * l21
@@ -63,11 +63,11 @@ def _direct_fit(points: Floats, out: Floats) -> None:
 
 @inlined
 def _conic_moments(points: Floats, rounding: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Compute moments of p = u^2 + v^2 - 2, q = u^2 - v^2 and r = 2 u v of the round points (u, v).
+    """Compute moments of p = u^2 + v^2 - 2, q = u^2 - v^2 and r = 2 u v of the whitened points (u, v).
 
     Args:
         points: (k, 2).
-        rounding: their mean (x, y) and Cholesky's factor (11, 21, 22) of their covariance.
+        rounding: mean (x, y) of the points, and Cholesky factor (11, 21, 22) of their covariance.
 
     Returns:
         The mean products pu, pv, qu, qv, ru, rv, and pp, pq, pr, qq, qr, rr without their part along u and v.
@@ -91,7 +91,7 @@ def _conic_moments(points: Floats, rounding: tuple[float, ...]) -> tuple[tuple[f
 
 @inlined
 def _elliptic_direction(quadratic: tuple[float, ...]) -> tuple[float, float, float]:
-    """Compute the unit vector w of the least w^T S w / w^T C w with C = diag(1, -1, -1), whose conic is an ellipse.
+    """Compute the unit vector w that minimises w^T S w / w^T C w, C = diag(1, -1, -1), among ellipses.
 
     The eigenvalue is the largest root of a cubic; two Rayleigh quotients polish it. `quadratic` holds S as 11, 12, 13,
     22, 23, 33.
@@ -120,10 +120,10 @@ def _elliptic_direction(quadratic: tuple[float, ...]) -> tuple[float, float, flo
 
 @inlined
 def taubin_fit(points: Floats, out: Floats) -> bool:
-    """Write Taubin's ellipse through points (n, 2) to out (5,); False where there is none.
+    """Fit Taubin's ellipse to points (n, 2) and write it to out (5,); return False if there is none.
 
-    The conic (x^2, x y, y^2, x, y, 1) . v has the least mean square value over the mean square of its gradient. It is
-    what `cv2.fitEllipseAMS` computes in single precision. Source: Taubin (1991).
+    The conic (x^2, x y, y^2, x, y, 1) . v minimises its mean square value over the mean square of its gradient.
+    `cv2.fitEllipseAMS` computes the same in single precision. Source: Taubin (1991).
     """
     mean_x, mean_y, scale = _unit(points)
     if not scale > 0.0:
@@ -147,7 +147,7 @@ def taubin_fit(points: Floats, out: Floats) -> bool:
 
 @inlined
 def _least_direction(scatter: Floats, gradient: Floats) -> Floats:
-    """Return the v (5,) of the least v^T S v / v^T G v, by inverse iteration; its largest element is 1 or -1."""
+    """Return the v (5,) that minimises v^T S v / v^T G v, by inverse iteration; its largest element is 1 or -1."""
     ridge = 0.0
     for j in range(5):
         ridge += 1e-15 * scatter[j, j]
@@ -173,7 +173,7 @@ def _least_direction(scatter: Floats, gradient: Floats) -> Floats:
 
 @inlined
 def _unit(points: Floats) -> tuple[float, float, float]:
-    """Compute the mean of points (n, 2) and their largest offset: what makes them small numbers about 0."""
+    """Compute the mean of points (n, 2) and their largest offset, for scaling to small numbers about 0."""
     n, x, y, scale = points.shape[0], 0.0, 0.0, 0.0
     for i in range(n):
         x, y = x + points[i, 0] / n, y + points[i, 1] / n
@@ -184,7 +184,7 @@ def _unit(points: Floats) -> tuple[float, float, float]:
 
 @inlined
 def _scatter(points: Floats, mean_x: float, mean_y: float, scale: float) -> tuple[Floats, Floats, Floats]:
-    """Mean (5,) and covariance (5, 5) of (x^2, x y, y^2, x, y) of scaled points; products (5, 5) of their gradients."""
+    """Compute mean (5,) and covariance (5, 5) of (x^2, x y, y^2, x, y), scaled points, and gradient products (5, 5)."""
     n, mean, scatter, gradient = points.shape[0], np.zeros(5), np.zeros((5, 5)), np.zeros((5, 5))
     z, by_x, by_y = np.empty(5), np.array([0.0, 0.0, 0.0, 1.0, 0.0]), np.array([0.0, 0.0, 0.0, 0.0, 1.0])
     for i in range(n):
@@ -205,7 +205,7 @@ def _scatter(points: Floats, mean_x: float, mean_y: float, scale: float) -> tupl
 
 @inlined
 def _axes(g11: float, g12: float, g22: float) -> tuple[float, float, float]:
-    """Compute semi-axes and angle of the ellipse with this shape matrix; NaN where there is none."""
+    """Compute semi-axes and angle of the ellipse with this shape matrix; NaN if there is none."""
     mean, half = 0.5 * (g11 + g22), 0.5 * (g11 - g22)
     major = mean + math.sqrt(half * half + g12 * g12)
     minor = (g11 * g22 - g12 * g12) / major

@@ -1,4 +1,4 @@
-"""The pupil boundary about one dark blob: glints inpainted, edges found, and an ellipse fitted to them."""
+"""The pupil boundary around one dark blob: inpaint glints, detect edges, and fit an ellipse to them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glare import Inpainted, inpaint_glints
 from .places import holding
 
-ROUGH = 0.8  # overlap with its boundary below which a rough candidate's edges are found again, about the boundary
+ROUGH = 0.8  # overlap with its boundary below which a rough candidate's edges are detected again, around the boundary
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PupilCandidate:
-    """A dark blob, the edge points around it, and the boundary through them; derived values are computed on demand.
+    """A dark blob, the edge points around it, and the boundary through them; derived values are computed on first use.
 
     `inpainted` is the image without glints near the blob.
     """
@@ -37,7 +37,7 @@ class PupilCandidate:
 
     @cached_property
     def model(self) -> EdgeModel:
-        """Pixel model, as far as the edges determine it."""
+        """Pixel model as far as the edges determine it."""
         candidate = self.candidate
         sigma = math.sqrt(max(self.edges.sigma_px**2 - self.edges.filter_px**2, 0.25))
         outer = np.array([candidate.inside_dn + candidate.step_dn])
@@ -49,33 +49,33 @@ class PupilCandidate:
         return self.inside(self.boundary.ellipse, self.model.sigma_px)
 
     def inside(self, ellipse: Ellipse, blur_px: float) -> Interior:
-        """Compute statistics of the pixels inside an ellipse about the blob."""
+        """Compute statistics of the pixels inside an ellipse around the blob."""
         return inspect_interior(self.inpainted, ellipse, blur_px, self.image.noise_dn)
 
     @cached_property
     def sectors(self) -> Bools:
-        """Sectors (SECTORS,) with an edge point, and gaps of up to two sectors between them."""
+        """Whether each sector (SECTORS,) has an edge point or lies in a gap of up to two sectors."""
         hit = holding(self.boundary.ellipse.numbers(), self.edges.points_px[self.boundary.inliers])
         grown = hit | np.roll(hit, 1) | np.roll(hit, -1)
         return np.asarray(grown & np.roll(grown, 1) & np.roll(grown, -1) | hit)
 
     @property
     def reach_px(self) -> float:
-        """Side of the square of pixels about the blob in which edges were looked for."""
+        """Side of the square around the blob in which edges were searched, px."""
         return 2.8 * float(self.candidate.ellipse.semi_axes_px[0]) + 16.0
 
     @property
     def core_dn(self) -> float:
-        """How much darker the middle is than the outer part, 0 where that is not significant.
+        """How much darker the middle is than the outer part, DN; 0 if that is not significant.
 
-        It is positive inside the outline of an iris, and negative if the pupil in it is bright.
+        Positive if the outline is that of an iris; negative if the pupil in that iris is bright.
         """
         inside = self.interior
         limit = max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
         return inside.darker_dn if abs(inside.darker_dn) > limit else 0.0
 
     def enlarged(self, work: Prepared) -> PupilCandidate:
-        """Convert the candidate to the pixels of the whole image."""
+        """Convert the candidate to pixels of the whole image."""
         edges, boundary, scale = self.edges, self.boundary, self.image.scale
         lengths = np.array([scale, scale, scale, scale, 1.0])
         return PupilCandidate(
@@ -103,9 +103,9 @@ def _enlarged(ellipse: Ellipse, scale: int) -> Ellipse:
 
 
 def find_boundary(work: Prepared, candidate: Candidate, shape: Shape) -> PupilCandidate | str:
-    """Find the boundary around a dark blob, or give the reason why there is none.
+    """Fit the boundary around a dark blob, or return the reason why there is none.
 
-    If the blob is rough and its boundary differs, the edges are found again about that boundary.
+    If the blob is rough and its boundary differs from it, edges are detected again around that boundary.
     """
     found = _find_boundary(work, candidate, shape)
     if isinstance(found, str) or not candidate.rough:

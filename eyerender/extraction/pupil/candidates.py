@@ -1,4 +1,4 @@
-"""Candidates for the pupil: dark elliptical blobs over a sweep of thresholds.
+"""Pupil candidates: dark elliptical blobs over a sweep of thresholds.
 
 Of nested blobs the innermost is taken.
 """
@@ -27,7 +27,7 @@ LEVELS = 20  # thresholds at even grey levels
 # hull is then a blob too.
 NOTCHED = 0.93
 ANGLES = 48  # samples around a blob
-MOST_BLOBS = 12  # that are ranked
+MOST_BLOBS = 12  # number of blobs that are ranked
 # Share of the thresholds, darkest first, that is tried first. The others are tried if these give no candidate.
 DARKER = 0.6
 # The statistics inside an ellipse of this semi-axis are good enough. From twice that on, every second pixel of every
@@ -44,11 +44,11 @@ class Candidate:
     """A dark blob.
 
     Attributes:
-        ellipse: with the blob's second moments.
+        ellipse: ellipse with the blob's second moments.
         inside_dn: level inside.
         step_dn: step from inside to a ring outside.
-        score: by which candidates are ranked.
-        rough: whether the ellipse is of a strongly reduced image.
+        score: rank of the candidate; higher is better.
+        rough: whether the ellipse comes from a strongly reduced image.
     """
 
     ellipse: Ellipse
@@ -59,13 +59,13 @@ class Candidate:
 
 
 def find_candidates(prepared: Prepared, shape: Shape, most: int = 4, *, levels: int = LEVELS) -> list[Candidate]:
-    """Find up to `most` candidates, best first; the list is empty if nothing dark and round stands out.
+    """Return up to `most` candidates, best first; none if nothing dark and round stands out.
 
     Args:
         prepared: the image.
         shape: sizes and shapes to look for.
         most: number of candidates.
-        levels: thresholds at even grey levels.
+        levels: number of thresholds at evenly spaced grey levels.
     """
     linear, noise_dn = prepared.linear, prepared.noise_dn
     factor = int(min(max(shape.least_px // 3.5, 1), 4))
@@ -84,11 +84,11 @@ def find_candidates(prepared: Prepared, shape: Shape, most: int = 4, *, levels: 
 
 
 def _reduced(linear: Image, factor: int, removal: int) -> Image:
-    """Reduce, smooth, and remove glints by a morphological opening (by a closing in a negative)."""
+    """Reduce and smooth an image, and remove glints by a morphological opening (in a negative, by a closing)."""
     height, width = linear.shape
     size = (max(1, width // factor), max(1, height // factor))
     small = linear[: size[1] * factor, : size[0] * factor]
-    if factor == 4:  # OpenCV has a fast function for halves only
+    if factor == 4:  # OpenCV has a fast function only for factors of two
         small = as_image(cv2.resize(small, (2 * size[0], 2 * size[1]), interpolation=cv2.INTER_AREA))
     small = as_image(cv2.resize(small, size, interpolation=cv2.INTER_AREA))
     small = as_image(cv2.GaussianBlur(small, (3, 3), 0.8))
@@ -98,9 +98,9 @@ def _reduced(linear: Image, factor: int, removal: int) -> Image:
 
 
 def _levels(small: Image, count: int) -> Floats:
-    """Compute thresholds: `count` at even levels, and a third as many at even areas.
+    """Compute thresholds: `count` at evenly spaced levels, and a third as many at evenly spaced areas.
 
-    Some of them separate the pupil even if its step is faint or the image has a small dark backdrop.
+    So some thresholds separate the pupil even if its step is faint or the image has a small dark background.
     """
     values = np.sort(small.ravel()[:: max(1, small.size // 8000)])
     low, high = float(values[0]), float(values[int(0.98 * values.size)])
@@ -115,7 +115,7 @@ def _levels(small: Image, count: int) -> Floats:
 
 
 def _sweep(small: Image, levels: Floats, factor: int, shape: Shape) -> Floats:
-    """Find blobs (n, 6) that could be a pupil: ellipse (x, y, a, b, angle) in reduced pixels, and filled share."""
+    """Return blobs (n, 6) that may be a pupil: ellipse (x, y, a, b, angle) in reduced pixels, and filled share."""
     height, width = small.shape
     least = max(0.5 * shape.least_px, shape.least_px - 2.0 * factor) / factor
     most = 1.3 * shape.most_px / factor
@@ -130,10 +130,10 @@ def _sweep(small: Image, levels: Floats, factor: int, shape: Shape) -> Floats:
         contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         seen += len(contours)
         for i, contour in enumerate(contours):
-            if not shortest < len(contour) < longest or hierarchy[0, i, 3] >= 0:  # holes have a parent
+            if not shortest < len(contour) < longest or hierarchy[0, i, 3] >= 0:  # contours of holes have a parent
                 continue
             x, y, w, h = cv2.boundingRect(contour)
-            # A backdrop touches at least two sides of the frame; a lid touches one along its width.
+            # A background touches at least two sides of the frame; a lid touches one along its width.
             sides = (x == 0) + (y == 0) + (x + w == width) + (y + h == height)
             if (
                 sides >= 2
@@ -152,13 +152,13 @@ def _sweep(small: Image, levels: Floats, factor: int, shape: Shape) -> Floats:
 
 
 def _on_border(contour: NDArray[Any], width: int, height: int) -> float:
-    """Share of a contour along the frame. A large share means a lid or a backdrop, not a pupil that the frame cuts."""
+    """Compute the share of a contour on the frame; a large share means a lid or background, not a cut pupil."""
     x, y = contour[:, 0, 0], contour[:, 0, 1]
     return np.count_nonzero((x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)) / len(contour)
 
 
 def _blob_ellipse(m: dict[str, float], least: float, most: float, shape: Shape) -> tuple[float, ...] | None:
-    """Ellipse with the second moments of a filled contour, and its filled share; None if it is not elliptical."""
+    """Compute the ellipse with a contour's second moments, and its filled share; None if it is not elliptical."""
     area = m["m00"]
     if area < math.pi * least**2 * 0.5:
         return None
@@ -191,7 +191,7 @@ def _ranked(small: Image, noise: float, factor: int, blobs: Floats, most: int) -
 
 @compiled("f8[:,::1], f8[:,::1], f8")
 def _best_blobs(blobs: Floats, levels: Floats, noise: float) -> Floats:
-    """Find different blobs of `_sweep` that stand out: at most MOST_BLOBS, best first.
+    """Select distinct blobs of `_sweep` that stand out: at most MOST_BLOBS, best first.
 
     Returns:
         Ellipse (x, y, a, b, angle), level inside, step and score of each, (k, 8).
@@ -219,7 +219,7 @@ def _best_blobs(blobs: Floats, levels: Floats, noise: float) -> Floats:
 
 @inlined
 def _score(levels: Floats, filled: float, noise: float) -> float:
-    """Score of a blob, from its levels (5,) as of `_ring_levels` and the share of its ellipse that it fills."""
+    """Compute the score of a blob from its levels (5,), as in `_ring_levels`, and the filled share of its ellipse."""
     typical, spread = levels[1], levels[4]
     strength = max(typical, 0.0) / (max(typical, 0.0) + 8.0 * noise + 4.0)
     uniform = 1.0 / (1.0 + (spread / max(typical, 1e-6)) ** 2)
@@ -228,7 +228,7 @@ def _score(levels: Floats, filled: float, noise: float) -> float:
 
 @inlined
 def _different(blobs: Floats, levels: Floats, score: Floats, noise: float) -> Indices:
-    """Compute indices (k,) of different blobs that stand out, at most MOST_BLOBS, by score."""
+    """Return the indices (k,) of distinct blobs that stand out, at most MOST_BLOBS, by score."""
     kept, count, order = np.empty(MOST_BLOBS, dtype=np.int64), 0, _descending(score)
     for place in range(order.size):
         i = order[place]
@@ -243,7 +243,7 @@ def _different(blobs: Floats, levels: Floats, score: Floats, noise: float) -> In
 
 @inlined
 def _descending(values: Floats) -> Indices:
-    """Compute indices (n,) of values from the largest down; equal ones in their order."""
+    """Return the indices (n,) of values in descending order; equal values keep their order."""
     out = np.empty(values.size, dtype=np.int64)
     for i in range(values.size):
         k = i
@@ -256,21 +256,21 @@ def _descending(values: Floats) -> Indices:
 
 @inlined
 def _inside(inner: Floats, outer: Floats) -> bool:
-    """Return whether one blob of `_sweep` is well inside another one."""
+    """Return whether one blob of `_sweep` is well inside another."""
     near = math.hypot(outer[0] - inner[0], outer[1] - inner[1]) < 0.6 * outer[3]
     return near and inner[2] * inner[3] < 0.6 * outer[2] * outer[3]
 
 
 @inlined
 def _core(inner: Floats, outer: Floats, noise: float) -> bool:
-    """Return whether the levels (5,) of a blob, as of `_ring_levels`, show it as the dark core of another one."""
+    """Return whether the levels (5,) of a blob, as in `_ring_levels`, show it as the dark core of another blob."""
     darker = outer[3] - inner[3] > max(0.1 * outer[1], 2.0 * noise)
     return darker and inner[2] > 0.55 and inner[1] > 0.12 * outer[1]
 
 
 @compiled("f4[:,::1], f8[:,::1], f8")
 def _ring_levels(small: Image, blobs: Floats, noise: float) -> Floats:
-    """Levels (n, 5) of blobs (n, 6): inside, step to a ring outside, share of that ring, near the edge, scatter."""
+    """Compute levels (n, 5) of blobs (n, 6): inside, step to a ring outside, its share, near the edge, scatter."""
     out = np.empty((blobs.shape[0], 5))
     within, step = np.empty((2, ANGLES)), np.empty(ANGLES)
     for k in range(blobs.shape[0]):
@@ -326,7 +326,7 @@ def _levels_along(
 
 @inlined
 def _mean_about(image: Image, x: float, y: float, box: int) -> float:
-    """Mean of the pixels up to `box` to each side of the one nearest to a point; outside the frame, its border's."""
+    """Average the pixels up to `box` to each side of the nearest one; beyond the frame, its border is repeated."""
     column, row, total = int(np.rint(x)), int(np.rint(y)), 0.0
     for j in range(row - box, row + box + 1):
         for i in range(column - box, column + box + 1):
@@ -335,7 +335,7 @@ def _mean_about(image: Image, x: float, y: float, box: int) -> float:
 
 
 def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
-    """Make a candidate of a known place, with the levels of the image there; None where it is no darker inside."""
+    """Create a candidate at a known ellipse, with the levels of the image; None if it is not darker inside."""
     about = ellipse.numbers()
     inside, step = _levels_about(prepared.linear, about)
     return Candidate(ellipse=ellipse, inside_dn=inside, step_dn=step) if step > prepared.noise_dn else None
@@ -354,7 +354,7 @@ def _levels_about(linear: Image, ellipse: tuple[float, ...]) -> tuple[float, flo
 
 @inlined
 def _same(first: Floats, second: Floats) -> bool:
-    """Return whether two blobs of `_sweep` are the same object at two thresholds."""
+    """Return whether two blobs of `_sweep` show the same object at two thresholds."""
     near = math.hypot(first[0] - second[0], first[1] - second[1]) < 0.35 * min(first[3], second[3])
     return near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65
 
@@ -377,8 +377,8 @@ class Interior:
 def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
     """Compute statistics of the pixels inside an ellipse, up to where the blur of the boundary begins.
 
-    The interior of a pupil is even. An iris has the pupil in its middle, and other objects have structure. Pixels that
-    glints covered do not count. Medians and quartiles are used because of fainter reflections.
+    The interior of a pupil is uniform. An iris has the pupil in its middle, and other objects have structure. Pixels
+    that glints covered do not count. Medians and quartiles are used because of fainter reflections.
     """
     a, b = ellipse.semi_axes_px.tolist()
     columns, rows = around(ellipse, a, inpainted.linear.shape)
@@ -436,7 +436,7 @@ def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float
 
 
 def find_inside(prepared: Prepared, inpainted: Inpainted, ellipse: Ellipse, shape: Shape) -> list[Candidate]:
-    """Compute candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
+    """Return candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
     a, b = ellipse.semi_axes_px.tolist()
     columns, rows = around(ellipse, a, inpainted.linear.shape)
     crop, _ = inpainted.cut(columns, rows)

@@ -1,4 +1,4 @@
-"""Selection of the edge points that lie on one ellipse: random samples of arcs, consensus, and OpenCV's AMS fit."""
+"""Select the edge points that lie on one ellipse: random samples of arcs, consensus, and Taubin's fit."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ ALL_AGREE = 0.85  # share of the highest support; the root mean square distance 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BoundaryFit:
-    """The ellipse through the edge points, corrected for curvature.
+    """An ellipse fitted to edge points, corrected for curvature.
 
     Attributes:
         ellipse: the ellipse.
-        inliers: (n,) edge points that it is fitted to.
+        inliers: (n,) which edge points it is fitted to.
         points_px: those points, corrected.
         support: share of the outline that they cover.
-        gap: share of the outline in the longest stretch without them.
-        residual_px: their root mean square distance.
-        sums: over those points, for the covariance and the leverage.
-        covariance: (5, 5) of (cx, cy, a, b, angle), from the scatter of the points and what is hidden of the outline.
+        gap: share of the outline in the longest stretch without points.
+        residual_px: rms distance of the points.
+        sums: sums over the points, for the covariance and the leverage.
+        covariance: (5, 5) of (cx, cy, a, b, angle), from the scatter of the points and the hidden part of the outline.
     """
 
     ellipse: Ellipse
@@ -59,12 +59,12 @@ UNEVEN = 0.01
 
 
 def fit_boundary(edges: EdgePoints, candidate: Candidate, shape: Shape, expected_noise_px: float) -> BoundaryFit | str:
-    """Fit the boundary of the pupil, or give the reason why there is none.
+    """Fit the boundary of the pupil, or return the reason why there is none.
 
     Args:
         edges: edge points around the candidate.
         candidate: the dark blob.
-        shape: sizes and shapes that are accepted.
+        shape: accepted sizes and shapes.
         expected_noise_px: standard deviation of an edge point along its normal.
     """
     if edges.points_px.shape[0] < 8:
@@ -86,7 +86,7 @@ def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance:
     whole = direct_fits(points[None])
     a, b = whole[0, 2:4].tolist()
     if _sane(a, b, candidate, shape):
-        most = points.shape[0] / math.sqrt(math.pi * (a + b))  # if all points were on the ellipse
+        most = points.shape[0] / math.sqrt(math.pi * (a + b))  # as if all points were on the ellipse
         if _support(points, edges.normals, whole, tolerance)[0] > ALL_AGREE * most:
             return Ellipse.of(whole[0])
     fits = np.concatenate([whole, _random_fits(edges, candidate)])
@@ -94,7 +94,7 @@ def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance:
         fits = fits[_sane(fits[:, 2], fits[:, 3], candidate, shape)]
     if fits.shape[0] == 0:
         return None
-    # Every third point suffices to choose the ellipses that are worth counting with all points.
+    # Every third point suffices to choose the ellipses that are then scored with all points.
     some, facing = np.ascontiguousarray(points[::3]), np.ascontiguousarray(edges.normals[::3])
     rough = _support(some, facing, fits, tolerance)
     fits = fits[np.argsort(-rough, kind="stable")[:FINALISTS]]
@@ -124,7 +124,7 @@ def _random_fits(edges: EdgePoints, candidate: Candidate) -> Floats:
 
 
 def _sane(a: Any, b: Any, candidate: Candidate, shape: Shape) -> Any:
-    """Return whether semi-axes, numbers or arrays, are plausible; those that are NaN are not."""
+    """Return whether semi-axes, numbers or arrays, are plausible; NaN is not."""
     a0, b0 = candidate.ellipse.semi_axes_px.tolist()
     alike = (a < 2.2 * a0) & (b > 0.4 * b0) & (b > shape.aspect * a)
     return alike & (a <= shape.most_px) & (b >= 0.8 * shape.least_px)
@@ -132,9 +132,9 @@ def _sane(a: Any, b: Any, candidate: Candidate, shape: Shape) -> Any:
 
 @compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8")
 def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) -> Floats:
-    """Compute the score (m,) of every ellipse (m, 5).
+    """Compute the score (m,) of every ellipse (m, 5): nearby points per length of the outline.
 
-    The score counts nearby points with an agreeing normal, weighted by closeness, per length.
+    Points count if their normal agrees, weighted by closeness.
     """
     out = np.zeros(fits.shape[0])
     for m in range(fits.shape[0]):
@@ -160,7 +160,7 @@ def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) ->
 
 
 def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float) -> BoundaryFit | str:
-    """Select points and refit with AMS until the selection settles."""
+    """Select points and refit until the selection settles."""
     begun = np.array(start.numbers())
     count, found, inliers, points, seen = _settled(edges.points_px, edges.normals, begun, edges.sigma_px, tolerance)
     if 0 <= count < 8:
@@ -198,7 +198,7 @@ def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float)
 def _settled(
     points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float
 ) -> tuple[int, Floats, Bools, Floats, Floats]:
-    """Select points and refit with AMS until the selection settles.
+    """Select points and refit until the selection settles, in compiled code.
 
     Edge points are moved outward by the curvature shift. The steepest place of a blurred convex edge is sigma^2 kappa /
     2 inside the true edge.
@@ -211,8 +211,8 @@ def _settled(
         tolerance: largest distance of a selected point, px; twice that for the first selection.
 
     Returns:
-        How many points were selected (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points
-        (n,), the points (n, 2) as moved, and (3,) support, gap and residual as in `BoundaryFit`.
+        The number of selected points (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points
+        (n,), the moved points (n, 2), and (3,) support, gap and residual as in `BoundaryFit`.
     """
     n = points.shape[0]
     ellipse, moved, nothing = start.copy(), np.empty((n, 2)), np.zeros(3)
@@ -240,10 +240,10 @@ def _select(
     points: Floats, normals: Floats, start: Floats, sigma_px: float, reach: float,
     moved: Floats, distance: Floats, chosen: Bools,
 ) -> int:  # fmt: skip
-    """Move points by the curvature shift and choose those near an ellipse; returns how many were chosen.
+    """Move points by the curvature shift and select those near an ellipse; return the number of selected points.
 
-    The arguments are those of `_settled`, the largest distance of a point, and what receives the points as moved
-    (n, 2), their distances (n,) and whether they are chosen (n,).
+    The arguments are those of `_settled`, the largest distance of a point, and output arrays: the moved points (n, 2),
+    their distances (n,) and whether they are selected (n,).
     """
     ellipse, n, count = (start[0], start[1], start[2], start[3], start[4]), points.shape[0], 0
     for i in range(n):
@@ -258,7 +258,7 @@ def _select(
 
 @inlined
 def _drop_outliers(distance: Floats, chosen: Bools) -> int:
-    """Choose fewer points (n,): those whose distance is near the median; returns how many."""
+    """Narrow the selection (n,) to points whose distance is near the median; return their number."""
     some = selected(distance, chosen)
     middle = quantile_of(some, 0.5)
     for i in range(some.size):
@@ -272,7 +272,7 @@ def _drop_outliers(distance: Floats, chosen: Bools) -> int:
 
 @inlined
 def _seen(numbers: Floats, points: Floats) -> Floats:
-    """Share of an outline that holds points (n, 2), that of the longest gap, and the root mean square distance, (3,).
+    """Compute (3,): share of an outline that holds points (n, 2), share of the longest gap, rms distance.
 
     The gap is the longest run of sectors (equal steps of the ellipse's parameter t) without a point.
     """
@@ -294,9 +294,9 @@ def _seen(numbers: Floats, points: Floats) -> Floats:
 
 @compiled("UniTuple(f8, 5), f8[:,::1], f8")
 def far_off(ellipse: tuple[float, ...], points: Floats, sigma_px: float) -> float:
-    """Compute the distance within which nine in ten edge points (n, 2) lie of an ellipse (cx, cy, a, b, angle).
+    """Compute the distance from an ellipse (cx, cy, a, b, angle) within which nine in ten edge points (n, 2) lie.
 
-    They are moved outward by the curvature shift.
+    The points are moved outward by the curvature shift first.
     """
     off = np.empty(points.shape[0])
     for i in range(off.size):

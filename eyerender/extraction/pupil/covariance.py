@@ -24,8 +24,8 @@ SELECTION = 1.6
 # 1.7 % from a circle). Of 0.01, 0.015 and 0.02, this one makes the covariance of cut pupils right (rendered development
 # images, both lids over the pupil: 68 and 95 % ellipses hold .61 and .90 of the centres).
 HIDDEN_UNEVEN = 0.015
-# The hidden part is no more uneven than this many times the scatter of the visible edge points. Drawn ellipses have a
-# scatter of 0.0017 of the radius, rendered pupils 0.004 and more.
+# The hidden part is assumed no more uneven than this many times the scatter of the visible edge points. Drawn ellipses
+# have a scatter of 0.0017 of the radius, rendered pupils 0.004 and more.
 ROUGHER = 3.0
 # Standard deviation of the difference of a pupil's semi-axes, and of what turns them, in its radius: 0.034 to 0.101 in
 # six rows of rendered development images (gaze of 6 to 18 degrees), 0.067 in all.
@@ -33,7 +33,7 @@ ELONGATION = 0.07
 
 
 def distance_slopes(ellipse: Ellipse, place: Place) -> Floats:
-    """Derivatives (5, n) of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes."""
+    """Compute derivatives (5, n) of the signed distance by cx, cy and the shape matrix (aa, bb, ab), ellipse's axes."""
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
     out = np.empty((SHAPE, place.nx.size))
     np.subtract(place.ny * sin, place.nx * cos, out=out[0])
@@ -62,10 +62,10 @@ class EdgeSums:
     """Sums over edge points near an ellipse, over all and over each group of three sectors.
 
     Attributes:
-        matrix: (5, 5) of the products of the distance's slopes.
-        scores: (5, GROUPS) of the slopes times the distance.
-        slopes: (5, GROUPS) of the slopes.
-        count: (GROUPS,) points.
+        matrix: (5, 5) sum of products of the distance's slopes.
+        scores: (5, GROUPS) sum of slopes times distance.
+        slopes: (5, GROUPS) sum of slopes.
+        count: (GROUPS,) number of points.
     """
 
     matrix: Floats
@@ -75,20 +75,20 @@ class EdgeSums:
 
     @staticmethod
     def of(ellipse: Ellipse, points: Floats) -> EdgeSums:
-        """Compute the sum over points (n, 2)."""
+        """Compute the sums over points (n, 2)."""
         return EdgeSums(*_edge_sums(ellipse.numbers(), points[:, 0].copy(), points[:, 1].copy()))
 
 
 @inlined
 def slopes_at(cos: float, sin: float, c: float, s: float, nx: float, ny: float, row: Floats) -> None:
-    """Write `distance_slopes` at one place into row (5,); cos and sin are those of the ellipse's angle."""
+    """Write `distance_slopes` at one position into row (5,); cos and sin are those of the ellipse's angle."""
     row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos
     row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
 
 
 @compiled("UniTuple(f8, 5), f8[::1], f8[::1]")
 def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Indices]:
-    """Return the sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle) and points (x, y)."""
+    """Compute the sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle) and points (x, y)."""
     cos, sin = math.cos(ellipse[4]), math.sin(ellipse[4])
     matrix, scores, slopes = np.zeros((SHAPE, SHAPE)), np.zeros((SHAPE, GROUPS)), np.zeros((SHAPE, GROUPS))
     number, row, place = np.zeros(GROUPS, dtype=np.int64), np.empty(SHAPE), np.empty(8 * BLOCK)
@@ -108,7 +108,7 @@ def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats
 
 
 def edge_covariance(sums: EdgeSums, residual_px: float) -> Floats:
-    """Find the covariance (5, 5) of the centre and shape matrix of an ellipse fitted to edge points with this residual.
+    """Compute the covariance (5, 5) of centre and shape matrix of an ellipse fitted to edge points with this residual.
 
     Neighbouring edge points share noise (through the filter) and texture. `sector_excess` accounts for that.
     """
@@ -121,14 +121,14 @@ def edge_covariance(sums: EdgeSums, residual_px: float) -> Floats:
 
 
 def hidden_part(ellipse: Ellipse, seen: Bools, residual_px: float) -> Floats:
-    """Covariance (5, 5) of the centre and shape matrix that unevenness causes where only a part of the outline is seen.
+    """Compute the covariance (5, 5) of centre and shape matrix due to unevenness of the hidden part of the outline.
 
-    The ellipse through the visible sectors differs from the one through all of them by a linear function of their
-    displacements. Those of a group of three sectors are alike, those of different groups independent.
+    The ellipse through the visible sectors differs from the one through all sectors by a linear function of the
+    sectors' displacements, which are equal within a group of three sectors and independent between groups.
 
     Args:
         ellipse: the ellipse through the visible sectors.
-        seen: (SECTORS,) which are visible.
+        seen: (SECTORS,) which sectors are visible.
         residual_px: root mean square distance of the edge points in them.
     """
     slopes = distance_slopes(ellipse, Place.middles(ellipse))
@@ -142,7 +142,7 @@ def hidden_part(ellipse: Ellipse, seen: Bools, residual_px: float) -> Floats:
 
 
 def towards_round(ellipse: Ellipse, covariance: Floats) -> tuple[Ellipse, Floats]:
-    """Compute the most likely ellipse, and its covariance, if pupils are as elongated as ELONGATION says.
+    """Compute the most likely ellipse and its covariance, given the prior ELONGATION of pupils.
 
     An arc between two lids hardly determines the size across it; a whole outline is not affected. One step of the
     Kalman filter.
@@ -174,18 +174,18 @@ def reshaped(ellipse: Ellipse, step: Floats) -> Ellipse:
 
 
 def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
-    """Say how far an ellipse through edge points follows displacements of parts of the outline.
+    """Compute how far an ellipse through edge points follows displacements of parts of the outline.
 
-    It is the root mean square, over the outline, of the boundary's standard deviation if groups of three sectors
-    that hold points were displaced independently by 1 px. A real boundary is uneven, so the hidden
-    part of an outline is the more uncertain the larger this is.
+    This is the rms, over the outline, of the boundary's standard deviation if groups of three sectors with points were
+    displaced independently by 1 px. Because real boundaries are uneven, a large value means that the hidden part of the
+    outline is uncertain.
     """
     moved = _inverse(sums.matrix) @ sums.slopes
     return max(_along_outline(ellipse.numbers(), moved @ moved.T), 1e-3)
 
 
 def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
-    """Compute the root mean square, over the outline, of the boundary's standard deviation along its normal, px."""
+    """Compute the rms, over the outline, of the boundary's standard deviation along its normal, px."""
     # Use the off-diagonal term of the shape matrix in place of the angle: d ab = (a - b) d angle.
     scale = np.ones(SHAPE)
     scale[4] = ellipse.semi_axes_px[0] - ellipse.semi_axes_px[1]
@@ -194,7 +194,7 @@ def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
 
 @compiled("UniTuple(f8, 5), f8[:,::1]")
 def _along_outline(ellipse: tuple[float, ...], covariance: Floats) -> float:
-    """Root mean square of the boundary's standard deviation, by the covariance (5, 5) of centre and shape matrix."""
+    """Compute the rms of the boundary's standard deviation, given the covariance (5, 5) of centre and shape matrix."""
     _, _, a, b, angle = ellipse
     cos, sin, total, row, count = math.cos(angle), math.sin(angle), 0.0, np.empty(SHAPE), 32
     for k in range(count):
@@ -209,12 +209,12 @@ def _along_outline(ellipse: tuple[float, ...], covariance: Floats) -> float:
 
 
 def _inverse(matrix: Floats) -> Floats:
-    """Compute the inverse (5, 5) of the points' matrix, which a ridge keeps regular."""
+    """Invert the points' matrix (5, 5) with a ridge that keeps it regular."""
     return np.asarray(np.linalg.inv(matrix + 1e-9 * np.trace(matrix) * np.eye(SHAPE)), dtype=np.float64)
 
 
 def to_axes(covariance: Floats, ellipse: Ellipse) -> Floats:
-    """Compute the covariance of (cx, cy, a, b, angle) from that of the shape matrix: d angle = d ab / (a - b)."""
+    """Convert the covariance of centre and shape matrix to (cx, cy, a, b, angle): d angle = d ab / (a - b)."""
     a, b = ellipse.semi_axes_px.tolist()
     # The standard deviation of the angle is at most that of a uniform orientation, pi / sqrt(12).
     floor = math.sqrt(covariance[4, 4] * 12.0) / math.pi

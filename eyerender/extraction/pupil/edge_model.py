@@ -8,10 +8,10 @@ s is the standard deviation of the blur and includes the pixel (s^2 = optics^2 +
 distribution and its density. The second term of E is the first order in s kappa of a blurred disc. The third term gives
 the blur heavier tails than a normal distribution; g is its excess kurtosis (Edgeworth series).
 
-outer is a Fourier series in u = t + angle: the ellipse's parameter t counted from the image's x axis. It therefore does
-not turn when the axes of a nearly round ellipse do. inner is a series of first order, for iris light that is scattered
-into the pupil. The slope multiplies a blurred ramp: the iris may grow brighter or darker outwards, as it does when the
-lamps stand beside the camera.
+outer is a Fourier series in u = t + angle: the ellipse's parameter t counted from the image's x axis, so it does not
+turn with the axes of a nearly round ellipse. inner is a series of first order, for iris light that is scattered into
+the pupil. The slope multiplies a blurred ramp: the iris may become brighter or darker outwards, as it does for lamps
+beside the camera.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class EdgeModel:
         slope: slope of the outer level, DN per px.
         kurtosis: kurtosis of the blur beyond a Gaussian's 0.
         lean: (cos u, sin u) coefficients of the inner level, DN.
-        displaced: (SECTORS,) how far the boundary's sectors lie inside the ellipse, px.
+        displaced: (SECTORS,) displacement of the boundary's sectors into the ellipse, px.
     """
 
     ellipse: Ellipse
@@ -64,7 +64,7 @@ class EdgeModel:
     def numbers(self) -> Floats:
         """Return the parameters (11 + 1 + 2 K,) without the displacements.
 
-        They are the centre, the semi-axes and the angle, sigma, inner level, slope, kurtosis, lean (two) and `outer`.
+        In order: centre, semi-axes, angle, sigma, inner level, slope, kurtosis, lean (two) and `outer`.
         """
         ellipse = self.ellipse
         head = ellipse.numbers()
@@ -73,7 +73,7 @@ class EdgeModel:
 
     @staticmethod
     def of(numbers: Floats) -> EdgeModel:
-        """Make the model of the parameters that `numbers` gives."""
+        """Create the model from parameters in the order of `numbers`."""
         sigma, inner, slope, kurtosis, lean_x, lean_y = numbers[5:11].tolist()
         return EdgeModel(
             ellipse=Ellipse.of(numbers),
@@ -101,7 +101,7 @@ _EXACT = np.zeros(0)
 
 @inlined
 def profiles(place: Floats, count: int, sigma: float, kurtosis: float, out: Floats) -> None:
-    """Write the blurred step and ramp across the boundary at `count` places, as columns of out (7 BLOCK,).
+    """Write the blurred step and ramp across the boundary at `count` positions, as columns of out (7 BLOCK,).
 
     E goes from 0 inside to 1 outside. The derivative of -(z^3 - 3 z) phi is He_4 phi.
 
@@ -109,7 +109,7 @@ def profiles(place: Floats, count: int, sigma: float, kurtosis: float, out: Floa
         place: (8 BLOCK,) of `places`.
         count: number of points.
         sigma: standard deviation of the blur, px.
-        kurtosis: its excess kurtosis.
+        kurtosis: excess kurtosis of the blur.
         out: (7 BLOCK,) edge, its derivatives, ramp and its derivatives.
     """
     for i in range(count):
@@ -131,7 +131,7 @@ def profiles(place: Floats, count: int, sigma: float, kurtosis: float, out: Floa
 
 @inlined
 def turn_harmonics(place: Floats, count: int, basis: Floats) -> None:
-    """Turn the harmonics (cos k u, then sin k u) in basis (2 BLOCK,) to the next order."""
+    """Advance the harmonics (cos k u, then sin k u) in basis (2 BLOCK,) to the next order."""
     for i in range(count):
         c, s, cu, su = basis[i], basis[BLOCK + i], place[COS_U + i], place[SIN_U + i]
         basis[i], basis[BLOCK + i] = c * cu - s * su, s * cu + c * su
@@ -139,7 +139,7 @@ def turn_harmonics(place: Floats, count: int, basis: Floats) -> None:
 
 @inlined
 def outer_levels(place: Floats, count: int, outer: Floats, basis: Floats, out: Floats) -> None:
-    """Write the outer levels of `count` pixels: the Fourier series `outer` at their places."""
+    """Write the outer levels of `count` pixels: the Fourier series `outer` at their positions."""
     for i in range(count):
         out[i], basis[i], basis[BLOCK + i] = outer[0], 1.0, 0.0
     for j in range(1, outer.size, 2):
@@ -150,7 +150,7 @@ def outer_levels(place: Floats, count: int, outer: Floats, basis: Floats, out: F
 
 @compiled("f8[::1], f8[::1], f8[::1], f8[::1]")
 def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
-    """Compute levels (n,) of the model of these numbers; `displaced` is empty for an exact ellipse."""
+    """Compute levels (n,) of the model with these parameters; `displaced` is empty for an exact ellipse."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
     inner_dn, slope, lean_x, lean_y = numbers[6], numbers[7], numbers[9], numbers[10]
     place, edge, basis = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(2 * BLOCK)

@@ -1,4 +1,4 @@
-"""Sub-pixel edge points on the boundary of a candidate: gradients, ridges, and tests of polarity and darkness."""
+"""Sub-pixel edge points on the boundary of a candidate: gradient ridges, with tests of polarity and darkness."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class EdgePoints:
     Attributes:
         points_px: (n, 2) ridge of the gradient, not corrected for curvature.
         normals: (n, 2) unit normals, from dark to bright.
-        ridge: (m,) rows and (m,) columns of all pixels of ridges, before the tests.
-        kept: (m,) which of them became edge points.
+        ridge: (m,) rows and (m,) columns of all ridge pixels, before the tests.
+        kept: (m,) which ridge pixels became edge points.
         sigma_px: width of the whole smoothing (optics, pixel and filter), measured across the edge.
         filter_px: sigma of the filter alone.
     """
@@ -52,7 +52,7 @@ class EdgePoints:
     filter_px: float
 
     def arcs(self) -> Indices:
-        """Compute the label (n,) of the connected piece that each point lies on."""
+        """Label the connected pieces on which the points lie, (n,)."""
         row, column = (one - one.min() for one in self.ridge)
         mask = np.zeros((row.max() + 1, column.max() + 1), np.uint8)
         mask[row, column] = 1
@@ -68,11 +68,11 @@ def find_edges(
     *,
     band: float,
 ) -> EdgePoints:
-    """Find edge points within `band` times the semi-axes of the candidate's outline (and at least 4 px).
+    """Detect edge points within `band` times the semi-axes of the candidate's outline (at least 4 px).
 
     A gradient ridge is kept if it points outward (within 45 deg of the candidate's normal), exceeds the noise, and has
-    dark pupil behind it and an iris ahead: nothing as bright as skin or the sclera, nor a level that keeps rising. A
-    window that the cornea mirrors adds its light to both.
+    dark pupil behind it and an iris ahead: nothing as bright as skin or sclera, and no level that keeps rising. The
+    reflection of a window adds its light to both.
 
     The sub-pixel position, along the gradient's larger component, is the vertex of the parabola through the logarithms
     of three magnitudes. It is exact for a Gaussian-blurred straight edge. Source: Devernay (1995), with the logarithm.
@@ -125,7 +125,7 @@ def find_edges(
 def _ridges(
     gx: Image, gy: Image, magnitude: Image, covered: Bytes, ellipse: tuple[float, ...], half_band: float, floor: float
 ) -> tuple[Floats, Floats, Floats, Indices, Indices]:
-    """Find the ridges of the gradient that point outward, near an ellipse (cx, cy, a, b, angle).
+    """Detect ridges of the gradient that point outward, near an ellipse (cx, cy, a, b, angle).
 
     Returns:
         Points (n, 2), normals (n, 2), squared widths of the profile along the normal (n,), rows and columns (n,).
@@ -154,7 +154,7 @@ def _ridges(
             if gx[y, x] * u + gy[y, x] * v > 0.7 * strength * max(math.sqrt(u * u + v * v), 1e-12):
                 row[n], column[n], here[n] = y, x, strength
                 n += 1
-    # A ridge has more flank than crest, so an upper quantile_of is the level of strong edges.
+    # A ridge has more flank than crest, so an upper quantile gives the level of strong edges.
     least = WEAK * quantile_of(here[:n], 0.9) if n else 0.0
     found = 0
     for i in range(n):
@@ -171,7 +171,7 @@ def _ridges(
 
 @inlined
 def _vertex(gx: Image, gy: Image, magnitude: Image, y: int, x: int, point: Floats, normal: Floats) -> float:
-    """Write the sub-pixel place of a ridge and its normal; returns the squared width of the profile."""
+    """Write the sub-pixel position of a ridge and its normal; return the squared width of the profile."""
     level = abs(gx[y, x]) >= abs(gy[y, x])
     strength, (before, after) = magnitude[y, x], _beside(gx, gy, magnitude, y, x)
     first, middle, last = math.log(max(before, 1e-3)), math.log(max(strength, 1e-3)), math.log(max(after, 1e-3))
@@ -186,7 +186,7 @@ def _vertex(gx: Image, gy: Image, magnitude: Image, y: int, x: int, point: Float
 
 @inlined
 def _beside(gx: Image, gy: Image, magnitude: Image, y: int, x: int) -> tuple[float, float]:
-    """Compute the gradient's magnitude at the pixels before and after one, along the gradient's larger component."""
+    """Return the gradient's magnitude at the two neighbours of a pixel along the gradient's larger component."""
     if abs(gx[y, x]) >= abs(gy[y, x]):
         return magnitude[y, x - 1], magnitude[y, x + 1]
     return magnitude[y - 1, x], magnitude[y + 1, x]
@@ -194,20 +194,20 @@ def _beside(gx: Image, gy: Image, magnitude: Image, y: int, x: int) -> tuple[flo
 
 @inlined
 def nearest(image: Image, x: float, y: float) -> float:
-    """Compute the level of the pixel nearest to a point; outside the frame its border is repeated."""
+    """Return the level of the pixel nearest to a point; outside the frame its border is repeated."""
     column = min(max(int(np.rint(x)), 0), image.shape[1] - 1)
     return image[min(max(int(np.rint(y)), 0), image.shape[0] - 1), column]
 
 
 @compiled("f4[:,::1], f8[:,::1], f8[:,::1], f8, UniTuple(f8, 6)")
 def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, limits: tuple[float, ...]) -> Bools:
-    """Return whether there is pupil behind points and iris ahead of them.
+    """Return which points have pupil behind them and iris ahead of them.
 
-    The limits are the pupil's level and, above it, the dark one, an iris' level, the rise at an edge inside a mirrored
-    window, the bright one, and the rise farther ahead. The level `depth` px behind is dark. Or it is darker than an
-    iris, and the level `depth` px ahead exceeds it by the rise inside a window, whose light then counts as the pupil's.
-    The level half as far ahead is not bright. From `depth` px ahead to half as far again, the level rises by less than
-    the last limit.
+    `limits` holds the pupil's level and, relative to it, the dark level, the iris' level, the rise at an edge inside a
+    window's reflection, the bright level, and the rise farther ahead. A point passes if the level `depth` px behind is
+    dark (or darker than an iris, if the level `depth` px ahead exceeds it by the rise inside a reflection, whose light
+    then counts as the pupil's), if the level half as far ahead is not bright, and if the level rises by less than the
+    last limit from `depth` px ahead to half as far again.
     """
     pupil, dark, iris, clear, bright, rise = limits
     out = np.empty(points.shape[0], dtype=np.bool_)
@@ -224,7 +224,7 @@ def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, l
 
 
 def filter_sigma(step_dn: float, noise_dn: float, b: float) -> float:
-    """Compute the width of the derivative filter: 1 px for a clear edge, up to 2.5 px (and b / 6) for a noisy one."""
+    """Choose the width of the derivative filter (px): 1 for a clear edge, up to 2.5 (and b / 6) for a noisy one."""
     return min(max(9.0 * noise_dn / max(step_dn, 1e-6), 1.0), max(1.0, min(2.5, b / 6.0)))
 
 
@@ -232,8 +232,8 @@ def edge_noise_px(step_dn: float, *, noise_dn: float, sigma_filter: float, sigma
     """Compute the standard deviation of one edge point along its normal, px.
 
     sigma_x = n'' / |g''|. The noise's second derivative along the normal after filtering is noise sqrt(3 / (16 pi)) /
-    s_f^3. The curvature of the gradient's ridge is step / (sqrt(2 pi) s_t^3). s_f is the width of the filter, s_t that
-    of the whole blur.
+    s_f^3. The curvature of the gradient's ridge is step / (sqrt(2 pi) s_t^3). s_f is the width of the filter, s_t the
+    width of the whole blur.
     """
     curvature = step_dn / (math.sqrt(2.0 * math.pi) * sigma_total**3)
     slope_noise = noise_dn * math.sqrt(3.0 / (16.0 * math.pi)) / sigma_filter**3
@@ -241,7 +241,7 @@ def edge_noise_px(step_dn: float, *, noise_dn: float, sigma_filter: float, sigma
 
 
 def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
-    """Compute derivatives of a Gaussian, normalised so that a ramp of 1 DN per px gives 1."""
+    """Filter with derivatives of a Gaussian, normalised so that a ramp of 1 DN per px gives 1."""
     smooth, slope = _filters(sigma)
     return (
         as_image(cv2.sepFilter2D(crop, cv2.CV_32F, slope, smooth, borderType=cv2.BORDER_REPLICATE)),
@@ -251,7 +251,7 @@ def _gradient(crop: Image, sigma: float) -> tuple[Image, Image]:
 
 @lru_cache(maxsize=64)
 def _filters(sigma: float) -> tuple[Floats, Floats]:
-    """Compute weights of a Gaussian, and of its derivative."""
+    """Return the weights of a Gaussian and of its derivative."""
     t = np.arange(-math.ceil(4.0 * sigma), math.ceil(4.0 * sigma) + 1, dtype=np.float64)
     smooth = np.exp(-0.5 * (t / sigma) ** 2)
     smooth /= smooth.sum()

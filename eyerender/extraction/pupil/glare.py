@@ -1,7 +1,7 @@
-"""Glints around a candidate, which are removed before its boundary is looked for.
+"""Removal of glints around a candidate, before its boundary is searched.
 
-Eight glints of a ring light fill a small pupil: their flanks are the steepest edges there, and the levels inside the
-pupil are theirs. A morphological opening gives the level around them.
+Eight glints of a ring light fill a small pupil: their flanks are the steepest edges, and they determine the levels
+inside the pupil. A morphological opening gives the level around them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ABOVE_IRIS, STANDS_OUT = 0.25, 0.75
 # interquartile ranges above the upper quartile. Source: Tukey (1977).
 FENCE, BESIDE_PX = 1.5, 3.0
 NO_PATCH = np.zeros((0, 0), dtype=np.float32)
-NOISE = 6.0  # in standard deviations: what noise alone does not reach in any pixel
+NOISE = 6.0  # standard deviations that noise alone does not reach in any pixel
 # Flank of a glint below these limits, px. A glint of sigma 2 and four steps falls from one step to a tenth of one in
 # 1.1 sigma.
 FLANK_PX = 3
@@ -65,7 +65,7 @@ class Inpainted:
         return crop, hidden
 
     def enlarged(self, linear: Image, scale: int) -> Inpainted:
-        """Return the same at `scale` times the size, of the image `linear` of that size."""
+        """Return the same result at `scale` times the size, for the image `linear` of that size."""
         if self.patch is None or self.mask is None:
             return Inpainted(linear)
         size = (scale * self.patch.shape[1], scale * self.patch.shape[0])
@@ -80,7 +80,7 @@ class Inpainted:
 def _beside(
     ellipse: tuple[float, ...], k: int, away: float, linear: Image, corner: tuple[int, int], patch: Image
 ) -> float:
-    """Compute the level at the pixel `away` outside an ellipse, in the middle of sector k."""
+    """Return the level at the pixel `away` outside an ellipse, in the middle of sector k."""
     cx, cy, a, b, angle = ellipse
     cos, sin, t = math.cos(angle), math.sin(angle), 2.0 * math.pi * ((k + 0.5) / SECTORS - 0.5) - angle
     c, s = math.cos(t), math.sin(t)
@@ -99,7 +99,7 @@ def _beside(
 def levels_beside(
     ellipse: tuple[float, ...], away_px: float, linear: Image, corner: tuple[int, int], patch: Image
 ) -> Image:
-    """Levels (SECTORS,) at the pixels `away_px` outside an ellipse (cx, cy, a, b, angle), in the middle of each sector.
+    """Return levels (SECTORS,) at pixels `away_px` outside an ellipse (cx, cy, a, b, angle), mid-sector.
 
     Outside the frame its border is repeated. The part of the image from `corner` on is replaced by `patch`, unless that
     is empty.
@@ -111,7 +111,7 @@ def levels_beside(
 
 
 def around(ellipse: Ellipse, reach: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Return columns and rows of an image (h, w) up to `reach` px from an ellipse's centre."""
+    """Return slices of columns and rows of an image (h, w) up to `reach` px from an ellipse's centre."""
     (cx, cy), (height, width) = ellipse.centre_px.tolist(), shape
     x0, x1 = max(0, math.floor(cx - reach)), min(width, math.ceil(cx + reach) + 1)
     y0, y1 = max(0, math.floor(cy - reach)), min(height, math.ceil(cy + reach) + 1)

@@ -1,8 +1,8 @@
-"""The least-squares system of the boundary's pixel model: slopes, normal equations, Gauss-Newton steps.
+"""Least squares of the boundary's pixel model: derivatives, normal equations, Gauss-Newton steps.
 
-A pupil boundary is not exactly an ellipse: every sector of it may be displaced, by amounts whose standard deviation is
-given. To first order a sector's displacement is one more linear parameter that affects only that sector's pixels. A
-step of the other parameters therefore eliminates all displacements (Schur's complement).
+A pupil boundary is not exactly an ellipse: every sector may be displaced, with a given standard deviation. To first
+order, a displacement is a linear parameter that affects only its sector's pixels, so all displacements are eliminated
+from the normal equations (Schur complement).
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ FIXED = SHAPE + 7
 # kurtosis of the blur; the lean of the inner level, in steps (scattered light only, so that noise does not produce a
 # lean).
 HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
-KURTOSIS_LIMITS = (-1.5, 3.0)  # beyond them the edge would not be monotonic
+KURTOSIS_LIMITS = (-1.5, 3.0)  # outside these limits the edge would not be monotonic
 STILL_PX = 1.5e-2  # a fit ends with a step smaller than this
 
 
 _Sums = tuple[Floats, float, Floats, Floats, Floats, Floats]  # the parts of `Sums`
-_Normal = tuple[Floats, Floats, float, Floats, Floats]  # those of `Normal`, but `across`
-_SUMS = "Tuple((f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[::1], f8[::1]))"  # for `compiled`
+_Normal = tuple[Floats, Floats, float, Floats, Floats]  # parts of `Normal`, except `across`
+_SUMS = "Tuple((f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[::1], f8[::1]))"  # type for `compiled`
 _NORMAL = "Tuple((f8[:,::1], f8[::1], f8, f8[::1], f8[::1]))"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
-    """Pixels near the boundary: their places x (n,) and y (n,), px, levels (n,), DN, and sectors (n,)."""
+    """Pixels near the boundary: positions x (n,) and y (n,), px, levels (n,), DN, and sectors (n,)."""
 
     x: Floats
     y: Floats
@@ -58,14 +58,14 @@ class Band:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pixels:
-    """Pixels near the boundary, in the order of their sectors.
+    """Pixels near the boundary, sorted by sector.
 
     Attributes:
-        x: (n,) px.
-        y: (n,) px.
-        level: (n,) DN.
-        index: (n,) which of the k sectors that have pixels each pixel is in.
-        sector: (k,) which of all sectors it is.
+        x: (n,) position, px.
+        y: (n,) position, px.
+        level: (n,) level, DN.
+        index: (n,) index of each pixel's sector among the k sectors with pixels.
+        sector: (k,) numbers of these sectors.
     """
 
     x: Floats
@@ -76,7 +76,7 @@ class Pixels:
 
     @staticmethod
     def of(band: Band, use: Bools, seen: Bools) -> Pixels:
-        """Choose the pixels (n,) in `use` whose sector is one of those `seen` (SECTORS,)."""
+        """Select the pixels (n,) in `use` whose sector is one of those `seen` (SECTORS,)."""
         return Pixels(*_grouped(band.x, band.y, band.level, band.sector, use, seen))
 
 
@@ -106,10 +106,10 @@ def _grouped(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Weights of the priors, beside the weight of a pixel's residual.
+    """Weights of the priors, relative to the weight of a pixel's residual.
 
-    They are those of the squares of slope, kurtosis, a lean and a harmonic (4,), then the standard deviation of a
-    sector's displacement and the weight of its square (infinite where no displacement is allowed).
+    These are the weights of the squares of slope, kurtosis, a lean and a harmonic (4,), then the standard deviation of
+    a sector's displacement and the weight of its square (infinite if no displacement is allowed).
     """
 
     weights: Floats
@@ -118,7 +118,7 @@ class Prior:
 
     @staticmethod
     def of(start: EdgeModel, noise_dn: float, uneven_px: float) -> Prior:
-        """Make the priors of a fit that starts from a model."""
+        """Compute the priors of a fit that starts from a model."""
         displacement = (noise_dn / uneven_px) ** 2 if uneven_px > 0.0 else math.inf
         step = max(start.step_dn, noise_dn)
         slope = SLOPE_SD * step / float(start.ellipse.semi_axes_px[1])
@@ -126,7 +126,7 @@ class Prior:
         return Prior(weights, uneven_px, displacement)
 
     def of_all(self, size: int) -> Floats:
-        """Compute the weight (size,) of every parameter except the displacements."""
+        """Return the weight (size,) of every parameter except the displacements."""
         out = np.zeros(size)
         out[7], out[8], out[9:11], out[FIXED:] = self.weights
         return out
@@ -134,17 +134,18 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sums:
-    """Sums over the pixels of the linearised model's products; p parameters, k sectors that have pixels.
+    """Sums of products of the linearised model over the pixels; p parameters, k sectors with pixels.
 
-    "Slopes" are the derivatives of a pixel's level by the parameters, "steepness" is that by the distance.
+    "Slopes" are derivatives of a pixel's level with respect to the parameters, "steepness" the derivative with respect
+    to the distance.
 
     Attributes:
-        matrix: (p, p) of the slopes' products.
-        cost: of the squared residuals.
-        pull: (p, k) of the slopes times the residual, in each sector.
-        across: (p, k) of the slopes times the steepness.
-        along: (k,) of the steepness times the residual.
-        square: (k,) of the squared steepness.
+        matrix: (p, p) products of slopes.
+        cost: squared residuals.
+        pull: (p, k) slopes times residual, per sector.
+        across: (p, k) slopes times steepness, per sector.
+        along: (k,) steepness times residual, per sector.
+        square: (k,) squared steepness, per sector.
     """
 
     matrix: Floats
@@ -156,7 +157,7 @@ class Sums:
 
     @staticmethod
     def of(pixels: Pixels, model: EdgeModel, displaced: Floats) -> Sums:
-        """Compute the sum with sectors that lie `displaced` (k,) px inside the ellipse."""
+        """Compute the sums with sectors `displaced` (k,) px into the ellipse."""
         return Sums(*_pixel_sums(pixels.x, pixels.y, pixels.level, pixels.index, model.numbers(), displaced))
 
 
@@ -164,7 +165,7 @@ class Sums:
 def _rows(
     place: Floats, edge: Floats, level: Floats, start: int, count: int, numbers: Floats, out: tuple[Floats, ...]
 ) -> None:  # fmt: skip
-    """Write the derivatives of the level by the parameters, the residuals, and the derivatives by the distance.
+    """Write a block's derivatives of the level by the parameters, residuals, and derivatives by the distance.
 
     Args:
         place: (8 BLOCK,) of `places`.
@@ -209,7 +210,7 @@ def _rows(
 def _add_weighted(
     rows: Floats, begin: int, end: int, residual: Floats, steep: Floats, k: int, pull: Floats, across: Floats
 ) -> None:
-    """Add the sums of rows (p, n), weighted by two values, from `begin` to `end`, to columns k of (p, q)."""
+    """Add the sums of rows (p, n), weighted by two values, over columns `begin` to `end`, to columns k of (p, q)."""
     for j in range(rows.shape[0]):
         first = second = 0.0
         for i in range(begin, end):
@@ -223,7 +224,7 @@ def _add_weighted(
 def _pixel_sums(
     x: Floats, y: Floats, level: Floats, index: Indices, numbers: Floats, displaced: Floats
 ) -> tuple[Floats, float, Floats, Floats, Floats, Floats]:
-    """Compute the parts of `Sums` for the model of these numbers (see `EdgeModel.numbers`)."""
+    """Compute the parts of `Sums` for the model with these parameters (see `EdgeModel.numbers`)."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
     sectors, size = displaced.size, numbers.size
     matrix, basis, place, edge = np.zeros((size, size)), np.empty(2 * BLOCK), np.empty(8 * BLOCK), np.empty(7 * BLOCK)
@@ -239,7 +240,7 @@ def _pixel_sums(
         _rows(place, edge, level, start, count, numbers, (flat, residual, steep, basis))
         add_products(rows, 0, count, matrix)
         begin = 0
-        while begin < count:  # the pixels of a sector follow each other
+        while begin < count:  # the pixels of a sector are contiguous
             k, end = index[start + begin], begin
             while end < count and index[start + end] == k:
                 cost += residual[end] * residual[end]
@@ -259,12 +260,12 @@ class Normal:
     """Normal equations with the sectors' displacements eliminated.
 
     Attributes:
-        matrix: (p, p) sum of the slopes' products.
-        vector: (p,) sum of the slopes times the residual.
+        matrix: (p, p) sum of products of slopes.
+        vector: (p,) sum of slopes times residual.
         cost: sum of squares.
         across: (p, k) products of each sector's displacement with the slopes, priors included.
-        along: (k,) its products with the residual, priors included.
-        inverse: (k,) inverse of its product with itself, prior included.
+        along: (k,) products of each displacement with the residual, priors included.
+        inverse: (k,) inverse of each displacement's product with itself, prior included.
     """
 
     matrix: Floats
@@ -284,7 +285,7 @@ class Normal:
 
 @compiled(f"{_SUMS}, f8[::1], f8")
 def _eliminated(sums: _Sums, displaced: Floats, displacement: float) -> _Normal:
-    """Compute the parts of `Normal`, but `across`, from those of `Sums` and the prior's weight (see `Prior`)."""
+    """Compute the parts of `Normal`, except `across`, from those of `Sums` and the prior's weight (see `Prior`)."""
     matrix, cost, pull, across, along, square = sums
     size, sectors = across.shape
     vector, products = np.zeros(size), np.zeros((size, size))
@@ -309,7 +310,7 @@ def _eliminated(sums: _Sums, displaced: Floats, displacement: float) -> _Normal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Result of the fit: the model, the displacements (k,) px, and the sums at it, up to a last tiny step."""
+    """Result of the fit: the model, the displacements (k,) px, and the sums there, up to a last tiny step."""
 
     model: EdgeModel
     displaced: Floats
@@ -317,9 +318,9 @@ class Solution:
 
 
 def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
-    """Fit the model with at most `steps` Gauss-Newton steps with Levenberg's damping.
+    """Fit the model with at most `steps` damped Gauss-Newton steps (Levenberg).
 
-    The cost is sum r^2 plus the priors' part. displaced (k,) is the start of the displacements.
+    The cost is sum r^2 plus the priors. `displaced` (k,) is the start of the displacements.
     """
     numbers = model.numbers()
     held, damping = prior.of_all(numbers.size), 1e-4
@@ -330,7 +331,7 @@ def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, st
     for _ in range(steps):
         trial, trial_displaced, largest, widened = _trial(normal, sums[3], held, numbers, displaced, damping)
         if largest < STILL_PX and widened < 10.0 * STILL_PX and damping < 1e-3:
-            # Another step would be several times smaller, and so small a step hardly changes a sum.
+            # Another step would be several times smaller, and a step this small hardly changes the sums.
             numbers, displaced = trial, trial_displaced
             break
         trial_sums = _pixel_sums(*about, trial, trial_displaced)
@@ -349,7 +350,7 @@ def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, st
 
 @inlined
 def _step(matrix: Floats, vector: Floats, held: Floats, numbers: Floats, damping: float) -> Floats:
-    """Solve the damped normal equations with the priors' weights, for parameters of equal scale."""
+    """Solve the damped normal equations, including the priors, with all parameters scaled alike."""
     size = vector.size
     scaled, scale, right = matrix.copy(), np.empty(size), np.empty(size)
     for j in range(size):
@@ -368,7 +369,7 @@ def _step(matrix: Floats, vector: Floats, held: Floats, numbers: Floats, damping
 
 @inlined
 def _moved(numbers: Floats, step: Floats) -> Floats:
-    """Apply a step of the parameters to the numbers of a model; the shape matrix's eigenvectors give the new axes."""
+    """Add a step to the parameters of a model; the shape matrix's eigenvectors give the new axes."""
     out = numbers.copy()
     for j in range(out.size):
         out[j] += step[j]
@@ -388,15 +389,15 @@ def _trial(
     """Take one damped step of at most 3 px.
 
     Args:
-        normal: what `_eliminated` returns.
-        across: of `Sums`.
+        normal: result of `_eliminated`.
+        across: as in `Sums`.
         held: (p,) weights of the priors.
         numbers: (p,) the model (see `EdgeModel.numbers`).
         displaced: (k,) displacements of the sectors.
         damping: added to the diagonal of the scaled normal matrix.
 
     Returns:
-        The numbers and displacements that it leads to, its largest change of the shape, and that of sigma, px.
+        The new parameters and displacements, and the step's largest change of the shape and of sigma, px.
     """
     matrix, vector, _, along, inverse = normal
     step = _step(matrix, vector, held, numbers, damping)

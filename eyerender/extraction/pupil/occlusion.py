@@ -1,4 +1,4 @@
-"""Occlusion: which pixels and sectors of the boundary the pixel model explains, and how uneven the boundary is."""
+"""Occlusion: which pixels and sectors of the boundary fit the pixel model, and how uneven the boundary is."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ FARTHEST = 3.5  # largest displacement of a sector, in standard deviations of wh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visible:
-    """The part of a boundary that the model explains.
+    """The part of a boundary that fits the model.
 
     Attributes:
-        use: (n,) pixels that are not outliers.
-        explained: (SECTORS,) sectors that the model explains.
+        use: (n,) which pixels are not outliers.
+        explained: (SECTORS,) which sectors the model explains.
         uneven_px: standard deviation of the sectors' displacements from the ellipse.
         displaced: (SECTORS,) most likely displacements, px inward.
         bins: (n,) sector of each pixel.
@@ -52,7 +52,7 @@ def visible_part(
 
     Args:
         model: the fitted model.
-        displaced: (SECTORS,) displacements that the fit found, px inward.
+        displaced: (SECTORS,) fitted displacements, px inward.
         band: n pixels.
         use: (n,) pixels that the fit used.
         seen: (SECTORS,) sectors that the fit used.
@@ -68,7 +68,7 @@ def visible_part(
 
 @compiled("f8[::1], f8[::1], f8[::1]")
 def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
-    """Compute the sector of each pixel (n,), and its distance, curvature, inner level and step (4, n)."""
+    """Compute the sector (n,) of each pixel, and its distance, curvature, inner level and step (4, n)."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
     bins, out = np.empty(x.size, dtype=np.int64), np.empty((4, x.size))
     place, basis, outer = np.empty(8 * BLOCK), np.empty(2 * BLOCK), np.empty(BLOCK)
@@ -87,7 +87,7 @@ def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
 
 @inlined
 def _clear(values: Floats) -> None:
-    """Set values (n,) to 0."""
+    """Set values (n,) to 0, in place."""
     for k in range(values.size):
         values[k] = 0.0
 
@@ -96,7 +96,7 @@ def _clear(values: Floats) -> None:
 def _displacements(
     bins: Indices, look: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Find the displacement of every sector that its pixels show, from what `_look` returns.
+    """Estimate the displacement of every sector from its pixels, given the result of `_look`.
 
     Returns:
         The residual of each pixel (n,), the displacements (SECTORS,) and their weights (SECTORS,).
@@ -135,7 +135,7 @@ def _displacements(
 
 @inlined
 def _uneven2(seen: Bools, whole: Floats, weight: Floats, by_noise: Floats) -> float:
-    """Compute the variance, beyond noise, of the displacements of visible sectors whose pixels show them."""
+    """Compute the variance, beyond noise, of the displacements of visible sectors that their pixels determine."""
     least, n = 0.1 * largest_size(weight), 0
     size, noise = np.empty(SECTORS), np.empty(SECTORS)
     for k in range(SECTORS):
@@ -151,7 +151,7 @@ def _uneven2(seen: Bools, whole: Floats, weight: Floats, by_noise: Floats) -> fl
 def _visible(
     bins: Indices, found: tuple[Floats, ...], use: Bools, seen: Bools, sectors: Bools, noise_dn: float, uneven_px: float
 ) -> tuple[Bools, Bools, float, Floats]:
-    """Compute the parts of `Visible`, but the sectors of the pixels, from what `_displacements` found."""
+    """Compute the parts of `Visible`, except the sectors of the pixels, from the result of `_displacements`."""
     residual, whole, weight = found
     by_noise = np.empty(SECTORS)
     for k in range(SECTORS):
@@ -186,7 +186,7 @@ def _visible(
 
 
 def clear_of_lids(seen: Bools, model: EdgeModel) -> Bools:
-    """Leave out the sectors beside each gap of two or more, as far as the blur of a lid margin reaches into them."""
+    """Exclude the sectors beside each gap of two or more, as far as the blur of a lid margin extends."""
     if seen.all():
         return seen
     gap = ~seen & (~np.roll(seen, 1) | ~np.roll(seen, -1))

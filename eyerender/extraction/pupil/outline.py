@@ -1,8 +1,8 @@
-"""What the image shows along an ellipse where no edge points are, and edge points that it does not explain.
+"""Image levels along an ellipse where there are no edge points, and edge points that the ellipse does not explain.
 
-A stretch of a pupil's outline without edge points is covered by a lid, lashes, or a reflection, few of which are as
-dark as the pupil. An ellipse that is too small or too far to one side has the pupil on both sides of its outline, and
-edge points beyond it.
+If a stretch of a pupil's outline has no edge points, a lid, lashes or a reflection covers it, and few of these are as
+dark as the pupil. An ellipse that is too small or off to one side has pupil on both sides of its outline, and edge
+points beyond it.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from .boundary import PupilCandidate
 from .glare import NO_PATCH, levels_beside
 from .places import SECTORS, holding, relative_to
 
-DARK = 0.35  # of the step: a lower level is the pupil's
-CLEAR = 0.15  # of b: edge points farther from the ellipse are not its own
+DARK = 0.35  # share of the step below which a level counts as the pupil's
+CLEAR = 0.15  # share of b: edge points farther from the ellipse do not belong to it
 # Of the median step at the ellipse's own points: the level of a shadow or a reflection outside it is lower.
 SHADED = 0.6
 
@@ -39,7 +39,7 @@ class Outline:
 
 
 def outline_of(found: PupilCandidate, ellipse: Ellipse) -> Outline:
-    """Look along an ellipse about a candidate."""
+    """Examine the levels along an ellipse around a candidate."""
     boundary, candidate, edges, inpainted = found.boundary, found.candidate, found.edges, found.inpainted
     b = float(ellipse.semi_axes_px[1])
     about = ellipse.numbers()
@@ -69,17 +69,17 @@ def _along(
     ellipse: tuple[float, ...], held: Bools, others: Floats, linear: Image, corner: tuple[int, int], patch: Image,
     away: tuple[float, float], levels: tuple[float, float],
 ) -> tuple[int, int, int, int, int, int]:  # fmt: skip
-    """Look along an ellipse (cx, cy, a, b, angle).
+    """Examine the levels along an ellipse (cx, cy, a, b, angle).
 
     Args:
         ellipse: the ellipse.
         held: (SECTORS,) sectors with edge points that it fits.
-        others: (m, 2) the other edge points.
+        others: (m, 2) edge points that it does not fit.
         linear: the image, DN.
         corner: column and row of the part of it that is replaced.
         patch: that part, empty if there is none.
-        away: distance at which levels are looked at, and that from which a point is not the ellipse's own, px.
-        levels: the pupil's, and that below which others are dark, DN.
+        away: distance at which levels are read, and distance from which a point does not belong to the ellipse, px.
+        levels: level of the pupil, and level below which others are dark, DN.
 
     Returns:
         Sectors without points that are dark on both sides; other points outside and inside the ellipse; sectors with

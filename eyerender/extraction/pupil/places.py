@@ -1,4 +1,4 @@
-"""Places of points relative to an ellipse: signed distance, nearest point, normal, curvature and sector."""
+"""Positions relative to an ellipse: signed distance, nearest point, normal, curvature and sector."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ...geometry.ellipse import Ellipse
 from ...jit import compiled, inlined
 
 SECTORS = 48  # equal steps of the ellipse's parameter u
-STEPS = 3  # of Newton's iteration to the nearest point; they reach 1e-6 px up to b / 2 away
+STEPS = 3  # Newton steps to the nearest point; they reach 1e-6 px up to b / 2 away
 BLOCK = 128  # points whose numbers stay in the first-level cache
 # Columns of a block of places, in the order of `Place`; the distance comes first.
 COS_T, SIN_T, NX, NY, CURVATURE, COS_U, SIN_U = (k * BLOCK for k in range(1, 8))
@@ -22,10 +22,10 @@ TAN_1, TAN_2, TAN_3, TAN_4, TAN_5 = (math.tan(2.0 * math.pi * k / SECTORS) for k
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """Where points (n,) lie relative to an ellipse.
+    """Positions of points (n,) relative to an ellipse.
 
-    It holds the signed distance, the nearest point's parameter (cos t, sin t), the outward normal there in the
-    ellipse's own axes (nx, ny), the curvature, and the parameter counted from the image's x axis (cos u, sin u).
+    These are the signed distance, the nearest point's parameter (cos t, sin t), the outward normal there in the
+    ellipse's axes (nx, ny), the curvature, and the parameter counted from the image's x axis (cos u, sin u).
     """
 
     distance: Floats
@@ -39,7 +39,7 @@ class Place:
 
     @staticmethod
     def middles(ellipse: Ellipse, count: int = SECTORS) -> Place:
-        """Compute places on the ellipse, in the middle of each of `count` sectors."""
+        """Return the positions on the ellipse in the middle of each of `count` sectors."""
         (a, b), angle = ellipse.semi_axes_px.tolist(), ellipse.angle_rad
         u = 2.0 * np.pi * ((np.arange(count) + 0.5) / count - 0.5)
         cos_t, sin_t = np.cos(u - angle), np.sin(u - angle)
@@ -50,14 +50,13 @@ class Place:
 
 @inlined
 def places(ellipse: tuple[float, ...], x: Floats, y: Floats, start: int, count: int, out: Floats) -> None:
-    """Write the places of `count` points from `start` on, as columns of out (8 BLOCK,), one after the other.
+    """Write the positions of `count` points, beginning with number `start`, as consecutive columns of out (8 BLOCK,).
 
     Newton's iteration finds the nearest point's parameter t, from the point's own direction:
 
     f(t) = (a^2 - b^2) cos t sin t - a p sin t + b q cos t = 0.
 
-    These are loops over simple sums, which the compiler turns into vector
-    instructions.
+    The loops are simple sums, which the compiler vectorises.
     """
     cx, cy, a, b, angle = ellipse
     cos, sin, eccentric = math.cos(angle), math.sin(angle), a * a - b * b
@@ -90,7 +89,7 @@ def places(ellipse: tuple[float, ...], x: Floats, y: Floats, start: int, count: 
 
 @inlined
 def sector_at(c: float, s: float) -> int:
-    """Sector of a direction (cos u, sin u), without its angle: by the ratio of the smaller to the larger component."""
+    """Return the sector of a direction (cos u, sin u), from the ratio of its smaller to its larger component."""
     x, y = abs(c), abs(s)
     t = min(x, y) / max(x, y)
     k = (t >= TAN_1) + (t >= TAN_2) + (t >= TAN_3) + (t >= TAN_4) + (t >= TAN_5)
@@ -101,7 +100,7 @@ def sector_at(c: float, s: float) -> int:
 
 @compiled("UniTuple(f8, 5), f8[::1], f8[::1]")
 def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats) -> Indices:
-    """Compute the sector (n,) of each point (x, y) near an ellipse (cx, cy, a, b, angle)."""
+    """Return the sector (n,) of each point (x, y) near an ellipse (cx, cy, a, b, angle)."""
     out, place = np.empty(x.size, dtype=np.int64), np.empty(8 * BLOCK)
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
@@ -112,7 +111,7 @@ def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats) -> Indices:
 
 
 def holding(ellipse: tuple[float, ...], points: Floats) -> Bools:
-    """Return whether each sector (SECTORS,) of an ellipse (cx, cy, a, b, angle) holds one of the points (n, 2)."""
+    """Return whether each sector (SECTORS,) of an ellipse (cx, cy, a, b, angle) contains one of the points (n, 2)."""
     out = np.zeros(SECTORS, dtype=bool)
     out[sectors_at(ellipse, points[:, 0].copy(), points[:, 1].copy())] = True
     return out
@@ -120,7 +119,7 @@ def holding(ellipse: tuple[float, ...], points: Floats) -> Bools:
 
 @inlined
 def relative_to(ellipse: tuple[float, ...], x: float, y: float) -> tuple[float, float, float, float]:
-    """Signed distance, outward normal (x, y) and curvature of an ellipse at a point near it, to first order."""
+    """Compute signed distance, outward normal (x, y) and curvature of an ellipse at a nearby point, to first order."""
     cx, cy, a, b, angle = ellipse
     cos, sin, dx, dy = math.cos(angle), math.sin(angle), x - cx, y - cy
     p, q = (dx * cos + dy * sin) / a, (dy * cos - dx * sin) / b

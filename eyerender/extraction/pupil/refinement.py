@@ -1,4 +1,4 @@
-"""Maximum-likelihood refinement: the pixel model of the boundary fitted to the pixels around it."""
+"""Maximum-likelihood refinement: fit the pixel model to the pixels around the boundary."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from .places import SECTORS, Place, sectors_at
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
 # side of the iris more, by a few hundredths of the step. Noise hides that from a test, but it shifts the centre.
 ORDERS = (1, 2, 4, 6, 8)
-# How far the band reaches beyond the boundary, in widths of the blur. Pixels farther out determine the outer level
-# better, but texture changes it with the distance. Where the wide band shows texture, the narrow one takes a third off
-# the error of the centre (rendered development images with textured irises).
+# Reach of the band beyond the boundary, in widths of the blur. Pixels farther out determine the outer level better, but
+# texture changes it with distance. If the wide band shows texture, the narrow one reduces the error of the centre by a
+# third (rendered development images with textured irises).
 WIDE, NARROW = 3.0, 1.0
 # Share of the outline in a gap between edge points that only a lid makes. The model then explains no sector without
 # edge points: the shadow of a lid looks like a shaded iris, which its outer level follows.
 LID = 0.3
-# What shows texture: a larger reduced chi^2, or a boundary more uneven than this share of its radius. Nine in ten
+# Signs of texture: a larger reduced chi^2, or a boundary more uneven than this share of its radius. Nine in ten
 # rendered pupils are, and one in twenty drawn ellipses in a textured iris.
 UNEXPLAINED, ROUGH = 1.5, 0.003
-# Largest distance outside the boundary, px, however wide the blur: the light changes across the iris, and not linearly.
+# Largest distance outside the boundary, px, whatever the blur: the light varies across the iris, and not linearly.
 OUTWARD_PX = 8.0
-# Fits at most; each leaves out what the previous one could not explain. The second number is for the narrower band, the
-# third for a boundary that was fitted before in the same band. A wide band that leaves more than noise in the fit of
-# PATIENCE is given up.
+# Largest number of fits; each leaves out what the previous one could not explain. The second number is for the narrower
+# band, the third for a boundary that was fitted before in the same band. A wide band whose fit number PATIENCE still
+# leaves more than noise is given up.
 TURNS, PATIENCE = (4, 2, 1), 2
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Ended:
-    """The end of a fit: its pixels, solution and prior, the sectors that it explains, and how far its band reaches."""
+    """The end of a fit: its pixels, solution and prior, the explained sectors, and the reach of its band."""
 
     pixels: Pixels
     found: Solution
@@ -51,7 +51,7 @@ class _Ended:
 
     @property
     def model(self) -> EdgeModel:
-        """The model, with the displacements of its sectors where it is uneven."""
+        """The model, with the displacements of its sectors if it is uneven."""
         if self.prior.uneven_px == 0.0:
             return self.found.model
         displaced = np.zeros(SECTORS)
@@ -73,11 +73,11 @@ class PixelFit:
     Attributes:
         model: the fitted pixel model.
         ellipse: the ellipse that fits the uneven boundary best.
-        covariance: (5, 5) of its (cx, cy, a, b, angle).
-        reduced_chi2: against the image's noise.
+        covariance: (5, 5) of (cx, cy, a, b, angle).
+        reduced_chi2: reduced chi^2 relative to the image's noise.
         residual_dn: root mean square residual.
         pixels: number of pixels used.
-        sectors: (SECTORS,) which parts of the outline were used.
+        sectors: (SECTORS,) which sectors of the outline were used.
         uneven_px: standard deviation of the sectors' displacements.
         outward: how far the band of pixels reached beyond the boundary, in widths of the blur.
     """
@@ -102,9 +102,9 @@ def refine(
     scatter_px: float,
     before: PixelFit | None = None,
 ) -> PixelFit | str:
-    """Fit the pixel model, in a narrower band if the wide one shows texture; or give the reason why the fit failed.
+    """Fit the pixel model, in a narrower band if the wide one shows texture; or return the reason for failure.
 
-    The arguments are those of `_fitted`, and the root mean square distance of the edge points from their ellipse.
+    The arguments are those of `_fitted`, and `scatter_px`, the rms distance of the edge points from their ellipse.
     """
     if before is not None:
         start_at = (before.model, before.uneven_px, before.sectors)
@@ -130,7 +130,7 @@ def _fitted(
     outward: float,
     turns: int,
 ) -> _Ended | str:
-    """Fit the pixel model, or give the reason why the fit failed.
+    """Fit the pixel model, or return the reason for failure.
 
     The Fourier order of the outer level is the one with the least BIC, predicted by one linear step. Pixels and sectors
     that the model cannot explain (lids, lashes, reflections) are left out and the rest is fitted again. If the boundary
@@ -139,12 +139,12 @@ def _fitted(
     Args:
         part: the part of the image about the boundary.
         start: model from the edges.
-        sectors: (SECTORS,) parts of the outline with edge points.
-        masked: (h, w) its pixels that glints affect or the sensor clipped.
+        sectors: (SECTORS,) which sectors of the outline have edge points.
+        masked: (h, w) which pixels glints affect or the sensor clipped.
         noise_dn: standard deviation of a pixel's noise.
-        before: model, unevenness and sectors of an earlier fit of the same boundary to start from.
+        before: model, unevenness and sectors of an earlier fit of the same boundary, as a start.
         outward: how far the band of pixels reaches beyond the boundary, in widths of the blur.
-        turns: number of fits at most.
+        turns: largest number of fits.
     """
     model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before[0]
     prior = Prior.of(start, noise_dn, 0.0 if before is None else before[1])
@@ -185,12 +185,12 @@ def _fitted(
 
 
 def _rough(model: EdgeModel, uneven_px: float) -> bool:
-    """Return whether a boundary is as uneven as those of real pupils in textured irises are."""
+    """Return whether a boundary is as uneven as those of real pupils in textured irises."""
     return uneven_px > ROUGH * math.sqrt(float(model.ellipse.semi_axes_px.prod()))
 
 
 def _near_boundary(part: Part, model: EdgeModel, masked: Bools, reach_out: float) -> Band:
-    """Find the pixels near the boundary.
+    """Collect the pixels near the boundary.
 
     The band reaches 4 sigma + 1 px inside the boundary and `reach_out` sigma + 1 px outside it, but not beyond
     OUTWARD_PX.
@@ -211,7 +211,7 @@ def _band(
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Select the pixels (x, y, level) between two ellipses around `ellipse`, given by their semi-axes.
 
-    corner: first pixel of `linear` in the whole image.
+    `corner` is the first pixel of `linear` in the whole image.
     """
     cx, cy, _, _, angle = ellipse
     cos, sin, reach = math.cos(angle), math.sin(angle), outer[0] + 2.0

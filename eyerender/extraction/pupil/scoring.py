@@ -8,10 +8,10 @@ The covariance is multiplied by the exponential of a function of the same form, 
 centres of right ellipses, with equal weight on every kind of image. Texture, reflections and lids displace the boundary
 over longer stretches than the scatter of its points shows.
 
-`scripts/fit_confidence.py` made them from seeds below 10,000 and from 50,000 to 50,093: 314 rendered eyes of the row
-`webcam` of `hard_eyes.py`, 152 of `stress`, 154 of each other row in lids, 60 of each without, 400 mixed drawn images
-(noise 0.5 to 30 DN, blur 0.7 to 4 px, steps of 12 to 75 DN, lids over up to half the pupil, iris texture), 50 to 80 of
-each other condition, and 80 without an eye.
+`scripts/fit_confidence.py` fitted the weights to images of the seeds below 10,000 and from 50,000 to 50,093: 314
+rendered eyes of the row `webcam` of `hard_eyes.py`, 152 of `stress`, 154 of each other row in lids, 60 of each without,
+400 mixed drawn images (noise 0.5 to 30 DN, blur 0.7 to 4 px, steps of 12 to 75 DN, lids over up to half the pupil, iris
+texture), 50 to 80 of each other condition, and 80 without an eye.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ FEATURES = (
 
 
 def features(ellipse: Ellipse, goodness: Goodness) -> Floats:
-    """Compute features (22,) on which the confidence depends, in the order of FEATURES."""
+    """Compute the features (22,) for the confidence, in the order of FEATURES."""
     g = goodness
     b = float(ellipse.semi_axes_px[1])
     return np.array(
@@ -78,9 +78,9 @@ def features(ellipse: Ellipse, goodness: Goodness) -> Floats:
 
 
 def design(rows: Floats, low: Floats, high: Floats) -> Floats:
-    """Find the design matrix (n, 1 + 3 x 22): 1, every feature scaled to 0..1 within its limits, and its two excesses.
+    """Compute the design matrix (n, 1 + 3 x 22): 1, the features scaled to 0..1 within their limits, and excesses.
 
-    The excesses are those over 1/3 and over 2/3.
+    The excesses are those over 1/3 and 2/3.
     """
     width = high - low
     width[width == 0.0] = 1.0
@@ -108,7 +108,7 @@ def calibrated(logit: Floats, bend: Floats) -> Floats:
 
 
 def covariance_scale(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "refined"]) -> float:
-    """Compute the factor of the covariance: how much farther ellipses like this one lie from the truth than it says."""
+    """Compute the factor of the covariance: how much larger the errors of similar ellipses are than it states."""
     low, high, _, _, weights = _arrays(method)
     row = design(features(ellipse, goodness)[None], low, high)
     return math.exp(min(max(float((row @ weights)[0]), SCALES[0]), SCALES[1]))
@@ -118,7 +118,7 @@ def covariance_scale(ellipse: Ellipse, goodness: Goodness, method: Literal["fast
 class ScoredCandidate:
     """A candidate, how well its boundary explains the image, and the probability that it is the pupil.
 
-    Both are from the edges alone.
+    Both use the edges only.
     """
 
     candidate: PupilCandidate
@@ -126,7 +126,7 @@ class ScoredCandidate:
     confidence: float
 
     def enlarged(self, work: Prepared) -> ScoredCandidate:
-        """Return the same in the pixels of the whole image; the evidence is that of the reduced one."""
+        """Convert the candidate to pixels of the whole image; the evidence remains that of the reduced one."""
         scale, goodness = self.candidate.image.scale, self.goodness
         pixels = ("residual_px", "blur_px", "boundary_sd_px", "uneven_px")
         lengths = {name: scale * getattr(goodness, name) for name in pixels}
@@ -134,13 +134,13 @@ class ScoredCandidate:
 
 
 def score(candidate: PupilCandidate) -> ScoredCandidate:
-    """Score a candidate by its edges alone."""
+    """Score a candidate by its edges."""
     goodness = goodness_of(candidate, None)
     return ScoredCandidate(candidate, goodness, confidence(candidate.boundary.ellipse, goodness, FAST))
 
 
 def goodness_of(found: PupilCandidate, fit: PixelFit | None) -> Goodness:
-    """Say how well a boundary explains the image, from its edges or the pixel model."""
+    """Measure how well a boundary explains the image, from its edges or the pixel model."""
     boundary, image = found.boundary, found.image
     about = outline_of(found, boundary.ellipse if fit is None else fit.ellipse)
     if fit is None:
@@ -173,7 +173,7 @@ def goodness_of(found: PupilCandidate, fit: PixelFit | None) -> Goodness:
 
 
 def pupil_of(scored: ScoredCandidate, fit: PixelFit | None, settings: ExtractionSettings) -> PupilResult:
-    """Make the pupil of a boundary, from its edges or the pixel model; missing where it is too unlikely to be right."""
+    """Return the pupil with this boundary, from its edges or the pixel model; missing if it is probably wrong."""
     found = scored.candidate
     ellipse = found.boundary.ellipse if fit is None else fit.ellipse
     goodness = scored.goodness if fit is None else goodness_of(found, fit)

@@ -3,8 +3,8 @@
 A hypothesis is a dark blob with the boundary through the edges around it. Its steps are
 
 1. `find_candidates`: dark elliptical blobs
-2. `find_boundary`: glints inpainted, edges found, an ellipse fitted to them
-3. `score`: the calibrated confidence of the boundary from its edges alone
+2. `find_boundary`: glints inpainted, edges detected, an ellipse fitted to them
+3. `score`: calibrated confidence of the boundary, from its edges
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from .glare import around
 from .scoring import ScoredCandidate, score
 
 SURE = 0.9  # a hypothesis of this confidence ends the search
-LATE_CONFIDENCE = 0.5  # least confidence of a hypothesis of a later look
+LATE_CONFIDENCE = 0.5  # least confidence of a hypothesis of a later pass
 LARGE_PX = 14.0  # pupils from this semi-axis on are found at a quarter of the scale, in a quarter of the time
 SCALES = (1, 2, 4)  # pixels of the image per pixel of the image searched
 LEAST_SIDE = 32  # px of a reduced image
-FEW = 9  # thresholds of the first look; the edges decide, and the later looks use all
+FEW = 9  # thresholds of the first pass; the edges decide, and later passes use all
 USUAL_PX = 7.0  # smaller pupils are looked for at full resolution and last; lashes and shadows are as small
 # Between two frames a pupil moves by up to a few of its own sizes (a saccade of 500 deg/s covers 4 mm in 1/30 s). Its
 # size changes by less than a third.
@@ -46,15 +46,15 @@ FLAT = 0.8  # ratio of axes below which a blob may be a pupil that lids cut
 def find_pupil(
     prepared: Prepared, shape: Shape, polarity: Literal["auto", "dark", "bright"], prior: PupilResult | None
 ) -> ScoredCandidate | PupilResult:
-    """Find the most likely boundary of a dark or a bright pupil, or the reason why there is none.
+    """Return the most likely boundary of a dark or a bright pupil, or the reason why there is none.
 
-    If the middle of a dark pupil is bright, it may be an iris with a bright pupil in it.
+    If the middle of a dark pupil is bright, it may be an iris with a bright pupil.
 
     Args:
         prepared: the image.
         shape: accepted sizes and shapes.
         polarity: whether the pupil is darker or brighter than the iris; auto: the image decides.
-        prior: the pupil of the previous frame. It only decides where is looked first.
+        prior: the pupil of the previous frame, which only decides where the search starts.
     """
     before = None if prior is None else prior.ellipse
     if prior is not None and prior.bright and polarity == "auto":
@@ -73,17 +73,17 @@ def find_pupil(
 
 
 def _contains(outer: PupilCandidate, inner: PupilCandidate) -> bool:
-    """Return whether a boundary lies inside a larger one."""
+    """Return whether the second boundary lies inside the first, larger one."""
     large, small = outer.boundary.ellipse, inner.boundary.ellipse
     apart = float(np.hypot(*(large.centre_px - small.centre_px)))
     return small.area_px2 < large.area_px2 and apart < float(large.semi_axes_px[1])
 
 
 def _search(work: Prepared, shape: Shape, prior: Ellipse | None) -> ScoredCandidate | PupilResult:
-    """Find the most likely boundary in an image in which the pupil is dark.
+    """Return the most likely boundary in an image with a dark pupil.
 
-    The first one that is certain ends the search. Otherwise the likeliest one of the first look is taken, unless a
-    later look finds one of `LATE_CONFIDENCE` that is likelier.
+    The first certain one ends the search. Otherwise the likeliest one of the first pass is returned, unless a later
+    pass finds a likelier one of at least `LATE_CONFIDENCE`.
     """
     if prior is not None:
         for near in _near(work, shape, prior):
@@ -120,7 +120,7 @@ def _likeliest(work: Prepared, shape: Shape) -> ScoredCandidate | PupilResult:
 
 
 def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, PupilCandidate | str]]:
-    """Compute boundaries, or why a candidate has none, and whether they are of a later look.
+    """Yield boundaries, or why a candidate has none, and whether they come from a later pass.
 
     1. the best candidate at a quarter of the scale, then those of a less reduced image, and those inside each that has
        a dark core
@@ -129,7 +129,7 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, PupilCandid
     3. pupils that lids cut: circles as wide as flat blobs
     4. pupils smaller than USUAL_PX
 
-    A boundary is in the pixels of the scale at which it was found.
+    A boundary is in pixels of the scale at which it was found.
     """
     whole: list[Candidate] = []
     for image, limits in _pyramid(work, shape):
@@ -146,7 +146,7 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, PupilCandid
 def _bounded(
     work: Prepared, candidates: Sequence[Candidate], shape: Shape, tried: list[Candidate]
 ) -> Iterator[PupilCandidate | str]:
-    """Compute boundaries about those candidates that were not tried before, and inside those with a darker core."""
+    """Yield boundaries around candidates that were not tried before, and inside those with a darker core."""
     for candidate in candidates:
         if any(_same(candidate.ellipse, one.ellipse) for one in tried):
             continue
@@ -159,7 +159,7 @@ def _bounded(
 
 
 def _pyramid(work: Prepared, shape: Shape) -> Iterator[tuple[Prepared, Shape]]:
-    """Return the image at full, half and quarter scale, and the sizes to look for there."""
+    """Return the image at full, half and quarter scale, and the sizes to search for there."""
     for scale in SCALES:
         if min(work.linear.shape) >= LEAST_SIDE * scale:
             least = max(shape.least_px / scale, LEAST_PX)
@@ -167,7 +167,7 @@ def _pyramid(work: Prepared, shape: Shape) -> Iterator[tuple[Prepared, Shape]]:
 
 
 def _at_full_scale(work: Prepared, scored: ScoredCandidate, shape: Shape) -> ScoredCandidate:
-    """A boundary of a reduced image in the pixels of the whole image: through the edges there, if it is as likely."""
+    """Refit a boundary of a reduced image to the edges of the whole image, if the result is as likely."""
     if scored.candidate.image is work:
         return scored
     coarse = scored.enlarged(work)
@@ -190,7 +190,7 @@ def _large(work: Prepared, shape: Shape) -> list[Candidate]:
 
 
 def _near(work: Prepared, shape: Shape, prior: Ellipse) -> Iterator[PupilCandidate | str]:
-    """Compute boundaries where the pupil was before, then those of dark blobs of its size around there."""
+    """Yield boundaries around the previous pupil, then those of dark blobs of its size in the neighbourhood."""
     candidate = candidate_at(work, prior)
     if candidate is not None:
         yield find_boundary(work, candidate, shape)
@@ -205,7 +205,7 @@ def _near(work: Prepared, shape: Shape, prior: Ellipse) -> Iterator[PupilCandida
 
 
 def _same(first: Ellipse, second: Ellipse) -> bool:
-    """Return whether two ellipses overlap by SAME; most pairs differ too much in size or place for a closer look."""
+    """Return whether two ellipses overlap by SAME; a quick test of size and position excludes most pairs."""
     ratio = first.area_px2 / second.area_px2
     apart = float(np.abs(first.centre_px - second.centre_px).max())
     near = apart < (1.0 - SAME) * math.pi * float(first.semi_axes_px[0])
@@ -213,16 +213,16 @@ def _same(first: Ellipse, second: Ellipse) -> bool:
 
 
 def _best(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Compute candidates that are not much worse than the best of them."""
+    """Return the candidates that are not much worse than the best one."""
     least = LIKELY * max((one.score for one in candidates), default=0.0)
     return [one for one in candidates if one.score >= least]
 
 
 def _rounder(candidates: Sequence[Candidate], shape: Shape) -> Iterator[Candidate]:
-    """Compute circles as wide as each flat blob, about its middle and to either side of it.
+    """Return circles as wide as each flat blob, about its middle and to either side of it.
 
     Half a disc of radius r has the second moments of an ellipse of semi-axes r and 0.53 r, 0.42 r from the middle of
-    the disc: 0.9 of the difference. A disc that two lids cut alike has its middle in the middle of the blob.
+    the disc: 0.9 of the difference. If two lids cut a disc equally, its middle is that of the blob.
     """
     for candidate in candidates:
         a, b = candidate.ellipse.semi_axes_px.tolist()

@@ -19,13 +19,13 @@ _PACKAGE = FOLDER.parents[1]
 
 
 def catalogue_names() -> tuple[str, ...]:
-    """List names of the catalogue, sorted, including those from other packages."""
+    """Return the names of the catalogue, sorted, including those from other packages."""
     return tuple(sorted(catalogue_files()))
 
 
 @cache
 def catalogue_files() -> Mapping[str, Path]:
-    """Return the eye file of each name."""
+    """Return the path of the eye file of each name."""
     return {path.stem: path for path in (*_PACKAGE.glob("*/eyes/*.yaml"), *FOLDER.glob("*.yaml"))}
 
 
@@ -33,7 +33,7 @@ def load_eye(name_or_path: str | Path) -> EyeSpec:
     """Load an eye of the catalogue by its name, or an eye file.
 
     Raises:
-        InputError: there is neither.
+        InputError: there is no such name and no such file.
     """
     if isinstance(name_or_path, str) and name_or_path in catalogue_names():
         return _shipped(name_or_path)

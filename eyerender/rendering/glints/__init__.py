@@ -1,1 +1,1 @@
-"""Corneal reflections and Purkinje images: traced, cut at edges, splatted, and occluded."""
+"""Corneal reflections and Purkinje images: traced, cut at edges, occluded, and splatted into the image."""

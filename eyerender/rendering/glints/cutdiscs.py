@@ -1,4 +1,4 @@
-"""Quadrature over lamps: whole discs, and discs of which an edge of any shape hides a part.
+"""Quadrature over lamps: whole discs, and discs partly hidden by an edge of any shape.
 
 Points are those of the unit disc, which `disc_points` spreads over a lamp's disc or ring with equal areas. A disc is
 cut into circles. Where an edge crosses a circle, bisection finds the angles at which the visibility changes, and
@@ -29,13 +29,13 @@ _RADIUS_STEPS, _ANGLE_STEPS = 10, 12  # bisections: to 1e-4 of the radius, 3e-5 
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """A quadrature over the unit disc: points (k, 2) and weights (k,); the weights of the whole disc sum to 1."""
+    """A quadrature over the unit disc: points (k, 2) and weights (k,), which sum to 1 for the whole disc."""
 
     point: Floats
     weight: Floats
 
     def join(self, other: Nodes) -> Nodes:
-        """Compute points of both."""
+        """Join the points of both quadratures."""
         return Nodes(np.concatenate([self.point, other.point]), np.concatenate([self.weight, other.weight]))
 
 
@@ -44,7 +44,7 @@ POINT = Nodes(np.zeros((1, 2)), np.ones(1))
 
 @lru_cache(maxsize=64)
 def quadrature(radial: int, angular: int) -> Nodes:
-    """Compute Gauss-Legendre nodes in r^2 and equal angles."""
+    """Compute nodes over the disc: Gauss-Legendre in r^2, equal steps in angle."""
     x, weight = np.polynomial.legendre.leggauss(radial)
     angle = 2 * np.pi * (np.arange(angular) + 0.5) / angular
     r = np.sqrt(0.5 * (x + 1))
@@ -53,17 +53,17 @@ def quadrature(radial: int, angular: int) -> Nodes:
 
 @lru_cache(maxsize=4)
 def rim(count: int) -> Nodes:
-    """Compute points of the unit circle, which have no weight: they show whether an edge cuts the disc."""
+    """Return points of the unit circle, without weight, which show whether an edge cuts the disc."""
     return Nodes(_polar(np.ones(count), 2 * np.pi * np.arange(count) / count), np.zeros(count))
 
 
 def cut_nodes(visible: Visible, radial: int, angular: int) -> Nodes:
-    """Compute nodes of the visible part of a disc.
+    """Compute a quadrature over the visible part of a disc.
 
     Args:
-        visible: whether points (n, 2) of the unit disc are visible.
-        radial: number of circles that the whole disc needs.
-        angular: number of points that a whole circle needs.
+        visible: returns whether points (n, 2) of the unit disc are visible.
+        radial: number of circles for the whole disc.
+        angular: number of points for a whole circle.
     """
     s, gauss = np.polynomial.legendre.leggauss(max(8, radial))
     s, gauss = 0.5 * (s + 1), 0.5 * gauss
@@ -85,7 +85,7 @@ def cut_nodes(visible: Visible, radial: int, angular: int) -> Nodes:
 
 
 def _edges(visible: Visible) -> Floats:
-    """Compute radii from 0 to 1 between which all circles are alike: hidden, partly visible, or visible."""
+    """Return radii from 0 to 1 between which all circles are alike: hidden, partly visible, or visible."""
 
     def kind(r: Floats) -> Floats:
         seen = _seen(visible, r, _ANGLES)
@@ -104,7 +104,7 @@ def _edges(visible: Visible) -> Floats:
 
 
 def _arcs(visible: Visible, r: Floats) -> tuple[Floats, Floats, Floats]:
-    """Visible arcs of circles of radii r (n,): index of the circle, and the angles at which the arc begins and ends."""
+    """Return visible arcs of circles of radii r (n,): index of the circle, and the angles of the arc's ends."""
     seen = _seen(visible, r, _ANGLES)
     step = 2 * np.pi / _ANGLES
     whole = np.flatnonzero(seen.all(axis=1))
@@ -132,7 +132,7 @@ def _arcs(visible: Visible, r: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _seen(visible: Visible, r: Floats, angles: int) -> Bools:
-    """Return whether evenly spaced points of circles (n,) are visible, (n, angles)."""
+    """Return which evenly spaced points of circles (n,) are visible, (n, angles)."""
     angle = 2 * np.pi * np.arange(angles) / angles
     return visible(_polar(*np.broadcast_arrays(r[:, None], angle))).reshape(len(r), angles)
 

@@ -1,4 +1,4 @@
-"""Occlusion of glints by an eye region, in words and numbers for the labels, and the lid margins."""
+"""Occlusion of glints by an eye region, for the labels, and landmarks of the lid margins."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _MARKS = 17
 
 
 def glint_reason(there: Bools, open_: Bools, blockers: Sequence[str | None]) -> str:
-    """State whether a lamp's mirror image is visible, partly or fully occluded (and mostly by what), or off the cornea.
+    """Describe a lamp's mirror image: visible, partly or fully occluded (and mostly by what), or off the cornea.
 
     Args:
         there: (k,) whether the cornea mirrors the points of the lamp to the camera.
-        open_: (k,) whether nothing of the scene is in the way.
-        blockers: (k,) names of the parts in the way, None where there is none.
+        open_: (k,) whether nothing of the scene blocks the point.
+        blockers: (k,) name of the blocking part, None if there is none.
     """
     if not np.any(there):
         return "off the cornea"
@@ -38,8 +38,8 @@ def lid_margins_px(
 ) -> dict[str, list[list[float]]] | None:
     """Compute landmarks along the inner edges of both lid margins, in full-sensor pixels.
 
-    They run from canthus to canthus, from temple to nose. None for a mesh whose margins are unknown, and where a
-    landmark lies behind the camera.
+    They run from canthus to canthus, from temple to nose. None if the mesh's margins are unknown, or a landmark lies
+    behind the camera.
     """
     if len(region.upper_margin) == 0:
         return None

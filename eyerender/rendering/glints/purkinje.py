@@ -1,8 +1,8 @@
 """Purkinje images 2 to 4: lamps mirrored by the back of the cornea, the lens' front and its back, with their energy.
 
-The solver of `optics` finds the path from the camera's nodal point through the surfaces, back at the mirror and out to
-the lamp. This module computes its energy. With T the product of 1 - F at every refraction and F at the mirror, and J
-the ray tube's cross section at the lamp per solid angle at the camera (equal to the reverse, both being in air):
+The solver of `optics` finds the path from the camera's nodal point through the surfaces, to the mirror and out to the
+lamp. This module computes its energy. With T the product of 1 - F at every refraction and F at the mirror, and J the
+ray tube's cross section at the lamp per solid angle at the camera (equal to the reverse, both being in air):
 
     e = I(d) T f_x f_y D / (J cos^3(theta))        as for the first image (`glints`)
 
@@ -33,7 +33,7 @@ from .tracing import GlintScene, Image, disc_points
 def purkinje_images(
     scene: GlintScene, eye: EyeModel, order: int, lights: Sequence[Lamp], nodes: Sequence[Nodes]
 ) -> list[Image]:
-    """Compute the images of the lamps through the given points of their discs."""
+    """Compute the mirror images of order `order` of the lamps, through given points of their discs."""
     camera, M, t = scene.camera, scene.M, scene.t
     images = []
     surfaces, indices, rims, passing, gradient = stack(eye, order)
@@ -72,7 +72,7 @@ def purkinje_images(
 
 
 def transmittance(path: Sequence[Crossing], traced: Traced, behind: float, film: float) -> Floats:
-    """Compute the transmittance of paths: F at the mirror, times 1 - F at every other crossing that the rays meet.
+    """Compute the transmittance of paths: F at the mirror, times 1 - F at every other surface on the path.
 
     `behind` is the index behind the mirror, `film` that of the film on the first surface, which is crossed twice.
     """
@@ -94,7 +94,7 @@ def transmittance(path: Sequence[Crossing], traced: Traced, behind: float, film:
 
 
 def _through_pupil(eye: EyeModel, points: Floats, corneal: int) -> Bools:
-    """Return whether rays cross the plane of the stop inside the pupil, on the way in and out."""
+    """Return whether rays cross the plane of the stop inside the pupil, both inwards and outwards."""
     n, c = eye.stop.normal, eye.stop.centre_mm
     inside = np.ones(points.shape[1], dtype=bool)
     for a, b in ((points[corneal], points[corneal + 1]), (points[-corneal - 1], points[-corneal - 2])):
@@ -106,10 +106,10 @@ def _through_pupil(eye: EyeModel, points: Floats, corneal: int) -> Bools:
 def stack(
     eye: EyeModel, order: int
 ) -> tuple[tuple[Surface, ...], tuple[float, ...], tuple[float, ...], tuple[bool, ...], GradientMedium | None]:
-    """Compute surfaces down to the mirror, with what a ray needs to pass them.
+    """Return the surfaces down to the mirror, with everything needed to trace a ray through them.
 
     Returns:
-        The surfaces, the indices behind them, their rims, whether a ray may miss them, and the gradient before the
+        The surfaces, the indices behind them, their rims, whether a ray may miss them, and the gradient in front of the
         mirror.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The lamps' mirror images in a picture: what is seen of them and why, and how they are splatted into it."""
+"""Mirror images of the lamps in an image: their visible parts, the reasons, and how they are splatted."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FRAMED = "occluded by frame"
 
 @dataclass(frozen=True, slots=True)
 class Shine:
-    """What a mirror image adds to a picture: its spots, a share of the exposure, and its circle of confusion (px)."""
+    """Contribution of a mirror image to an image: spots, share of the exposure, circle of confusion (px)."""
 
     spots: Spots
     share: float
@@ -34,7 +34,7 @@ class Shine:
 
 
 def add_shines(shines: Sequence[Shine], picture: Singles, job: RenderJob) -> None:
-    """Add mirror images, blurred by lens and pixels, to the picture (height, width) of a job's window."""
+    """Add mirror images, blurred by lens and pixels, to the image (height, width) of a job's window."""
     lit = [shine for shine in shines if len(shine.spots.energy)]
     if not lit:
         return
@@ -48,14 +48,14 @@ def add_shines(shines: Sequence[Shine], picture: Singles, job: RenderJob) -> Non
 
 @dataclass(frozen=True, slots=True)
 class Mirrored:
-    """The glints, (order, table) of the requested further images, and why each glint is visible or not."""
+    """Tables of the glints and of the requested mirror images (order, table), and why each glint is visible or not."""
 
     glints: GlintTable
     others: tuple[tuple[int, GlintTable], ...]
     reasons: tuple[str, ...]
 
     def behind(self, covered: Bools, window: Window) -> Mirrored:
-        """Return the same where what frames the camera's view covers pixels (height, width) of a window."""
+        """Hide mirror images where a frame around the view covers pixels (height, width) of a window."""
         table, (x0, y0, width, height) = self.glints, window
         xy = np.nan_to_num(table.xy_px, nan=-1e6)
         column, row = (np.rint(xy - (x0, y0)).astype(int)).T
@@ -72,15 +72,15 @@ class Mirrored:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MirrorImages:
-    """The mirror images of a job's lamps and of the sun, before it is known what hides them.
+    """Mirror images of a job's lamps and of the sun, before occlusion.
 
     Attributes:
         job: the job.
         lamps: its lamps, and the sun if there is one.
         scene: the mirrors.
-        first: the images in the front of the cornea.
-        further: the requested images of higher orders.
-        nearness: (n, 2) inverse depths (1/mm) of the first images; NaN where they do not matter.
+        first: images in the front of the cornea.
+        further: requested images of higher orders.
+        nearness: (n, 2) inverse depths (1/mm) of the first images; NaN where not needed.
     """
 
     job: RenderJob
@@ -92,11 +92,11 @@ class MirrorImages:
 
     @classmethod
     def of(cls, job: RenderJob, mesh: SurfaceMesh | None) -> MirrorImages:
-        """Find the images, with NumPy alone unless a mesh replaces the cornea's front."""
+        """Compute the images, on the host unless a mesh replaces the cornea's front."""
         eye = job.eye
         scene = GlintScene.of(eye, job.film_index, job.M, job.t, job.camera, mesh)
         lamps = (*job.lights, *sun_lamps(job.ambient, job.anchor_mm))
-        # Further images are small, because their mirrors are strongly curved, or concave with a short focus.
+        # These images are small, because their mirrors are strongly curved, or concave with a short focus.
         nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in lamps]
         further = {order: purkinje_images(scene, eye, order, lamps, nodes) for order in sorted({*job.purkinje} - {1})}
         near = 1 in job.purkinje and job.lens.focus_mm is not None
@@ -105,9 +105,9 @@ class MirrorImages:
         return cls(job=job, lamps=lamps, scene=scene, first=first, further=further, nearness=nearness)
 
     def seen(self, place: Background | RegionScene, blur: Blur, share: float = 1.0) -> tuple[Mirrored, list[Shine]]:
-        """Find the visible parts of the images in posed surroundings, and their contribution to the blurred picture.
+        """Return the visible parts of the images in posed surroundings, and their contribution to the blurred image.
 
-        The tables and reasons are those of the lamps alone. `share` is that of the exposure for which the job stands.
+        Tables and reasons are for lamps only, without the sun. `share` is the job's share of the exposure.
         """
         job, anchor, count = self.job, self.job.anchor_mm, len(self.job.lights)
 
@@ -119,7 +119,7 @@ class MirrorImages:
         further = {order: self.scene.seen(images, clear) for order, images in self.further.items()}
         shines = []
         for order in sorted({*job.purkinje}):
-            # The further images are about as far as the iris.
+            # The images of higher orders are about as far away as the iris.
             sizes = [blur.of_image(near) for near in self.nearness] if order == 1 else [blur.subject_px] * len(glints)
             shines += [
                 Shine(glint.spots, share, size) for glint, size in zip(further.get(order, glints), sizes, strict=True)
@@ -129,7 +129,7 @@ class MirrorImages:
 
 
 def _reason(job: RenderJob, place: Background | RegionScene, glint: Glint) -> str:
-    """State whether or why not a lamp's glint is visible."""
+    """Describe whether, or why not, a lamp's glint is visible."""
     image = glint.image
     open_ = glint.clear if place.obstructed else np.ones(len(glint.clear), dtype=bool)
     names: list[str | None] = [None] * len(open_)

@@ -6,10 +6,10 @@ The mirror point of each point of an LED comes from `optics.solve`, the ray tube
     E = I(d) F / J                                          irradiance at the nodal point, for each point of the LED
     e = E f_x f_y / cos^3(theta)                            energy of the spot, in radiance times pixels
 
-theta is the angle to the optical axis. Lens distortion moves a spot and leaves its energy. An LED of finite size
+theta is the angle to the optical axis. Lens distortion moves a spot without changing its energy. An LED of finite size
 is integrated with Gauss-Legendre nodes in r^2 and equal angles, each with its own position and energy. The image of a
-near LED, which spans several pixels, is thus an energy-weighted disc. Where the limbus, the globe or something of the
-scene hides a part of an LED, the nodes are those of the visible part (`cut`).
+near LED, which spans several pixels, is thus an energy-weighted disc. If the limbus, the globe or something else hides
+a part of an LED, the nodes cover only the visible part (`cutdiscs`).
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from ..records.job import ring_radius_mm
 from .cutdiscs import POINT, Nodes, cut_nodes, quadrature, rim
 
 _PARALLAX_MM = 0.05
-_MAP_ERROR = 1e-3  # of the extent of a lamp's image
+_MAP_ERROR = 1e-3  # share of the extent of a lamp's image
 
 Visibility = Callable[[Floats, Floats], Bools]
-_ON_RIM = 16  # points: an edge that passes between them hides less than 0.2 % of a disc
+_ON_RIM = 16  # points: an edge that falls between them hides less than 0.2 % of a disc
 _LEAST = 2, 10  # circles, and points on each, of a wide lamp
 _ROUGH = quadrature(*_LEAST).join(rim(_ON_RIM))
 
@@ -54,7 +54,7 @@ class GlintTable(ArrayValue):
     """Visible glints, one row per lamp.
 
     Attributes:
-        xy_px: (n, 2) energy-weighted place in full-sensor pixels.
+        xy_px: (n, 2) energy-weighted position in full-sensor pixels.
         energy: (n,) radiance times pixels (mW/mm^2/sr px) that reaches the camera.
         share: (n,) share of the lamp's image that is visible.
         visible: (n,) whether any of it is.
@@ -68,7 +68,7 @@ class GlintTable(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots(ArrayValue):
-    """Points of a lamp's image: places (k, 2) px and energies (k,)."""
+    """Points of a lamp's image: positions (k, 2) px and energies (k,)."""
 
     xy_px: Floats
     energy: Floats
@@ -83,9 +83,9 @@ class Image:
         entry_mm: (k, 3) where their light enters the eye.
         exit_mm: (k, 3) where it leaves the eye.
         xy_px: (k, 2) pixels.
-        energy: (k,) energies, also where a larger cornea would mirror the point; 0 where no ray is found.
+        energy: (k,) energies, also of points that only a larger cornea would mirror; 0 where no ray is found.
         there: (k,) whether the eye mirrors the point to the camera.
-        found: (k,) whether it does, or a larger cornea would.
+        found: (k,) whether the eye, or a larger cornea, mirrors the point to the camera.
     """
 
     source_mm: Floats
@@ -98,7 +98,7 @@ class Image:
 
     @property
     def spots(self) -> Spots:
-        """Points that the eye mirrors to the camera."""
+        """Return the points that the eye mirrors to the camera."""
         return Spots(frozen(self.xy_px[self.there]), frozen(self.energy[self.there]))
 
     def join(self, other: Image) -> Image:
@@ -111,16 +111,16 @@ class Image:
         return [Image(**{name: part[k] for name, part in columns.items()}) for k in range(len(counts))]
 
     def last(self, count: int) -> Image:
-        """Return the last points."""
+        """Return the last points of the image."""
         return Image(**{f.name: getattr(self, f.name)[-count:] for f in fields(self)})
 
 
 @dataclass(frozen=True, slots=True)
 class Glint:
-    """A lamp's mirror image, and what the camera sees of it.
+    """A lamp's mirror image, and its part visible to the camera.
 
     Attributes:
-        image: through points of the whole lamp and of its rim, whose energies are 0.
+        image: image of points of the whole lamp, and of its rim with energy 0.
         clear: (k,) whether nothing of the scene hides these points.
         spots: the points that make up the visible part.
     """
@@ -132,7 +132,7 @@ class Glint:
 
 @dataclass(frozen=True, slots=True)
 class Images:
-    """The lamps' images before it is known what hides them, and the circles and points that wide lamps need."""
+    """Images of the lamps before occlusion, with the numbers of circles and points that wide lamps need."""
 
     parts: list[Image]
     counts: dict[int, tuple[int, int]]
@@ -142,8 +142,8 @@ class Images:
 class GlintScene:
     """Input of the glints: front cornea with its film and rim, pose (x_world = M x + t), and camera.
 
-    A function `clear` says whether the way is free. It takes points (n, 3) and (n, 3) of the world, and returns
-    whether nothing of the scene stands between them.
+    Methods take a function `clear`, which receives points (n, 3) and (n, 3) in the world and returns whether nothing of
+    the scene stands between them.
     """
 
     surface: Surface
@@ -161,7 +161,7 @@ class GlintScene:
     def of(
         cls, eye: EyeModel, film_index: float, M: Floats, t: Floats, camera: PinholeCamera, mesh: SurfaceMesh | None
     ) -> GlintScene:
-        """Return the mirrors of an eye; a mesh replaces the cornea's front."""
+        """Create the mirrors of an eye; a mesh replaces the cornea's front."""
         return cls(
             surface=eye.front[0], index=float(eye.front_indices[0]), film_index=film_index,
             limbus_radius_mm=float(eye.limbus_radius_mm), sclera_centre_mm=np.asarray(eye.sclera.centre_mm),
@@ -181,7 +181,7 @@ class GlintScene:
         return Images(images, counts)
 
     def glints(self, lights: Sequence[Lamp], images: Images, clear: Visibility) -> list[Glint]:
-        """Compute glints of lamps from their images, as finely as their edges require."""
+        """Compute the glints of lamps from their images, as finely as their edges require."""
         glints = self.seen(images.parts, clear)
         for k, count in images.counts.items():
             visible = glints[k].clear & glints[k].image.there
@@ -204,7 +204,7 @@ class GlintScene:
         return np.stack([(xy[1, k, :, k] - xy[0, k, :, k]) / (2 * _PARALLAX_MM) for k in (0, 1)], axis=1)
 
     def seen(self, images: Sequence[Image], clear: Visibility) -> list[Glint]:
-        """Compute glints of images, made of their points that the camera sees."""
+        """Select the points of images that the camera sees, as glints."""
         out = []
         ways = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm"))
         free = _split(self._clear(clear, *ways), [len(i.energy) for i in images])
@@ -214,7 +214,7 @@ class GlintScene:
         return out
 
     def _cut(self, lamp: Lamp, image: Image, counts: tuple[int, int], clear: Visibility) -> Spots:
-        """Compute spots of the visible part of a lamp, whose whole `image` is known at some points."""
+        """Compute spots of the visible part of a lamp whose whole `image` is known at some points."""
         mirror = self._mirror_map(lamp, image)
 
         def visible(points: Floats) -> Bools:
@@ -234,9 +234,9 @@ class GlintScene:
         return cut.spots
 
     def _mirror_map(self, lamp: Lamp, image: Image) -> Callable[[Floats], Floats] | None:
-        """Polynomial from points of the unit disc to mirror points (eye frame), or None where it is not accurate.
+        """Fit a polynomial from points of the unit disc to mirror points (eye frame); None if it is not accurate.
 
-        It only decides which points are visible; their places and energies are exact.
+        The polynomial only decides which points are visible; their positions and energies are exact.
         """
         if float(ring_radius_mm(lamp)) > 0 or not np.all(image.found):
             return None
@@ -255,7 +255,7 @@ class GlintScene:
         return np.asarray(self.M.T @ (self.camera.nodal_point_mm - self.t))
 
     def _clear(self, clear: Visibility, sources: Floats, entries: Floats, exits: Floats) -> Bools:
-        """Return whether nothing of the scene stands between points of lamps and of the eye, and the camera, (k,)."""
+        """Return whether the scene leaves the ways lamp to eye and eye to camera free, (k,)."""
         node = np.broadcast_to(self.camera.nodal_point_mm, exits.shape)
         both = clear(np.concatenate([sources, node]), np.concatenate([entries, exits]))
         return np.asarray(both[: len(sources)] & both[len(sources) :])
@@ -290,13 +290,13 @@ class GlintScene:
         return whole.parts(emitters.counts)
 
     def _reflect(self, sources: Floats, viewpoints: Floats) -> _Reflections:
-        """Find the points that mirror sources (k, 3) to viewpoints (k, 3); eye frame."""
+        """Solve for the points that mirror sources (k, 3) to viewpoints (k, 3); eye frame."""
         lamp, node = components(sources), components(viewpoints)
         rays = mirrored_rays(self.surface, lamp, node, rim_mm=self.limbus_radius_mm)
         # Where a larger cornea would mirror a point, the solver finds the ray too.
         found = np.asarray((rays.status == Status.OK) | (rays.status == Status.OUTSIDE_LIMBUS))
         found &= rays.residual_mm < RESIDUAL_LIMIT_MM
-        # The solver's ray runs from the camera to the lamp, the light in the other direction.
+        # The solver's ray runs from the camera to the lamp, the light in the opposite direction.
         y, d, w = (
             np.where(found[:, None], a, (1.0, 0.0, 0.0)) for a in (join(rays.exit), -join(rays.end), -join(rays.way))
         )
@@ -326,7 +326,7 @@ class GlintScene:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Reflections(MirrorPoints):
-    """Points that mirror sources to viewpoints; they are found on the cornea, or on a larger one.
+    """Points that mirror sources to viewpoints, on the cornea or on its continuation.
 
     Attributes:
         there: (n,) whether they are on the cornea.
@@ -340,13 +340,13 @@ class _Emitters:
     """Points of lamps.
 
     Attributes:
-        points: (k, 3) in the world, those of each lamp side by side.
-        weights: (k,) shares of their lamps.
+        points: (k, 3) mm in the world, grouped by lamp.
+        weights: (k,) weights within their lamps.
         which: (k,) numbers of the lamps.
         counts: number of points of each lamp.
-        axes: (n, 3) of the lamps.
-        strength: (n,) mW/sr along the axes.
-        exponent: (n,) of the lobes.
+        axes: (n, 3) axes of the lamps.
+        strength: (n,) radiant intensities along the axes, mW/sr.
+        exponent: (n,) exponents of the lobes.
     """
 
     points: Floats
@@ -359,7 +359,7 @@ class _Emitters:
 
     @classmethod
     def of(cls, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> _Emitters:
-        """Take the given points of the discs of lamps."""
+        """Compute the given points of the discs of lamps."""
         counts = [len(n.weight) for n in nodes]
         return cls(
             points=np.concatenate([disc_points(lamp, n.point) for lamp, n in zip(lights, nodes, strict=True)]),
@@ -372,14 +372,14 @@ class _Emitters:
         )
 
 
-@remembered  # lamps are the same from frame to frame
+@remembered  # lamps do not change between frames
 def _roughly(*lights: Lamp) -> _Emitters:
-    """Make few points of lamps and points of their rims."""
+    """Return a coarse quadrature of lamps, with points of their rims."""
     return _Emitters.of(lights, [_ROUGH if lamp.radius_mm > 0 else POINT for lamp in lights])
 
 
 def glint_table(glints: Sequence[Glint]) -> GlintTable:
-    """Compute places, energies and visible shares of the glints of all lamps."""
+    """Compute positions, energies and visible shares of the glints of all lamps."""
     place, share = [], []
     for glint in glints:
         xy, energy, whole = glint.spots.xy_px, glint.spots.energy, glint.image.energy.sum()
@@ -399,7 +399,7 @@ def _split(array: NDArray[Any], counts: Sequence[int]) -> list[NDArray[Any]]:
 
 
 def _node_counts(xy: Floats, sigma_px: float) -> tuple[int, int]:
-    """List numbers of circles and of points on each that a lamp needs whose rim is seen at pixels (k, 2)."""
+    """Compute the numbers of circles and of points on each for a lamp whose rim is imaged at pixels (k, 2)."""
     # The integrand, a Gaussian over the lamp's image, is smooth on the scale of sigma (and of the pixel).
     extent = float(np.max(np.hypot(*(xy - xy.mean(axis=0)).T))) / math.sqrt(2) if len(xy) else 1.0
     radial = min(max(math.ceil(1.5 + 1.5 * extent / math.hypot(sigma_px, 0.29)), 2), 64)
@@ -407,7 +407,7 @@ def _node_counts(xy: Floats, sigma_px: float) -> tuple[int, int]:
 
 
 def disc_basis(light: Lamp) -> tuple[Floats, Floats]:
-    """Make two unit vectors (3,) across a lamp's axis."""
+    """Return two unit vectors (3,) across a lamp's axis."""
     return _across(*light.axis.tolist())
 
 

@@ -1,1 +1,1 @@
-"""What rays meet: the exact surfaces of the eye, meshes of them, menisci, and the region."""
+"""Ray intersections: exact surfaces of the eye, meshes of them, menisci, and the region."""

@@ -1,8 +1,8 @@
-"""The eye as a shape: hits of rays on its exact surfaces, and the way behind the cornea to the plane of the iris.
+"""The eye as a shape: ray hits on its exact surfaces, and refraction behind the cornea to the plane of the iris.
 
-The methods have the names and tasks of those of Mitsuba's shapes. So a shape that is written in Python, where Mitsuba
-allows one, can call them and take its place in the scene among the meshes. Until then `primary` compares its hits with
-those of the scene, and `directlight` its shadows.
+The methods have the names and roles of those of Mitsuba's shapes, so a custom shape could call them once Mitsuba allows
+shapes written in Python. Until then `primary` combines these hits with those of the scene, and `directlight` the
+shadows.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _FAR = float(np.finfo(np.float32).max)
 
 @dataclass(kw_only=True)
 class EyeHit:
-    """Preliminary hit of a ray on the eye; what lies behind the surface is not computed yet.
+    """Preliminary hit of a ray on the eye, without what lies behind the surface.
 
     Attributes:
-        t: distance, without bound where the ray misses.
+        t: distance, infinite where the ray misses.
         cornea: whether the ray enters through the clear part of the cornea.
         sclera: whether it meets the sclera.
-        to_cornea: distance to the cornea from the start next to the eye.
-        to_sclera: distance to the sclera from there.
+        to_cornea: distance to the cornea from the start near the eye.
+        to_sclera: distance to the sclera from the same start.
         facing: unit normal of the cornea, in its own frame.
     """
 
@@ -50,7 +50,7 @@ class EyeShape:
     frame: Frame
 
     def ray_intersect_preliminary(self, o: mi.Vector3f, d: mi.Vector3f) -> EyeHit:
-        """Intersect rays (scene's frame) with the eye, as if it stood alone."""
+        """Intersect rays (scene's frame) with the eye, ignoring all other surfaces."""
         frame = self.frame
         t0, oe, de = self._start(o, d)
         front = frame.surfaces[0]
@@ -60,7 +60,7 @@ class EyeShape:
         on_cornea &= (_from_axis(yl) < frame.limbus.radius) & (yl.x > frame.limbus.floor)
         ts, on_sclera = intersect_sphere(oe - frame.sclera.centre, de, frame.sclera.radius)
         # The sphere's front is behind the cornea, so a ray that meets the sphere first has met no clear cornea. This
-        # avoids cracks, even where the rim of a tilted or toric cornea is no circle of the sphere.
+        # avoids cracks even where the rim of a tilted or toric cornea is not a circle of the sphere.
         on_cornea &= ~on_sclera | (tc < ts)
         on_sclera &= ~on_cornea
         t = t0 + dr.select(on_cornea, tc, ts)
@@ -70,7 +70,7 @@ class EyeShape:
         return EyeHit(t=t, cornea=on_cornea, sclera=on_sclera, to_cornea=tc, to_sclera=ts, facing=facing)
 
     def compute_surface_interaction(self, o: mi.Vector3f, d: mi.Vector3f, hit: EyeHit) -> SurfaceInteraction:
-        """Compute what rays (scene's frame) meet on the eye and behind its cornea."""
+        """Complete hits of rays (scene's frame): the surface of the eye and what lies behind its cornea."""
         frame, front = self.frame, self.frame.surfaces[0]
         _, oe, de = self._start(o, d)
         dl = front.vector_in(de)
@@ -84,13 +84,13 @@ class EyeShape:
         return si
 
     def ray_intersect(self, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
-        """Compute what rays (scene's frame) meet of the eye, as if it stood alone."""
+        """Intersect rays (scene's frame) with the eye and complete the hits, ignoring all other surfaces."""
         return self.compute_surface_interaction(o, d, self.ray_intersect_preliminary(o, d))
 
     def ray_test(self, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool) -> mi.Bool:
         """Return whether the eye blocks rays from points x along d (eye frame) within a distance.
 
-        `sphere` and `cornea` mark the rays that the globe's sphere and the cornea's bulge can block.
+        `sphere` and `cornea` mark the rays that the globe's sphere and the cornea can block.
         """
         frame = self.frame
         t, met = intersect_sphere(x - frame.sclera.centre, d, frame.sclera.radius)
@@ -104,7 +104,7 @@ class EyeShape:
         return blocked | (met & cornea & (t > EPSILON_MM) & (t < distance))
 
     def _start(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f, mi.Vector3f]:
-        """Distance to a point next to the eye, where rays must start in single precision; it and d in the eye frame."""
+        """Return the distance to a start near the eye (single precision requires one), the start, and d, eye frame."""
         t0 = -dr.dot(o, d) - _NEAR_MM
         return t0, self.frame.point_to_eye(o + t0 * d), self.frame.vector_to_eye(d)
 
@@ -112,7 +112,7 @@ class EyeShape:
     def _through_cornea(
         self, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3f
     ) -> SurfaceInteraction:
-        """Follow rays that meet the cornea in x (eye frame) along dl (the cornea's frame) to the plane of the iris."""
+        """Refract rays that meet the cornea at x (eye frame) along dl (the cornea's frame) to the plane of the iris."""
         on_cornea = si.cornea
         if dr.hint(on_cornea, exclude=[self, facing, x, dl, on_cornea]):
             _refract(self.frame, si, facing, x, dl)
@@ -120,7 +120,7 @@ class EyeShape:
 
 
 def _refract(frame: Frame, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3f) -> None:
-    """Refract rays at the cornea, and set what they meet; see `EyeShape._through_cornea`."""
+    """Refract rays at the cornea and record what they meet; see `EyeShape._through_cornea`."""
     front = frame.surfaces[0]
     c = -dr.dot(facing, dl)
     c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
@@ -140,17 +140,17 @@ def _refract(frame: Frame, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Ve
     pu, pv = stop_coordinates(frame, inner)
     margin = frame.boundary.radius(pu, pv)
     si.normal, si.mirrored, si.passed = front.vector_out(facing), mirrored, dr.select(reached, passed, 0)
-    # A ray that finds no way may have no place at all, and nothing may be computed from that.
+    # A ray without a path may have no position at all, and nothing may be computed from it.
     si.inner = dr.select(reached, inner, frame.stop.centre)
     si.slant = dr.select(reached & (down < -0.05), w / down - n, 0)
     si.pupil = reached & (pu * pu + pv * pv < margin * margin)
 
 
 def _beyond_root(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
-    """Compute places in the plane of the iris, just beyond its root, that stand for points behind the plane.
+    """Return points in the plane of the iris, just beyond its root, that represent points behind the plane.
 
-    Where a shallow chamber's cornea ends behind the plane, a real iris bends back to its root. It is lit there about as
-    at the end of the flat one.
+    In a shallow chamber the cornea may end behind the plane, and a real iris bends back to its root. Its illumination
+    there is about that at the end of the flat iris.
     """
     n, centre = frame.stop.normal, frame.stop.centre
     scale = (frame.iris.root_radius + EPSILON_MM) * dr.rsqrt(dr.maximum(x.y * x.y + x.z * x.z, 1e-12))
@@ -164,7 +164,7 @@ def _from_axis(x: mi.Vector3f) -> mi.Float:
 
 
 def intersect_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Bool]:
-    """Compute the distance to the near side of a sphere about the origin, and whether it is met from outside."""
+    """Intersect a sphere about the origin: distance to its near side, and whether it is met from outside."""
     b, c = dr.dot(o, d), dr.squared_norm(o) - radius * radius
     disc = b * b - c
     q = dr.sqrt(dr.maximum(disc, 0)) - b

@@ -1,4 +1,4 @@
-"""What a ray meets: the record that hits fill and shading reads."""
+"""The surface interaction: the record that ray hits fill and shading reads."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from ..records.frame import Frame
 from ..records.recording import syntax
 from ..records.surfaces import Bundle
 
-EPSILON_MM = 2e-3  # points closer than this are the same in single precision
+EPSILON_MM = 2e-3  # points closer than this coincide in single precision
 _WET = 0.93  # gloss of the sclera
 _DEEPEST = 0.75  # least inverse depth of the image of an iris, relative to the cornea's: grazing rays come from afar
 
 
 @dataclass(kw_only=True)
 class SurfaceInteraction:
-    """What a ray meets first, and what it meets behind the cornea. Points and normals are in the eye frame.
+    """First surface that a ray meets, and the surface behind the cornea. Points and normals are in the eye frame.
 
     Attributes:
         cornea: whether the ray enters through the clear part of the cornea.
         sclera: whether it meets the sclera.
         other: whether it meets anything of the scene that is not the eye.
-        distance: to the first surface, mm.
-        point: on the first surface.
-        normal: there.
-        opacity: of the tissue there: 0 clear cornea, 1 sclera.
+        distance: distance to the first surface, mm.
+        point: point on the first surface.
+        normal: unit normal there.
+        opacity: opacity of the tissue there: 0 clear cornea, 1 sclera.
         mirrored: reflectance of the front cornea.
         passed: transmittance of the refracted ray, 0 where it does not reach the plane of the iris.
         inner: point in the plane of the iris.
         slant: lateral motion of the ray per mm of height above that plane.
         pupil: whether the inner point lies in the pupil.
-        albedo: of a surface that is not the eye.
-        gloss: of such a surface, or of the wet sclera.
+        albedo: albedo of a surface that is not the eye.
+        gloss: gloss of such a surface, or of the wet sclera.
         received: light that such a surface receives from other surfaces (see `radiosityfield.RadiosityField`).
-        level: normal without the relief of skin in which light spreads.
+        level: normal without the relief, on skin with subsurface scattering.
     """
 
     cornea: mi.Bool
@@ -59,8 +59,8 @@ class SurfaceInteraction:
 
     @classmethod
     def blank(cls) -> SurfaceInteraction:
-        """Return the interaction of rays that meet nothing, for others to fill."""
-        # Arrays of their own, because Dr.Jit writes the results of branches into them.
+        """Return the interaction of rays that meet nothing, to be filled."""
+        # Separate arrays, because Dr.Jit writes the results of branches into them.
         cornea, sclera, other, pupil = (mi.Bool(False) for _ in range(4))
         distance, mirrored, passed, albedo = (mi.Float(0) for _ in range(4))
         point, normal, inner, slant = (mi.Vector3f(0) for _ in range(4))
@@ -72,7 +72,7 @@ class SurfaceInteraction:
 
     @property
     def matte(self) -> mi.Bool:
-        """Whether the first surface is matte, at least in part."""
+        """Whether the first surface is at least partly matte."""
         return (self.cornea & (self.opacity > 0)) | self.sclera | self.other
 
     @property
@@ -97,10 +97,10 @@ class SurfaceInteraction:
 
     @syntax
     def nearness(self, frame: Frame, d: mi.Vector3f) -> mi.Float:
-        """Compute the inverse depth (1/mm) of what camera rays along d (scene's frame) show.
+        """Compute the inverse depth (1/mm) of what camera rays along d (scene's frame) show, for defocus.
 
-        Behind the cornea it is the change of direction that keeps a ray on its place in the plane of the iris while the
-        pinhole moves across the optical axis. The image is astigmatic, so this is the mean of moves in two directions.
+        Behind the cornea, this is the change of direction that keeps a ray on its point in the plane of the iris while
+        the pinhole moves across the optical axis. The image is astigmatic, so two directions of motion are averaged.
         """
         near = dr.rcp(dr.maximum(self.distance * dr.dot(d, frame.camera.forward), 1e-3))
         if dr.hint(self.lit_inside & (self.opacity < 0.5), exclude=[self, frame, d]):
@@ -129,7 +129,7 @@ class SurfaceInteraction:
 
 @syntax
 def outer_albedo(frame: Frame, si: SurfaceInteraction) -> mi.Float:
-    """Find the albedo of the first surface where it is matte: sclera, the limbus' rim, or the scene's own material."""
+    """Return the albedo of the first surface where it is matte: sclera, limbus' rim, or the scene's own material."""
     albedo = mi.Float(si.albedo)
     if dr.hint(~si.other, exclude=[frame, si]):
         albedo = sclera_albedo(frame, si.point)

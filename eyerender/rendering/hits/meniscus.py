@@ -1,11 +1,10 @@
-"""The menisci: water between lids and globe, which mirrors the lamps and bends the light behind it.
+"""The menisci: water between lids and globe, which mirrors the lamps and refracts the light behind it.
 
-A camera ray is refracted at the water's surface, n sin(a') = sin(a), and goes on to the globe. There it meets the tear
-film that lies everywhere, so the rest of its way is that of the ray in air which the globe refracts into the same
-direction.
+A camera ray is refracted at the water's surface, n sin(a') = sin(a), and continues to the globe. There it meets the
+tear film, so its further path is that of the ray in air which the globe refracts into the same direction.
 
-The margin below the other edge of the meniscus, where the water is thinnest, is seen without displacement. Water
-shadows nothing.
+The lid margin below the far edge of the meniscus, where the water is thinnest, is shown without displacement. Water
+casts no shadow.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _LEAST = 0.1  # cosine below which a ray is not followed
 
 @dataclass(kw_only=True)
 class View:
-    """What a camera ray shows, and its direction in air there (scene's frame)."""
+    """The surface that a camera ray shows, and its direction in air there (scene's frame)."""
 
     si: SurfaceInteraction
     d: mi.Vector3f
@@ -41,7 +40,7 @@ def water_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -
 
 
 def on_water(frame: Frame, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
-    """Replace the surface that camera rays meet by a meniscus where one is in front of it."""
+    """Replace the surface met by camera rays with a meniscus where one is in front of it."""
     if frame.region is None or frame.region.water is None:
         return si
     hit = water_hit(frame, o, d, si.distance)
@@ -55,10 +54,10 @@ def on_water(frame: Frame, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3
 def through_water(
     frame: Frame, hit: TriangleHit, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f
 ) -> tuple[SurfaceInteraction, mi.Vector3f]:
-    """Bend camera rays at menisci that they hit in front of the globe.
+    """Refract camera rays at menisci that they hit in front of the globe.
 
     Returns:
-        What they show of the globe, and their directions in air before it.
+        The surface of the globe that they show, and their directions in air in front of it.
     """
     view = View(si=si, d=mi.Vector3f(d))
     if dr.hint(hit.is_valid() & ~si.other, exclude=[frame, hit, si, o, d]):
@@ -67,7 +66,7 @@ def through_water(
 
 
 def _bent(frame: Frame, hit: TriangleHit, view: View, o: mi.Vector3f, d: mi.Vector3f) -> View:
-    """Refract rays into the water and out of it; those that find no way keep their direction."""
+    """Refract rays into the water and out of it; rays without a solution keep their direction."""
     si = view.si
     x = o + hit.t * d
     surface = frame.region.surface(hit.prim_index, hit.prim_uv, hit.is_valid() & ~si.other)
@@ -79,7 +78,7 @@ def _bent(frame: Frame, hit: TriangleHit, view: View, o: mi.Vector3f, d: mi.Vect
     way = dr.select(enters & leaves, outside, d)
     seen = EyeShape(frame=frame).ray_intersect(x + (deep / cosine) * inside, way)
     found = enters & leaves & seen.globe
-    # Below the water nothing mirrors the lamps. The distance is that at which the depth is the one without water.
+    # Below the water nothing mirrors the lamps. The distance gives the depth that the point has without water.
     forward, dry = frame.camera.forward, mi.Float(0)
     seen.distance = si.distance * (dr.dot(d, forward) / dr.dot(way, forward))
     seen, kept = (replace(s, gloss=dry, mirrored=dry) for s in (seen, si))
@@ -87,9 +86,9 @@ def _bent(frame: Frame, hit: TriangleHit, view: View, o: mi.Vector3f, d: mi.Vect
 
 
 def _refracted(d: mi.Vector3f, normal: mi.Vector3f, eta: mi.Float) -> tuple[mi.Vector3f, mi.Bool]:
-    """Compute directions behind a surface whose normal faces the ray, and whether there are any.
+    """Compute refracted directions at a surface whose normal faces the ray, and whether they exist.
 
-    eta: index before the surface over that behind it.
+    `eta` is the refractive index in front of the surface over that behind it.
     """
     c = -dr.dot(normal, d)
     rest = 1 - eta * eta * (1 - c * c)

@@ -1,14 +1,14 @@
-"""Refracting surfaces as triangle meshes: hits of Embree or OptiX, with interpolated normals.
+"""Refracting surfaces as triangle meshes: hits by Embree or OptiX, with interpolated normals.
 
-A mesh is a patch of one of the eye's dielectric bodies (`eye.meshes`). It lies in a Mitsuba scene of its own, so a ray
-that has been refracted by one surface cannot meet that surface again. Its points are on the triangles, its normals
-n / |n| are interpolated from those of the vertices, n = sum_i b_i N_i with barycentric coordinates b_i. Paths and
-glints are found by Newton's method on the mesh itself. Their derivatives need dn for a step of the point:
+A mesh is a patch of one of the eye's dielectric bodies (`eye.meshes`). It has its own Mitsuba scene, so a ray that has
+been refracted by a surface cannot meet that surface again. Its points are on the triangles, its normals n / |n| are
+interpolated from those of the vertices, n = sum_i b_i N_i with barycentric coordinates b_i. Paths and glints are found
+by Newton's method on the mesh itself. Their derivatives need dn for a step of the point:
 
     dn = sum_i N_i db_i,    db_i linear in the step over the surface's plane (y, z)
 
-Both are continuous over edges, so Newton's steps cross them. Beyond the rim of the mesh, where no path ends, the search
-goes on over the closed form.
+Both are continuous over edges, so Newton's steps can cross them. Beyond the rim of the mesh, where no path ends, the
+search continues on the closed form.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ...geometry.surfaces import Surface as ExactSurface
 from ..records.frame import aligned_copy, upload_array
 from ..records.surfaces import Bundle, NormalForm, Surface
 
-_ABOVE_MM = 40.0  # beyond every cornea along its axis
+_ABOVE_MM = 40.0  # height beyond every cornea along its axis
 _STEPS = 12
 _SETTLED = 1e-12
 _PARALLEL = 1e-9
@@ -40,10 +40,10 @@ class MirrorPoints:
     """Points that mirror sources to viewpoints (n, 3), in the eye frame.
 
     Attributes:
-        point: on the mirror.
+        point: point on the mirror.
         normal: unit normal there.
         arrives: unit direction of the light before it is reflected.
-        leaves: unit direction after.
+        leaves: unit direction of the light after reflection.
         cross_section: cross section of the ray tube at the source per solid angle at the viewpoint, (n,) mm^2/sr.
         found: (n,) whether there is such a point.
     """
@@ -63,7 +63,7 @@ class MeshGeometry:
     Attributes:
         scene: the mesh.
         faces: four entries for each triangle, of which the first three are its vertices.
-        vertices: eight numbers for each vertex: place, 0, normal, 0.
+        vertices: eight numbers per vertex: position, 0, normal, 0.
     """
 
     scene: mi.Scene
@@ -72,7 +72,7 @@ class MeshGeometry:
 
     @classmethod
     def of(cls, name: str, vertices: Floats, normals: Floats, faces: Ints) -> MeshGeometry:
-        """Make a mesh of vertices (n, 3) with normals (n, 3), and triangles (m, 3)."""
+        """Create a mesh from vertices (n, 3), normals (n, 3) and triangles (m, 3)."""
         mesh = mi.Mesh(name, len(vertices), len(faces))
         params = mi.traverse(mesh)
         params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
@@ -86,15 +86,15 @@ class MeshGeometry:
         return cls(scene=scene, faces=mi.UInt32(aligned_copy(corners.ravel())), vertices=upload_array(records))
 
     def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> mi.PreliminaryIntersection3f:
-        """Compute the first hit of rays of the surface's frame."""
+        """Compute the first hit of rays in the surface's frame."""
         return self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True, active=True)
 
     def above(self, y: mi.Float, z: mi.Float) -> mi.PreliminaryIntersection3f:
-        """Compute the hit at given (y, z), by rays along the axis from outside."""
+        """Compute the hit at given (y, z), with rays along the axis from outside."""
         return self.hit(mi.Vector3f(_ABOVE_MM, y, z), mi.Vector3f(-1, 0, 0))
 
     def corners(self, hit: mi.PreliminaryIntersection3f) -> tuple[list[mi.Vector3f], list[mi.Vector3f]]:
-        """Compute places and normals of the corners of the triangles that were hit."""
+        """Return positions and normals of the corners of the hit triangles."""
         met = hit.is_valid()
         i = dr.gather(mi.Vector4u, self.faces, hit.prim_index, met)
         rows = [[dr.gather(mi.Vector4f, self.vertices, 2 * k + part, met) for k in (i.x, i.y, i.z)] for part in (0, 1)]
@@ -107,7 +107,7 @@ class MeshGeometry:
         return dr.normalize(_mixed(normals, hit.prim_uv))
 
     def form(self, hit: mi.PreliminaryIntersection3f) -> tuple[mi.Float, NormalForm]:
-        """Find the height x on the axis' direction, and the normal form, whose Hessian is the slope of the normals."""
+        """Compute the height x at a hit, and the normal form, whose Hessian is the slope of the normals."""
         places, normals = self.corners(hit)
         n = _mixed(normals, hit.prim_uv)
         inv = dr.rsqrt(dr.squared_norm(n))
@@ -125,7 +125,7 @@ class SurfaceMesh:
     """One surface as a mesh, in its own frame (+x outward, mm), on the host in float64.
 
     Attributes:
-        geometry: the same for the kernels.
+        geometry: the same mesh for the kernels.
     """
 
     def __init__(self, patch: Patch, surface: ExactSurface) -> None:
@@ -136,7 +136,7 @@ class SurfaceMesh:
         self.geometry = MeshGeometry.of(patch.name, self.vertices, self.normals, self.faces)
 
     def mirrored(self, start: Floats, source: Floats, viewpoint: Floats) -> MirrorPoints:
-        """Find mirror points of sources (n, 3) for viewpoints (n, 3) from points (n, 3) near them; eye frame."""
+        """Solve for mirror points of sources (n, 3) and viewpoints (n, 3), from starts (n, 3) near them; eye frame."""
         y, lamp, node = ((p - self.origin) @ self.rotation for p in (start, source, viewpoint))
         q = y[:, 1:].copy()
         found = np.ones(len(q), dtype=bool)
@@ -186,7 +186,7 @@ class SurfaceMesh:
 
 
 def _either(which: mi.Bool, one: NormalForm, other: NormalForm) -> NormalForm:
-    """Return one normal form or the other."""
+    """Select one of two normal forms by a mask."""
     return NormalForm(
         dr.select(which, one.normal, other.normal),
         dr.select(which, one.inverse, other.inverse),
@@ -212,7 +212,7 @@ class MeshedSurface(Surface):
         return dr.select(met, hit.t, 0), met, N
 
     def on_surface(self, x: mi.Vector3f) -> tuple[mi.Vector3f, NormalForm]:
-        """Point of the mesh at the same local (y, z), and its form; beyond the mesh those of the closed form."""
+        """Return the mesh point at the same local (y, z), and its form; beyond the mesh those of the closed form."""
         l = self.point_in(x)
         hit = self._mesh().above(l.y, l.z)
         met = hit.is_valid()
@@ -222,7 +222,7 @@ class MeshedSurface(Surface):
         return point, _either(met, form, other)
 
     def refract_bundle(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
-        """Enter the eye through the mesh with ray differentials; beyond the mesh through the closed form."""
+        """Refract a bundle into the eye at the mesh; beyond the mesh at the closed form."""
         hit = self._mesh().hit(self.point_in(b.y), self.vector_in(b.w))
         met = hit.is_valid()
         t, form = hit.t, self._mesh().form(hit)[1]
@@ -234,14 +234,14 @@ class MeshedSurface(Surface):
 
 
 class Meshes:
-    """The corneas of the last eyes as meshes."""
+    """Cache of the last eyes' corneas as meshes."""
 
     def __init__(self, kept: int = 4) -> None:
         self._kept = kept
         self._made: dict[Any, tuple[SurfaceMesh, ...]] = {}
 
     def of(self, eye: EyeModel, edge_mm: float) -> tuple[SurfaceMesh, ...]:
-        """Meshes of an eye's refracting surfaces in front of the iris, whose edges are at most about `edge_mm` long."""
+        """Return meshes of an eye's refracting surfaces in front of the iris, with edges of at most about `edge_mm`."""
         stop = np.concatenate([eye.stop.centre_mm, eye.stop.normal])
         key = (eye.front, float(eye.limbus_radius_mm), stop.tobytes(), edge_mm)
         if key not in self._made:
@@ -253,12 +253,12 @@ class Meshes:
 
 
 def resolution(radius_mm: float, edge_mm: float) -> tuple[int, int]:
-    """Compute rings and sectors of a cap of a radius whose rings and whose rim have edges of at most a length."""
+    """Compute the numbers of rings and sectors of a cap whose edges are at most `edge_mm` long."""
     return math.ceil(radius_mm / edge_mm), max(8, math.ceil(2 * math.pi * radius_mm / edge_mm))
 
 
 def meshed(surfaces: Sequence[Surface], meshes: Sequence[SurfaceMesh]) -> tuple[Surface, ...]:
-    """Put meshes in the place of surfaces."""
+    """Replace surfaces by their meshes."""
     return tuple(
         MeshedSurface(s.origin, s.axes, s.shape, s.eta, s.kind, s.table, s.film, mesh.geometry)
         for s, mesh in zip(surfaces, meshes, strict=True)
@@ -273,9 +273,9 @@ def _mixed(corners: Sequence[mi.Vector3f], uv: mi.Point2f) -> mi.Vector3f:
 def _unevenness(
     x: Floats, n: Floats, slope: Floats, normal_slope: Floats, lamp: Floats, node: Floats
 ) -> tuple[Floats, Floats]:
-    """By how much the bisector h of the ways to lamp and viewpoint is not parallel to n: (n, 2), with its Jacobian.
+    """Compute how far the bisector h of the directions to lamp and viewpoint deviates from n: (n, 2), and its Jacobian.
 
-    In the surface's frame, with the index i of y and z: h_i n_x - n_i h_x.
+    The deviation is h_i n_x - n_i h_x in the surface's frame, for i = y and z.
     """
     h, dh = np.zeros_like(x), np.zeros_like(slope)
     for end in (lamp, node):
@@ -295,7 +295,7 @@ def _unevenness(
 
 
 def _tube(out: Floats, x: Floats, N: Floats, n: Floats, normal_slope: Floats, lamp: Floats, node: Floats) -> Floats:
-    """Compute the cross section at the lamp of a tube of rays from the viewpoint, per solid angle there, (n,)."""
+    """Compute the cross section, at the lamp, of a ray tube from the viewpoint per solid angle there, (n,)."""
     s, rest = np.linalg.norm(x - node, axis=1), np.linalg.norm(lamp - x, axis=1)
     c = -np.sum(N * out, axis=1)
     w = out + 2 * c[:, None] * N

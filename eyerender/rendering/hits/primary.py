@@ -1,6 +1,6 @@
-"""Camera rays: the nearer of the hits on the eye and on the rest of the scene, and the surface there.
+"""Camera rays: the nearer hit, on the eye or on the rest of the scene, and the surface there.
 
-The eye is met in closed form (`EyeShape`), and everything else by Embree or OptiX.
+The eye is intersected in closed form (`EyeShape`), everything else by Embree or OptiX.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .interaction import SurfaceInteraction
 
 @dataclass(kw_only=True)
 class TriangleHit:
-    """Hit on a triangle, infinitely far where there is none, with Mitsuba's names."""
+    """Hit on a triangle, at infinite distance if there is none; with Mitsuba's names."""
 
     t: mi.Float
     prim_index: mi.UInt32
@@ -27,13 +27,13 @@ class TriangleHit:
 
     @classmethod
     def of(cls, hit: mi.PreliminaryIntersection3f) -> TriangleHit:
-        """Take what is needed of a hit of Embree or OptiX."""
+        """Copy what is needed from a hit by Embree or OptiX."""
         t = dr.select(hit.is_valid(), hit.t, dr.inf)
         return cls(t=t, prim_index=mi.UInt32(hit.prim_index), prim_uv=hit.prim_uv)
 
     @classmethod
     def on_plane(cls, plane_x: mi.Float, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> TriangleHit:
-        """Intersect the plane x = `plane_x` in closed form, nearer than a distance, as its first triangle, extended."""
+        """Intersect the plane x = `plane_x`, given by its first triangle, in closed form, up to a distance."""
         t = (plane_x - o.x) / d.x
         y, z = o.y + t * d.y, o.z + t * d.z
         met = (t > 0) & (t < nearest) & (dr.maximum(dr.abs(y), dr.abs(z)) < HALF_MM)
@@ -54,9 +54,9 @@ def first_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> 
 def intersect(
     frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True
 ) -> tuple[SurfaceInteraction, TriangleHit]:
-    """Trace rays (scene's frame); the surface of what is not the eye is not evaluated yet (see `appearance`).
+    """Trace rays (scene's frame); surfaces other than the eye are not evaluated yet (see `appearance`).
 
-    coherent: whether neighbouring rays are alike, as those of a camera.
+    `coherent` states that neighbouring rays are similar, as those of a camera.
     """
     eye = EyeShape(frame=frame).ray_intersect(o, d)
     if frame.structure.obstacles:
@@ -68,14 +68,14 @@ def intersect(
 
 
 def behind(eye: SurfaceInteraction, hit: TriangleHit, active: mi.Bool) -> SurfaceInteraction:
-    """Keep what rays meet of the eye where nothing is hit in front of it."""
+    """Keep the hits on the eye that nothing in front occludes."""
     other, clear = hit.is_valid() & active, ~hit.is_valid() & active
     distance = dr.select(other, hit.t, eye.distance)
     return replace(eye, cornea=eye.cornea & clear, sclera=eye.sclera & clear, other=other, distance=distance)
 
 
 def appearance(frame: Frame, si: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f) -> SurfaceInteraction:
-    """Add the surface of what is not the eye to the result of `intersect` along d."""
+    """Add the surfaces other than the eye to the result of `intersect` along d."""
     region, background = frame.region, frame.background
     if region is not None:
         there = region_interaction(frame, region.face(hit), hit.prim_uv, d, si.other)
@@ -99,7 +99,7 @@ def region_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> TriangleHit:
 
 
 def hidden(frame: Frame, eye: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
-    """Return whether anything of the scene is in front of the globe where the rays of `EyeShape` meet it."""
+    """Return whether anything of the scene is in front of the globe along the rays that meet it."""
     if not frame.structure.obstacles:
         return eye.globe & TriangleHit.on_plane(frame.backdrop_x, o, d, eye.distance).is_valid()
     return ray_blocked(frame.scene, segment(o, d, eye.distance), eye.globe)
@@ -115,7 +115,7 @@ def ray_blocked(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
 
 
 def segment(o: mi.Vector3f, d: mi.Vector3f, length: mi.Float) -> mi.Ray3f:
-    """Compute rays that end after a length, such as at the globe: what is behind it does not matter."""
+    """Create rays that end after a length, for example at the globe, whatever lies behind."""
     ray = mi.Ray3f(mi.Point3f(o), d)
     ray.maxt = length
     return ray
@@ -124,7 +124,7 @@ def segment(o: mi.Vector3f, d: mi.Vector3f, length: mi.Float) -> mi.Ray3f:
 def region_interaction(
     frame: Frame, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool
 ) -> SurfaceInteraction:
-    """Compute what rays along d (scene's frame) meet on triangles of an eye region."""
+    """Compute the interaction of rays along d (scene's frame) with triangles of an eye region."""
     skin = frame.region.surface(face, uv, active)
     si = _matte(frame, skin.point, skin.normal, d, active)
     level = _facing(frame, skin.smooth, d) if frame.structure.scattering else None
@@ -134,12 +134,12 @@ def region_interaction(
 def _matte(
     frame: Frame, point: mi.Vector3f, normal: mi.Vector3f, d: mi.Vector3f, active: mi.Bool
 ) -> SurfaceInteraction:
-    """Compute the interaction with matte points of the scene; normals are turned to the viewer."""
+    """Compute the interaction with matte points of the scene, with normals turned to the viewer."""
     place = frame.point_to_eye(point)
     return replace(SurfaceInteraction.blank(), other=active, point=place, normal=_facing(frame, normal, d))
 
 
 def _facing(frame: Frame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
-    """Compute normals (eye frame) turned to the viewer; normals and rays are given in the scene's frame."""
+    """Turn normals (scene's frame) to the viewer and convert them to the eye frame."""
     normal = frame.vector_to_eye(normal)
     return dr.normalize(dr.select(dr.dot(normal, frame.vector_to_eye(d)) > 0, -normal, normal))

@@ -1,1 +1,1 @@
-"""The integrator: set-up of a frame, samples of its pixels, and their shading."""
+"""The integrator: frame set-up, camera samples, and their shading."""

@@ -1,7 +1,7 @@
-"""Bare eyes: one lane per sample, which is shaded where it is traced.
+"""Render bare eyes: one lane per sample, shaded where it is traced.
 
-A bare frame traces no rays through a tree unless there are obstacles, and merging would find few samples that share a
-surface point. To write the hits to memory between tracing and shading would cost a tenth more.
+Without an eye region, rays traverse no acceleration structure unless there are obstacles, and few samples share a
+surface point, so merging would not pay. Storing the hits between tracing and shading would cost a tenth more time.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _EVEN, _STEP = 0.03, 0.12  # relative differences within an even pixel, and betw
 
 
 def is_adaptive(request: FilmRequest) -> bool:
-    """Return whether even pixels may do with their first four samples."""
+    """Return whether uniform pixels may use only their first four samples."""
     return not request.layered and request.spp >= _MANY
 
 
 def render_samples(request: FilmRequest, first: int, count: int) -> tuple[list[mi.Float], mi.UInt32]:
-    """Compute sums over `count` samples of each pixel, from number `first`, and failed light paths."""
+    """Sum the radiance over `count` samples of each pixel, from number `first`, and count failed light paths."""
     index = dr.arange(mi.UInt32, request.window[2] * request.window[3] * count)
     n = dr.opaque(mi.UInt32, count)
     pixel = index // n
@@ -41,18 +41,18 @@ def render_samples(request: FilmRequest, first: int, count: int) -> tuple[list[m
 
 
 def render_adaptively(request: FilmRequest, most: int) -> tuple[list[mi.Float], mi.UInt32]:
-    """Compute sums over the samples of each pixel, taking all of them only where the first four differ.
+    """Sum the radiance over the samples of each pixel; take all of them only where the first four differ.
 
-    Where these agree, and their mean is not far from those of the eight neighbours, no edge crosses the pixel, and they
-    stand for all samples. The pixels around the window are looked at, too, so that no pixel depends on the window. At
-    `most` so many samples are taken at a time.
+    If the four agree, and their mean is close to those of the eight neighbours, no edge crosses the pixel and the four
+    stand for all samples. A border of one pixel around the window is examined too, so that no pixel depends on the
+    window. At most `most` samples are taken per pass.
     """
     x0, y0, width, height = request.window
     first, failed = _first_samples(request.spp), mi.UInt32(0)
     pixels, pattern = Pixels.of((x0 - 1, y0 - 1, width + 2, height + 2)), Pattern.of(request.spp, request.seed)
 
     def radiance_of(pixel: mi.UInt32, numbers: Ints) -> mi.Float:
-        """Compute the radiance of samples with these numbers, those of each pixel side by side."""
+        """Compute the radiance of samples with these numbers, stored side by side per pixel."""
         nonlocal failed
         index = dr.arange(mi.UInt32, dr.width(pixel) * len(numbers))
         each = dr.opaque(mi.UInt32, len(numbers))
@@ -63,7 +63,7 @@ def render_adaptively(request: FilmRequest, most: int) -> tuple[list[mi.Float], 
         failed += failures
         return radiance
 
-    # Few pixels at a time, because there may be more than can be held.
+    # Few pixels at a time, because the uneven ones may be more than memory holds.
     count, stretch = (width + 2) * (height + 2), most // len(first)
     ends = [(start, min(start + stretch, count)) for start in range(0, count, stretch)]
     parts = [radiance_of(dr.arange(mi.UInt32, *span), first) for span in ends]
@@ -81,10 +81,10 @@ def render_adaptively(request: FilmRequest, most: int) -> tuple[list[mi.Float], 
 
 
 def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[mi.Float, mi.UInt32, mi.UInt32]:
-    """Find sums of four samples in the pixels of a window, those of even pixels for all samples, and the uneven pixels.
+    """Sum the first four samples of each pixel, scaled to all samples in uniform pixels; list the uneven pixels.
 
-    `radiance` holds four samples of each pixel of the window and of a border of one pixel about it. The uneven pixels
-    are numbered without and with this border.
+    `radiance` holds four samples per pixel of the window and of a border of one pixel. The numbers of the uneven pixels
+    are returned without and with this border.
     """
     width = dr.opaque(mi.UInt32, size[0])
     four = dr.gather(mi.Vector4f, radiance, dr.arange(mi.UInt32, (size[0] + 2) * (size[1] + 2)))
@@ -113,7 +113,7 @@ def _with_uneven(radiance: mi.Float, size: tuple[int, int], spp: int) -> tuple[m
 
 @lru_cache(maxsize=16)
 def _first_samples(count: int) -> Ints:
-    """List numbers of the samples nearest to the middles of a pixel's quarters."""
+    """Return the numbers of the samples nearest to the centres of a pixel's quarters."""
     k = np.arange(count)
     x, y = (k + 0.5) / count, (k * lattice_generator(count) % count + 0.5) / count
     chosen: list[int] = []
@@ -128,7 +128,7 @@ def _first_samples(count: int) -> Ints:
 def _shade_samples(
     frame: Frame, pixels: Pixels, pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32, layered: bool
 ) -> tuple[list[mi.Float], mi.UInt32]:
-    """Say what samples k of pixels show, and the number of failed light paths."""
+    """Compute the radiance of samples k of pixels, and count failed light paths."""
     samples = Samples.of(*pixels.at(pixel), pattern)
     o, d, root = samples.ray(frame, k)
     radiance, failures = shade(frame, o, d, *samples.pair(k, 0))
@@ -137,7 +137,7 @@ def _shade_samples(
         si, _ = intersect(frame, o, d, True)
         near = si.nearness(frame, d)
         lanes = [dr.select(part, x, 0) for part in (si.other, si.globe) for x in (lanes[0], mi.Float(1), near)]
-    dr.eval(lanes, failures)  # together, because a separate reduction would trace everything again
+    dr.eval(lanes, failures)  # in one reduction, because a second one would trace everything again
     failed = dr.sum(failures)
     dr.eval(failed)
     return lanes, failed

@@ -1,6 +1,6 @@
-"""The whole sensor in coarse cells, for the light that a lens scatters into a window from outside of it.
+"""The whole sensor in coarse blocks, for light that the lens scatters into a window from outside.
 
-It is a picture of the same frame through a camera with larger pixels, in which hairs and menisci are not supersampled.
+The same frame is rendered by a camera with larger pixels, without supersampling of hairs and menisci.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _CELLS, _SAMPLES = 4096, 4
 
 @dataclass(frozen=True, slots=True)
 class CoarseSensor:
-    """The whole sensor in cells whose samples are being taken.
+    """A coarse rendering of the whole sensor, in progress.
 
     Attributes:
-        film: the cells.
-        blocks: number of blocks along the side of a cell, in which the lens' scattered light is smooth.
+        film: the cells being rendered.
+        blocks: number of blocks along the side of a cell; scattered light is smooth over a block.
         size: number of blocks down and across.
     """
 
@@ -37,7 +37,7 @@ class CoarseSensor:
 
     @classmethod
     def begin(cls, bound: BoundFrame) -> CoarseSensor | None:
-        """Begin to take the samples; None if the window of the frame's job lacks no scattered light."""
+        """Start the rendering; return None if no light scatters into the window from outside."""
         job, frame = bound.host.job, bound.frame
         if not misses_light(job.lens, job.camera, job.window):
             return None
@@ -56,6 +56,6 @@ class CoarseSensor:
         return cls(film, blocks, (-(-height // block), -(-width // block)))
 
     def picture(self) -> Singles:
-        """Compute the mean radiance of the blocks times its weight, as of `film.start`, (height, width) in blocks."""
+        """Compute the mean weighted radiance of the blocks, as in `film.start`, (height, width) in blocks."""
         down, across = self.size
         return self.film.means()[0].repeat(self.blocks, axis=0).repeat(self.blocks, axis=1)[:down, :across]

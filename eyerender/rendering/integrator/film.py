@@ -1,12 +1,12 @@
-"""The film: a window's samples, and the mean radiance of each pixel.
+"""The film: the samples of a window, and the mean radiance of each pixel.
 
-Bare eyes are shaded sample by sample (`bare`). Before an eye region, which fills the image, there are four stages:
+Bare eyes are shaded sample by sample (`bare`). With an eye region, which fills the image, there are four stages:
 visibility of all samples (`visibility`), merging of the hits of a group (`merging`), shading (`groupshading`), and the
 weighted sum over a pixel's groups.
 
-Hairs are thinner than the distance of a pixel's few samples, and every pixel has the same lattice of them. So hairs
-would be rows of dots. The groups of pixels at hairs have several times as many samples; their shading costs no more.
-So have those at menisci, in which the mirror images of lamps are thinner still; there every sample is shaded.
+Hairs are thinner than the spacing of a pixel's few samples, and every pixel has the same lattice of samples, so hairs
+would become rows of dots. Pixels at hairs therefore have several times as many samples in each group; shading costs no
+more. Pixels at menisci, where the mirror images of lamps are thinner still, have as many, and every sample is shaded.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from .visibility import GroupPass, HitTable, trace_region
 
 _LANES = 2**24  # samples at a time; more are rendered in several passes
 _TILE = 4  # pixels across and down
-_FEW_LAMPS = 2  # with so few lamps shadows are dark, and they are sampled finely
+_FEW_LAMPS = 2  # with at most so many lamps, shadows are dark and finely sampled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Film:
-    """A window whose samples are being taken: the device may still be at work until `means` reads the sums.
+    """A window being rendered; the device may still be at work until `means` reads the sums.
 
     Attributes:
-        sums: over the samples of each pixel: the radiance, or for each part what `start` says.
+        sums: sums over the samples of each pixel: the radiance, or three numbers per part (see `start`).
         failed: number of failed light paths.
-        request: what is bound.
+        request: the window and its samples.
     """
 
     sums: list[mi.Float]
@@ -51,27 +51,28 @@ class Film:
     request: FilmRequest
 
     def means(self) -> tuple[Singles, int]:
-        """Read the means over the samples (see `start`), and the number of failed light paths."""
+        """Return the means over the samples (see `start`), and the number of failed light paths."""
         shape = self.request.window[:1:-1]
         means = [total.numpy().reshape(shape) / np.float32(self.request.spp) for total in self.sums]
         failed = int(self.failed.numpy()[0])
         if self.request.layered:
             return np.stack(means).reshape(-1, 3, *shape), failed
-        # The light that samples on the globe are denied may be more than what they have, never in a smooth pixel.
+        # Light that shadows remove from samples on the globe may exceed the light that remains, but never in a smooth
+        # pixel.
         return np.maximum(means[0], 0, out=means[0]), failed
 
 
 def mean_radiance(bound: BoundFrame, window: Window, spp: int, seed: int) -> tuple[Singles, int]:
-    """Find the mean radiance of each pixel times cos^4(theta) / D (mW/mm^2/sr), (height, width); failed light paths."""
+    """Render the mean of radiance times cos^4(theta) / D (mW/mm^2/sr), (height, width); count failed light paths."""
     return start(bound, window, spp, seed, layered=False).means()
 
 
 def start(bound: BoundFrame, window: Window, spp: int, seed: int, *, layered: bool) -> Film:
-    """Begin to take the samples of a window.
+    """Start rendering a window.
 
-    Its `means` are those of `mean_radiance`. If `layered`, there are three numbers for each part of the scene, from
-    front to back (hairs and tears, skin, globe; or background and globe): the radiance of the part, which adds up to
-    that of `mean_radiance`; the share of the samples that show it; that share times their mean inverse depth (1/mm).
+    The `means` of the result equal `mean_radiance`. If `layered`, there are three numbers for each part of the scene,
+    from front to back (hairs and tears, skin, globe; or background and globe): its radiance (the parts add up to
+    `mean_radiance`), the share of the samples that show it, and that share times their mean inverse depth (1/mm).
     """
     request = FilmRequest(bound=bound, window=window, spp=spp, seed=seed, layered=layered)
     if bound.frame.structure.region:
@@ -86,13 +87,13 @@ def start(bound: BoundFrame, window: Window, spp: int, seed: int, *, layered: bo
 def _in_passes(
     request: FilmRequest, parts: int, size: int, render: Callable[[FilmRequest, int, int], tuple[Any, mi.UInt32]]
 ) -> tuple[list[mi.Float], mi.UInt32]:
-    """Add up the sums and failures of as many passes as memory needs, for `parts` of each pixel of `size` samples."""
+    """Sum radiance and failures over as many passes as memory requires: `parts` per pixel, of `size` samples each."""
     each = max(1, min(parts, _LANES // (request.window[2] * request.window[3] * size)))
     sums: list[mi.Float] = []
     failed = mi.UInt32(0)
     for first in range(0, parts, each):
         if sums:
-            dr.sync_thread()  # else all passes would need memory at once
+            dr.sync_thread()  # otherwise all passes would be in memory at once
         seen, failures = render(request, first, min(each, parts - first))
         sums = [a + b for a, b in zip(sums, seen, strict=True)] if sums else seen
         failed += failures
@@ -101,7 +102,7 @@ def _in_passes(
 
 
 def _render_groups(request: FilmRequest, first: int, count: int) -> tuple[list[mi.Float], mi.UInt32]:
-    """Compute sums over some groups of samples of each pixel before an eye region, and failed light paths."""
+    """Sum the radiance over some sample groups of each pixel with an eye region, and count failed light paths."""
     frame, lamps = request.bound.frame, request.bound.host.lamps
     pattern = Pattern.of(request.spp, request.seed, times=request.times)
     sharp = int(lamps.suns and lamps.widths[-1] < SMALL)
@@ -124,18 +125,18 @@ def _render_groups(request: FilmRequest, first: int, count: int) -> tuple[list[m
 
 @dataclass(kw_only=True)
 class _Tiles:
-    """The groups of a window's pixels, tile by tile: one group of each pixel of a tile is a packet.
+    """The sample groups of a window, tile by tile; one group of each pixel of a tile forms a packet.
 
-    Embree traces sixteen neighbouring lanes together. They are one group of 4 x 4 pixels each, so that their rays to
-    the lamps go the same way. The last tiles may extend beyond the window.
+    Embree traces sixteen neighbouring lanes together. They hold one group of each pixel of a 4 x 4 tile, so that their
+    rays to the lamps run nearly parallel. The last tiles may extend beyond the window.
 
     Attributes:
         pixels: the window.
         height: of the window.
         columns: number of tiles across.
         groups: the groups of each pixel.
-        own_shadows: as of `PixelGroup`.
-        layered: as of `PixelGroup`.
+        own_shadows: as in `PixelGroup`.
+        layered: as in `PixelGroup`.
     """
 
     pixels: Pixels
@@ -146,7 +147,7 @@ class _Tiles:
     layered: bool
 
     def group(self, frame: Frame, pattern: Pattern, hits: HitTable, lane: mi.UInt32) -> tuple[PixelGroup, mi.Bool]:
-        """Return the groups of lanes, and whether their pixels are inside the window."""
+        """Return the sample groups of lanes, and whether their pixels are inside the window."""
         packet = lane // _TILE**2
         lane = lane - packet * _TILE**2
         tile = packet // self.groups.count
@@ -177,7 +178,7 @@ class _Tiles:
 
     @syntax
     def splat(self, lanes: list[mi.Float], pixels: int) -> list[mi.Float]:
-        """Compute the sum over the groups of each pixel, in the order of the pixels."""
+        """Sum over the groups of each pixel, in the order of the pixels."""
         pixel = dr.arange(mi.UInt32, pixels)
         y = pixel // self.pixels.width
         x = pixel - y * self.pixels.width
@@ -190,7 +191,7 @@ class _Tiles:
 
 
 def _added(sums: list[mi.Float], lanes: list[mi.Float], i: mi.UInt32) -> list[mi.Float]:
-    """Compute sums to which number `i` of other arrays is added."""
+    """Add number `i` of other arrays to sums."""
     return [total + dr.gather(mi.Float, lane, i) for total, lane in zip(sums, lanes, strict=True)]
 
 

@@ -42,7 +42,7 @@ _FARTHEST_MM = 60.0  # half the largest width of the grid over the background's 
 
 @dataclass(slots=True)
 class _Next:
-    """The job of the next frame, and its data from the second thread: the mesh of its region, then the rest."""
+    """The job of the next frame, with its region mesh and host data, which the second thread computes."""
 
     job: RenderJob
     posed: Future[RegionMesh] | None = None
@@ -71,18 +71,18 @@ def _grids_behind_cornea(
     frame: Frame, shape: ReliefShape | None, side: mi.UInt32, points: mi.UInt32, factors: mi.Float | None,
     sizes: _GridSizes,
 ) -> tuple[IrisIrradiance | None, IrisRelief, FundusIrradiance]:  # fmt: skip
-    """Fill the grids of the lamps' light on the iris, on its relief, and on the fundus."""
+    """Fill the irradiance grids behind the cornea: on the iris, on its relief, and on the fundus."""
     pupil = FundusIrradiance.build(frame, factors)
     on_iris = IrisIrradiance.build(frame, sizes.lamps, points) if sizes.gridded else None
     return on_iris, IrisRelief.build(frame, shape, side, points, (sizes.nodes, sizes.points)), pupil
 
 
 class FrameBuilder:
-    """Builds frames from cached scenes, textures and maps.
+    """Builder of frames from cached scenes, textures and maps.
 
     Args:
-        beside: runs host work in one second thread.
-        obstacles: bodies in the scene's frame about eyes without a region.
+        beside: executor of one thread, for host work.
+        obstacles: bodies in the scene's frame around eyes without a region.
     """
 
     def __init__(self, beside: Executor, obstacles: Sequence[Obstacle] = ()) -> None:
@@ -99,14 +99,14 @@ class FrameBuilder:
         self._next: _Next | None = None
 
     def _expect(self, job: RenderJob) -> None:
-        """Start making the mesh of the next job in the second thread; head meshes need none."""
+        """Start computing the mesh of the next job in the second thread; head meshes need none."""
         self._next = _Next(job)
         region = job.region
         if region is not None and region.head is None:
             self._next.posed = self._beside.submit(region_mesh, region, job.globe)
 
     def prepare(self) -> None:
-        """Start the host work of the next job in the second thread, once this frame is launched."""
+        """Start the host work of the next job in the second thread, after this frame is launched."""
         after = self._next
         if after is None or (after.job.region is not None and after.posed is None):
             return
@@ -118,17 +118,18 @@ class FrameBuilder:
     def set(
         self, job: RenderJob, *, lit: bool = True, after: RenderJob | None = None
     ) -> tuple[BoundFrame, Background | RegionScene]:
-        """Set up the frame of a job and the surroundings of its eye, which keep their pose until the next call.
+        """Set up the frame of a job and the surroundings of its eye; both are valid until the next call.
 
         Args:
             job: the job.
-            lit: whether radiance is wanted, not only geometry.
-            after: the job of the next frame, if it is known.
+            lit: whether to compute light, not only geometry.
+            after: the job of the next frame, if known.
         """
         host, surroundings = self._host_data(job)
         region = surroundings if isinstance(surroundings, RegionScene) else None
         textures = self._textures_of(job)
-        # Large kernels that need little are launched first, so that the device is busy while NumPy prepares the rest.
+        # Large kernels that need few inputs are launched first, so that the device is busy while NumPy prepares the
+        # rest.
         shadow_maps = None if region is None else ShadowMaps.build(region, host.shadow_map_table)
         structure = Structure(
             surfaces=kinds(job.eye),
@@ -160,7 +161,7 @@ class FrameBuilder:
     def _light(
         self, host: HostData, frame: Frame, surroundings: Background | RegionScene, after: RenderJob | None
     ) -> None:
-        """Compute the radiosity, and fill the grids of irradiance that the frame can use."""
+        """Compute the radiosity and fill the irradiance grids that the frame can use."""
         job = host.job
         parts = panel_lamps(job.ambient, job.anchor_mm) + bright_lamps(job.ambient.map, self._maps, job.anchor_mm)
         panels = LampTable.of(parts, job.M, job.t)
@@ -176,7 +177,7 @@ class FrameBuilder:
             frame.caches.globe = GlobeIrradiance.build(frame, reach, points, host.lamps.gridded)
 
     def _fill_grids(self, host: HostData, frame: Frame, surroundings: Background | RegionScene) -> None:
-        """Fill the grids of irradiance behind the cornea."""
+        """Fill the irradiance grids behind the cornea."""
         job, lamps, heights = host.job, host.lamps, frame.textures.heights
         size = ReliefSize.of(job)
         side, shape = dr.opaque(mi.UInt32, size.side), None
@@ -206,7 +207,7 @@ class FrameBuilder:
         return host or HostData(job, surroundings.posed), surroundings
 
     def _pose_surroundings(self, job: RenderJob, known: RegionMesh | None) -> Background | RegionScene:
-        """Pose the surroundings of a job; the mesh of a region may be known."""
+        """Pose the surroundings of a job; the mesh of a region may already be computed."""
         if job.region is None:
             self._background.show(job.look)
             return self._background
@@ -217,11 +218,11 @@ class FrameBuilder:
         return surroundings
 
     def _region(self, job: RenderJob, known: RegionMesh | None) -> RegionScene:
-        """Find the scene of a subject.
+        """Return the scene of a subject, from the cache or by refilling another one.
 
         A new subject reuses the scene buffers of an earlier one, so recordings stay valid. A subject that returns after
-        its scene was reused gets its own, or subjects that take turns would refill one scene forever. So does the other
-        eye of a subject at once, because the first will return.
+        its scene was reused gets its own scene, otherwise subjects that alternate would refill one scene forever. The
+        second eye of a subject gets its own scene at once, because the first eye will return.
         """
         assert job.region is not None
         spec, globe = job.region, job.globe

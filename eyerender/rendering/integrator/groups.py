@@ -1,10 +1,11 @@
-"""Groups of samples before an eye region, and the turns in which they take the lamps.
+"""Groups of samples in front of an eye region, and how they take turns at the lamps.
 
-A group is a few samples of one pixel. Every sample has a camera ray of its own. What the group hits of the region is
-merged (`merging`) and shaded once, and the globe is shaded for every sample (`groupshading`).
+A group is a few samples of one pixel, each with its own camera ray. The group's hits on the region are merged
+(`merging`) and shaded once; hits on the globe are shaded sample by sample (`groupshading`).
 
-The groups of a pixel take the lamps in turn, and so do the samples on the globe. A lamp used by c of n counts n / c
-times, so that every lamp has its exact share in every pixel. The sun, whose shadows are dark and sharp, is used by all.
+The groups of a pixel take turns at the lamps, and so do the samples on the globe. A lamp used by c of n users is
+weighted n / c, so that every lamp has its exact share in every pixel. The sun, whose shadows are dark and sharp, is
+used by all.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from .visibility import HitTable
 
 @dataclass(kw_only=True)
 class LampShare:
-    """A lamp, and the number of users for which one user's ray to it stands."""
+    """A lamp, and the number of users that one user's ray to it represents."""
 
     lamp: Lamp
     weight: mi.Float
@@ -31,18 +32,18 @@ class LampShare:
 
 @dataclass(kw_only=True)
 class LampTurns:
-    """Lamps that `users`, such as the groups of a pixel, take in turn. The sun, the last lamp, has no turns."""
+    """Assignment of lamps to `users`, such as the groups of a pixel, in turn. The sun, the last lamp, has no turns."""
 
     lights: Lights
     users: mi.UInt32
 
     @property
     def others(self) -> mi.UInt32:
-        """Number of lamps but the sun. A frame without lamps has a dark one."""
+        """Number of lamps except the sun. A frame without lamps has a dark one."""
         return dr.maximum(self.lights.count, 1) - self.lights.suns
 
     def count(self, user: mi.UInt32) -> mi.UInt32:
-        """Count the lamps of a user."""
+        """Return the number of lamps of a user."""
         several = quotient(self.users + self.others - 1 - user, self.users)
         return dr.select(self.users < self.others, several, dr.minimum(self.others, 1)) + self.lights.suns
 
@@ -61,19 +62,19 @@ class PixelGroup:
 
     Attributes:
         samples: all samples of the pixel.
-        number: number of the group in its pixel.
+        number: number of the group within its pixel.
         count: number of samples in the group.
-        hits: what they hit of the region.
+        hits: hits on the region.
         first_hit: index of the first of these hits.
-        plain: whether the pixel shows nothing but the sheet of skin, and there is one hit for the group.
+        plain: whether the pixel shows only the sheet of skin, and the group has one hit.
         wet: whether the pixel may show menisci.
-        halved: whether half of the samples that meet the globe are shaded for all of them.
+        halved: whether only half of the samples on the globe are shaded, on behalf of all.
         turns: turns of the pixel's groups, for light on the region.
         sample_turns: turns of the pixel's samples, for light on the globe.
-        own_shadows: whether pairs of samples send rays of their own to the group's first lamp about the lids and on
-            hairs, where lashes cast shadows finer than a pixel.
-        sharp: whether every sample does so, and everywhere: the lamp is the sun.
-        layered: whether the depths of the parts are wanted.
+        own_shadows: whether pairs of samples trace their own ray to the group's first lamp near the lids and on hairs,
+            where lashes cast shadows finer than a pixel.
+        sharp: whether every sample does so everywhere, because the lamp is the sun.
+        layered: whether to sum the depths of the parts.
     """
 
     samples: Samples
@@ -91,35 +92,35 @@ class PixelGroup:
     layered: bool
 
     def in_order(self, i: mi.UInt32) -> mi.UInt32:
-        """Return the i-th sample to examine: the middle one first, then the remaining ones in turn."""
+        """Return the i-th sample to examine: the middle one first, then the others in order."""
         middle = self.count >> 1
         return dr.select(i == 0, middle, dr.select(i <= middle, i - 1, i))
 
     def of_pixel(self, j: mi.UInt32) -> mi.UInt32:
-        """Compute the number of sample j within its pixel."""
+        """Return the number of sample j within its pixel."""
         return self.number * self.count + j
 
     def ray(self, frame: Frame, j: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
-        """Origin and direction (scene's frame) of sample j, and its weight, cos^4(theta) / D of `camera_ray`."""
+        """Return origin and direction (scene's frame) of sample j, and its weight, cos^4(theta) / D of `camera_ray`."""
         o, d, root = self.samples.ray(frame, self.of_pixel(j))
         return o, d, root * root
 
     @syntax
     def hit(self, frame: Frame, j: mi.UInt32) -> TriangleHit:
-        """Say what sample j hits of the region."""
+        """Return the hit of sample j on the region."""
         hit = self.hits.at(self.first_hit + dr.select(self.plain, 0, j))
-        # Now and then a ray slips between two triangles. Then it stands for itself alone.
+        # Occasionally a ray slips between two triangles. Then the sample stands for itself only.
         if dr.hint(self.plain & ~hit.is_valid(), exclude=[self, frame, j]):
             hit = region_hit(frame, *self.ray(frame, j)[:2])
         return hit
 
     def spot(self, j: mi.UInt32) -> mi.Point2f:
-        """Compute the place of sample j on the lamps' discs, [0, 1)^2."""
+        """Return the position of sample j on the lamps' discs, [0, 1)^2."""
         return self.samples.pair(self.of_pixel(j), 0)
 
     @property
     def shared_spot(self) -> mi.Point2f:
-        """The same for the group. The groups that use a lamp have consecutive places."""
+        """Return the group's position on the lamps' discs; groups that share a lamp have consecutive positions."""
         lamps = dr.maximum(self.turns.others, 1)
         several = self.turns.users < self.turns.others
         return self.samples.pair(dr.select(several, self.number, self.number // lamps), 0)

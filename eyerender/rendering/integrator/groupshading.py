@@ -1,4 +1,4 @@
-"""Stage 3 before an eye region: shading a group's samples on the globe and its merged points on the region."""
+"""Stage 3 with an eye region: shade a group's samples on the globe, and its merged points on the region."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from .groups import PixelGroup
 from .merging import RegionSample, WeightedHit, blocked_from_region, merge_hits
 from .shading import direct, indirect, off_eye
 
-_FAINT = 1e-3  # highlights so weak, relative to the other light or to a white surface, need no ray for their shadow
+_FAINT = 1e-3  # highlights this weak, relative to the other light or to a white surface, need no shadow ray
 
 
 @dataclass(kw_only=True)
 class GlobeSamples:
-    """A group's samples on the globe.
+    """Sums over a group's samples on the globe.
 
     Attributes:
-        lit: radiance times weight of the samples that are shaded.
-        shaded: weight of these.
-        weight: of all samples on the globe.
+        lit: sum of radiance times weight over the shaded samples.
+        shaded: sum of weights of the shaded samples.
+        weight: sum of weights of all samples on the globe.
         near: sum of weights times inverse depth (1/mm).
-        water: radiance times weight of the menisci before globe and skin.
+        water: sum of radiance times weight of menisci in front of globe and skin.
         failures: number of failed light paths.
     """
 
@@ -45,22 +45,23 @@ class GlobeSamples:
 
     @classmethod
     def none(cls) -> GlobeSamples:
-        """Return the sums of no samples."""
+        """Return empty sums."""
         lit, shaded, weight, near, water = (mi.Float(0) for _ in range(5))
         return cls(lit=lit, shaded=shaded, weight=weight, near=near, water=water, failures=mi.UInt32(0))
 
     @property
     def radiance(self) -> mi.Float:
-        """Radiance times weight of all samples. The shaded ones stand for the others."""
+        """Sum of radiance times weight of all samples; the shaded ones stand for the others."""
         return self.water + self.lit * dr.select(self.shaded > 0, self.weight / self.shaded, 0)
 
 
 def shade_group(frame: Frame, group: PixelGroup) -> tuple[list[mi.Float], mi.UInt32]:
-    """Sum what a group's samples show, and count the failed light paths.
+    """Sum the radiance of a group's samples, and count the failed light paths.
 
     Returns:
-        The radiance times weight. If layered, for each part of the scene from front to back (before the skin, skin,
-        globe): that of the part, its number of samples, and this number times inverse depth (1/mm).
+        Radiance times weight. If layered, three numbers for each part of the scene, from front to back (in front of the
+        skin, skin, globe): its radiance times weight, its number of samples, and that number times inverse depth
+        (1/mm).
     """
     sheet, before = merge_hits(frame, group)
     globe = shade_globe(frame, group)
@@ -93,16 +94,16 @@ def shade_globe(frame: Frame, group: PixelGroup) -> GlobeSamples:
 
 @syntax
 def _add_globe_sample(frame: Frame, group: PixelGroup, globe: GlobeSamples, j: mi.UInt32, hit: TriangleHit) -> None:
-    """Add what sample j shows of the globe and of menisci."""
+    """Add the light of sample j from the globe and from menisci."""
     o, d, weight = group.ray(frame, j)
     view = View(si=behind(EyeShape(frame=frame).ray_intersect(o, d), hit, mi.Bool(True)), d=mi.Vector3f(d))
     if dr.hint(group.wet, exclude=[frame, group, o, j, weight]):
         _look_through_water(frame, group, globe, view, o, j, weight)
     on_globe = view.si.globe
     if group.layered:
-        # Before the branch below: Dr.Jit would reuse its values outside of it.
+        # Computed before the branch below, because Dr.Jit would reuse its values outside of it.
         globe.near = globe.near + dr.select(on_globe, weight * view.si.nearness(frame, view.d), 0)
-    # Of any four samples the two in the middle: of twelve, these are a lattice about the pixel's centre.
+    # Of any four samples, use the two in the middle: for twelve samples, these form a lattice about the pixel's centre.
     in_turn = ~group.halved | (((j + 1) & 2) > 0) | (globe.shaded == 0)
     if dr.hint(on_globe & in_turn, exclude=[frame, group, view, j, weight]):
         radiance, failures = _globe_radiance(frame, group, view, j)
@@ -115,13 +116,13 @@ def _add_globe_sample(frame: Frame, group: PixelGroup, globe: GlobeSamples, j: m
 def _look_through_water(
     frame: Frame, group: PixelGroup, globe: GlobeSamples, view: View, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
 ) -> None:
-    """Add the light that menisci mirror along sample j's ray, and move the view to the surface behind them."""
+    """Add the light that menisci mirror along sample j's ray, and continue the view to the surface behind them."""
     if frame.region.water is None:
         return
     hit = water_hit(frame, o, view.d, view.si.distance)
     no = mi.Bool(False)
     sample = WeightedHit(j=j, hit=hit, on_sheet=no, weight=weight, near=mi.Float(0), own_ray=no)
-    # Mirror images of lamps in water are smaller than a pixel, so no sample stands for others.
+    # Mirror images of lamps in water are smaller than a pixel, so no sample can stand for others.
     drop = RegionSample.none()
     drop.add(hit.is_valid(), sample, no)
     globe.water = shade_region(frame, group, drop, globe.water, on_sheet=False)
@@ -145,13 +146,13 @@ def _globe_radiance(frame: Frame, group: PixelGroup, view: View, j: mi.UInt32) -
 
 @dataclass(kw_only=True)
 class _LitPoint:
-    """A surface point in the light of lamps (eye frame).
+    """A surface point lit by lamps (eye frame).
 
     Attributes:
-        si: the point.
-        normal: normal of the film that mirrors.
-        to_camera: unit direction of the viewer.
-        spot: place on the lamps' discs, [0, 1)^2.
+        si: the surface there.
+        normal: normal of the mirroring film.
+        to_camera: unit direction to the viewer.
+        spot: position on the lamps' discs, [0, 1)^2.
     """
 
     si: SurfaceInteraction
@@ -160,18 +161,18 @@ class _LitPoint:
     spot: mi.Point2f
 
     def source(self, lamp: Lamp) -> mi.Vector3f:
-        """Compute the point of a lamp."""
+        """Return the point of a lamp from which light arrives."""
         return lamp.point(self.spot.x, *dr.sincos(self.spot.y * (2 * dr.pi)))
 
     def radiance(self, lamp: Lamp, albedo: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Compute the radiance towards the viewer when nothing is in the lamp's way, and the irradiance (mW/mm^2)."""
+        """Compute the radiance towards the viewer from an unblocked lamp, and the irradiance (mW/mm^2)."""
         irradiance, shine = direct_light(lamp, self.source(lamp), self.si, (self.normal, self.to_camera))
         return direct(self.si, albedo, irradiance, shine), irradiance
 
 
 @syntax
 def _highlights_of_globe(frame: Frame, lit: _LitPoint, albedo: mi.Float) -> mi.Float:
-    """Radiance of the globe where light spreads inside: that light is known, and the tear film's highlight remains."""
+    """Compute the tear film's highlight on the globe where subsurface light is already computed."""
     tissues, si = frame.caches.diffusion, lit.si
     covered, share = ~si.cornea | (si.opacity > 0), tissues.lamps_at_globe(frame, si.point)
     total = direct(si, albedo, tissues.at_globe(frame, si.point), mi.Float(0))
@@ -185,9 +186,9 @@ def _highlights_of_globe(frame: Frame, lit: _LitPoint, albedo: mi.Float) -> mi.F
 
 @syntax
 def _lamps_on_globe(frame: Frame, group: PixelGroup, lit: _LitPoint, albedo: mi.Float, j: mi.UInt32) -> mi.Float:
-    """Compute the radiance of the matte globe at sample j: the light of all lamps, less what is kept from it.
+    """Compute the radiance of the matte globe at sample j: light of all lamps minus what is blocked.
 
-    The samples of a pixel share the rays to the lamps. So only shadows that end within the pixel are noisy.
+    The samples of a pixel share their rays to the lamps, so noise occurs only where a shadow's edge crosses the pixel.
     """
     total, i = mi.Float(0), mi.UInt32(0)
     while dr.hint(i < frame.lights.count, label="all lamps", exclude=[frame, lit, albedo]):
@@ -209,14 +210,14 @@ def _lamps_on_globe(frame: Frame, group: PixelGroup, lit: _LitPoint, albedo: mi.
 
 @syntax
 def shade_region(frame: Frame, group: PixelGroup, point: RegionSample, total: mi.Float, *, on_sheet: bool) -> mi.Float:
-    """Add to `total` the radiance of a merged point times its weight."""
+    """Add the radiance of a merged point, times its weight, to `total`."""
     if dr.hint(point.weight > 0, exclude=[frame, group, point, on_sheet]):
         total = _add_region(frame, group, point, total, on_sheet)
     return total
 
 
 def _add_region(frame: Frame, group: PixelGroup, point: RegionSample, total: mi.Float, on_sheet: bool) -> mi.Float:
-    """Add the light of other surfaces and of the lamps that the group uses."""
+    """Add light from other surfaces and from the lamps that the group uses."""
     _, d, _ = group.ray(frame, point.j)
     si = region_interaction(frame, point.face, point.uv, d, point.weight > 0)
     radiance = off_eye(frame, si, d, si.albedo, si.received)
@@ -234,7 +235,7 @@ def _add_region(frame: Frame, group: PixelGroup, point: RegionSample, total: mi.
 def _highlights_of_skin(
     group: PixelGroup, point: RegionSample, lit: _LitPoint, total: mi.Float, share_of: Callable[[mi.UInt32], mi.Float]
 ) -> mi.Float:
-    """Add the highlights of skin in which light spreads; `share_of` a lamp reaches it."""
+    """Add the highlights of skin with subsurface scattering; `share_of` a lamp reaches it."""
     k = mi.UInt32(0)
     lamps = group.turns.count(group.number)
     while dr.hint(k < lamps, label="highlights", exclude=[group, point, lit, share_of, lamps]):
@@ -249,7 +250,7 @@ def _highlights_of_skin(
 def _lamps_on_region(
     frame: Frame, group: PixelGroup, point: RegionSample, lit: _LitPoint, total: mi.Float, on_sheet: bool
 ) -> mi.Float:
-    """Add the light of lamps on a matte surface with highlights, with their shadows."""
+    """Add the light of lamps on a matte surface with highlights, including shadows."""
     k = mi.UInt32(0)
     lamps = group.turns.count(group.number)
     while dr.hint(k < lamps, label="its lamps", exclude=[frame, group, point, lit, on_sheet, lamps]):

@@ -1,4 +1,4 @@
-"""Host-side precomputation for a job: nothing here asks the device, so a second thread may do it during the tracing."""
+"""Host-side precomputation for a job; never touches the device, so a second thread may run it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class HostData:
 
     Args:
         job: the job.
-        posed: the mesh of its region, None for a bare eye.
+        posed: the posed mesh of its region; None for a bare eye.
     """
 
     def __init__(self, job: RenderJob, posed: RegionMesh | None) -> None:
@@ -39,7 +39,7 @@ class HostData:
 
     @classmethod
     def compute(cls, job: RenderJob, posed: RegionMesh | None) -> HostData:
-        """Compute everything that a picture needs."""
+        """Compute everything that the image needs."""
         data = cls(job, posed)
         _ = data.parameters, data.lamps, data.returned, data.patches, data.lid_margins_px
         if job.mesh_edge_mm is None:
@@ -53,29 +53,29 @@ class HostData:
 
     @cached_property
     def sunlit(self) -> RenderJob:
-        """The job with the sun, if there is one, as its last lamp."""
+        """The job, with the sun (if any) as its last lamp."""
         suns = sun_lamps(self.job.ambient, self.job.anchor_mm)
         return replace(self.job, lights=(*self.job.lights, *suns))
 
     @cached_property
     def parameters(self) -> Parameters:
-        """The numbers of the frame."""
+        """Frame parameters on the host."""
         return parameters_of(self.job)
 
     @cached_property
     def lamps(self) -> LampTable:
-        """The lamps and the sun in the eye frame."""
+        """Lamps and sun in the eye frame."""
         job, lights = self.job, self.sunlit.lights
         return LampTable.of(lights, job.M, job.t, len(lights) - len(job.lights))
 
     @cached_property
     def returned(self) -> FundusLight:
-        """What the fundus returns of the lamps' light and the sun's."""
+        """Light of the lamps and the sun that the fundus returns."""
         return returned_light(self.sunlit)
 
     @cached_property
     def blur(self) -> Blur:
-        """The lens."""
+        """Defocus of the job."""
         return Blur.of(self.job, self.posed)
 
     @cached_property
@@ -92,22 +92,22 @@ class HostData:
 
     @cached_property
     def shadow_map_table(self) -> Singles:
-        """Table of the lamps' shadow maps of a region, the sun's too."""
+        """Table of the shadow maps of all lamps, and of the sun, for a region."""
         return shadow_map_table(self.sunlit.lights, self.job.anchor_mm, self.reach_mm)
 
     @cached_property
     def mirror_images(self) -> MirrorImages:
-        """The lamps' mirror images in the closed form of the cornea."""
+        """Mirror images of the lamps in the closed-form cornea."""
         return MirrorImages.of(self.job, None)
 
     @cached_property
     def patches(self) -> GlobePatches:
-        """The patches of the globe between which light is exchanged."""
+        """Patches of the globe that exchange light."""
         return globe_patches(self.job.globe, self.posed)
 
     @cached_property
     def tissue_cells(self) -> DiffusionGrids:
-        """Cells where the light in the tissues of a procedural region is computed."""
+        """Grid cells where subsurface light of a procedural region is computed."""
         assert self.posed is not None
         return DiffusionGrids.of(self.job, self.posed, self.blur.border_px)
 
@@ -117,10 +117,10 @@ class HostData:
         return None if self.posed is None else lid_margins_px(self.posed, self.job.camera, self.job.anchor_mm)
 
     def marks(self, window: Window) -> NDArray[np.uint8]:
-        """Compute classes of a window's pixels, row by row: sums of `FINE`, `WET` and `PLAIN`.
+        """Classify a window's pixels, row by row, as sums of `FINE`, `WET` and `PLAIN`.
 
-        A pixel is `FINE` if thin hairs or menisci may show in it, `WET` if menisci may, and `PLAIN` if nothing but the
-        sheet of skin does.
+        A pixel is `FINE` if it may show thin hairs or menisci, `WET` if it may show menisci, and `PLAIN` if it shows
+        only the sheet of skin.
         """
         if window not in self._marks:
             camera, anchor = self.job.camera, self.job.anchor_mm

@@ -1,7 +1,7 @@
-"""Stage 2 before an eye region: merging the hits of a group of samples.
+"""Stage 2 with an eye region: merge the hits of a group of samples.
 
-There are at most two merged points, one on the sheet of skin and one before it (hairs, tears). Each is the hit of the
-first sample there and has the weight of all.
+There are at most two merged points: one on the sheet of skin and one in front of it (hairs, tears). Each is the hit of
+the first sample there and carries the weight of all.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from ..records.recording import syntax
 from ..transport.directlight import lamp_blocked, shadowless
 from .groups import PixelGroup
 
-_LIDS_MM = 18.0  # about the axis of the unrotated eye: the region of the lids, where lashes cast shadows
+_LIDS_MM = 18.0  # radius about the axis of the unrotated eye: the region of the lids, where lashes cast shadows
 
 
 @dataclass(kw_only=True)
 class WeightedHit:
-    """A sample's hit on the region, with its weight.
+    """A sample's weighted hit on the region.
 
     Attributes:
         j: number of the sample in its group.
-        hit: where it hits.
-        on_sheet: whether it hits the sheet of skin.
-        weight: of the sample.
+        hit: the hit.
+        on_sheet: whether it lies on the sheet of skin.
+        weight: weight of the sample.
         near: weight times inverse depth (1/mm).
-        own_ray: whether the sample does not rely on the group's ray to the lamp.
+        own_ray: whether the sample traces its own ray to the lamp instead of sharing the group's.
     """
 
     j: mi.UInt32
@@ -43,15 +43,15 @@ class WeightedHit:
 
 @dataclass(kw_only=True)
 class RegionSample:
-    """The surface point that stands for all samples of a group on one kind of surface.
+    """The surface point that represents all samples of a group on one kind of surface.
 
     Attributes:
         j: number of its sample.
         face: its triangle.
-        uv: barycentric coordinates there.
-        weight: of the samples.
-        shared: of those that rely on the group's ray to the lamp.
-        clear: of the others that see the lamp.
+        uv: barycentric coordinates on it.
+        weight: sum of weights of the samples.
+        shared: sum of weights of the samples that share the group's ray to the lamp.
+        clear: sum of weights of the other samples that see the lamp.
         near: sum of weights times inverse depth (1/mm).
     """
 
@@ -65,7 +65,7 @@ class RegionSample:
 
     @classmethod
     def none(cls) -> RegionSample:
-        """Return the point of no samples."""
+        """Return the point of an empty group."""
         j, face, uv = mi.UInt32(0), mi.UInt32(0), mi.Point2f(0)
         return cls(j=j, face=face, uv=uv, weight=mi.Float(0), shared=mi.Float(0), clear=mi.Float(0), near=mi.Float(0))
 
@@ -83,7 +83,7 @@ class RegionSample:
 
 @syntax
 def merge_hits(frame: Frame, group: PixelGroup) -> tuple[RegionSample, RegionSample]:
-    """Merge a group's hits to a point on the sheet of skin and a point before it."""
+    """Merge a group's hits to one point on the sheet of skin and one in front of it."""
     sheet, before = RegionSample.none(), RegionSample.none()
     i, asked, blocked = mi.UInt32(0), mi.Bool(False), mi.Bool(False)
     while dr.hint(i < group.count, label="merge", exclude=[frame, group]):
@@ -101,7 +101,7 @@ def merge_hits(frame: Frame, group: PixelGroup) -> tuple[RegionSample, RegionSam
 
 
 def _weighted_hit(frame: Frame, group: PixelGroup, j: mi.UInt32) -> WeightedHit:
-    """Read sample j's hit, and decide whether its shadow needs a ray of its own."""
+    """Read sample j's hit, and decide whether it needs its own shadow ray."""
     hit, (o, d, weight), near = group.hit(frame, j), group.ray(frame, j), mi.Float(0)
     x, on_sheet = o + hit.t * d, frame.region.on_sheet(hit.prim_index)
     own_ray = hit.is_valid() & group.own_shadows
@@ -127,7 +127,7 @@ def _own_shadow(frame: Frame, group: PixelGroup, sample: WeightedHit, active: mi
 def blocked_from_region(
     frame: Frame, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, active: mi.Bool
 ) -> mi.Bool:
-    """Find whether anything keeps a lamp's light from points x of the region (eye frame), on its sheet or before it."""
-    # Where the lamp's shadow map shows bare skin alone, only the globe may be in the way.
+    """Return whether anything blocks a lamp's light at points x of the region (eye frame), on its sheet or in front."""
+    # Where the lamp's shadow map shows only bare skin, only the globe may block the light.
     clear = shadowless(frame, lamp.number, frame.point_to_scene(x), active & on_sheet)
     return lamp_blocked(frame, x, source, True, True, active & ~clear)

@@ -1,4 +1,4 @@
-"""Requests to the film: which window of which frame, with which samples."""
+"""Requests to the film: which window of which frame to render, with which samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TIMES, _ENOUGH = 3, 32  # times as many samples at hairs, unless a pixel has mo
 
 @dataclass(frozen=True, slots=True)
 class BoundFrame:
-    """A frame on the device, ready to be rendered, and the host's data of its job."""
+    """A frame on the device, ready to be rendered, and the host data of its job."""
 
     frame: Frame
     host: HostData
@@ -29,8 +29,8 @@ class FilmRequest:
         bound: the frame.
         window: (x0, y0, width, height) in full-sensor pixels.
         spp: samples per pixel.
-        seed: of the samples.
-        layered: whether the parts of the scene are wanted one by one, with their depths.
+        seed: seed of the samples.
+        layered: whether to render the parts of the scene separately, with their depths.
     """
 
     bound: BoundFrame
@@ -41,7 +41,7 @@ class FilmRequest:
 
     @property
     def group_size(self) -> int:
-        """Number of samples of a pixel in a group; where light spreads in the skin, there are no fine shadows."""
+        """Samples per group; larger with subsurface scattering, which leaves no fine shadows in skin."""
         if self.bound.frame.structure.scattering and self.spp == _LARGEST_GROUP:
             return self.spp
         size = _LARGEST_GROUP
@@ -51,10 +51,10 @@ class FilmRequest:
 
     @property
     def groups(self) -> int:
-        """Number of groups of a pixel."""
+        """Groups per pixel."""
         return self.spp // self.group_size
 
     @property
     def times(self) -> int:
-        """How many times as many samples supersampled pixels have."""
+        """Factor by which supersampled pixels have more samples."""
         return _TIMES if self.spp <= _ENOUGH else 1

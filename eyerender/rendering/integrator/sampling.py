@@ -1,14 +1,13 @@
-"""Camera rays and sample points of a window of the sensor, on Dr.Jit arrays.
+"""Camera rays and sample positions of a window of the sensor, on Dr.Jit arrays.
 
-Places in the pixel form a rank-1 lattice, x = (k + 1/2) / N, y = frac((k a + 1/2) / N), with the a whose smallest
-distance is largest, tiled over the sensor. The edges of a frame are thus sampled by one regular lattice, which places a
-contour far better than the same number of independent samples (Sloan and Joe 1994, chapter 4). Its mean is the pixel's
-centre in every image: a random shift of the whole lattice would move the image, but not the computed glints, by up to 1
-/ (2 N) px. All seeds share it, so the mean over seeds keeps the lattice's error.
+Positions in the pixel form a rank-1 lattice, x = (k + 1/2) / N, y = frac((k a + 1/2) / N), tiled over the sensor; a
+maximises the smallest distance between points. A regular lattice locates edges far better than as many independent
+samples (Sloan and Joe 1994, chapter 4). Its mean is always the pixel's centre: a random shift would move the image, but
+not the computed glints, by up to 1 / (2 N) px. All seeds share the lattice, so averaging over seeds keeps its error.
 
-Places on the lamps: sample k is at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018). The
-shift is a hash of the pixel's place on the whole sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft
-shadows show noise and no bands. Nothing depends on threads, on the window, or on what was rendered before.
+Positions on the lamps: sample k is at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018).
+The shift is a hash of the pixel's position on the sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft
+shadows show noise rather than bands. Nothing depends on threads, the window, or earlier renderings.
 """
 
 from __future__ import annotations
@@ -27,16 +26,16 @@ from ..records.frame import Frame
 _PHI = 1.324717957244746
 _ALPHA = tuple(round(_PHI ** -(k + 1) * 2**32) for k in range(2))
 _UNDISTORT_STEPS = 6
-_UNDISTORTED = 1e-4  # residual of what Newton's method has solved, in units of the focal length
+_UNDISTORTED = 1e-4  # largest accepted residual of Newton's method, in units of the focal length
 _CALLS = 3  # pairs of further numbers of a sample
 
 
 @lru_cache(maxsize=64)
 def lattice_generator(count: int) -> int:
-    """The a, prime to `count`, whose lattice {(k, k a mod N)} / N has the largest smallest distance on the torus."""
+    """Return the a, prime to `count`, whose lattice {(k, k a mod N)} / N has the largest minimum distance (torus)."""
     if count <= 2:
         return 1
-    # For long lattices every a near the golden section is good, so the best of a few is found quickly.
+    # For long lattices every a near the golden section is good, so a few candidates suffice.
     golden = round(count * 0.6180339887498949)
     choice = range(1, count) if count <= 1024 else range(max(1, golden - 64), min(count, golden + 64))
     k = np.arange(1, count)
@@ -61,7 +60,7 @@ class Pixels:
 
     @classmethod
     def of(cls, window: Window) -> Pixels:
-        """Upload the place of a window."""
+        """Upload the position of a window."""
         corner = dr.opaque(mi.Int32, window[0]), dr.opaque(mi.Int32, window[1])
         return cls(corner=corner, width=dr.opaque(mi.UInt32, window[2]))
 
@@ -73,15 +72,15 @@ class Pixels:
 
 @dataclass(kw_only=True)
 class Pattern:
-    """The samples of all pixels of a frame: numbers and steps of two lattices, and keys of the further numbers.
+    """Sample pattern of all pixels of a frame: number and step of two lattices, and keys for further random numbers.
 
-    A step is the lattice's generator over its number, in units of 2^-32, so that wrapping takes the place of a
-    remainder: processors divide whole numbers one by one.
+    A step is the lattice's generator over its number, in units of 2^-32. Integer overflow then replaces the remainder,
+    which processors can only compute one lane at a time.
 
     Attributes:
-        usual: number and step of the usual lattice.
-        fine: those of the lattice of supersampled pixels.
-        keys: of the further numbers.
+        usual: number and step of the ordinary lattice.
+        fine: number and step of the lattice of supersampled pixels.
+        keys: keys of the further random numbers.
     """
 
     usual: tuple[mi.UInt32, mi.UInt32]
@@ -90,7 +89,7 @@ class Pattern:
 
     @classmethod
     def of(cls, count: int, seed: int, *, times: int = 1) -> Pattern:
-        """Make the pattern of `count` samples, `times` as many in supersampled pixels, for a seed."""
+        """Create the pattern of `count` samples for a seed, with `times` as many in supersampled pixels."""
         usual, fine = (
             (dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, -(-(lattice_generator(n) << 32) // n) & 0xFFFFFFFF))
             for n in (count, count * times)
@@ -101,13 +100,13 @@ class Pattern:
 
 @dataclass(kw_only=True)
 class Samples:
-    """The samples of pixels, one pixel per lane. They are the same in every window.
+    """Samples of pixels, one pixel per lane. They do not depend on the window.
 
     Attributes:
         u: column of the pixel on the sensor.
-        v: its row.
+        v: row of the pixel on the sensor.
         count: number of samples.
-        step: of the lattice, as in `Pattern`.
+        step: step of the lattice, as in `Pattern`.
         keys: as in `Pattern`.
     """
 
@@ -119,17 +118,17 @@ class Samples:
 
     @classmethod
     def of(cls, u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = False) -> Samples:
-        """Return the samples of pixels (u, v), which are supersampled where `fine`."""
+        """Return the samples of pixels (u, v), supersampled where `fine`."""
         (few, one), (many, other) = pattern.usual, pattern.fine
         return cls(u=u, v=v, count=dr.select(fine, many, few), step=dr.select(fine, other, one), keys=pattern.keys)
 
     def in_pixel(self, k: mi.UInt32) -> mi.Point2f:
-        """Compute the place of sample `k` in the pixel, [0, 1)^2."""
+        """Compute the position of sample `k` in the pixel, [0, 1)^2."""
         scale = dr.rcp(mi.Float(self.count))
         return mi.Point2f((mi.Float(k) + 0.5) * scale, mi.Float((k * self.step) >> 8) * 2.0**-24 + 0.5 * scale)
 
     def pair(self, k: mi.UInt32, call: int) -> mi.Point2f:
-        """Make two further numbers of sample `k`, [0, 1)^2: each call of a pixel has its own shift."""
+        """Compute two further random numbers of sample `k`, [0, 1)^2; each `call` has its own shift per pixel."""
         tea: Any = mi.sample_tea_32
         pixel = (self.u & mi.UInt32(0xFFFF)) | (self.v << mi.UInt32(16))
         return mi.Point2f(
@@ -140,17 +139,18 @@ class Samples:
         )
 
     def ray(self, frame: Frame, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
-        """Compute the camera ray of sample `k`, as by `camera_ray`."""
+        """Compute the camera ray of sample `k`, as in `camera_ray`."""
         place = self.in_pixel(k)
         return camera_ray(frame, mi.Float(self.u) + (place.x - 0.5), mi.Float(self.v) + (place.y - 0.5))
 
 
 def camera_ray(frame: Frame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
-    """Compute the ray of the scene's frame through pixel (u, v), centres at integers.
+    """Compute the ray through pixel (u, v) in the scene's frame, with pixel centres at integers.
 
     Returns:
-        Origin, unit direction, and the root of the weight cos^4(theta) / D of its radiance: theta is the angle to the
-        camera's axis, D the area on the sensor per area without distortion. It is 0 where the lens images nothing.
+        Origin, unit direction, and the square root of the weight cos^4(theta) / D of its radiance: theta is the angle
+        to the camera's axis, D the area on the sensor per area without distortion. The weight is 0 where the lens forms
+        no image.
     """
     fx, fy = frame.camera.focal
     cx, cy = frame.camera.principal

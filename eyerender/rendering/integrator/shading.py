@@ -2,8 +2,8 @@
 
     L = (1 - F) / n^2 * albedo / pi * sum_l I_l (1 - F_l) cos(theta) / J_l
 
-from the iris, which every lamp lights through all refracting surfaces (`directlight`). Sclera and background are matte
-and lit directly.
+is the radiance of the iris, which every lamp lights through all refracting surfaces (`directlight`). Sclera and
+background are matte and lit directly.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from ..records.frame import Frame
 from ..records.recording import syntax
 from ..transport.directlight import lamp_light, on_relief
 
-_FLAT_MM = 1e-2  # from the plane of the background
+_FLAT_MM = 1e-2  # distance from the plane of the background
 
 
 def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.UInt32]:
-    """Compute the radiance (mW/mm^2/sr) along rays of the scene's frame before a bare eye, and failed light paths.
+    """Compute the radiance (mW/mm^2/sr) along rays of the scene's frame for a bare eye, and count failed light paths.
 
-    u, v: place on each lamp's disc, [0, 1).
+    (u, v) is the position on each lamp's disc, [0, 1)^2.
     """
     si = on_relief(frame, first_hit(frame, o, d, mi.Bool(True)))
     known, outer_known = mi.Bool(False), mi.Float(0)
@@ -39,15 +39,15 @@ def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float
 
 
 def direct(si: SurfaceInteraction, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
-    """Compute the radiance of matte surfaces lit by the lamps: from their irradiance, and from their sheen."""
+    """Compute the radiance of lamp-lit matte surfaces: from their irradiance and their sheen."""
     return dr.select(si.met, si.cover * (albedo * outer * dr.inv_pi + shine), 0)
 
 
 @syntax
 def of_surroundings(frame: Frame, si: SurfaceInteraction, known: mi.Bool) -> mi.Vector4f:
-    """Light that a bare globe and its background receive from other surfaces (see `radiosityfield.RadiosityField`).
+    """Return the light that a bare globe and its background receive from other surfaces.
 
-    Obstacles receive nothing. The light from other surfaces on the globe is left out where it is `known`.
+    See `radiosityfield.RadiosityField`. Obstacles receive nothing. Where `known`, the light on the globe is left out.
     """
     known = known & ~si.other
     wanted = si.matte if frame.structure.ambient else si.matte & ~known
@@ -59,7 +59,7 @@ def of_surroundings(frame: Frame, si: SurfaceInteraction, known: mi.Bool) -> mi.
 
 @syntax
 def _from_other_surfaces(frame: Frame, other: mi.Bool, x: mi.Vector3f) -> mi.Vector4f:
-    """Return the same for points x (scene's frame) of the globe, or of something `other`."""
+    """Return the light from other surfaces at points x (scene's frame) of the globe, or of something `other`."""
     radiosity = frame.caches.radiosity
     if dr.hint(other, exclude=[frame, radiosity, x]):
         on_plane = dr.abs(x.x - frame.backdrop_x) < _FLAT_MM
@@ -72,13 +72,13 @@ def _from_other_surfaces(frame: Frame, other: mi.Bool, x: mi.Vector3f) -> mi.Vec
 def indirect(
     frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float, received: mi.Vector4f
 ) -> mi.Float:
-    """Compute the radiance other than `direct`.
+    """Compute all radiance except that of `direct`.
 
     Args:
         frame: the frame.
-        si: the surface that is seen, and the iris behind it.
+        si: the visible surface, and the iris behind it.
         d: directions of the rays (scene's frame).
-        albedo: of what is matte.
+        albedo: albedo of matte surfaces.
         inner: irradiance of the lamps in the plane of the iris.
         received: light of other surfaces on the first surface (see `radiosityfield.RadiosityField`).
     """
@@ -94,7 +94,7 @@ def indirect(
 
 
 def off_eye(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, received: mi.Vector4f) -> mi.Float:
-    """Compute the radiance as of `indirect` of what is not the clear cornea."""
+    """Compute the radiance as in `indirect`, except for the clear cornea."""
     even, mirrored = received.x, mi.Float(0)
     if frame.structure.ambient:
         facing = si.normal if si.level is None else si.level
@@ -106,7 +106,7 @@ def off_eye(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Flo
 
 @syntax
 def _radiosity_of_iris(frame: Frame, si: SurfaceInteraction, lit: mi.Float) -> mi.Float:
-    """Compute the radiosity in the plane of the iris, which has the irradiance `lit` from the lamps."""
+    """Compute the radiosity in the plane of the iris, given its irradiance `lit` from the lamps."""
     radiosity = mi.Float(0)
     if dr.hint(si.lit_inside, exclude=[frame, si, lit]):
         albedo = mi.Float(frame.pupil_albedo)
@@ -117,10 +117,10 @@ def _radiosity_of_iris(frame: Frame, si: SurfaceInteraction, lit: mi.Float) -> m
 
 
 def _mirrored(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f) -> mi.Float:
-    """Compute the radiance that wet surfaces mirror to the camera, without that of the lamps.
+    """Compute the radiance that wet surfaces mirror to the camera, except that of the lamps.
 
-    The front cornea, where it is clear, mirrors the ambient light and the surfaces about it. The film of tears
-    elsewhere mirrors the ambient light.
+    The clear front cornea mirrors the ambient light and the surfaces around it. Elsewhere the tear film mirrors the
+    ambient light.
     """
     clear = 1 - si.cover
     normal, share, wet, film = si.normal, si.mirrored * clear, si.cornea & (clear > 0), mi.Bool(False)
@@ -144,7 +144,7 @@ def _mirrored(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f) -> mi.Float:
 def _mirror_of_scene(
     frame: Frame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
 ) -> mi.Float:
-    """Compute the radiance of the skin that the cornea mirrors; `seen` where a ray meets nothing."""
+    """Compute the radiance of skin mirrored by the cornea; `seen` where a ray meets nothing."""
     hit = frame.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
     surface, met = mi.Float(0), hit.is_valid()
     if frame.region is not None:
@@ -157,7 +157,7 @@ def _mirror_of_scene(
 def _mirror_of_plane(
     frame: Frame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
 ) -> mi.Float:
-    """Compute the radiance of the background's plane that the cornea mirrors; `seen` where a ray does not meet it."""
+    """Compute the radiance of the background's plane mirrored by the cornea; `seen` where a ray misses it."""
     t = (frame.backdrop_x - start.x) / dr.select(way.x < -1e-4, way.x, -1)
     x = start + t * way
     if dr.hint(wet & (way.x < -1e-4) & (t > 0), exclude=[frame, x]):

@@ -1,8 +1,8 @@
-"""Stage 1 before an eye region: what every sample of a window hits of the region.
+"""Stage 1 with an eye region: trace every sample of a window to the region.
 
-The hits of a pixel are side by side, and so are its rays: Embree traces packets of such rays in half of the time that
-packets of sixteen pixels take. Pixels are of three classes. Supersampled ones, at thin hairs and menisci, have several
-times as many samples. In those that show only skin, the middle sample of a group stands for all.
+Rays and hits of a pixel are stored side by side: Embree traces packets of such rays in half the time of packets of
+sixteen pixels. There are three classes of pixels. Supersampled pixels, at thin hairs and menisci, have several times as
+many samples. In pixels that show only skin, the middle sample of a group stands for all.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from .sampling import Pattern, Pixels, Samples
 
 @dataclass(kw_only=True)
 class GroupPass:
-    """The groups of samples that one pass takes of each pixel.
+    """Sample groups that one pass takes of each pixel.
 
     Attributes:
         first: number of the first group.
         count: number of groups.
         total: number of groups of a pixel in all passes.
         size: samples of a group.
-        times: how many times as many there are in supersampled pixels.
+        times: factor for the size in supersampled pixels.
     """
 
     first: mi.UInt32
@@ -49,11 +49,11 @@ class GroupPass:
 
 @dataclass(kw_only=True)
 class HitTable:
-    """Hits of all samples of a pass on an eye region.
+    """Hits on an eye region of all samples of a pass.
 
     Attributes:
-        marks: class of each pixel of the window, as of `HostData.marks`.
-        first: index of its first hit.
+        marks: class of each pixel of the window, as in `HostData.marks`.
+        first: index of the first hit of each pixel.
         hits: the hits, those of a pixel side by side.
     """
 
@@ -74,7 +74,7 @@ class _Lanes:
 
     Attributes:
         lane: numbers of the lanes.
-        order: the pixels: supersampled ones, usual ones, and those that show only skin.
+        order: the pixels: supersampled ones, ordinary ones, and those that show only skin.
         pixel_ends: ends of the first two classes in `order`.
         lane_ends: their ends in `lane`.
     """
@@ -85,7 +85,7 @@ class _Lanes:
     lane_ends: tuple[mi.UInt32, mi.UInt32]
 
     def samples(self, groups: GroupPass) -> tuple[mi.UInt32, mi.UInt32, mi.Bool]:
-        """Compute the pixel and number of each lane's sample, and whether the pixel is supersampled."""
+        """Return the pixel and the number of each lane's sample, and whether the pixel is supersampled."""
         fine, plain = self.lane < self.lane_ends[0], self.lane >= self.lane_ends[1]
         before = dr.select(fine, 0, dr.select(plain, self.pixel_ends[1], self.pixel_ends[0]))
         i = self.lane - dr.select(fine, 0, dr.select(plain, self.lane_ends[1], self.lane_ends[0]))
@@ -99,14 +99,14 @@ class _Lanes:
 
 
 def trace_region(request: FilmRequest, pattern: Pattern, first: int, count: int, *, every: bool) -> HitTable:
-    """Trace the samples of some groups of each pixel.
+    """Trace the samples of some groups of each pixel to the region.
 
     Args:
-        request: what is bound.
+        request: the window and its samples.
         pattern: the samples.
         first: number of the first group.
         count: number of groups.
-        every: whether every sample is traced, even in pixels that show only skin.
+        every: trace every sample, even in pixels that show only skin.
     """
     marks = request.bound.host.marks(request.window)
     if every:

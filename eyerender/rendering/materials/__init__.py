@@ -1,1 +1,1 @@
-"""Materials: albedo and relief of iris and sclera, and the gloss of skin and of the tear film."""
+"""Materials: albedo and relief of iris and sclera, and gloss of skin and tear film."""

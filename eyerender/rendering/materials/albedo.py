@@ -1,4 +1,4 @@
-"""Albedo and relief of iris and sclera, from maps over their own coordinates, and opacity of the cornea's rim."""
+"""Albedo and relief of iris and sclera from maps in their own coordinates, and opacity of the cornea's rim."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ...region.mapcache import kept
 from ...region.texture import sclera_texture
 from ..records.frame import Frame
 
-GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of maps of the globe
+GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of the globe's maps
 _WIDE_MM = 2.5  # width of an iris whose relief has its full height
 STEEPEST = 1.5  # slope of the opacity of the cornea's rim where it is steepest, times the width of the rim
 
@@ -26,7 +26,7 @@ class Textures:
 
     Attributes:
         iris: relative albedo (mean 1) of the iris over (angle, pupil to root).
-        heights: height (mm) of the iris over the same.
+        heights: height (mm) of the iris over the same coordinates.
         raised: whether the iris has any heights.
         sclera: relative albedo of the sclera.
     """
@@ -38,7 +38,7 @@ class Textures:
 
     @classmethod
     def of(cls, look: Look) -> Textures:
-        """Make the textures of one eye."""
+        """Create the textures of one eye."""
         maps = kept(iris_maps, DrawnPattern.of(look.iris_seed, look.iris))
         # The texture repeats so that the angle wraps. Additional rows separate the ends along the radius.
         maps = np.concatenate([maps[:, :1], maps, maps[:, -1:]], axis=1)
@@ -52,29 +52,29 @@ class Textures:
 
 
 def limbal_radius(frame: Frame, local: mi.Vector3f) -> mi.Float:
-    """Radius (mm) of points (the front cornea's frame) about its axis, with their height divided by the limbus' aspect.
+    """Compute the radius (mm) of points (front cornea's frame) about its axis, heights divided by the limbus' aspect.
 
-    Points of the visible limbus all have the radius of the limbus.
+    All points of the visible limbus then have the radius of the limbus.
     """
     up = local.y * frame.limbus.up[0] + local.z * frame.limbus.up[1]
     return dr.sqrt(local.y * local.y + local.z * local.z + frame.limbus.lowering * up * up)
 
 
 def opacity(frame: Frame, rho: mi.Float) -> mi.Float:
-    """Share by which the cornea's rim has turned to sclera at a `limbal_radius`: a smooth step up to the limbus."""
+    """Compute the opacity of the cornea's rim at a `limbal_radius`: a smooth step up to the limbus."""
     s = dr.clip((rho - frame.limbus.radius) * frame.limbus.gain + 1, 0, 1)
     return s * s * (3 - 2 * s)
 
 
 def stop_coordinates(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-    """Compute coordinates of points of the stop's plane along its semi-axes, in units of these."""
+    """Compute coordinates of points of the stop's plane along its semi-axes, in units of their lengths."""
     q = x - frame.stop.centre
     a, b = frame.stop.axes
     return dr.dot(q, frame.stop.u) / a, dr.dot(q, frame.stop.v) / b
 
 
 def _iris_place(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
-    """Place of points of the iris' plane: share of the way from margin to root, turn, distance to the root, width."""
+    """Compute polar coordinates on the iris: share of the way margin to root, turn, distance to the root, width."""
     pu, pv = stop_coordinates(frame, x)
     a, b = frame.stop.axes
     beyond = (dr.sqrt(pu * pu + pv * pv) - frame.boundary.radius(pu, pv)) * dr.sqrt(a * b)
@@ -89,9 +89,9 @@ def _on_iris(texture: mi.Texture2f, s: mi.Float, turn: mi.Float) -> mi.Float:
 
 
 def iris_height(frame: Frame, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float:
-    """Height (mm) of the iris above points of its plane, 0 in the pupil and beyond the root, by the map of its heights.
+    """Compute the iris height (mm) above points of its plane from the height map; 0 in the pupil and beyond the root.
 
-    The pattern stretches with the iris. A narrow iris is as steep as a wide one, so its heights are less.
+    The pattern stretches with the iris. A narrow iris is as steep as a wide one, so its heights are smaller.
     """
     s, turn, left, width = _iris_place(frame, x)
     bulge = frame.iris.convexity * dr.minimum(width / WIDTH_MM, 1) * 4 * s * (1 - s)
@@ -110,7 +110,7 @@ def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
 
 
 def globe_map(frame: Frame, point: mi.Vector3f) -> mi.Point2f:
-    """Find the place in [0, 1]^2 of points of the globe (eye frame) in the azimuthal equidistant map of its front."""
+    """Map points of the globe (eye frame) to [0, 1]^2, in the azimuthal equidistant map of its front."""
     r = point - frame.sclera.centre
     polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / GLOBE_EDGE
     inv = dr.rcp(dr.maximum(dr.sqrt(r.y * r.y + r.z * r.z), 1e-6))

@@ -1,4 +1,4 @@
-"""Gloss of skin and of wet tissue: films of oil and tears, whose highlights have the shape of their roughness."""
+"""Gloss of skin and wet tissue: films of oil and tears, whose roughness shapes their highlights."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ _RIPPLES = ((0.05, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to tho
 
 
 def sheen(normal: mi.Vector3f, to_lamp: mi.Vector3f, to_camera: mi.Vector3f, gloss: mi.Float) -> mi.Float:
-    """Mirror-like reflectance f (1/sr) of skin (gloss below 0.5) and of wet tissue (above), about a `glossy_normal`.
+    """Compute the specular BRDF f (1/sr) of skin (gloss below 0.5) or wet tissue (above), about a `glossy_normal`.
 
         f = w D F / (4 (l . h)^2),  D = a^2 / (pi ((n . h)^2 (a^2 - 1) + 1)^2)
 
     with h half way between lamp and camera (GGX: Walter et al. 2007; the visibility term: Kelemen, Szirmay-Kalos 2001;
-    F: Schlick 1994). The roughness a stands for what is finer than a pixel: no oil on skin mirrors like water, and only
-    standing water does; films are rougher the thinner they are. Oil on tears, which makes their gloss higher than
-    `_WATER`, mirrors more.
+    F: Schlick 1994). The roughness a represents structure finer than a pixel: only standing water is smooth, and
+    thinner films are rougher. Oil on tears, at a gloss above `_WATER`, reflects more.
     """
     wet = gloss > 0.5
     half = dr.normalize(to_lamp + to_camera)
@@ -43,7 +42,7 @@ def _ggx(nh: mi.Float, a: mi.Float) -> mi.Float:
 
 
 def glossy_normal(normal: mi.Vector3f, gloss: mi.Float) -> mi.Vector3f:
-    """Compute the normal (eye frame) of what mirrors: of skin itself, or of the tear film on wet tissue."""
+    """Compute the normal (eye frame) of the mirroring surface: skin itself, or the tear film on wet tissue."""
     return dr.select(gloss > 0.5, film_normal(normal), normal)
 
 
@@ -57,7 +56,7 @@ def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
 
 
 def film_reflectance(cosine: mi.Float, gloss: mi.Float) -> mi.Float:
-    """Compute the share of the light from wide surroundings that the film of wet tissue mirrors."""
+    """Compute the share of light from wide surroundings that the film on wet tissue mirrors."""
     return (2 * gloss - 1) * _schlick(dr.clip(cosine, 0, 1), mi.Float(_F0_TEARS))
 
 

@@ -1,1 +1,1 @@
-"""What is returned: windows with their picture and glints, labels, and exported scenes."""
+"""Rendering results: windows with their image and glints, labels, and exported scenes."""

@@ -2,9 +2,9 @@
 
     mitsuba -m scalar_rgb scene.xml        (or llvm_ad_rgb, cuda_ad_rgb)
 
-Lengths are mm, radiance is mW/mm^2/sr. What stock Mitsuba lacks is left out, and the file says so: textures, the
-relief of the iris, the limbus' soft rim and its lower height, menisci, light inside tissue, lens distortion, the
-point-spread function, ambient light but the sun, and lamps that are neither Lambertian discs nor isotropic points.
+Lengths are mm, radiance is mW/mm^2/sr. Features that stock Mitsuba lacks are left out, and the file says so: textures,
+the relief of the iris, the limbus' soft rim and its lower height, menisci, light inside tissue, lens distortion, the
+point-spread function, ambient light except the sun, and lamps that are neither Lambertian discs nor isotropic points.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ...rig.imaging import Ambient
 from ..records.job import RenderJob, sun_lamps
 
 _BACKDROP_HALF_MM = 500.0
-_FILM_MM = 0.01  # three times the thickness of real ones, which single precision would not resolve
+_FILM_MM = 0.01  # three times the real thickness, which single precision would not resolve
 
 
 def export_scene(
@@ -37,9 +37,9 @@ def export_scene(
     """Write `scene.xml` and `meshes/*.ply` for one job.
 
     Args:
-        job: what to show; its window becomes the film's crop.
+        job: the job to export; its window becomes the film's crop.
         folder: an existing folder.
-        spp: samples per pixel of the path integrator that the file asks for.
+        spp: samples per pixel of the file's path integrator.
         max_depth: path depth of that integrator.
         rings: rings of the meshes.
         sectors: sectors of the meshes.
@@ -97,7 +97,7 @@ def export_scene(
 def bake_meshes(eye: EyeModel, folder: str | Path, *, rings: int = 24, sectors: int = 96) -> Path:
     """Write every patch of an eye as PLY, and describe them in `manifest.json`.
 
-    The manifest holds meaning, unit, frame, licence, indices and SHA-256.
+    The manifest states meaning, unit, frame, licence, refractive indices and SHA-256.
 
     Returns:
         The path of the manifest.
@@ -237,7 +237,7 @@ def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
 
 
 def _film(front: Patch, index: float, sectors: int) -> tuple[Patch, Patch, Patch]:
-    """Film of tears on the front of the cornea, the front below it, and what closes the gap between their rims."""
+    """Return the tear film on the front of the cornea, the front below it, and the band between their rims."""
     below = replace(front, vertices=front.vertices - _FILM_MM * front.normals, exterior=index)
     j = np.arange(sectors)
     k = (j + 1) % sectors

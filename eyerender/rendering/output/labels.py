@@ -1,4 +1,4 @@
-"""Raster labels: the parts of the eye that the pixels of a window show, and the highlights of wet and oily surfaces."""
+"""Raster labels: the part of the eye in each pixel of a window, and the highlights of wet and oily surfaces."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from ..records.frame import Frame
 from ..records.recording import recorded, syntax
 from ..transport.directlight import direct_light, lamp_blocked
 
-_HIGHLIGHT = 0.5  # of the scattered light
-_ACROSS = 3  # points of a pixel across and down that are looked at
+_HIGHLIGHT = 0.5  # share of the scattered light
+_ACROSS = 3  # sample points of a pixel across and down
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartLabels(ArrayValue):
-    """What each pixel's centre shows, seen through the cornea; arrays (height, width).
+    """Part at each pixel's centre, seen through the cornea; arrays (height, width).
 
     Attributes:
-        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 what frames the camera's view.
+        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the camera's view.
         amodal: the same for the eye alone, without occluders.
     """
 
@@ -40,20 +40,20 @@ class PartLabels(ArrayValue):
     amodal: Bytes
 
     def behind(self, covered: Bools) -> PartLabels:
-        """Return the labels where what frames the camera's view covers the pixels (height, width)."""
+        """Return the labels with a frame around the view over the `covered` pixels (height, width)."""
         part = self.part.copy()
         np.copyto(part, FRAME, where=covered)
         return replace(self, part=sealed(part))
 
     def visible_fraction(self, part: int) -> float:
-        """Compute the visible share of the amodal pixels of a part in the window; NaN where there are none."""
+        """Compute the visible share of a part's amodal pixels in the window; NaN if there are none."""
         whole = int(np.count_nonzero(self.amodal == part))
         both = int(np.count_nonzero((self.amodal == part) & (self.part == part)))
         return both / whole if whole else float("nan")
 
 
 def part_labels(bound: BoundFrame, window: Window) -> Callable[[], PartLabels]:
-    """Begin to compute the labels of a window; the result waits for them. Rays that miss the globe are not traced."""
+    """Start computing the labels of a window; reading them waits for the result. Rays that miss the globe end."""
     _, _, width, height = window
     found = _parts(bound.frame.bare(), Pixels.of(window), width * height)
     return lambda: PartLabels(*(frozen(part.numpy().reshape(height, width), np.uint8) for part in found))
@@ -61,7 +61,7 @@ def part_labels(bound: BoundFrame, window: Window) -> Callable[[], PartLabels]:
 
 @recorded
 def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8]:
-    """Return parts that the centres of pixels show, with and without occluders."""
+    """Return the parts at the pixels' centres, with and without occluders."""
     u, v = pixels.at(dr.arange(mi.UInt32, count))
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
     eye = EyeShape(frame=frame).ray_intersect(o, d)
@@ -74,10 +74,10 @@ def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8
 
 
 def highlights(bound: BoundFrame, window: Window) -> Bools:
-    """Find pixels (height, width) whose skin, lids, lashes and tears mirror lamps: more than half of what they scatter.
+    """Return pixels (height, width) where skin, lids, lashes or tears mirror over half of the lamp light they scatter.
 
-    Both are light of the lamps alone, with its shadows. Lens and sensor do not matter, nor do glints of the cornea.
-    Pixels that show mostly cornea are not marked. Without an eye region nothing but the cornea mirrors lamps.
+    Only light of the lamps counts, with its shadows. Lens, sensor and corneal glints have no influence, and pixels that
+    show mostly cornea are not marked. Without an eye region only the cornea mirrors lamps, so no pixel is marked.
     """
     mirrored = scattered = beside = np.zeros(window[2] * window[3], np.float32)
     for i in range(_ACROSS * _ACROSS if bound.frame.structure.region else 0):
@@ -90,12 +90,12 @@ def highlights(bound: BoundFrame, window: Window) -> Bools:
 
 
 def _lamps_at(frame: Frame, window: Window, right: float, down: float) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Mirrored and scattered radiance of lamps at places (px) beside a window's pixel centres; share of the pixel."""
+    """Compute mirrored and scattered radiance of lamps at offsets (px) from pixel centres, and the pixel's share."""
     u, v = Pixels.of(window).at(dr.arange(mi.UInt32, window[2] * window[3]))
     right_of, below = (dr.opaque(mi.Float, x) for x in (right, down))
     o, d, _ = camera_ray(frame, mi.Float(u) + right_of, mi.Float(v) + below)
     si = first_hit(frame, o, d, mi.Bool(True))
-    albedo = outer_albedo(frame, si)  # of what is below the water
+    albedo = outer_albedo(frame, si)  # albedo of the surface below the water
     si = on_water(frame, si, o, d)
     shine, irradiance = _shine(frame, si, (glossy_normal(si.normal, si.gloss), -frame.vector_to_eye(d)))
     there = si.other | si.sclera
@@ -106,7 +106,7 @@ def _lamps_at(frame: Frame, window: Window, right: float, down: float) -> tuple[
 
 @syntax
 def _shine(frame: Frame, si: SurfaceInteraction, mirror: tuple[mi.Vector3f, mi.Vector3f]) -> tuple[mi.Float, mi.Float]:
-    """Compute the radiance that points mirror of all lamps, and irradiance; `mirror` as of `direct_light`."""
+    """Compute the radiance of all lamps that points mirror, and the irradiance; `mirror` as in `direct_light`."""
     shine, irradiance, k = mi.Float(0), mi.Float(0), mi.UInt32(0)
     while dr.hint(k < frame.lights.count, label="highlights", exclude=[frame, si, mirror]):
         lamp = frame.lights[k]

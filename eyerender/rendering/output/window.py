@@ -1,4 +1,4 @@
-"""A traced frame, and the window of the sensor that lens and sensor make of it on the host."""
+"""A traced frame, and the sensor window that lens and sensor make of it on the host."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class RenderedWindow(ArrayValue):
         irradiance: (height, width) W/m^2 of the sensor.
         dn: (height, width) digital numbers of the sensor.
         bit_depth: bits of `dn`.
-        labels: raster labels, if they were requested.
-        glints: the first images.
-        purkinje: (order, table) of the further mirror images that were requested.
+        labels: raster labels, if requested.
+        glints: the glints, the mirror images of order 1.
+        purkinje: (order, table) of the other mirror images that were requested.
         failed_paths: number of light paths that did not converge; they are missing from the irradiance.
         glint_reasons: for each glint, whether it is visible or what hides it.
-        lid_margins_px: landmarks along the lids, where there are any.
-        highlights: (height, width) pixels with highlights of wet and oily surfaces, if they were requested.
+        lid_margins_px: landmarks along the lids, if there are any.
+        highlights: (height, width) mask of highlights of wet and oily surfaces, if requested.
     """
 
     window: Window
@@ -52,19 +52,19 @@ class RenderedWindow(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RawFrame(ArrayValue):
-    """A frame before the lens and the sensor.
+    """A traced frame before lens and sensor are applied.
 
     Attributes:
         job: the frame's job.
-        picture: mean radiance of the pixels with the border that the lens needs, or its parts.
+        picture: mean radiance of the pixels, with the border that the lens needs, or its parts.
         glints: light of the lamps' mirror images.
-        blur: the lens.
-        mirrored: the glints' places and energies.
+        blur: defocus of the job.
+        mirrored: positions and energies of the glints.
         labels: raster labels, if they were requested.
         failed: number of light paths that did not converge.
         lid_margins_px: landmarks along the lids, where there are any.
         highlights: (height, width) highlights of wet and oily surfaces, if they were requested.
-        around: mean radiance of the whole sensor in blocks (`CoarseSensor`), where light from there strays into the
+        around: mean radiance of the whole sensor in blocks (`CoarseSensor`), if light scatters from there into the
             window; else None.
     """
 
@@ -126,7 +126,7 @@ class RawFrame(ArrayValue):
         return np.asarray(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)))
 
     def _around(self, cells: Singles) -> Singles:
-        """Return the whole sensor in blocks, behind openings, with the mirror images of the lamps."""
+        """Return the whole sensor in blocks, seen through the openings, with the mirror images of the lamps."""
         job, side = self.job, stray.block_px(self.job.lens)
         lens, camera = stray.in_blocks(job.lens, job.camera, side)
         whole, picture = (0, 0, *camera.resolution_px), cells.copy()
@@ -144,7 +144,7 @@ class RawFrame(ArrayValue):
 
 
 def _framed(picture: Singles, lens: Lens, camera: PinholeCamera, window: Window) -> Singles:
-    """Compute the picture (height, width) of a window behind vignetting and openings; it may be changed."""
+    """Compute the image (height, width) of a window behind vignetting and openings; the input may be changed."""
     if lens.vignetting > 0:
         picture *= defocus.vignette(lens, camera, window)
     return np.asarray(stray.framed(picture, lens, camera, window))

@@ -1,1 +1,1 @@
-"""Device records: the frame, its surfaces and lamps, their upload, and the recording of kernels."""
+"""Device records: the frame, its surfaces and lamps, their upload, and recorded kernels."""

@@ -1,4 +1,4 @@
-"""What depends on an eye and a few plain values alone, and is kept while frames show the same eye in other poses."""
+"""Cache of results that depend only on an eye and a few plain values, for frames of the same eye in other poses."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any, Generic, TypeVar
 from ...eye.model import EyeModel
 
 _T = TypeVar("_T")
-_EYES = 4  # kept: two of a person, and those of the next
+_EYES = 4  # cached eyes: two of a person, and those of the next
 
 
 class EyeCache(Generic[_T]):
-    """Results of a few eyes. Eyes are compared by identity, for comparing their numbers takes longer than is gained."""
+    """Cache of results for a few eyes, compared by identity because comparing their numbers would take too long."""
 
     def __init__(self) -> None:
         self._known: list[tuple[EyeModel, Any, _T]] = []
 
     def get(self, eye: EyeModel, values: Any, make: Callable[[], _T]) -> _T:
-        """Return the result for an eye and other values, which `make` computes if they are new."""
+        """Return the result for an eye and other values; call `make` if it is not cached."""
         for known, others, result in self._known:
             if known is eye and others == values:
                 return result

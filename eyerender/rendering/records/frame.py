@@ -1,7 +1,7 @@
 """A frame on the device; its parameters are opaque Dr.Jit arrays of size one.
 
-A literal that changes between frames would be compiled into the kernel, so everything that can change is stored here.
-`Structure` holds what chooses the kernel (the kinds of surfaces, whether the lens distorts).
+A literal would be compiled into the kernel, so every number that changes between frames is stored here as an array.
+`Structure` holds the plain values that select the kernel (the kinds of surfaces, whether the lens distorts).
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner r
 def aligned_copy(values: NDArray[Any]) -> NDArray[Any]:
     """Copy an array so that it starts at a multiple of 64 bytes.
 
-    Dr.Jit shares NumPy's memory. It gathers several numbers at once only from aligned memory, so without this the place
-    of an allocation would decide which kernel is compiled for a frame.
+    Dr.Jit shares NumPy's memory and gathers several numbers at once only from aligned memory. Without alignment, the
+    address of an allocation would decide which kernel is compiled.
     """
     memory = np.empty(values.nbytes + _ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % _ALIGNMENT
@@ -42,39 +42,39 @@ def aligned_copy(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def upload_array(numbers: Reals) -> mi.Float:
-    """Send numbers to the device, row by row."""
+    """Copy numbers to the device, row by row."""
     return mi.Float(aligned_copy(np.asarray(numbers, dtype=np.float32).ravel()))
 
 
 def upload_scalars(numbers: NDArray[np.float32]) -> list[mi.Float]:
-    """Send numbers to the device as arrays of size one, in one transfer and one kernel."""
+    """Copy numbers to the device as arrays of size one, in one transfer and one kernel."""
     return _apart(mi.Float(aligned_copy(numbers)), dr.opaque(mi.UInt32, 0), numbers.size)
 
 
 @recorded
 def _apart(buffer: mi.Float, first: mi.UInt32, count: int) -> list[mi.Float]:
-    # Places that are known when a kernel is compiled would be copied one by one.
+    # Constants known at compile time would be copied one by one.
     numbers = [dr.gather(mi.Float, buffer, first + k) for k in range(count)]
     dr.eval(numbers)
     return numbers
 
 
 def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
-    """Compute the whole part of a / b for numbers below a million: processors divide whole numbers one by one."""
+    """Compute floor(a / b) of numbers below a million in floating point; integer division does not vectorise."""
     return mi.UInt32((mi.Float(a) + 0.5) / mi.Float(b))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
-    """Plain values that choose the compiled kernels.
+    """Plain values that select the compiled kernels.
 
     Attributes:
         surfaces: (kind, tilted) of each refracting surface.
         distorted: whether the camera's lens distorts.
-        obstacles: whether anything can block light; the background's plane alone hides no lamp before it.
+        obstacles: whether anything can block light; the background's plane alone cannot.
         region: whether the eye has a region instead of a background.
-        ambient: whether there is other light than that of the lamps.
-        scattering: whether light spreads inside skin and sclera.
+        ambient: whether there is light other than that of the lamps.
+        scattering: whether skin and sclera have subsurface scattering.
     """
 
     surfaces: tuple[tuple[Kind, bool], ...]
@@ -87,17 +87,17 @@ class Structure:
 
 @dataclass(kw_only=True)
 class Frame(FrameParameters):
-    """A frame on the device: its parameters, and all that kernels read.
+    """A frame on the device: its parameters, and everything else that kernels read.
 
     Attributes:
-        structure: chooses the kernels.
+        structure: selects the kernels.
         boundary: the shape of the pupil's boundary.
         lights: the lamps (`Lights`).
         textures: the maps of the eye (`albedo.Textures`).
         region: the eye region (`region.SkinGeometry`), if there is one.
-        background: else the surroundings of the eye (`background.BackgroundGeometry`).
-        caches: light that is computed before the samples.
-        scene: Mitsuba's scene of all that is not the eye.
+        background: surroundings of an eye without a region (`background.BackgroundGeometry`).
+        caches: light computed before the samples.
+        scene: Mitsuba scene of everything except the eye.
     """
 
     structure: Structure
@@ -114,10 +114,10 @@ class Frame(FrameParameters):
     def upload(
         cls, structure: Structure, parameters: Parameters, waves: Floats, tables: Sequence[Singles | None]
     ) -> Frame:
-        """Send the numbers of a frame to the device; its other parts are set afterwards.
+        """Copy the numbers of a frame to the device; its other parts are set afterwards.
 
         Args:
-            structure: chooses the kernels.
+            structure: selects the kernels.
             parameters: the numbers.
             waves: the pupil's boundary.
             tables: the cells of measured surfaces.
@@ -140,7 +140,7 @@ class Frame(FrameParameters):
         return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, caches=Caches())
 
     def bare(self) -> Frame:
-        """Return the frame without lamps, textures and light, for recordings that should last when these change."""
+        """Return the frame without lamps, textures and light, for recordings that remain valid when these change."""
         return replace(self, lights=None, textures=None, caches=Caches())
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
@@ -161,15 +161,15 @@ class Frame(FrameParameters):
         return self.vector_to_scene(x) + self.pose.shift
 
 
-HARMONICS = 32  # largest number for the pupil's boundary
+HARMONICS = 32  # largest number of coefficients of the pupil's boundary
 
 
 @dataclass(kw_only=True)
 class PupilBoundary:
-    """The pupil's boundary: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), f the angle in the stop's plane.
+    """The pupil's boundary: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), with f the angle in the stop's plane.
 
     Attributes:
-        count: number of the z_k; an ellipse has none and costs nothing.
+        count: number of coefficients z_k; 0 for an ellipse, which costs no time.
         waves: the real and imaginary parts of the z_k, k from 1.
     """
 
@@ -178,7 +178,7 @@ class PupilBoundary:
 
     @classmethod
     def upload(cls, waves: Floats) -> PupilBoundary:
-        """Send z_k = c_k - i s_k, (n, 2), to the device."""
+        """Copy z_k = c_k - i s_k, (n, 2), to the device."""
         table = np.zeros((HARMONICS, 2), np.float32)
         table[: len(waves)] = waves
         return cls(count=dr.opaque(mi.UInt32, len(waves)), waves=mi.Float(aligned_copy(table.ravel())))
@@ -213,7 +213,7 @@ class Lights:
 
     @classmethod
     def upload(cls, table: LampTable) -> Lights:
-        """Send lamps to the device."""
+        """Copy lamps to the device."""
         rows = np.zeros((max(len(table), 1), _LIGHT_ROW), np.float32)
         rows[: len(table), : table.rows.shape[1]] = table.rows
         sharp = table.suns and table.widths[-1] < SMALL
@@ -231,7 +231,7 @@ class Lights:
 
 @dataclass(kw_only=True)
 class Lamp:
-    """One LED on the device: I(w) = intensity * max(0, cos)^exponent, from an annulus of points across its axis."""
+    """One LED on the device: I(w) = intensity * max(0, cos)^exponent, emitted by an annulus across its axis."""
 
     position: mi.Vector3f
     axis: mi.Vector3f
@@ -242,14 +242,14 @@ class Lamp:
     number: mi.UInt32
 
     def point(self, u: mi.Float, sine: mi.Float, cosine: mi.Float) -> mi.Vector3f:
-        """Compute the point of the emitting disc or ring, uniform by area: u in [0, 1) and a direction in its plane."""
+        """Sample the emitting disc or ring, uniformly by area: u in [0, 1) and a direction in its plane."""
         e1, e2 = mi.coordinate_system(self.axis)
         inner = self.inner_radius * self.inner_radius
         r = dr.sqrt(inner + u * (self.radius * self.radius - inner))
         return self.position + (r * cosine) * e1 + (r * sine) * e2
 
     def node(self, k: mi.UInt32, count: mi.UInt32) -> mi.Vector3f:
-        """Point k of the `count` that stand for the lamp at the nodes of a grid: its middle, or four about it."""
+        """Return point k of the `count` that represent the lamp at grid nodes: its middle, or four around it."""
         turn = (mi.Float(k) + 0.5) * (0.5 * dr.pi)
         return self.point(dr.select(count > 1, 0.5, 0), *dr.sincos(turn))
 

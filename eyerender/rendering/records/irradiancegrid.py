@@ -1,9 +1,9 @@
-"""Irradiance on a square grid that is filled once per frame, interpolated by cubics where these are good enough.
+"""Irradiance on a square grid, filled once per frame and interpolated by cubics where that is accurate.
 
-Light of lamps changes slowly from place to place, except at the edges of shadows and where a lamp sets. So a few
-thousand exact values give it everywhere else. A cell holds the sum over those lamps for which third differences between
-the sixteen nodes about it say that cubic interpolation is good to a thousandth, and whose light is known at all
-sixteen. It marks the other lamps: there, every sample follows light paths of its own to them.
+The light of lamps varies slowly, except at shadow edges and where a lamp sets below the horizon, so a few thousand
+exact values suffice elsewhere. A cell holds the sum over those lamps whose light is known at all sixteen surrounding
+nodes, and for which third differences predict a cubic interpolation error below a thousandth. It marks the other lamps;
+samples in the cell trace light paths to them individually.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class IrradianceGrid:
 
     Attributes:
         side: number of nodes along a side.
-        cells: irradiance at the sixteen nodes about each cell, row by row, summed over the lamps that the cell holds.
-        left: bit l of a cell stands for lamp l, which the cell lacks. Of more than 32 lamps it lacks all or none.
+        cells: irradiance at the sixteen nodes around each cell, row by row, summed over the lamps that the cell holds.
+        left: bit l of a cell is set if it lacks lamp l. With more than 32 lamps, a cell lacks all or none.
     """
 
     side: int
@@ -38,7 +38,7 @@ class IrradianceGrid:
 
     @classmethod
     def unknown(cls, side: int) -> IrradianceGrid:
-        """Make a grid whose cells lack all lamps."""
+        """Create a grid whose cells lack all lamps."""
         grid = cls(side=side, cells=dr.zeros(mi.Float, 16 * side**2), left=dr.full(mi.UInt32, ALL, side**2))
         dr.make_opaque(grid.cells, grid.left)
         return grid
@@ -52,14 +52,14 @@ class IrradianceGrid:
 
         Args:
             side: number of nodes along a side.
-            nodes: irradiance of the nodes, lamp by lamp and row by row, negative where it is not known; evaluated.
+            nodes: irradiance of the nodes, lamp by lamp and row by row, negative where unknown; evaluated.
             lamps: number of lamps, on the device.
-            more: further light at the nodes, which changes slowly, so it does not decide what a cell holds; evaluated.
-            held: called with a lamp, the cell, and the third difference that is allowed there, where cubic
-                interpolation is not good enough; tells whether the caller holds this lamp's light in another way.
+            more: additional, slowly varying light at the nodes, which does not decide what a cell holds; evaluated.
+            held: called with a lamp, a cell and the allowed third difference where cubic interpolation is too
+                inaccurate; returns whether the caller holds this lamp's light in another way.
 
         Returns:
-            The grid, and the lamps of each cell that the caller holds, as bits.
+            The grid, and a bit mask per cell of the lamps that the caller holds.
         """
         cell = dr.arange(mi.UInt32, side * side)
         row = cell // side
@@ -67,7 +67,7 @@ class IrradianceGrid:
         within = (column > 0) & (row > 0) & (column < side - 2) & (row < side - 2)
         around, many = nodes_about(cell, side), lamps > BITS
         usual = _sum_of_lamps(nodes, lamps, cell, side) / mi.Float(lamps)
-        # An array of its own for each: Dr.Jit writes the results of the loop into them.
+        # Separate arrays for each, because Dr.Jit writes the results of the loop into them.
         none, dark = mi.UInt32(0) * cell, mi.Float(0) * mi.Float(cell)
         k, left, elsewhere, sums = mi.UInt32(0), mi.UInt32(none), mi.UInt32(none), [mi.Float(dark) for _ in around]
         while dr.hint(k < lamps, label="cells", exclude=[cls, side, nodes, around, more, held]):
@@ -93,14 +93,14 @@ class IrradianceGrid:
         return cls(side=side, cells=cells, left=left), elsewhere
 
     def place(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> Place:
-        """Find the cells of places in units of the distance between nodes."""
+        """Return the grid places of points given in units of the node spacing."""
         inside = active & (u >= 0) & (v >= 0) & (u < self.side - 1) & (v < self.side - 1)
         i, j = mi.UInt32(u), mi.UInt32(v)
         across, down = (cubic_weights(p - mi.Float(n)) for p, n in ((u, i), (v, j)))
         return Place(cell=j * self.side + i, across=mi.Vector4f(*across), down=mi.Vector4f(*down), inside=inside)
 
     def at(self, place: Place) -> tuple[mi.Float, mi.UInt32]:
-        """Compute the irradiance (mW/mm^2) at places, and the lamps that it lacks: all of them outside the grid."""
+        """Interpolate the irradiance (mW/mm^2) at places; also return the lamps it lacks (outside the grid: all)."""
         total = mi.Float(0)
         for k in range(4):
             row = dr.gather(mi.Vector4f, self.cells, 4 * place.cell + k, place.inside)
@@ -111,7 +111,7 @@ class IrradianceGrid:
 
 @dataclass(kw_only=True)
 class Place:
-    """Places in a grid: the cell, the weights of its four columns and rows of nodes, and whether the grid is there."""
+    """A position in a grid: its cell, the weights of its four columns and rows of nodes, and whether it is inside."""
 
     cell: mi.UInt32
     across: mi.Vector4f
@@ -121,7 +121,7 @@ class Place:
 
 @syntax
 def _sum_of_lamps(nodes: mi.Float, lamps: mi.UInt32, node: mi.UInt32, side: int) -> mi.Float:
-    """Compute the irradiance of nodes from all lamps whose light is known there."""
+    """Sum the irradiance of nodes over all lamps whose light is known there."""
     k, total = mi.UInt32(0), mi.Float(0) * mi.Float(node)
     while dr.hint(k < lamps, label="all lamps", exclude=[nodes, side]):
         total += dr.maximum(dr.gather(mi.Float, nodes, k * side**2 + node), 0)
@@ -131,7 +131,7 @@ def _sum_of_lamps(nodes: mi.Float, lamps: mi.UInt32, node: mi.UInt32, side: int)
 
 @syntax
 def _ask(held: Held, lamp: mi.UInt32, cell: mi.UInt32, allowed: mi.Float, asked: mi.Bool) -> mi.Bool:
-    """Ask whether the caller holds a lamp's light, where this is to be `asked`."""
+    """Call `held` for a lamp where `asked`; False elsewhere."""
     kept = mi.Bool(False)
     if dr.hint(asked, exclude=[held]):
         kept = held(lamp, cell, allowed)
@@ -143,20 +143,20 @@ def _sum(a: list[mi.Float], b: list[mi.Float]) -> list[mi.Float]:
 
 
 def grid_nodes(side: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Compute the column and row of all nodes of a grid, in row order."""
+    """Return the column and row of all nodes of a grid, in row order."""
     index = dr.arange(mi.UInt32, side * side)
     row = index // side
     return index - row * side, row
 
 
 def nodes_about(cell: mi.UInt32, side: int) -> list[mi.UInt32]:
-    """List numbers of the sixteen nodes about cells of a grid, row by row."""
+    """Return the numbers of the sixteen nodes around cells of a grid, row by row."""
     nodes = (mi.Int32(cell) + dv * side + du for dv in range(-1, 3) for du in range(-1, 3))
     return [mi.UInt32(dr.clip(node, 0, side**2 - 1)) for node in nodes]
 
 
 def unevenness(values: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Compute the largest third difference, least and greatest of the values at the `nodes_about` cells."""
+    """Compute the largest third difference, the minimum and the maximum of the values at the `nodes_about` cells."""
     bent, least, most = mi.Float(0), values[0], values[0]
     for e in [values[n : n + 4] for n in range(0, 16, 4)] + [values[n::4] for n in range(4)]:
         bent = dr.maximum(bent, dr.abs(e[0] - 3 * e[1] + 3 * e[2] - e[3]))
@@ -166,6 +166,6 @@ def unevenness(values: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float]:
 
 
 def cubic_weights(s: mi.Float) -> tuple[mi.Float, ...]:
-    """Find weights of four neighbours at the place s, 0 to 1 between the second and the third (Keys 1981, a = -1/2)."""
+    """Compute the weights of four neighbours at s in [0, 1] between the second and the third (Keys 1981, a = -1/2)."""
     r = 1 - s
     return -0.5 * s * r * r, 1 + s * s * (1.5 * s - 2.5), 1 + r * r * (1.5 * r - 2.5), -0.5 * r * s * s

@@ -1,4 +1,4 @@
-"""The parameters of a frame, from eye, pose, camera, lamps and look: on the host, in float64, without Mitsuba."""
+"""Frame parameters from eye, pose, camera, lamps and appearance: on the host, in float64, without Mitsuba."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from .parameters import (
 _SENSOR, _LOOK, _LENS, _AMBIENT = Sensor(), Look(), Lens(), Ambient()
 _SUN_MM = 1e6
 _POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
-_PANEL_PARTS = 4  # along each side
+_PANEL_PARTS = 4  # parts of a panel along each side
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
 
@@ -62,16 +62,16 @@ class RenderJob(ArrayValue):
         wavelength_nm: wavelength in vacuum.
         seed: seed of samples and noise.
         labels: whether to compute raster labels.
-        highlights: whether to find the highlights of wet and oily surfaces.
-        purkinje: mirror images of the lamps to show, from 1 (the glint) to 4.
-        apex_mm: (3,) apex of the unrotated eye in the world, to which the surround is fixed. By default it follows from
-            a turn about a point 13.5 mm behind the apex.
+        highlights: whether to label the highlights of wet and oily surfaces.
+        purkinje: orders of the lamps' mirror images to render, from 1 (the glint) to 4.
+        apex_mm: (3,) apex of the unrotated eye in the world, to which the background is fixed. The default assumes a
+            rotation about a point 13.5 mm behind the apex.
         region: the eye region; None for the bare eye.
         lens: focus and vignetting.
         ambient: light other than that of the lamps.
-        focus_dpt: vergence at which the eye is focused, 1 / distance in metres.
+        focus_dpt: vergence (D) of the point in focus, 1 / its distance in metres.
         mesh_edge_mm: edge length of meshes that replace the cornea's surfaces; None: closed forms.
-        interreflection: whether surfaces send light to each other.
+        interreflection: whether surfaces illuminate each other.
     """
 
     eye: EyeModel
@@ -109,17 +109,17 @@ class RenderJob(ArrayValue):
 
     @property
     def film_index(self) -> float:
-        """Index of what lies on the front cornea."""
+        """Refractive index at the front of the cornea."""
         return film_index(self.eye, self.look)
 
 
 def film_index(eye: EyeModel, look: Look) -> float:
-    """Compute the index of what lies on the front cornea: tears, or the cornea itself where there is no film."""
+    """Return the refractive index at the front of the cornea: tears, or the cornea itself without a tear film."""
     return TEARS.index(eye.wavelength_nm) if look.tear_film else float(eye.front_indices[0])
 
 
 def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
-    """Compute the posed globe of an eye, p = M x + t into the frame of the unrotated eye."""
+    """Return the posed globe of an eye; p = M x + t maps to the frame of the unrotated eye."""
     sclera = eye.sclera
     return Globe(
         cornea=eye.front[0],
@@ -142,7 +142,7 @@ def _kind(surface: Surface) -> Kind:
 
 
 def tables(eye: EyeModel) -> tuple[NDArray[np.float32] | None, ...]:
-    """Compute spline coefficients of the measured surfaces in front of the iris; None for other surfaces."""
+    """Return spline coefficients of the measured surfaces in front of the iris; None for other surfaces."""
     return tuple(lattice(s, float(eye.limbus_radius_mm)).table if isinstance(s, Measured) else None for s in eye.front)
 
 
@@ -201,7 +201,7 @@ def parameters_of(job: RenderJob) -> Parameters:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Still:
-    """Parameters that depend on the eye alone; the surfaces have no film."""
+    """Parameters that depend on the eye only; surfaces have no tear film."""
 
     surfaces: tuple[SurfaceParameters, ...]
     image: ImageParameters
@@ -243,10 +243,10 @@ def _surface_parameters(surface: Surface, eta: float, limbus_mm: float) -> Surfa
 
 
 def boundary_waves(eye: EyeModel) -> Floats:
-    """Fourier coefficients (k, 2) of the pupil's relative radius over the angle in the stop's plane, as c_k and -s_k.
+    """Compute Fourier coefficients (k, 2), c_k and -s_k, of the pupil's relative radius over the stop plane's angle.
 
-    The stop's own angle runs in the other direction for a left eye: f' = pi - f, cos(k f') = (-1)^k cos(k f),
-    sin(k f') = -(-1)^k sin(k f).
+    For a left eye the stop's own angle runs in the opposite direction: f' = pi - f, cos(k f') = (-1)^k cos(k f), sin(k
+    f') = -(-1)^k sin(k f).
     """
     cosines, sines = np.asarray(eye.stop.contour, dtype=float)
     if float(eye.stop.handed) < 0:
@@ -256,7 +256,7 @@ def boundary_waves(eye: EyeModel) -> Floats:
 
 
 def panel_table(ambient: Ambient, anchor: Floats) -> Floats:
-    """Compute panels in the scene's frame, (n, 13): centre, normal, right, up (over half sizes), radiance."""
+    """Return panels in the scene's frame, (n, 13): centre, normal, right, up (over half sizes), radiance."""
     rows = []
     for panel in ambient.panels:
         centre = np.asarray(panel.centre_mm, dtype=float) - anchor
@@ -267,7 +267,7 @@ def panel_table(ambient: Ambient, anchor: Floats) -> Floats:
 
 
 def panel_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
-    """Parts of panels as lamps, which light the iris through the cornea: each part is Lambertian, at its centre."""
+    """Divide panels into lamps that light the iris through the cornea: each part is Lambertian, at its centre."""
     out = []
     for panel, row in zip(ambient.panels, panel_table(ambient, anchor), strict=True):
         centre, normal = row[0:3] + anchor, row[3:6]
@@ -289,7 +289,7 @@ def panel_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
 
 
 def sun_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
-    """Return the sun, if there is one, as a lamp: a disc of even radiance a kilometre from the eye."""
+    """Return the sun, if there is one, as a lamp: a uniform disc at a distance of a kilometre."""
     if ambient.sun is None or ambient.sun.irradiance_w_m2 == 0:
         return ()
     sun = ambient.sun
@@ -320,7 +320,7 @@ class LampTable(ArrayValue):
 
     @classmethod
     def of(cls, lights: Sequence[Lamp], M: Floats, t: Floats, suns: int = 0) -> LampTable:
-        """Make the table of lamps of the world for an eye at x_world = M x + t."""
+        """Create the table from lamps in the world for an eye at x_world = M x + t."""
         rows = [
             [*(M.T @ (lamp.position_mm - t)), *(M.T @ lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
              lamp.lobe_exponent, ring_radius_mm(lamp)]
@@ -333,27 +333,27 @@ class LampTable(ArrayValue):
 
     @property
     def widths(self) -> Floats:
-        """Radii of the lamps over their distances from the apex of the eye, (n,)."""
+        """Radius of each lamp over its distance from the apex of the eye, (n,)."""
         return np.asarray(self.rows[:, 6] / np.maximum(np.linalg.norm(self.rows[:, :3], axis=1), 1e-3))
 
     @property
     def widest(self) -> float:
-        """Largest of these."""
+        """Largest of the `widths`."""
         return float(np.max(self.widths, initial=0.0))
 
     @property
     def points(self) -> int:
-        """Number of points that stand for each lamp at the nodes of a grid: its middle, or four about it."""
+        """Number of points that represent each lamp at grid nodes: its middle, or four around it."""
         return 1 if self.widest < _POINT_LIKE and not np.any(self.rows[:, 9] > 0) else 4
 
     @property
     def gridded(self) -> bool:
-        """Whether the lamps are so small that their light may be interpolated on grids."""
+        """Whether the lamps are small enough for light interpolated on grids."""
         return self.widest < _LARGE
 
 
 def returned_light(job: RenderJob) -> FundusLight:
-    """Return factors of the fundus for the lamps of a job."""
+    """Return the fundus factors for the lamps of a job."""
     fundus = job.look.fundus
     spread = Spread(
         reflectance=fundus.reflectance,
@@ -367,7 +367,7 @@ def returned_light(job: RenderJob) -> FundusLight:
 
 
 def ring_radius_mm(lamp: Lamp) -> float:
-    """Compute the radius of the dark middle of a ring-shaped lamp; 0 for points and discs."""
+    """Return the radius of the dark middle of a ring-shaped lamp (mm); 0 for points and discs."""
     return lamp.inner_radius_mm
 
 
@@ -385,5 +385,5 @@ def _shape(surface: Surface, limbus_mm: float) -> Floats:
 
 
 def apex_of(surface: Surface) -> Floats:
-    """Compute the apex of a surface in the eye frame, (3,) mm."""
+    """Return the apex of a surface in the eye frame, (3,) mm."""
     return np.asarray(surface.origin_mm + surface.rotation[:, 0] * float(surface.sag(0.0, 0.0)))

@@ -1,8 +1,7 @@
-"""Measured surfaces for the device: bicubic B-splines on a paraboloid, on the host, without Mitsuba.
+"""Tables of measured surfaces for the device: bicubic B-splines on a paraboloid, on the host, without Mitsuba.
 
-One kind of table serves Zernike expansions and grids, with the transition to the outer biconic in it. Its spacing makes
-it agree with the exact surface to some 1e-7 mm, as far as the device's single precision goes. Glints are computed on
-the exact surface.
+One kind of table serves Zernike expansions and grids, including the transition to the outer biconic. It agrees with the
+exact surface to some 1e-7 mm, the limit of single precision. Glints are computed on the exact surface.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ SPACING_MM = 0.15
 _MARGIN_MM = 1.2
 _STEEPEST = 0.93
 _POWERS = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6.0
-"""Rows: what the powers 0 to 3 of the share of a cell get from its four B-spline coefficients."""
+"""Rows: contributions of the four B-spline coefficients of a cell to the powers 0 to 3 of the position in it."""
 
 
 class Lattice(NamedTuple):
-    """The device's numbers of a measured surface.
+    """Bicubic lookup table of a measured surface, as stored on the device.
 
     Attributes:
         shape: (R, 1 + Q, cells per mm, cells in a row, 0).
-        table: (n * n * 16,) the depth on the paraboloid of R in each cell, sum_pq a_pq s^p t^q with the shares s and t
-            of the cell along y and z; cells row by row along z, and in each a_00, a_01, ...
+        table: (n * n * 16,) depth relative to the paraboloid of R: sum_pq a_pq s^p t^q in each cell, with s and t in
+            [0, 1] along y and z. Cells are stored row by row along z, each as a_00, a_01, ...
     """
 
     shape: tuple[float, ...]
@@ -41,8 +40,8 @@ class Lattice(NamedTuple):
 def lattice(surface: Measured, limbus_mm: float) -> Lattice:
     """Sample a surface on a square that reaches beyond the limbus.
 
-    Beyond the margin, or where the sheet becomes steep because it ends, the surface is continued along its tangents:
-    the search for paths may pass there.
+    Beyond the margin, or where the sheet becomes steep near its end, the surface is continued along its tangents,
+    because the path search may pass there.
 
     Raises:
         ValueError: the surface opens to +x.

@@ -1,8 +1,8 @@
-"""The parameters of a frame: the numbers that change from frame to frame, by name.
+"""Frame parameters: the numbers that change from frame to frame, by name.
 
-The same classes are used on both sides. On the host (`job.parameters_of`) their leaves are NumPy numbers in float64.
-On the device (`frame.Frame`) they are Dr.Jit arrays of size one: a Float, a Vector3f for three numbers, or a tuple of
-Floats. Nothing here depends on Mitsuba.
+Host and device use the same classes. On the host (`job.parameters_of`) the leaves are NumPy numbers in float64. On the
+device (`frame.Frame`) they are Dr.Jit arrays of size one: a Float, a Vector3f for three numbers, or a tuple of Floats.
+Nothing here depends on Mitsuba.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
-# Numbers and vectors of either side. Dr.Jit resolves these annotations, so they name nothing of Mitsuba.
+# Types of numbers and vectors on either side. Dr.Jit resolves these annotations, so they must not name Mitsuba.
 Number: TypeAlias = Any
 Vector: TypeAlias = Any
 
@@ -26,12 +26,12 @@ class SurfaceParameters:
     """One refracting surface in the eye frame, lengths in mm.
 
     Attributes:
-        origin: (3,) origin of the surface's own frame.
+        origin: (3,) origin of the surface's frame.
         shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic, (R, p, cells per mm, cells in a
             row, 0) of a measured surface (see `surfaces`).
-        eta: index of refraction before the surface over that behind it, for light that enters the eye.
-        axes: the unit axes of its frame, three (3,); None if they are the eye's own.
-        film: index before the surface over that of a film on it; None where no film can be.
+        eta: refractive index in front of the surface over that behind it, for light that enters the eye.
+        axes: three unit axes (3,) of the surface's frame; None if they are those of the eye.
+        film: refractive index in front of the surface over that of a film on it; None if there can be no film.
     """
 
     origin: Vector
@@ -54,10 +54,10 @@ class StopParameters:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IrisParameters:
-    """The iris.
+    """Iris parameters.
 
-    Radius of the root (mm), mean albedo, contrast of the texture, darkening at the root, scale of the heights, and
-    convexity (mm).
+    These are the radius of the root (mm), mean albedo, contrast of the texture, darkening at the root, scale of the
+    heights, and convexity (mm).
     """
 
     root_radius: Number
@@ -70,17 +70,17 @@ class IrisParameters:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LimbusParameters:
-    """The limbus and the cornea before it.
+    """The limbus and the cornea in front of it.
 
     Attributes:
         radius: radius about the front surface's axis, mm.
         floor: lowest x of the cornea in that surface's frame, mm.
         gain: 1 / width, 1/mm.
-        albedo: of the limbus.
-        up: (2,) direction upwards in that surface's y, z plane.
+        albedo: albedo of the limbus.
+        up: (2,) upward direction in that surface's y, z plane.
         lowering: 1 / aspect^2 - 1, with the height of the visible limbus over its width.
-        bulge: (3,) middle of a sphere that contains the cornea's front.
-        bulge_radius: its radius, mm.
+        bulge: (3,) centre of a sphere that contains the front of the cornea.
+        bulge_radius: radius of that sphere, mm.
     """
 
     radius: Number
@@ -113,9 +113,9 @@ class PoseParameters:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraParameters:
-    """Camera as the kernels use it.
+    """Camera parameters for the kernels.
 
-    It holds the centre of projection (3,) mm, the axes right, down and forward (3,), focal lengths and principal point
+    These are the centre of projection (3,) mm, the axes right, down and forward (3,), focal lengths and principal point
     (px), and the lens distortion (k1, k2, p1, p2, k3).
     """
 
@@ -138,10 +138,10 @@ class ImageParameters:
 
 @dataclass(kw_only=True)
 class FrameParameters:
-    """Parameters that the host and the device share; eye frame and scene's frame are in mm.
+    """Parameters that host and device share; lengths in mm, in the eye frame or the scene's frame.
 
     Attributes:
-        inner_index: index of refraction of the medium before the iris.
+        inner_index: refractive index of the medium in front of the iris.
         stop: the aperture stop.
         iris: the iris.
         limbus: the limbus.
@@ -149,10 +149,10 @@ class FrameParameters:
         image: the stop's Gaussian image.
         pose: the pose of the eye.
         camera: the camera.
-        pupil_albedo: share of the light that the pupil reflects back.
+        pupil_albedo: share of the light that the pupil reflects.
         globe_reach: radius (mm) of the sphere about the sclera's centre that contains the cornea too.
         backdrop_x: the background's plane, x in the scene's frame (mm).
-        ambient_irradiance: even light from all sides, mW/mm^2.
+        ambient_irradiance: irradiance of uniform light from all sides, mW/mm^2.
     """
 
     inner_index: Number
@@ -186,7 +186,7 @@ def packed(tree: Any) -> np.ndarray[Any, np.dtype[np.float32]]:
 
 
 def rebuilt(tree: _Tree, leaf: Callable[[int], Any]) -> _Tree:
-    """Rebuild a tree with other leaves: `leaf(size)` returns each, called in the order of `packed`."""
+    """Rebuild a tree of parameters; `leaf(size)` returns each leaf, in the order of `packed`."""
     node: Any = tree
     made: Any
     if is_dataclass(node):

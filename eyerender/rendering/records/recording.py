@@ -1,4 +1,4 @@
-"""Decorators of kernels: Python's own loops and branches, and recordings that are played back without tracing."""
+"""Decorators of kernels: Python loops and branches, and recordings that are replayed without tracing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _played: list[OrderedDict[Any, Any]] = []
 
 
 def syntax(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Let a function loop and branch on Dr.Jit arrays: `drjit.syntax`, with the function's type and all its defaults.
+    """Allow a function to loop and branch on Dr.Jit arrays: `drjit.syntax` with the function's type and defaults.
 
     Every local variable that a loop or branch reads becomes part of its state, unless `dr.hint` excludes it. Records
     are excluded.
@@ -30,15 +30,15 @@ def syntax(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Make a function of Dr.Jit arrays, and of records of them, play its kernels back.
+    """Record the kernels of a function of Dr.Jit arrays and records, and replay them in later calls.
 
-    Its plain values, such as numbers of lanes and whether something is on, make recordings of their own. It may not
-    read arrays to the host, or make arrays of NumPy's. Whatever changes between frames must be among the arguments.
+    Each set of plain argument values, such as numbers of lanes and flags, has its own recording. The function must not
+    read arrays to the host or create arrays from NumPy. Everything that changes between frames must be an argument.
 
-    Dr.Jit compares plain values, too, but misses the change of one that is also found before it: it takes a call with
-    (True, False, True) for one with (True, False, False). So they choose the recordings here.
+    Plain values select the recording here because Dr.Jit's own comparison has a defect: a call with (True, False, True)
+    matches one with (True, False, False).
 
-    The first call is not recorded, because the recording of a function that is called once is never played back.
+    The first call is not recorded, because a function that is called only once gains nothing.
     """
     variants: OrderedDict[Any, Any] = OrderedDict()
     _played.append(variants)
@@ -57,7 +57,7 @@ def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
             dr.eval(result)
             return result
         if variants[key] is None:
-            # A run over many subjects may record often without being wrong, so there is no warning.
+            # A run over many subjects may record often for good reason, so there is no warning.
             variants[key] = dr.freeze(function, limit=_KEPT, warn_after=2**31 - 1, auto_opaque=False)
         variants.move_to_end(key)
         return variants[key](*args, **kwargs)  # type: ignore[no-any-return]
@@ -66,7 +66,7 @@ def recorded(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _collect(value: Any, plain: list[Any]) -> None:
-    """Append the plain values in an argument, and the types of what else it holds, in their order."""
+    """Append the plain values in an argument and the types of everything else, in order."""
     kind = type(value)
     plain.append(kind)
     if kind in _PLAIN:
@@ -89,25 +89,25 @@ _PLAIN = {type(None), bool, int, float, str}
 
 @cache
 def _names(kind: type) -> tuple[str, ...]:
-    """List names of what objects of a class hold that Dr.Jit finds."""
+    """Return the attribute names of a class that Dr.Jit traverses."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
 
 
 def forget() -> None:
     """Forget all recordings.
 
-    They are useless once there are new shapes, because each has all shapes as inputs, and once the code that they play
-    has been replaced.
+    Recordings become useless when there are new shapes, because each has all shapes as inputs, and when the recorded
+    code has been replaced.
     """
     for variants in _played:
         variants.clear()
 
 
 def uncollected(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Keep the garbage collector from running in a function.
+    """Disable the garbage collector during a function.
 
-    Dr.Jit cannot record the release of NumPy's memory. And a frame has some ten thousand short-lived objects, whose
-    collection takes a twentieth of its time.
+    Dr.Jit cannot record the release of NumPy's memory. Also, collecting the ten thousand short-lived objects of a frame
+    takes a twentieth of its time.
     """
 
     @wraps(function)

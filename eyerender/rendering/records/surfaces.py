@@ -7,8 +7,8 @@ A surface is given in its own frame, +x outward:
     measured  x + g(y, z) = 0,  g = (y^2 + z^2) / (2 R) + sum_pq a_pq s^p t^q,  a bicubic in each cell
 
 with c = 1/R > 0 and p = 1 + Q for the biconic's two meridians. A conic has a = (1 + Q, 1, 1), b = R, c = 0. The
-coefficients of a measured surface are data (see `lattice`), so a new one compiles nothing. Lengths are in mm. The
-differentials follow Igehy (1999), 'Tracing ray differentials', equations 10-18.
+coefficients of a measured surface are data (see `lattice`), so a new surface needs no new kernel. Lengths are in mm.
+The differentials follow Igehy (1999), 'Tracing ray differentials', equations 10-18.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Bundle:
 
 
 class NormalForm(NamedTuple):
-    """Outward unit normal, inverse length of the gradient, and the Hessian as a function of a vector."""
+    """Outward unit normal, inverse length of the gradient, and a function that multiplies the Hessian by a vector."""
 
     normal: mi.Vector3f
     inverse: mi.Float
@@ -55,13 +55,13 @@ class Surface:
 
     Attributes:
         origin: origin of the surface's frame.
-        axes: unit axes of the surface's frame in the eye frame, or None if they are the eye's own.
+        axes: unit axes of the surface's frame in the eye frame; None if they are those of the eye.
         shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic, (R, p, cells per mm, cells in a
             row, 0) of a measured surface, whose conic of R and p is where the search for hits starts.
-        eta: index before over index behind, for light that enters the eye.
-        kind: which of the three it is.
+        eta: refractive index in front over that behind, for light that enters the eye.
+        kind: quadric, biconic or measured.
         table: the cells of a measured surface (see `lattice`).
-        film: index before over that of a film on the surface; None for a bare one.
+        film: refractive index in front over that of a film on the surface; None without a film.
     """
 
     origin: mi.Vector3f
@@ -73,7 +73,7 @@ class Surface:
     film: mi.Float | None = None
 
     def mirrored(self, c1: mi.Float, c2: mi.Float) -> mi.Float:
-        """Compute the share of the light that is mirrored, from the cosines before and behind the surface."""
+        """Compute the reflectance from the cosines in front of and behind the surface."""
         return fresnel(c1, c2, self.eta, self.film)
 
     def point_in(self, x: mi.Vector3f) -> mi.Vector3f:
@@ -94,10 +94,10 @@ class Surface:
         return a * v.x + b * v.y + c * v.z
 
     def hit(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
-        """Find the distance to the point where a ray from outside enters, and whether it does, in the surface's frame.
+        """Compute the distance at which a ray from outside enters, and whether it does, in the surface's frame.
 
-        The origin must be within some centimetres, or single precision costs more than a micrometre. A measured surface
-        is replaced by the conic that is like it, which is enough for shadows and first guesses; `intersect` is exact.
+        The origin must be within a few centimetres; farther away, single precision loses more than a micrometre. A
+        measured surface is approximated by its conic, which is enough for shadows and first guesses; `meet` is exact.
         """
         t, ok = self._near(o, d)
         if self.kind == "biconic":
@@ -105,7 +105,7 @@ class Surface:
         return t, ok
 
     def _near(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool]:
-        """The same for the quadric that a surface is, or is like: that of a biconic has its curvatures at the apex."""
+        """Intersect the quadric itself, or the osculating quadric of a biconic."""
         if self.kind == "biconic":
             Ry, Rz, py, pz, _ = self.shape
             b, c = 0.5 * (Ry + Rz), 0
@@ -125,7 +125,7 @@ class Surface:
         return C / q, (D > 0) & (q > 0)
 
     def meet(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Bool, mi.Vector3f]:
-        """Find the distance and success as from `hit`, exact for every surface, and the outward unit normal there."""
+        """Compute distance and success as in `hit`, exactly for every surface, and the outward unit normal there."""
         t, ok = self._near(o, d)
         if self.kind == "quadric":
             return t, ok, self.normal(o + t * d)
@@ -135,10 +135,10 @@ class Surface:
     def _refined(
         self, o: mi.Vector3f, d: mi.Vector3f, t: mi.Float, ok: mi.Bool, order: int
     ) -> tuple[mi.Float, mi.Bool, tuple[mi.Float, ...]]:
-        """Two Newton steps from the quadric to a biconic or measured surface, and its sag where the second one began.
+        """Refine the hit on a biconic or measured surface by two Newton steps; return the sag where the second began.
 
-        The conic of a measured surface is within 0.1 mm and the first step within 1 um, where the slopes are as good as
-        exact. For order 2, the second derivatives take the slopes on to the hit.
+        The conic of a measured surface lies within 0.1 mm and the first step within 1 um, where the slopes are
+        practically exact. For order 2, the slopes are extrapolated to the hit with the second derivatives.
         """
         value, slope = self._sag_form(o + t * d)
         t -= value / dr.dot(slope, d)
@@ -149,16 +149,16 @@ class Surface:
             g, gy, gz, gyy, gyz, gzz = jet
             y, z = step * d.y, step * d.z
             jet = (g, gy - gyy * y - gyz * z, gz - gyz * y - gzz * z, gyy, gyz, gzz)
-        # A ray that meets the quadric and just misses the surface jumps by centimetres.
+        # A ray that meets the quadric but just misses the surface jumps by centimetres.
         return t - step, ok & (dr.abs(step) < _SETTLED_MM), jet
 
     def _sag_form(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
-        """F = x + g(y, z) of a biconic or a measured surface, and its gradient."""
+        """Compute F = x + g(y, z) of a biconic or a measured surface, and its gradient."""
         g, gy, gz, *_ = self._sag(x.y, x.z, 1)
         return x.x + g, mi.Vector3f(1, gy, gz)
 
     def _sag(self, y: mi.Float, z: mi.Float, order: int = 2) -> tuple[mi.Float, ...]:
-        """Compute the sag g, its two first and three second derivatives (yy, yz, zz); at least those up to `order`."""
+        """Compute the sag g and its derivatives by y and z: two first and three second ones, at least up to `order`."""
         if self.table is not None:
             return self._spline(self.table, y, z, order)
         Ry, Rz, py, pz, _ = self.shape
@@ -219,7 +219,7 @@ class Surface:
         return NormalForm(G * inv, inv, lambda v: mi.Vector3f(ax * v.x, ay * v.y, az * v.z))
 
     def refract(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Bool]:
-        """Enter the eye along a ray of the eye frame: hit point, direction behind, transmittance 1 - F, and success."""
+        """Refract a ray of the eye frame into the eye: hit point, direction behind, transmittance 1 - F, success."""
         ol, dl = self.point_in(o), self.vector_in(d)
         t, ok, N = self.meet(ol, dl)
         c = -dr.dot(N, dl)
@@ -228,7 +228,7 @@ class Surface:
         return o + t * d, self.vector_out(w), 1 - self.mirrored(c, c2), ok & (c > 0)
 
     def on_surface(self, x: mi.Vector3f) -> tuple[mi.Vector3f, NormalForm]:
-        """Point of the surface (eye frame) at the same local (y, z) as a point near it, and its form for `bend`."""
+        """Return the surface point (eye frame) at the local (y, z) of a nearby point, and its form for `bend`."""
         l = self.point_in(x)
         form: NormalForm | None = None
         if self.kind != "quadric":
@@ -238,12 +238,13 @@ class Surface:
             ax, ay, az, b, c = self.shape
             C = ay * l.y * l.y + az * l.z * l.z + c
             sag = -C / (b + dr.sqrt(dr.maximum(b * b - ax * C, 1e-3)))
-        # In single precision the change must be computed apart from the point, because it is much smaller.
+        # In single precision the change must be computed apart from the point, because it is much smaller than the
+        # point.
         point = x + self.vector_out(mi.Vector3f(sag - l.x, 0, 0))
         return point, self._normal_form(self.point_in(point)) if form is None else form
 
     def refract_bundle(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
-        """Enter the eye with ray differentials: the bundle behind, the transmittance 1 - F, and success."""
+        """Refract a ray with differentials into the eye: the bundle behind, the transmittance 1 - F, and success."""
         o, d = self.point_in(b.y), self.vector_in(b.w)
         t, ok = self._near(o, d)
         form: NormalForm | None = None
@@ -255,7 +256,7 @@ class Surface:
         return out, share, ok & (c > 1e-4)
 
     def bend(self, b: Bundle, form: NormalForm, *, mirror: bool = False) -> tuple[Bundle, mi.Float, mi.Float]:
-        """Refract or mirror a bundle whose ray has reached the surface: the bundle, its share, cosine of incidence."""
+        """Refract or mirror a bundle whose ray is on the surface: the bundle, its share, cosine of incidence."""
         d = self.vector_in(b.w)
         N, inv, hessian = form
         c = -dr.dot(N, d)
@@ -298,7 +299,9 @@ def _slope(c: list[mi.Float], s: mi.Float) -> mi.Float:
 
 
 def fresnel(c1: mi.Float, c2: mi.Float, eta: mi.Float, film: mi.Float | None = None) -> mi.Float:
-    """Find the unpolarised Fresnel reflectance of a dielectric: cosines before and behind, eta = n_before / n_behind.
+    """Compute the unpolarised Fresnel reflectance of a dielectric surface, optionally with a film.
+
+    c1 and c2 are the cosines in front and behind, eta = n_before / n_behind:
 
     F = (rs^2 + rp^2) / 2,  rs = (eta c1 - c2) / (eta c1 + c2),  rp = (c1 - eta c2) / (c1 + eta c2)   (Born & Wolf 1.5)
 
@@ -307,7 +310,7 @@ def fresnel(c1: mi.Float, c2: mi.Float, eta: mi.Float, film: mi.Float | None = N
     if film is None:
         s, p = _polarized(c1, c2, eta)
         return 0.5 * (s + p)
-    # Rounding may bring a ray that grazes the surface from behind it, where two shares above 1 would have a huge sum.
+    # Rounding may start a grazing ray behind the surface, where two shares above 1 would have a huge sum.
     c1 = dr.maximum(c1, 0)
     inside = dr.sqrt(dr.maximum(1 - film * film * (1 - c1 * c1), 0))
     shares = zip(_polarized(c1, inside, film), _polarized(inside, c2, eta / film), strict=True)

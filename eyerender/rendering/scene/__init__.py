@@ -1,1 +1,1 @@
-"""Scenes of triangles: the eye region, a head, the background; and what pixels can show, from their projection."""
+"""Scenes of triangles (eye region, head, background), and classes of pixels from their projection."""

@@ -1,8 +1,8 @@
 """Background of an eye without a region: a matte plane and other obstacles.
 
-It is fixed in the scene's frame (the world's axes, origin at the apex of the unrotated eye), so neither a pose nor a
-camera rebuilds it. The plane is of matte skin behind the apex, through which the globe protrudes. It does
-not imitate lids and brow.
+The background is fixed in the scene's frame (the world's axes, origin at the apex of the unrotated eye), so it need not
+be rebuilt for another pose or camera. The plane is matte skin behind the apex, and the globe protrudes through it. It
+does not imitate lids and brow.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Obstacle(ArrayValue):
 
 @dataclass(frozen=True, slots=True)
 class Matte:
-    """Points of the background: place, geometric normal (scene's frame), albedo."""
+    """Points of the background: position, geometric normal (scene's frame), albedo."""
 
     point: mi.Vector3f
     normal: mi.Vector3f
@@ -50,12 +50,12 @@ class Matte:
 class BackgroundGeometry:
     """Triangles of the background for the kernels, and the map of its plane.
 
-    Kernels read them from buffers and do not call methods of Mitsuba's shapes and materials: the code of such a call
-    depends on how many objects the process has made.
+    Kernels read them from buffers instead of calling methods of Mitsuba's shapes and materials, because the code of
+    such a call depends on the number of objects that the process has created.
 
     Attributes:
         corners: four entries for each triangle, of which the first three are its vertices.
-        vertices: four numbers for each vertex: place (mm), and albedo, negative for that of the map.
+        vertices: four numbers per vertex: position (mm), and albedo, or a negative number to use the map.
         map: albedo of the plane.
     """
 
@@ -65,7 +65,7 @@ class BackgroundGeometry:
 
     @classmethod
     def of(cls, faces: Ints) -> BackgroundGeometry:
-        """Send the triangles (m, 3) to the device."""
+        """Copy the triangles (m, 3) to the device."""
         corners = np.zeros((len(faces), 4), np.uint32)  # four entries, which are gathered together
         corners[:, :3] = faces
         blank, texture = mi.TensorXf(np.zeros((2, 2, 1), np.float32)), cast(Any, mi.Texture2f)
@@ -73,11 +73,11 @@ class BackgroundGeometry:
         return cls(corners=mi.UInt32(aligned_copy(corners.ravel())), vertices=mi.Float(0), map=plane)
 
     def place(self, vertices: Floats, albedo: Floats) -> None:
-        """Set the vertices (n, 3) mm and their albedos (n,); negative ones stand for the map of the plane."""
+        """Set the vertices (n, 3) mm and their albedos (n,); a negative albedo selects the map of the plane."""
         self.vertices = mi.Float(aligned_copy(np.column_stack([vertices, albedo]).astype(np.float32).ravel()))
 
     def paint(self, tile: Floats) -> None:
-        """Set the map of the plane's albedo, which repeats."""
+        """Set the repeating albedo map of the plane."""
         self.map.set_tensor(mi.TensorXf(tile.astype(np.float32)[..., None]))
 
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> Matte:
@@ -113,7 +113,7 @@ class Background:
         params["vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
         params["faces"] = mi.UInt32(triangles.astype(np.uint32).ravel())
         params.update()
-        # Without robust intersections rays slip between neighbouring triangles on some processors.
+        # Without robust intersections, rays slip between neighbouring triangles on some processors.
         self.scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "background": mesh})
         self._params: Any = mi.traverse(self.scene)
         self.geometry = BackgroundGeometry.of(triangles)
@@ -121,7 +121,7 @@ class Background:
         self._shown: tuple[float, float, float] | None = None
 
     def show(self, look: Look) -> None:
-        """Update distance, albedo and contrast of the plane to a look."""
+        """Set distance, albedo and contrast of the plane from a look."""
         wanted = (look.backdrop_distance_mm, look.backdrop_albedo, look.backdrop_contrast)
         if wanted == self._shown:
             return
@@ -135,12 +135,12 @@ class Background:
         self._shown = wanted
 
     def clear(self, a: Floats, b: Floats) -> Bools:
-        """Whether nothing of the background stands between points (n, 3) of the scene's frame; ends not included."""
+        """Return whether the background leaves the lines between points (n, 3), scene's frame, free; ends excluded."""
         return clear_between(self.scene, a, b) if self.obstructed else _beside_plane(self._vertices[0, 0], a, b)
 
 
 def _beside_plane(x: float, a: Floats, b: Floats) -> Bools:
-    """Return whether the plane at x does not stand between points (n, 3)."""
+    """Return whether the plane at x leaves the line between points (n, 3) free."""
     table = _between(a, b).astype(float)
     o, d, length = table[:, :3], table[:, 3:6], table[:, 6]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -151,10 +151,10 @@ def _beside_plane(x: float, a: Floats, b: Floats) -> Bools:
 
 
 def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
-    """Return whether nothing of a Mitsuba scene stands between points (n, 3) of its frame; ends not included."""
+    """Return whether a Mitsuba scene leaves the line between points (n, 3) of its frame free, ends excluded."""
     if not len(a):
         return np.zeros(0, dtype=bool)
-    # Some rays more than there are make few numbers of rays, so that recordings are played back.
+    # Rounding the number of rays up gives few different sizes, so that recordings are replayed.
     step = max(1 << len(a).bit_length() >> 3, _FEWEST)
     count = -(-len(a) // step) * step
     table = _between(a, b)[np.minimum(np.arange(count), len(a) - 1)]
@@ -163,7 +163,7 @@ def clear_between(scene: mi.Scene, a: Floats, b: Floats) -> Bools:
 
 @recorded
 def _met(scene: mi.Scene, table: mi.Float, count: int) -> mi.Bool:
-    """Return whether rays meet anything; the table holds origin, direction and length of each."""
+    """Return whether rays meet anything; each row of the table holds origin, direction and length."""
     met = scene.ray_test(_rays(table, count))
     dr.eval(met)
     return met
@@ -176,14 +176,14 @@ def rays_between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> mi.Ray3f:
 
 
 def _between(a: Floats, b: Floats, margin_mm: float = 1e-3) -> Singles:
-    """Compute the origin, direction and length (n, 7) of such rays."""
+    """Compute origin, direction and length (n, 7) of the rays of `rays_between`."""
     length = lengths(b - a)
     d = (b - a) / length[:, None]
     return np.column_stack([a + margin_mm * d, d, length - 2 * margin_mm]).astype(np.float32)
 
 
 def _rays(table: mi.Float, count: int) -> mi.Ray3f:
-    # The values are gathered from one buffer, else the kernel would depend on the alignment of every NumPy array.
+    # The values are gathered from one buffer, otherwise the kernel would depend on the alignment of every NumPy array.
     row = dr.arange(mi.UInt32, count) * 7
     o = [dr.gather(mi.Float, table, row + k) for k in range(7)]
     ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:6]))

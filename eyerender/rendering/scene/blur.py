@@ -1,4 +1,4 @@
-"""Defocus of a job: one kernel where everything is equally out of focus, else one per depth."""
+"""Defocus of a job: one kernel if everything is equally out of focus, otherwise one per depth."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ...rig.camera import Window
 from ..records.job import RenderJob
 
 _GLOBE_MM = 13.5  # the globe and the cornea about the sclera's centre
-_BESIDE = 0.25  # of a window's size: the border about it whose things may blur into it
+_BESIDE = 0.25  # share of a window's size: objects in this border may blur into the window
 
 
 @dataclass(frozen=True, slots=True)
 class Blur:
-    """Defocus of a job's picture.
+    """Defocus of a job's image.
 
     Attributes:
         job: the job.
         subject_px: diameter of the circle of confusion of the eye.
-        layered: whether other depths are blurred visibly more or less.
-        reach: pixels beyond the window's border that are needed.
+        layered: whether the blur of other depths differs visibly.
+        reach: number of pixels needed beyond the window's border.
     """
 
     job: RenderJob
@@ -34,7 +34,7 @@ class Blur:
 
     @classmethod
     def of(cls, job: RenderJob, posed: RegionMesh | None) -> Blur:
-        """Find the blur of a job, with its posed region, before it is rendered.
+        """Compute the blur of a job with its posed region, before rendering.
 
         Raises:
             InputError: the eye would be blurred over more than 400 px.
@@ -56,7 +56,7 @@ class Blur:
 
     @property
     def border_px(self) -> int:
-        """Width of the border about the job's window that lens and point-spread function need."""
+        """Width of the border around the job's window that lens and point-spread function need."""
         return self.reach + psf.margin(self.job.sensor.psf_sigma_px)
 
     @property
@@ -66,10 +66,10 @@ class Blur:
         return x0 - pad, y0 - pad, width + 2 * pad, height + 2 * pad
 
     def of_pictures(self, pictures: Reals) -> Reals:
-        """Blur a picture, smaller by the reach on every side.
+        """Blur an image; the result is smaller by the reach on every side.
 
         Args:
-            pictures: (height, width) radiance; of a layered blur its parts (`film.start`).
+            pictures: (height, width) radiance; for a layered blur, its parts (`film.start`).
         """
         if not self.layered:
             return defocus.defocused(pictures, self.subject_px)
@@ -81,7 +81,7 @@ class Blur:
         return defocus.blurred(layers, self.reach)
 
     def of_image(self, nearness: Floats) -> float:
-        """Diameter of the circle of confusion of a mirror image: mean square over its inverse depths (1/mm)."""
+        """Compute the circle of confusion (diameter, px) of a mirror image: rms over its inverse depths (1/mm)."""
         job = self.job
         if not np.all(np.isfinite(nearness)):
             return self.subject_px
@@ -89,7 +89,7 @@ class Blur:
 
 
 def _depths(job: RenderJob, posed: RegionMesh | None) -> Floats:
-    """Compute depths (mm) of things in the window: nearest and farthest."""
+    """Compute the nearest and farthest depth (mm) of objects in the window."""
     camera = job.camera
     middle = float(camera.R[2] @ (np.asarray(job.eye.sclera.centre_mm) @ job.M.T + job.t) + camera.t[2])
     depths = [middle - _GLOBE_MM, middle]

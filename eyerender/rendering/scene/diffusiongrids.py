@@ -1,4 +1,4 @@
-"""Cells of the grids of light in the tissues that matter in a pose (see `diffusion`), found on the host."""
+"""Select the grid cells of subsurface light (see `diffusion`) that matter in a pose, on the host."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from ...region.skin import SHEET_ROWS, sheet_place
 from ...rig.stray import misses_light
 from ..records.job import RenderJob
 
-GRID_ROWS, GRID_COLUMNS = 160, 768  # of the finer grid over the sheet of skin
-SIDE = 192  # of the grid over the front of the globe
-WIDTH = 2.5  # of this grid in units of the globe's radius, in Lambert's equal-area projection
-_REDUCTIONS = 2  # of the grid over the skin, by 2 each, whose cells have marks of their own
-_FINE_PX_PER_MM = 11.0  # in pictures of fewer pixels per mm every second row and column of the skin's grid will do
-_SPARE, _SPARE_MM = 24.0, 10.0  # beyond the window, from where light still arrives: in units of d, and at least
-_EDGE_MM = 0.4  # about the lids' margins, where the globe may be seen
+GRID_ROWS, GRID_COLUMNS = 160, 768  # size of the finer grid over the sheet of skin
+SIDE = 192  # size of the grid over the front of the globe
+WIDTH = 2.5  # width of this grid in units of the globe's radius, in Lambert's equal-area projection
+_REDUCTIONS = 2  # reductions of the skin's grid by 2 each, with separate marks of their cells
+_FINE_PX_PER_MM = 11.0  # in images with fewer pixels per mm, every second row and column of the skin's grid suffices
+_SPARE, _SPARE_MM = 24.0, 10.0  # reach outside the window from which light arrives: in units of d, and at least
+_EDGE_MM = 0.4  # distance from the lid margins within which the globe may be visible
 
 
 @dataclass(frozen=True, slots=True)
 class DiffusionGrids:
-    """The cells of a pose, and how far light spreads in skin and sclera (d, mm)."""
+    """Cells of a pose, and the diffusion length d (mm) in skin and sclera."""
 
     sheet: SheetCells
     globe: GlobeCells
@@ -35,7 +35,7 @@ class DiffusionGrids:
 
     @classmethod
     def of(cls, job: RenderJob, posed: RegionMesh, spare_px: int) -> DiffusionGrids:
-        """Find the cells of a job with scattering and a posed region; `spare_px` beyond the window are rendered."""
+        """Select the cells of a job with a posed region; `spare_px` pixels beyond the window are rendered."""
         scattering = job.look.scattering
         assert scattering is not None
         assert job.region is not None
@@ -52,8 +52,8 @@ class SheetCells:
 
     Attributes:
         rows: number of the grid's rows.
-        columns: number of its columns, which close.
-        numbers: of the cells that matter, and of the cells about them on the grid reduced by 2 and by 4.
+        columns: number of its columns, which form a closed ring.
+        numbers: numbers of the cells that matter, and of the surrounding cells on the grid reduced by 2 and by 4.
         edges: row of the sheet's vertices at the edges of the grid's rows.
         middles: row of the sheet's vertices in their middles.
     """
@@ -66,7 +66,7 @@ class SheetCells:
 
     @classmethod
     def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> SheetCells:
-        """Find the cells that are shown in the window, or so close that their light gets there."""
+        """Select the cells shown in the window, or so close that their light reaches it."""
         each = 1 if float(job.camera.scale_at(job.t)) > _FINE_PX_PER_MM else 2
         rows, columns = GRID_ROWS // each, GRID_COLUMNS // each
         texels = SHEET_ROWS // rows
@@ -95,7 +95,7 @@ class GlobeCells:
 
     @classmethod
     def of(cls, posed: RegionMesh, globe: Globe, reach_mm: float) -> GlobeCells:
-        """Find the cells of a pose; light gets as far as `reach_mm` from under a lid."""
+        """Select the cells of a pose; light spreads up to `reach_mm` from under a lid."""
         centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
         y, z = (v + c for v, c in zip(_globe_cells(globe.radius_mm), centre[1:], strict=True))
         upper, lower = (m[np.argsort(m[:, 1])] for m in (posed.upper_margin, posed.lower_margin))
@@ -110,7 +110,7 @@ class GlobeCells:
 
 @lru_cache(maxsize=4)
 def _globe_cells(radius_mm: float) -> tuple[Floats, Floats]:
-    """Compute places (y, z) of the cells of the grid over the globe about its middle, mm."""
+    """Compute positions (y, z) mm of the cells of the grid over the globe, relative to its centre."""
     row, column = np.divmod(np.arange(SIDE * SIDE), SIDE)
     a, b = ((k - 0.5 * (SIDE - 1)) * (WIDTH / SIDE) for k in (column, row))
     scale = radius_mm * np.sqrt(np.maximum(1 - 0.25 * (a * a + b * b), 0))
@@ -118,7 +118,7 @@ def _globe_cells(radius_mm: float) -> tuple[Floats, Floats]:
 
 
 def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -> Bools:
-    """Say which points (n, 3) are in a window or within its margin."""
+    """Return which points (n, 3) project into a window or its margin."""
     camera, whole = job.camera, misses_light(job.lens, job.camera, job.window)
     x0, y0, width, height = (0, 0, *camera.resolution_px) if whole else job.window
     xy, front = camera.project(points)
@@ -130,7 +130,7 @@ def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -
 
 
 def _grown(marked: Bools) -> Bools:
-    """Compute marks of a grid, whose columns close, and of all neighbours."""
+    """Dilate marks of a grid by one cell; its columns form a closed ring."""
     out = marked | np.roll(marked, 1, axis=1) | np.roll(marked, -1, axis=1)
     grown = out.copy()
     grown[1:] |= out[:-1]

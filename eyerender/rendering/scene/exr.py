@@ -1,4 +1,4 @@
-"""OpenEXR files: linear irradiance in full float precision."""
+"""Write OpenEXR files: linear irradiance in full float precision."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ...errors import EyerenderError
 
 @contextmanager
 def second_thread() -> Iterator[None]:
-    """Lend Dr.Jit a second thread; Mitsuba's OpenEXR hangs where it has a single one."""
+    """Give Dr.Jit a second thread; Mitsuba's OpenEXR hangs with a single one."""
     import drjit as dr
 
     count = dr.thread_count()
@@ -29,15 +29,15 @@ def second_thread() -> Iterator[None]:
 
 
 def write_exr(path: Path, image: Singles) -> None:
-    """Write irradiance (h, w), W/m^2, as an EXR of one channel; its header has the attributes `quantity` and `unit`.
+    """Write irradiance (h, w), W/m^2, as a one-channel EXR with the attributes `quantity` and `unit` in its header.
 
     Raises:
-        EyerenderError: the disk refuses it.
+        EyerenderError: the file cannot be written.
     """
     import mitsuba as mi
 
     try:
-        # Mitsuba accepts no read-only array, so this is a copy.
+        # a copy, because Mitsuba rejects read-only arrays
         with second_thread():
             bitmap = mi.Bitmap(np.array(image, dtype=np.float32)[..., None])
             header = bitmap.metadata()

@@ -1,4 +1,4 @@
-"""A user's own head mesh in Mitsuba, in place of the procedural eye region: one fixed mesh with one map."""
+"""A user's head mesh in Mitsuba, replacing the procedural eye region: one fixed mesh with one map."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _RINGS, _TURNS = 40, 240
 
 
 def place_scene(spec: Region, globe: Globe, known: RegionMesh | None) -> RegionScene:
-    """Make the scene of a spec: its head mesh, or the procedural region, whose mesh may be known."""
+    """Create the scene of a spec: its head mesh, or the procedural region, whose mesh may already be computed."""
     return (RegionScene if spec.head is None else HeadScene)(spec, globe, known)
 
 
 class HeadScene(RegionScene):
-    """The Mitsuba scene of a head mesh about one eye.
+    """The Mitsuba scene of a head mesh around one eye.
 
     Raises:
         InputError: the mesh cannot be read, or reaches into the cornea in the eye's pose.
@@ -40,7 +40,7 @@ class HeadScene(RegionScene):
         self._refuse_crossing(spec, globe)
 
     def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
-        """Turn to an eye and its pose; the mesh itself moves only with the place of the globe at rest."""
+        """Show an eye in its pose; the mesh moves only with the position of the globe at rest."""
         new = self._shown != (spec, globe)
         posed = super().show(spec, globe, known)
         if new:
@@ -63,7 +63,7 @@ class HeadScene(RegionScene):
         return None
 
     def _refuse_crossing(self, spec: Region, globe: Globe) -> None:
-        """Raise an error where the mesh reaches too deep into the cornea.
+        """Raise an error if the mesh reaches too deep into the cornea.
 
         The depth is measured along lines from the globe's centre that are 0.15 mm apart on the cornea.
         """
@@ -81,7 +81,7 @@ class HeadScene(RegionScene):
 
 
 def cornea_depth_mm(place: RegionScene, globe: Globe) -> Floats:
-    """Depth (mm, 0 to 4) by which the mesh reaches into the posed cornea along lines from the globe's centre, (n,)."""
+    """Compute the depth (n,), 0 to 4 mm, of the mesh inside the posed cornea, along lines from the globe's centre."""
     surface = globe.cornea
     if surface is None:
         return np.zeros(1)
@@ -93,7 +93,7 @@ def cornea_depth_mm(place: RegionScene, globe: Globe) -> Floats:
     out = points - (globe.M @ globe.centre_mm + globe.t)
     out /= np.linalg.norm(out, axis=1, keepdims=True)
     table = np.column_stack([points - _DEPTH_MM * out, out]).astype(np.float32)
-    # The values are gathered from one buffer, else the kernel would depend on the alignment of every NumPy array.
+    # The values are gathered from one buffer, otherwise the kernel would depend on the alignment of every NumPy array.
     buffer, row = mi.Float(table.ravel()), dr.arange(mi.UInt32, len(table)) * 6
     o = [dr.gather(mi.Float, buffer, row + k) for k in range(6)]
     ray = mi.Ray3f(mi.Point3f(*o[:3]), mi.Vector3f(*o[3:]))

@@ -1,9 +1,9 @@
 """Classes of pixels: skin-only tiles, and pixels at thin hairs and menisci, which are supersampled.
 
-The skin is a sheet with a hole, the fissure, that ends at a border. A ray whose pixel lies within the border's outline
-and not within the hole's outline crosses the sheet, because the number of crossings is the difference of the two
-winding numbers. Hairs and the line of tears are in front of the sheet. The tears, hairs that are thick in the picture
-and both outlines are marked, with some pixels to spare, and thin hairs pixel by pixel.
+The skin is a sheet with a hole, the fissure, that ends at a border. A ray whose pixel lies inside the border's outline
+but outside the hole's outline crosses the sheet, because the number of crossings is the difference of the two winding
+numbers. Hairs and the tear meniscus lie in front of the sheet. Menisci, hairs that are thick in the image, and both
+outlines are marked with a margin of some pixels; thin hairs are marked pixel by pixel.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ...region.mesh import HAIRS, RegionMesh
 from ...rig.camera import PinholeCamera, Window
 
 _TILE_PX = 8
-_STEP_PX = 4.0  # between marked points of a curve
+_STEP_PX = 4.0  # distance between marked points of a curve
 _SPARE_PX = 1.0
 _HAIR_MM = 0.1  # no hair and no part of a margin is thicker
 _THICK_PX, _FINE_STEP_PX, _SLACK_PX = 2.0, 0.5, 0.02
@@ -23,10 +23,10 @@ _NEAREST_MM = 3.0  # if hairs are closer to the camera, no tile is skin-only
 
 
 def skin_only_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, int]:
-    """Find the tiles (rows, columns) of a window that show nothing but skin and thin hairs, and the tile size (px).
+    """Return which tiles (rows, columns) of a window show only skin and thin hairs, and the tile size (px).
 
-    `supersampled_pixels` finds the thin hairs. There are no such tiles if the region's border is unknown, or if hairs
-    come too close to the camera.
+    `supersampled_pixels` marks the thin hairs. No tile qualifies if the region's border is unknown, or if hairs are too
+    close to the camera.
     """
     nothing = np.zeros((1, 1), dtype=bool), max(window[2:])
     if len(region.border) == 0:
@@ -59,17 +59,17 @@ def skin_only_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats
 def supersampled_pixels(
     region: RegionMesh | None, camera: PinholeCamera, anchor_mm: Floats, window: Window
 ) -> tuple[Bools, Bools]:
-    """Find the pixels (height, width) of a window at menisci or touched by hairs at most two pixels thick.
+    """Return the pixels (height, width) of a window at menisci, or touched by hairs at most two pixels thick.
 
-    The second result marks pixels that may show menisci; these are all pixels if a meniscus is too close. Marks do not
-    depend on the window.
+    The second result marks pixels that may show menisci: all of them if a meniscus is too close. The marks of a pixel
+    do not depend on the window.
     """
     if region is None:
         return np.zeros((window[3], window[2]), dtype=bool), np.zeros((window[3], window[2]), dtype=bool)
     fine = np.zeros((window[3], window[2]), dtype=bool)
     for curve, radii in zip(region.strands[:HAIRS], region.radii, strict=True):
         _mark_hairs(fine, curve + anchor_mm, radii, camera, window)
-    # Menisci are grids, of which the strands are the rows.
+    # Menisci are grids; their rows are the strands.
     grids = region.strands[HAIRS:]
     wet, every = _drawn([*grids, *(grid.transpose(1, 0, 2) for grid in grids)], camera, anchor_mm, window)
     wet = _with_beside(wet)
@@ -77,7 +77,7 @@ def supersampled_pixels(
 
 
 def _thin(depth_mm: float, camera: PinholeCamera) -> bool:
-    """Return whether hairs at this depth are thin in the picture."""
+    """Return whether hairs at this depth are thin in the image."""
     focal = float(max(camera.K[0, 0], camera.K[1, 1]))
     return depth_mm >= _NEAREST_MM and _HAIR_MM * focal <= _THICK_PX * depth_mm
 
@@ -88,7 +88,7 @@ def _mark_hairs(marked: Bools, curves: Floats, radii: Floats, camera: PinholeCam
     focal = float(max(camera.K[0, 0], camera.K[1, 1]))
     if not curves.size or not _thin(float(depth.min()), camera):
         return
-    # Away from the axis the picture is stretched.
+    # Away from the optical axis the image is stretched.
     thick = radii * focal * np.linalg.norm(curves - camera.nodal_point_mm, axis=-1) / depth**2 + _SLACK_PX
     start, way, ends = _pieces(camera.project(curves)[0] - window[:2], marked.shape, thick)
     half = np.maximum(*ends.T)
@@ -113,7 +113,7 @@ def _mark_hairs(marked: Bools, curves: Floats, radii: Floats, camera: PinholeCam
 
 
 def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, window: Window) -> tuple[Bools, bool]:
-    """Pixels on curves in a window and a border of one pixel about it; whether no curve is too close to be drawn."""
+    """Return the pixels on curves, in a window and a one-pixel border, and whether no curve is too close to draw."""
     x0, y0, width, height = window
     marked, every = np.zeros((height + 2, width + 2), dtype=bool), True
     for curve in (c for c in curves if c.size):
@@ -122,7 +122,7 @@ def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, windo
             every = False
             continue
         xy = camera.project(curve + anchor_mm)[0] - (x0 - 1, y0 - 1)
-        # Pieces beside the window need no points.
+        # Pieces outside the window need no points.
         start, way, _ = _pieces(xy, (height + 2, width + 2))
         count = np.ceil(np.hypot(way[:, 0], way[:, 1]) / _FINE_STEP_PX).astype(int) + 1
         step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -144,7 +144,7 @@ def _with_beside(marked: Bools) -> Bools:
 
 
 def _pieces(xy: Floats, shape: tuple[int, int], values: Floats | None = None) -> tuple[Floats, Floats, Floats]:
-    """Cut polylines (n, k, 2) into the straight pieces near a grid of this shape: start and way (m, 2).
+    """Cut polylines (n, k, 2) into straight pieces near a grid of this shape: start and displacement (m, 2).
 
     The third result (m, 2) are `values` (n, k) at the ends of the pieces.
     """
@@ -183,7 +183,7 @@ def _winding(xy: Floats, shape: tuple[int, int]) -> Floats:
     edge, row = np.nonzero(turn)
     share = (y[row] - ay[edge, 0]) / (by[edge, 0] - ay[edge, 0])
     x = ax[edge, 0] + share * (bx[edge, 0] - ax[edge, 0])
-    # A crossing counts for all middles beyond it.
+    # A crossing counts for all tile centres beyond it.
     column = np.clip(np.ceil(x - 0.5).astype(int), 0, columns)
     steps = np.zeros((rows, columns + 1), dtype=int)
     np.add.at(steps, (row, column), turn[edge, row])

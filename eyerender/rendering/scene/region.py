@@ -1,9 +1,8 @@
-"""The eye region in Mitsuba: triangles with one map, moved in place, of one subject after another.
+"""The eye region in Mitsuba: triangles with one map, moved in place and reused for one subject after another.
 
 The triangles are in the scene's frame (the world's axes, origin at the apex of the unrotated eye) as one instance,
-because Mitsuba lets Embree build an instance's tree without the spatial splits of a scene's own meshes, which takes a
-third of the time. The menisci are a scene of their own. The appearance of a hit is read from buffers of our own
-(`SkinGeometry`), so kernels do not change.
+because Embree then builds their tree without spatial splits, in a third of the time. The menisci form a separate scene.
+The appearance at a hit is read from separate buffers (`SkinGeometry`), so kernels do not change.
 """
 
 from __future__ import annotations
@@ -29,19 +28,19 @@ from ..records.frame import aligned_copy
 from .background import clear_between, rays_between
 from .diffusiongrids import GRID_COLUMNS, GRID_ROWS
 
-SHEET_COLUMNS = COLUMNS + 1  # of the sheet's grid, because the first column is repeated
+SHEET_COLUMNS = COLUMNS + 1  # columns of the sheet's grid; the first column is repeated
 
 
 class RegionScene:
-    """The Mitsuba scene of an eye region; `show` moves it, and `fill` gives it to another subject.
+    """The Mitsuba scene of an eye region; `show` poses it, `fill` replaces its subject.
 
     Attributes:
         scene: the solid parts.
         skin: the region for the kernels.
-        relief: mean slopes of the map over the cells of the grids on which light spreads, by their numbers of rows.
+        relief: mean slopes of the map over the cells of the diffusion grids, by number of rows.
         sheet_faces: number of triangles of the sheet of skin.
         posed: the mesh in its pose.
-        subject: what the scene was made for.
+        subject: identity of the subject it was made for.
     """
 
     obstructed = True
@@ -60,10 +59,10 @@ class RegionScene:
 
     @staticmethod
     def _loaded(name: str, parts: dict[str, Any]) -> mi.Scene:
-        """Make a scene and its tree."""
+        """Create a scene and its acceleration structure."""
         scene: dict[str, Any] = {"type": "scene", **parts}
         if name == "solid":
-            # Without robust intersections rays slip between the triangles of a large face on some processors. An
+            # Without robust intersections, rays slip between the triangles of a large face on some processors. An
             # instance cannot have them, but its triangles are small.
             scene["embree_use_robust_intersections"] = True
         return mi.load_dict(scene)
@@ -76,7 +75,7 @@ class RegionScene:
         return {"solid": (slice(0, v), slice(0, f)), "film": (slice(v, None), slice(f, None))}
 
     def _dress(self, spec: Region, globe: Globe, posed: RegionMesh) -> None:
-        """Send the appearance of a subject to the device."""
+        """Copy the appearance of a subject to the device."""
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
         pixels = aligned_copy(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
@@ -93,11 +92,11 @@ class RegionScene:
         self.subject = self.key(spec, globe)
 
     def takes(self, spec: Region) -> bool:
-        """Return whether a subject fits into the scene's meshes."""
+        """Return whether a subject fits the meshes of the scene."""
         return not self.fixed and spec.head is None
 
     def fill(self, spec: Region, globe: Globe, known: RegionMesh | None) -> None:
-        """Show another subject with the same shapes, so that recordings can still be played back."""
+        """Replace the subject by one with the same shapes, so that recordings remain valid."""
         posed = known or self._posed(spec, globe)
         for name, cut in self._cuts(posed.layout).items():
             self._set(name, "faces", _faces(posed.layout, *cut))
@@ -106,12 +105,12 @@ class RegionScene:
 
     @staticmethod
     def key(spec: Region, globe: Globe) -> tuple[Any, ...]:
-        """Identify a scene: the subject, the side, and the state of a head mesh's files."""
+        """Return the cache key of a scene: the subject, the side, and the state of a head mesh's files."""
         files = () if spec.head is None else file_states(spec.head)
         return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
 
     def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
-        """Move lids and lashes to a pose and a blink, whose mesh may be known."""
+        """Pose lids and lashes, including a blink; the mesh of the pose may already be computed."""
         if self._shown != (spec, globe):
             posed = known or self._posed(spec, globe)
             if posed is not self.posed:
@@ -122,7 +121,7 @@ class RegionScene:
         return self.posed
 
     def at_rest(self, globe: Globe) -> RegionMesh:
-        """Compute the mesh of the subject with open lids about a globe; the scene keeps its pose."""
+        """Compute the mesh of the subject with open lids around a globe; the scene keeps its pose."""
         assert self._shown is not None
         return self._posed(self._shown[0].model_copy(update={"blink": 0.0}), globe)
 
@@ -132,13 +131,13 @@ class RegionScene:
         params[next(key for key in params.keys() if key.endswith(array))] = values  # noqa: SIM118  # no dictionary
 
     def _send(self, posed: RegionMesh) -> None:
-        """Set the vertices, and build the trees of what was set."""
+        """Set the vertices, and rebuild the acceleration structures."""
         for name, (cut, _) in self._cuts(posed.layout).items():
             self._set(name, "vertex_positions", _floats(posed.vertices[cut]))
             self._params[name].update()
 
     def _pose_skin(self, posed: RegionMesh) -> None:
-        """Send places and normals of the vertices to the kernels."""
+        """Copy positions and normals of the vertices to the kernels' buffers."""
         self._records[:, 0:3], self._records[:, 4:7] = posed.vertices, posed.normals
         self.skin.vertices = mi.Float(aligned_copy(self._records.ravel()))
 
@@ -150,16 +149,16 @@ class RegionScene:
         return kept(skin_texels, spec.model_copy(update={"blink": 0.0}))
 
     def _inner(self) -> Bools | None:
-        """Mark triangles of the sheet of skin away from its ends; None if it is not known to be one surface."""
+        """Mark triangles of the sheet of skin away from its ends; None if it may not be a single surface."""
         return ~sheet_ends()
 
     def clear(self, a: Floats, b: Floats) -> Bools:
-        """Return whether nothing of the region stands between points (n, 3) of the scene's frame; ends not included."""
+        """Return whether the region leaves the line between points (n, 3) of the scene's frame free, ends excluded."""
         return clear_between(self.scene, a, b)
 
 
 def _mean_slopes(pixels: NDArray[np.float16]) -> dict[int, mi.Float]:
-    """Compute means of the slopes of a map over the cells of the two grids on which light spreads, by their rows."""
+    """Average the slopes of a map over the cells of the two diffusion grids, by number of rows."""
     slopes = pixels[:SHEET_ROWS, :, 1:3]
     down, across = len(slopes) // GRID_ROWS, slopes.shape[1] // GRID_COLUMNS
     parts = [slopes[i::down, j::across].astype(np.float32) for i in range(down) for j in range(across)]
@@ -173,13 +172,13 @@ def _floats(values: Floats) -> mi.Float:
 
 
 def _faces(layout: RegionLayout, vertices: slice, faces: slice) -> mi.UInt32:
-    """Return some of the triangles, with numbers of some of the vertices."""
+    """Return some of the triangles, with renumbered vertices."""
     triangles = layout.faces[faces] - vertices.start
     return mi.UInt32(aligned_copy(triangles.astype(np.uint32).ravel()))
 
 
 def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
-    """Make a mesh of some of the triangles."""
+    """Create a mesh of some of the triangles."""
     corners, triangles = posed.vertices[vertices], _faces(posed.layout, vertices, faces)
     mesh = mi.Mesh("region", len(corners), len(triangles) // 3)
     params = mi.traverse(mesh)
@@ -190,14 +189,14 @@ def _mesh(posed: RegionMesh, vertices: slice, faces: slice) -> mi.Mesh:
 
 
 def _instance(mesh: mi.Mesh) -> dict[str, Any]:
-    """Make a group of one mesh, and the group's only instance."""
+    """Create a group of one mesh, and the group's only instance."""
     group = mi.load_dict({"type": "shapegroup", "mesh": mesh})
     return {"group": group, "shown": mi.load_dict({"type": "instance", "of": group})}
 
 
 @dataclass(kw_only=True)
 class SkinPoint:
-    """Points of the region: place, normals with and without relief, albedo, gloss, received light (see `radiosity`)."""
+    """Points of the region: position, normals with and without relief, albedo, gloss, light from other surfaces."""
 
     point: mi.Vector3f
     normal: mi.Vector3f
@@ -215,11 +214,12 @@ class SkinGeometry:
         map: relative albedo, slopes and gloss over the coordinates of the map.
         water: the menisci, which are not in the scene because light passes through them; None if they are opaque.
         is_sheet: whether the skin is known to be one surface.
-        faces: four entries for each triangle: its vertices, and 1 unless it is a part inside the sheet of skin.
+        faces: four entries per triangle: its vertices, and 0 if it lies inside the sheet of skin, away from its ends,
+            else 1.
         vertices: eight numbers for each vertex: place (scene's frame, mm), first coordinate of the map, normal, second
             coordinate of the map.
-        received: four numbers for each vertex: the light of other surfaces, as in `radiosityfield.RadiosityField`.
-        sheet: number of the triangles of the sheet, which come first.
+        received: four numbers per vertex: light from other surfaces, as in `radiosityfield.RadiosityField`.
+        sheet: number of triangles of the sheet, which come first.
         film: number of the first triangle of the menisci.
         mirror: -1 for a left eye, else 1.
     """
@@ -238,13 +238,13 @@ class SkinGeometry:
     def of(
         cls, look: mi.Texture2f, layout: RegionLayout, mirror: float, inner: Bools | None, water: mi.Scene | None
     ) -> SkinGeometry:
-        """Send the triangles of a region to the device.
+        """Copy the triangles of a region to the device.
 
         Args:
             look: the map.
             layout: the triangles.
             mirror: -1 for a left eye, else 1.
-            inner: which triangles of the sheet are not at its ends; None if it is not known to be one surface.
+            inner: which triangles of the sheet are away from its ends; None if it may not be a single surface.
             water: the menisci.
         """
         faces = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
@@ -257,13 +257,13 @@ class SkinGeometry:
         )  # fmt: skip
 
     def corners(self, face: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f, mi.Bool]:
-        """Corners of triangles (scene's frame), and whether these are more than a part inside the sheet of skin."""
+        """Return the corners of triangles (scene's frame), and whether these are not just inside the sheet of skin."""
         corner = dr.gather(mi.Vector4u, self.faces, face)
         a, b, c = (dr.gather(mi.Vector4f, self.vertices, 2 * i) for i in (corner.x, corner.y, corner.z))
         return *(mi.Vector3f(p.x, p.y, p.z) for p in (a, b, c)), corner.w > 0
 
     def sheet_point(self, row: mi.Float, column: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """Find points of the sheet's triangles at fractional rows and columns of its grid, and the smooth normals."""
+        """Interpolate points on the sheet at fractional rows and columns of its grid, and the smooth normals."""
         i, j = mi.UInt32(dr.clip(row, 0, ROWS - 1.001)), mi.UInt32(dr.clip(column, 0, SHEET_COLUMNS - 1.001))
         wide = dr.select(i < FINE, mi.UInt32(1), 2)
         j -= j & (wide - 1)
@@ -289,29 +289,29 @@ class SkinGeometry:
         return u, v
 
     def tilted(self, normal: mi.Vector3f, slope_y: mi.Float, slope_z: mi.Float) -> mi.Vector3f:
-        """Compute normals of a relief: n - (g - n (n . g)) for the slope g over the tangent plane of the normal n."""
+        """Tilt normals by a relief: n - (g - n (n . g)) for the slope g over the tangent plane of the normal n."""
         g = mi.Vector3f(0, self.mirror * slope_y, slope_z)
         return dr.normalize(normal - (g - normal * dr.dot(normal, g)))
 
     def face(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
-        """Compute the index of the layout's triangle that was hit."""
+        """Return the index of the triangle that was hit in the layout."""
         return mi.UInt32(hit.prim_index)
 
     def on_water(self, hit: mi.PreliminaryIntersection3f) -> mi.UInt32:
-        """Compute the index of the layout's triangle of the menisci that was hit."""
+        """Return the index of the meniscus triangle that was hit in the layout."""
         return hit.prim_index + self.film
 
     def on_sheet(self, face: mi.UInt32) -> mi.Bool:
-        """Return whether a triangle belongs to the sheet of skin, not to what is in front of it."""
+        """Return whether a triangle belongs to the sheet of skin rather than to something in front of it."""
         return face < self.sheet
 
     def corner(self, face: mi.UInt32, uv: mi.Point2f, u: mi.Float, active: mi.Bool) -> mi.UInt32:
-        """Compute vertices of triangles, each as often as its barycentric weight for even u in [0, 1)."""
+        """Choose a vertex of triangles at random, by barycentric weight, from a uniform u in [0, 1)."""
         corner = dr.gather(mi.Vector4u, self.faces, face, active)
         return dr.select(u < uv.x, corner.y, dr.select(u < uv.x + uv.y, corner.z, corner.x))
 
     def from_behind(self, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
-        """Whether rays along d (scene's frame) meet triangles on their inner side, such as a lid's from within it."""
+        """Return whether rays along d (scene's frame) meet triangles on their inner side, such as that of a lid."""
         corner = dr.gather(mi.Vector4u, self.faces, face, active)
         corners = (corner.x, corner.y, corner.z)
         a, b, c = (
@@ -343,13 +343,13 @@ class SkinGeometry:
 
 
 def _sheet_vertex(row: mi.UInt32, column: mi.UInt32) -> mi.UInt32:
-    """List numbers of vertices of the sheet, like those of `mesh.sheet_vertices`."""
+    """Return the numbers of vertices of the sheet, as in `mesh.sheet_vertices`."""
     half = COLUMNS // 2
     return dr.select(row > FINE, half * (FINE + 1) + (half + 1) * row + (column >> 1), SHEET_COLUMNS * row + column)
 
 
 def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:
-    """First part of the region between points (n, 3) a and b of the scene's frame, None where there is none."""
+    """Return the first part of the region between points (n, 3) a and b of the scene's frame; None if there is none."""
     hit = place.scene.ray_intersect_preliminary(rays_between(a, b), coherent=False, active=True)
     valid, face = hit.is_valid(), place.skin.face(hit)
     dr.eval(valid, face)

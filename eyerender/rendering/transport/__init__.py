@@ -1,1 +1,1 @@
-"""Transport of light: lamps, shadow maps, irradiance grids, environment, radiosity, diffusion in tissue."""
+"""Light transport: lamps, shadow maps, irradiance grids, environment, radiosity, subsurface diffusion."""

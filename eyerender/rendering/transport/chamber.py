@@ -1,4 +1,4 @@
-"""Light inside the anterior chamber: what iris and chamber wall send to each other by way of the cornea.
+"""Interreflection in the anterior chamber: iris and chamber wall light each other by way of the cornea.
 
 Light that the iris scatters is mirrored by the cornea (by Fresnel, totally beyond the critical angle) and returns to
 it. The irradiance that this adds varies slowly, so it is computed at a few patches: points on rings in the plane of the
@@ -7,16 +7,17 @@ are traced through the exact surfaces:
 
     E_i = E0_i + (1 / K) sum_k [ F_k rho_j E_j + n^2 (1 - F_k) pi L_k ]
 
-with F_k the share that the cornea mirrors, j the patch where the mirrored ray arrives, and L_k the radiance that comes
-from outside along the ray that leaves the eye. Both sums depend on the eye alone, and they are linear in its lights.
-For a new pose, one ray is followed outside for each bundle of like rays, from whatever patches.
+with F_k the reflectance of the cornea, j the patch where the mirrored ray arrives, and L_k the radiance from outside
+along the ray that leaves the eye. The rays and F_k depend on the eye alone. For a new pose, one outgoing ray is traced
+for each bundle of similar rays of all patches.
 
-Limbal tissue is translucent. Of the light that falls on it, a share T goes through and leaves its inner side scattered.
-This side is that of the cornea's rim, as far as the rim has turned to sclera (opacity o), and the chamber's wall:
+Limbal tissue is translucent. It transmits a share T of the light that falls on it, scattered from its inner side: the
+opaque part of the cornea's rim (opacity o) and the chamber's wall:
 
     E_i += T sum_s (f_is + w_is) E_s,   f_is = integral over the rim's sector s of o cos_i cos / (pi r^2) dA
 
-with E_s the irradiance of the limbus in sector s from outside, and w_is the share of the wall in the view of patch i.
+with E_s the irradiance of the limbus in sector s from outside, and w_is the form factor of the wall as seen from patch
+i.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ from ...region.look import LIMBAL_RING, Look
 from .chamberrays import ChamberShape, Walls, air_side, trace_inside
 
 IRIS_RINGS, TURNS = 16, 16  # points in the plane of the iris, over radius and angle
-ROOT_RINGS = 14  # of these on iris and pupil, the others beyond the root
+ROOT_RINGS = 14  # rings on iris and pupil; the others lie beyond the root
 IRIS = IRIS_RINGS * TURNS
-LEVELS = 2  # of points on the wall
+LEVELS = 2  # levels of points on the wall
 PATCHES = IRIS + TURNS * LEVELS
-RAYS = 256  # from each point
+RAYS = 256  # rays from each point
 _ROWS, _FINE = 8, 4  # points on the cornea's rim: across it, and in each sector
 _FAR_MM = 8.0  # distance of what rays that leave the eye meet: so far apart are two rays at an angle of 1
 _ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
@@ -49,7 +50,7 @@ _SAME_MM = 0.005  # chambers of depths and radii that differ by less are one
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Chamber:
-    """The chamber of one eye, in the eye frame; it equals only itself.
+    """The anterior chamber of one eye, in the eye frame; compared by identity.
 
     Arrays with PATCHES rows list the rings from the middle, then the wall.
 
@@ -59,7 +60,7 @@ class Chamber:
         points: (PATCHES, 3) patches, mm.
         normals: (PATCHES, 3) unit normals into the chamber.
         valid: (PATCHES,) whether a patch is in the chamber.
-        exchange: (PATCHES, PATCHES) share of the radiosity of each patch in the irradiance of each other.
+        exchange: (PATCHES, PATCHES) form factors: irradiance of each patch per radiosity of each other.
         leaving: (PATCHES, RAYS, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none.
     """
 
@@ -73,11 +74,11 @@ class Chamber:
 
 
 def chamber_of(eye: EyeModel, film: float) -> Chamber:
-    """Compute the chamber of an eye with a film of this index on its cornea; pupil and albedos do not matter.
+    """Compute the chamber of an eye with a film of this index on its cornea; pupil and albedos have no influence.
 
-    As the pupil of a person changes, the centre of the stop moves within the plane of the iris, and by a micrometre
-    across it. A plane that is square to the axis stays the same plane, so depth and root are rounded to `_SAME_MM`, and
-    all images of a person share one chamber, whichever comes first. A tilted plane has a chamber of its own.
+    As the pupil of a person changes, the centre of the stop moves within the plane of the iris, and by about a
+    micrometre across it. Depth and root are therefore rounded to `_SAME_MM`, so that all images of a person share one
+    chamber, whichever comes first. If the plane is tilted, each pupil has its own chamber.
     """
     root_mm = float(eye.iris_root_radius_mm)
     if np.array_equal(eye.stop.normal, [1.0, 0.0, 0.0]):
@@ -94,12 +95,12 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
 
 
 def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float, aspect: float = 1.0) -> Floats:
-    """Share (PATCHES, TURNS) by which light that comes through each sector of the limbal tissue lights each patch.
+    """Compute the share (PATCHES, TURNS) of the light through each limbal sector that reaches each patch.
 
     Args:
         eye: the eye.
         chamber: its chamber.
-        width_mm: width of the cornea's rim that turns to sclera.
+        width_mm: width of the cornea's opaque rim.
         aspect: height of the visible limbus over its width.
     """
     return _through_limbus(chamber, eye.front[0], float(eye.limbus_radius_mm), float(width_mm), float(aspect))
@@ -107,9 +108,9 @@ def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float, aspect: flo
 
 @remembered
 def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
-    """Bundle the rays that leave an eye: those of like origin and direction, from whatever patches, are one bundle.
+    """Bundle the rays of all patches that leave an eye by similar origin and direction.
 
-    From the outer iris few rays leave. So none is left out, and one ray of each bundle is followed for all.
+    One ray of each bundle is traced for all. No ray is left out, because few leave from the outer iris.
 
     Args:
         chamber: the chamber of the eye.
@@ -121,13 +122,13 @@ def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
     """
     patch, ray = np.nonzero(chamber.leaving[..., 6])
     rays, count = chamber.leaving[patch, ray], 2**halvings
-    # Some rays are there twice at first, so that all bundles have the same number.
+    # Some rays appear twice at first, so that all bundles have the same number.
     full = -(-len(rays) // count) * count
     order = np.arange(full) * len(rays) // full
     at = (rays[:, :6] * np.repeat([1.0, _FAR_MM], 3)).astype(np.float32).T.take(order, axis=1)
 
     def off_middle(parts: int) -> Singles:
-        """Deviations (6, parts, rays) from the mean of each part."""
+        """Return deviations (6, parts, rays) from the mean of each part."""
         of_part = at.reshape(6, parts, -1)
         return np.asarray(of_part - of_part.mean(axis=2, keepdims=True))
 
@@ -165,9 +166,9 @@ def _through_limbus(chamber: Chamber, front: Surface, limbus: float, width: floa
 
 
 def _rim(front: Surface, limbus: float, width: float, aspect: float) -> tuple[Floats, Floats, Floats]:
-    """Points of the cornea's opaque rim: y and z in its frame, and opacity times the area (mm^2) across its axis.
+    """Sample the cornea's opaque rim: y and z in its frame, and opacity times the area (mm^2) across its axis.
 
-    The rim is the transition up to the visible limbus, and what is opaque between this ellipse and the round limbus.
+    The rim is the transition up to the visible limbus, and the opaque area between this ellipse and the round limbus.
     """
     turn = 2 * np.pi / (TURNS * _FINE)
     angle = (np.arange(TURNS * _FINE) + 0.5) * turn
@@ -186,7 +187,7 @@ def _rim(front: Surface, limbus: float, width: float, aspect: float) -> tuple[Fl
 
 
 def limbus_points(eye: EyeModel) -> tuple[Floats, Floats]:
-    """Points of the limbus, one in the middle of each sector, and the unit normals there (TURNS, 3)."""
+    """Return points of the limbus, one in the middle of each sector, and their unit normals (TURNS, 3)."""
     angle, r = 2 * np.pi * (np.arange(TURNS) + 0.5) / TURNS, float(eye.limbus_radius_mm)
     front, y, z = eye.front[0], r * np.cos(angle), r * np.sin(angle)
     at = np.asarray(front.origin_mm) + np.stack([front.sag(y, z), y, z], axis=-1) @ np.asarray(front.rotation).T
@@ -194,13 +195,13 @@ def limbus_points(eye: EyeModel) -> tuple[Floats, Floats]:
 
 
 def _in_plane(centre: Floats, normal: Floats, y: Floats, z: Floats) -> Floats:
-    """Points (..., 3) of the plane of the iris at (y, z)."""
+    """Return points (..., 3) of the plane of the iris at (y, z)."""
     x = centre[0] - (normal[1] * (y - centre[1]) + normal[2] * (z - centre[2])) / normal[0]
     return np.stack([x, y, z], axis=-1)
 
 
 def patch_albedo(eye: EyeModel, chamber: Chamber, look: Look) -> Floats:
-    """Mean albedo (PATCHES,) of the patches, from that of pupil, iris with its limbal ring, and limbal tissue."""
+    """Compute the mean albedo (PATCHES,) of the patches: pupil, iris with its limbal ring, or limbal tissue."""
     fine = (np.arange(4) + 0.5) / 4
     ring, turn = np.arange(IRIS)[:, None] // TURNS, np.arange(IRIS)[:, None] % TURNS
     part, side = (v.ravel() for v in np.meshgrid(fine, fine))
@@ -213,7 +214,7 @@ def patch_albedo(eye: EyeModel, chamber: Chamber, look: Look) -> Floats:
 
 
 def _limbal_ring(stop: Stop, points: Floats, left_mm: Floats) -> Floats:
-    """Share of the limbal ring's darkness at points (..., 3) at such distances from the root, as in `iris_albedo`."""
+    """Compute the limbal ring's share of darkness at points (..., 3) at distances `left_mm` from the root."""
     a, b = stop.semi_axes_mm
     _, y, z = np.moveaxis((points - stop.centre_mm) @ stop.rotation, -1, 0)
     margin = stop.relative_radius(np.arctan2(z / b, stop.handed * y / a))
@@ -224,7 +225,7 @@ def _limbal_ring(stop: Stop, points: Floats, left_mm: Floats) -> Floats:
 
 
 def _radius(ring: Floats, root: float, reach: float) -> Floats:
-    """Radius (mm) where so many rings end: those within the root have equal areas, and so have those beyond it."""
+    """Compute the outer radius (mm) of a ring; rings within the root have equal areas, and so have those beyond it."""
     beyond = np.maximum(ring - ROOT_RINGS, 0) / (IRIS_RINGS - ROOT_RINGS)
     return np.asarray(np.sqrt(root**2 * np.minimum(ring / ROOT_RINGS, 1) + (reach**2 - root**2) * beyond))
 
@@ -277,7 +278,7 @@ def _choose_patches(walls: Walls, root: float, reach: float) -> tuple[Floats, Fl
 
 
 def _pattern(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
-    """Origins and cosine-distributed directions (n RAYS, 3): an additive sequence, shifted from point to point."""
+    """Sample origins and cosine-distributed directions (n RAYS, 3) by an additive sequence, shifted per point."""
     phi = 1.324717957244746
     k = np.arange(RAYS)
     shift = np.arange(len(points))[:, None]
@@ -293,7 +294,7 @@ def _pattern(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
 
 
 def _average_over_sectors(exchange: Floats, valid: Bools) -> Floats:
-    """Exchange (PATCHES, PATCHES) averaged over neighbouring sectors, because an eye is nearly round."""
+    """Average the exchange (PATCHES, PATCHES) over neighbouring sectors, because an eye is nearly round."""
     patch = np.arange(PATCHES)
     on_wall = patch >= IRIS
     turn = np.where(on_wall, (patch - IRIS) // LEVELS, patch % TURNS)
@@ -308,7 +309,7 @@ def _average_over_sectors(exchange: Floats, valid: Bools) -> Floats:
 def _patches_at(
     back: Floats, on_wall: Bools, radii: tuple[float, float], points: Floats, valid: Bools
 ) -> list[tuple[Ints, Floats]]:
-    """Patches that stand for points of arrival, each with its weight (n,): on the same side of the iris' root."""
+    """Return the patches that represent points of arrival, with weights (n,): on the same side of the iris' root."""
     turn = np.arctan2(back[:, 2], back[:, 1]) / (2 * np.pi) * TURNS % TURNS
     root2, reach2 = np.square(radii)
     r2 = back[:, 1] ** 2 + back[:, 2] ** 2
@@ -325,7 +326,7 @@ def _patches_at(
             index.append(k)
             weight.append(np.abs(1 - a - f) * np.abs(1 - b - g) * valid[k])
     total = np.sum(weight, axis=0)
-    # Arrivals whose four neighbours are all outside the chamber are next to the rim.
+    # Arrivals whose four neighbours are all outside the chamber lie next to the rim.
     best = [np.where(total > 0, w / np.where(total > 0, total, 1), 0) for w in weight]
     wall, sector = points[IRIS:], turn.astype(int) % TURNS
     first, last = wall[sector * LEVELS, 0], wall[sector * LEVELS + LEVELS - 1, 0]

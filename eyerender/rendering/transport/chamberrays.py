@@ -11,25 +11,25 @@ from ...eye.meshes import chamber_rim
 from ...geometry.surfaces import Surface, components
 from ...optics.interface import fresnel
 
-_WEAK, _FEW = 0.25, 4  # of the rays of which the cornea mirrors less, one of four stands for all
+_WEAK, _FEW = 0.25, 4  # one in _FEW is traced for all of the rays that the cornea mirrors less than _WEAK
 _STEPS = 20  # crossings and mirrorings of a ray
 _NEAR_MM = 1e-6
-_AHEAD_MM = 1e-4  # hits are looked for from here on: a root cannot be computed from a point of the surface itself
-_BELOW_MM = 1.0  # how far below the plane of the iris the wall ends
+_AHEAD_MM = 1e-4  # hits are searched from here on, because a root cannot be computed from a point on the surface itself
+_BELOW_MM = 1.0  # depth of the wall's end below the plane of the iris
 _WALL_MM = 1.0  # thickness of the sclera
-_SECTORS = 16  # over which the foot of the wall is averaged
+_SECTORS = 16  # sectors over which the foot of the wall is averaged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChamberShape:
-    """What of an eye determines its chamber; hashable.
+    """The properties of an eye that determine its chamber; hashable.
 
     Attributes:
         front: refracting surfaces from outside inwards.
-        indices: index of refraction behind each.
-        film: that of the film on the first surface.
-        centre: of the plane of the iris, mm.
-        normal: of that plane.
+        indices: refractive index behind each.
+        film: refractive index of the film on the first surface.
+        centre: centre of the plane of the iris, mm.
+        normal: normal of that plane.
         limbus: radius of the limbus about the axis, mm.
         root: radius of the root of the iris, mm.
         sclera_x: x of the centre of the sclera's sphere, mm.
@@ -49,10 +49,10 @@ class ChamberShape:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Walls:
-    """Surfaces about the chamber: refracting ones from outside inwards, their indices, film, plane and wall.
+    """Surfaces around the chamber: refracting ones outside in, their indices, film, iris plane and wall.
 
-    The wall is a cone about x with radius `rim` at x = `top`, which grows by `slope` per mm downwards. Where the cornea
-    has a back surface, which meets the plane of the iris, the wall is the rim of the cornea in front of that.
+    The wall is a cone about x with radius `rim` at x = `top`, which grows by `slope` per mm downwards. If the cornea
+    has a back surface, which meets the plane of the iris, the wall is the cornea's rim in front of it.
     """
 
     front: tuple[Surface, ...]
@@ -66,7 +66,7 @@ class Walls:
 
     @classmethod
     def of(cls, shape: ChamberShape) -> Walls:
-        """Make the walls of a chamber."""
+        """Create the walls of a chamber."""
         centre, limbus = np.array(shape.centre), shape.limbus
         front = shape.front[0]
         top = float(np.asarray(front.origin_mm)[0] + front.sag(np.array(limbus), np.array(0.0)))
@@ -85,7 +85,7 @@ class Walls:
 
     @property
     def layer(self) -> int:
-        """Medium that the wall bounds, as the number of surfaces in front of it."""
+        """Medium bounded by the wall, as the number of surfaces in front of it."""
         return max(len(self.front) - 1, 1)
 
     def height(self, p: Floats) -> Floats:
@@ -114,14 +114,14 @@ class Walls:
 
 
 def air_side(surface: Surface) -> float:
-    """Compute the sign of the implicit function of a surface on its air side."""
+    """Return the sign of the implicit function of a surface on its air side."""
     apex = np.asarray(surface.origin_mm) + np.asarray(surface.rotation)[:, 0]
     return float(np.sign(surface.implicit(apex[None])[0]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrivals:
-    """Where traced rays end: those that left (`out`: their numbers), and arrivals (`ray`: their numbers)."""
+    """Ends of traced rays: numbers of the rays that left the eye (`out`) and that arrived (`ray`)."""
 
     out: Ints
     origin: Floats
@@ -135,7 +135,7 @@ class Arrivals:
 
 @dataclass(slots=True, kw_only=True)
 class _Rays:
-    """Rays on their way: numbers, weights, points, directions, and in which medium (surfaces in front of it)."""
+    """Rays in flight: numbers, weights, points, directions, and medium (surfaces in front of it)."""
 
     number: Ints
     weight: Floats
@@ -151,9 +151,9 @@ class _Rays:
 
 
 def trace_inside(walls: Walls, o: Floats, d: Floats, layer: Ints) -> Arrivals:
-    """Trace rays until they arrive at the plane or the wall, and keep those that leave through the front first.
+    """Trace rays until they arrive at the plane or the wall; record those that leave through the front first.
 
-    The cornea's back refracts them; it mirrors only what it mirrors totally.
+    The back of the cornea refracts them and mirrors only by total reflection.
     """
     rays = _Rays(number=np.arange(len(o)), weight=np.ones(len(o)), o=o, d=d, layer=layer)
     first = np.ones(len(o), dtype=bool)
@@ -188,7 +188,7 @@ def trace_inside(walls: Walls, o: Floats, d: Floats, layer: Ints) -> Arrivals:
 
 
 def _surface_distances(walls: Walls, rays: _Rays) -> tuple[Floats, Floats]:
-    """Distances (n,) to the surface in front of the rays' medium and to that behind it; infinite where it is missed."""
+    """Compute distances (n,) to the surfaces in front of and behind the rays' medium; infinite if missed."""
     outer, inner = np.full(len(rays.number), np.inf), np.full(len(rays.number), np.inf)
     for k, surface in enumerate(walls.front):
         here = rays.layer == k + 1
@@ -205,9 +205,9 @@ def _surface_distances(walls: Walls, rays: _Rays) -> tuple[Floats, Floats]:
 
 
 def _mirror_at_front(walls: Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tuple[Ints, Floats, Floats, Floats]]:
-    """Mirror rays at the inner side of the front; also returns what leaves the eye there for the first time.
+    """Mirror rays at the inner side of the front; also return the rays that leave the eye there for the first time.
 
-    `first` marks the rays of which nothing has left.
+    `first` marks the rays that have not left yet.
     """
     n, w = walls.front[0].normal(rays.o), rays.d
     cosine = np.sum(n * w, axis=1)
@@ -245,7 +245,7 @@ def _distance_outwards(surface: Surface, o: Floats, d: Floats) -> Floats:
 
 
 def _refract(d: Floats, n: Floats, eta: float) -> Floats:
-    """Refract directions at normals against them; grazing beyond total reflection."""
+    """Refract directions at normals that face them; beyond total reflection, return grazing directions."""
     c = -np.sum(n * d, axis=1)
     c2 = np.sqrt(np.maximum(1 - eta * eta * (1 - c * c), 0))
     w = eta * d + (eta * c - c2)[:, None] * n

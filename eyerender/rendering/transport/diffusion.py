@@ -1,13 +1,12 @@
-"""Light of all lamps on skin and sclera after its way through the tissue, once per frame on grids over their surfaces.
+"""Subsurface light of all lamps on skin and sclera, computed once per frame on grids over their surfaces.
 
-Light enters the skin at one point and leaves it around there. What leaves is the irradiance, averaged about each point
-with the weights of `optics.diffusion`, times the albedo. So even light is reflected as by a matte surface, shadows have
-soft edges, and the finest relief is seen in the sheen alone.
+Light that enters the skin at one point leaves it in the neighbourhood. The radiosity is the irradiance, averaged around
+each point with the weights of `optics.diffusion`, times the albedo. So uniform light is reflected as by a matte
+surface, shadows have soft edges, and fine relief shows only in the sheen.
 
-`tissuelight` finds the light that falls on the grids. Here it is averaged over rings of a few points in the tangent
-plane, each ring a sixth of the light (texture-space diffusion). Points of wide rings read grids that were reduced by
-factors of two, and so are the cells whose light they give. On the skin the way out to the rings is walked in steps,
-because the size of a cell changes along it.
+`tissuelight` computes the irradiance of the grids. This module averages it over rings of a few points in the tangent
+plane, each ring with a sixth of the light (texture-space diffusion). Wide rings are computed for, and read from, grids
+reduced by factors of two. On the skin the rings are reached in steps, because the size of the cells varies.
 """
 
 from __future__ import annotations
@@ -32,20 +31,20 @@ from .tissuelight import TissueScene, light_on_globe, light_on_skin
 _RINGS, _TURNS = 6, 6
 _LEVEL_RINGS = (0, 1), (1, 4), (4, 6)  # whose light is found on the grid over the skin, and on its two reductions
 _FOOTPRINT = 0.8  # size of the cells that a ring reads, in units of its radius
-_RAYS = 6  # to the lamps from each cell, and at least one to each
+_RAYS = 6  # rays to the lamps from each cell, and at least one to each lamp
 _SMALL, _WIDE_RAYS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
 
 
 @dataclass(kw_only=True)
 class DiffusedLight:
-    """Light of the lamps on skin and globe, each after its way through the tissue.
+    """Light of the lamps on skin and globe after subsurface scattering.
 
     Attributes:
-        size: of the grid over the skin.
+        size: size of the grid over the skin.
         skin: light of cells of the skin.
         skin_seen: shares of the lamps that its coarse cells see, cell by cell.
         globe: light of cells of the globe.
-        globe_seen: shares of the lamps that they see.
+        globe_seen: shares of the lamps that cells of the globe see.
         lamps: number of the lamps, at least 1.
     """
 
@@ -87,20 +86,20 @@ class DiffusedLight:
         return _diffused_light(scene, *grids, RingPoints.of(cells.thick_mm), RingPoints.of(cells.thin_mm))
 
     def at_skin(self, u: mi.Float, v: mi.Float) -> mi.Float:
-        """Compute the irradiance (mW/mm^2) at coordinates of the map of the skin."""
+        """Interpolate the irradiance (mW/mm^2) at coordinates of the map of the skin."""
         return self.size.cells(*self.size.place(u, v), 0).interpolate(mi.Float, self.skin)
 
     def lamps_at_skin(self, u: mi.Float, v: mi.Float) -> Callable[[mi.UInt32], mi.Float]:
-        """Compute shares of the lamps, by their numbers, that the skin sees at coordinates of its map."""
+        """Return a function of a lamp's number: the share of the lamp that the skin sees at coordinates of its map."""
         cells = self.size.cells(*self.size.place(u, v), 1)
         return lambda lamp: dr.clip(cells.interpolate(mi.Float, self.skin_seen, self.lamps, lamp), 0, 1)
 
     def at_globe(self, frame: Frame, x: mi.Vector3f) -> mi.Float:
-        """Compute the irradiance (mW/mm^2) at points of the globe (eye frame)."""
+        """Interpolate the irradiance (mW/mm^2) at points of the globe (eye frame)."""
         return globe_cells(*_place_on_globe(frame, x)).interpolate(mi.Float, self.globe)
 
     def lamps_at_globe(self, frame: Frame, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
-        """Compute shares of the lamps, by their numbers, that points of the globe (eye frame) see."""
+        """Return a function of a lamp's number: the share of the lamp that points of the globe (eye frame) see."""
         row, column = (mi.UInt32(dr.clip(p + 0.5, 0, SIDE - 1)) for p in _place_on_globe(frame, x))
         first = (row * SIDE + column) * self.lamps
         return lambda lamp: dr.gather(mi.Float, self.globe_seen, first + lamp)
@@ -115,7 +114,7 @@ def _place_on_globe(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
 def _diffused_light(
     scene: TissueScene, sheet: SheetGrid, globe: GlobeGrid, thick: RingPoints, thin: RingPoints
 ) -> DiffusedLight:
-    """Find the light on skin and globe, and let it spread; `thick` and `thin` are the rings in skin and sclera."""
+    """Compute the light on skin and globe, and diffuse it; `thick` and `thin` are the rings in skin and sclera."""
     frame = scene.frame
     lit, skin_seen = light_on_skin(scene, sheet)
     skin = spread_in_skin(sheet, frame.region, lit, thick)
@@ -132,17 +131,17 @@ def _diffused_light(
 
 @dataclass(frozen=True, slots=True)
 class RingPoints:
-    """Points in the tangent plane that stand for equal shares of the light: (x, y, dx, dy) in mm, row by row.
+    """Points in the tangent plane with equal shares of the light: (x, y, dx, dy) in mm, row by row.
 
-    Walks go out from the middle over points of growing distance; dx and dy are the steps. Points of a walk alternate
-    in direction, so that neighbouring rings fill each other's gaps.
+    A walk leads from the centre outwards; dx and dy are its steps. Successive points alternate in direction, so that
+    neighbouring rings fill each other's gaps.
     """
 
     table: mi.Float
 
     @classmethod
     def of(cls, length_mm: float) -> RingPoints:
-        """Make the points for light that spreads so far."""
+        """Compute the points for a diffusion length of `length_mm`."""
         turn = 2 * np.pi * (np.arange(_TURNS)[:, None] + 0.5 + 0.5 * (np.arange(_RINGS) % 2)) / _TURNS
         point = rings(_RINGS)[:, None] * length_mm * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
         steps = np.diff(point, axis=1, prepend=np.zeros((_TURNS, 1, 2)))
@@ -151,10 +150,10 @@ class RingPoints:
     def point(
         self, k: mi.UInt32, inner: mi.UInt32, count: mi.UInt32
     ) -> tuple[mi.Point2f, mi.Point2f, mi.Float, mi.Bool]:
-        """Compute the point k of `count` rings from the ring `inner` on, walk by walk.
+        """Return point k of `count` rings from the ring `inner` on, walk by walk.
 
         Returns:
-            The point, the step to it, its distance from the middle (mm), and whether a walk begins there.
+            The point, the step to it, its distance from the centre (mm), and whether a walk begins there.
         """
         turn = quotient(k, count)
         begins = k == turn * count
@@ -164,10 +163,10 @@ class RingPoints:
 
 
 def spread_in_skin(grid: SheetGrid, skin: SkinGeometry, irradiance: mi.Float, points: RingPoints) -> mi.Float:
-    """Let the light that falls on the skin spread: what leaves it, cell by cell."""
+    """Diffuse the irradiance of the skin: return what leaves each cell."""
     metric, light = SheetMetric.measure(grid, skin), mi.Float(0)
     lit = Pyramid.build(irradiance, grid.size.rows, grid.size.columns, closed=True)
-    # The farther light has come, the more evenly it is spread, and the fewer cells tell it.
+    # Light from farther away is spread more evenly, so fewer cells suffice for it.
     for level, of_rings in reversed(list(enumerate(_LEVEL_RINGS))):
         index, columns, size = grid.cells[level], grid.size.columns >> level, float(1 << level)
         row, column = ((mi.Float(n) + 0.5) * size - 0.5 for n in (index // columns, index % columns))
@@ -185,7 +184,7 @@ def spread_in_skin(grid: SheetGrid, skin: SkinGeometry, irradiance: mi.Float, po
 def _gather_on_skin(
     lit: Pyramid, metric: SheetMetric, points: RingPoints, row: mi.Float, column: mi.Float, of_rings: tuple[int, int]
 ) -> mi.Float:
-    """Compute the share that some of the rings have in the mean over all ring points about cells of the skin."""
+    """Sum the light of some of the rings around cells of the skin, as a part of the mean over all ring points."""
     inner, count = mi.UInt32(of_rings[0]), mi.UInt32(of_rings[1] - of_rings[0])
     k, total, i, j = mi.UInt32(0), mi.Float(0) * row, mi.Float(row), mi.Float(column)
     while dr.hint(k < count * _TURNS, label="rings on skin", exclude=[lit, metric, points]):
@@ -197,7 +196,7 @@ def _gather_on_skin(
 
 
 def spread_in_globe(grid: GlobeGrid, radius_mm: mi.Float, irradiance: mi.Float, points: RingPoints) -> mi.Float:
-    """Let the light that falls on the globe spread: what leaves it between the lids, cell by cell."""
+    """Diffuse the irradiance of the globe: return what leaves each cell between the lids."""
     side, light = mi.UInt32(SIDE), dr.zeros(mi.Float, SIDE * SIDE)
     lit = Pyramid.build(irradiance, side, side, closed=False)
     dr.scatter(light, _gather_on_globe(lit, grid.between, radius_mm, points), grid.between)
@@ -206,7 +205,7 @@ def spread_in_globe(grid: GlobeGrid, radius_mm: mi.Float, irradiance: mi.Float, 
 
 @syntax
 def _gather_on_globe(lit: Pyramid, index: mi.UInt32, radius_mm: mi.Float, points: RingPoints) -> mi.Float:
-    """Compute the mean over the ring points about cells of the globe."""
+    """Average over the ring points around cells of the globe."""
     n = globe_direction(mi.Float(index // SIDE), mi.Float(index % SIDE))
     across = dr.normalize(mi.Vector3f(-n.y, n.x, 0))
     up = dr.cross(n, across)

@@ -1,4 +1,4 @@
-"""Light of all lamps: directly on matte surfaces, and through the cornea on the iris by manifold connections."""
+"""Lamp light: directly on matte surfaces, and through the cornea on the iris by manifold connections."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def lamp_blocked(
 def _eye_blocks(
     frame: Frame, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
 ) -> mi.Bool:
-    """Whether the eye blocks rays from points x along d (see `EyeShape.ray_test`), which most pass at a distance."""
+    """Return whether the eye blocks rays from points x along d (see `EyeShape.ray_test`); most miss it by far."""
     r = x - frame.sclera.centre
     along = dr.dot(r, d)
     reach = frame.globe_reach
@@ -57,13 +57,13 @@ def _eye_blocks(
 def direct_light(
     lamp: Lamp, source: mi.Vector3f, view: SurfaceInteraction, mirror: tuple[mi.Vector3f, mi.Vector3f] | None = None
 ) -> tuple[mi.Float, mi.Float]:
-    """Compute the light that a lamp gives to matte points in air, without shadows.
+    """Compute the unshadowed light of a lamp at matte points in air.
 
     Args:
         lamp: the lamp.
         source: points of the lamp.
-        view: the points that are lit.
-        mirror: normal of what mirrors and unit direction of the viewer (eye frame), if their sheen is wanted.
+        view: the lit points.
+        mirror: normal of the mirroring surface and unit direction of the viewer (eye frame), to compute their sheen.
 
     Returns:
         Irradiance (mW/mm^2), and the radiance of the sheen towards the viewer.
@@ -77,7 +77,7 @@ def direct_light(
 
 
 def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vector3f) -> mi.Float:
-    """Compute the irradiance (mW/mm^2) of points x by a lamp's point `source`, without shadows."""
+    """Compute the unshadowed irradiance (mW/mm^2) of points x from a lamp's point `source`."""
     to = source - x
     inv2 = dr.rcp(dr.squared_norm(to))
     to *= dr.sqrt(inv2)
@@ -96,22 +96,22 @@ def irradiance_at(
     off_globe: mi.Bool,
     on_sheet: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
-    """Compute the irradiance of points in air straight from all lamps.
+    """Compute the direct irradiance of points in air from all lamps.
 
     Args:
         frame: the frame.
         x: the points (eye frame).
         normal: unit normals there.
-        u: place on each lamp's disc, [0, 1).
-        v: the same, second coordinate.
+        u: first coordinate on each lamp's disc, [0, 1).
+        v: second coordinate.
         off_globe: marks points off the globe.
-        on_sheet: marks points on the outer side of a region's sheet of skin, for which the shadow maps spare rays.
+        on_sheet: marks points on the outer side of a region's sheet of skin, where shadow maps save rays.
 
     Returns:
-        Irradiance (mW/mm^2), and the same without shadows.
+        Irradiance (mW/mm^2), with and without shadows.
     """
     sine, cosine = dr.sincos(v * (2 * dr.pi))
-    # One zero for both sums: whether Dr.Jit takes two for one varies, and with it the kernel.
+    # One zero for both sums: Dr.Jit may or may not merge two, which would change the kernel.
     dark = mi.Float(0) * x.x
     i, total, free = mi.UInt32(0), mi.Float(dark), mi.Float(dark)
     while dr.hint(i < frame.lights.count, label="lamps on places", exclude=[frame]):
@@ -127,7 +127,7 @@ def irradiance_at(
 
 
 def shadowless(frame: Frame, lamp: mi.UInt32, x: mi.Vector3f, on_sheet: mi.Bool) -> mi.Bool:
-    """Find whether the shadow maps show that nothing stands between points of the sheet (scene's frame) and a lamp."""
+    """Return whether the shadow maps exclude anything between points of the sheet (scene's frame) and a lamp."""
     maps = frame.caches.shadow_maps
     return mi.Bool(False) if maps is None else maps.at(lamp, x, on_sheet)
 
@@ -139,14 +139,14 @@ def lamp_light(
 
     Args:
         frame: the frame.
-        view: the points that are lit.
-        u: place on each lamp's disc, [0, 1).
-        v: the same, second coordinate.
-        known: where the light at the first surface is not wanted.
+        view: the lit points.
+        u: first coordinate on each lamp's disc, [0, 1).
+        v: second coordinate.
+        known: where the light at the first surface is already known.
 
     Returns:
-        Irradiance (mW/mm^2) at the first surface where it is matte, the irradiance in the plane of the iris, and failed
-        paths.
+        Irradiance (mW/mm^2) at the first surface where it is matte, irradiance in the plane of the iris, and number of
+        failed paths.
     """
     direct = _onto_matte(frame, view, u, v, view.matte & ~known)
     return direct, *irradiance_through_cornea(frame, view.inner, view.lit_inside, u, v)
@@ -154,9 +154,9 @@ def lamp_light(
 
 @syntax
 def _onto_matte(frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, wanted: mi.Bool) -> mi.Float:
-    """Compute the irradiance of the first surface straight from all lamps.
+    """Compute the direct irradiance of the first surface from all lamps.
 
-    The cornea is convex: where it faces a lamp it does not shadow itself.
+    The cornea is convex, so it does not shadow itself where it faces a lamp.
     """
     sine, cosine = dr.sincos(v * (2 * dr.pi))
     i, total = mi.UInt32(0), mi.Float(0)
@@ -180,23 +180,23 @@ def irradiance_through_cornea(
     normal: mi.Vector3f | None = None,
     surfaces: tuple[Surface, ...] | None = None,
 ) -> tuple[mi.Float, mi.UInt32]:
-    """Compute the irradiance (mW/mm^2) of all lamps at points behind the cornea, and failed paths.
+    """Compute the irradiance (mW/mm^2) of all lamps at points behind the cornea, and count failed paths.
 
     Args:
         frame: the frame.
         inner: the points (eye frame).
-        inside: where they are wanted.
-        u: place on each lamp's disc, [0, 1).
-        v: the same, second coordinate.
+        inside: points for which to compute it.
+        u: first coordinate on each lamp's disc, [0, 1).
+        v: second coordinate.
         normal: unit normals at the points; None for points of the plane of the iris.
-        surfaces: those in front of the points; None for all.
+        surfaces: surfaces in front of the points; None for all.
     """
     wanted = inside & behind((surfaces or frame.surfaces)[-1], inner)
     cached, count = frame.caches.iris, frame.lights.count
     total, left = (mi.Float(0), mi.UInt32(ALL)) if cached is None else cached.at(frame, inner, wanted)
     many = count > BITS
     sine, cosine = dr.sincos(v * (2 * dr.pi))
-    # Of the lamps whose light is not known, the next one is at the lowest bit; without bits the number is too high.
+    # Of the lamps whose light is unknown, the next one is at the lowest set bit; without bits the number is too high.
     i = dr.select(left == 0, count, dr.select(many, 0, dr.tzcnt(left)))
     failures = mi.UInt32(0)
     while dr.hint(wanted & (i < count), label="lamps", exclude=[frame, normal, surfaces, cached]):
@@ -212,9 +212,9 @@ def irradiance_through_cornea(
 
 @syntax
 def irradiance_off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float) -> mi.Float:
-    """Irradiance (mW/mm^2) of points before the eye (eye frame) from all lamps by way of the cornea as a mirror.
+    """Compute the irradiance (mW/mm^2) of points outside the eye (eye frame) from lamps mirrored by the cornea.
 
-    u, v: place on each lamp's disc, [0, 1).
+    (u, v) is the position on each lamp's disc, [0, 1)^2.
     """
     sine, cosine = dr.sincos(v * (2 * dr.pi))
     reach = frame.limbus.radius
@@ -234,9 +234,9 @@ def irradiance_off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: 
 
 
 def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
-    """Tell whether points (eye frame) are behind a surface, or at most `ahead_mm` in front of it.
+    """Return whether points (eye frame) are behind a surface, or at most `ahead_mm` in front of it.
 
-    Only such points receive light through the surface. The end of an iris may not: a cornea with a shallow chamber ends
+    Only such points receive light through the surface. The outer iris may not: in a shallow chamber, the cornea ends
     behind the plane of the iris.
     """
     away = 8.0
@@ -246,7 +246,7 @@ def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
 
 
 def on_relief(frame: Frame, view: SurfaceInteraction) -> SurfaceInteraction:
-    """Return the view with the places on the relief of the iris that the rays meet, as their feet in its plane."""
+    """Return the view with the points where the rays meet the iris relief, as their feet in its plane."""
     if frame.caches.relief is None:
         return view
     seen = view.cornea & ~view.pupil & (view.passed > 0)
@@ -258,13 +258,13 @@ class LampPath:
     """Light path from a point of a lamp through the cornea to a point behind it.
 
     Attributes:
-        gain: irradiance (mW/mm^2) if nothing is in the way.
-        whole: the same if all of the cornea were clear.
+        gain: irradiance (mW/mm^2) if nothing blocks the path.
+        whole: the same if the whole cornea were clear.
         out: `limbal_radius` where the path enters, mm.
         entry: where the path enters the front surface (eye frame).
         enters: whether there is a path, through the clear part of the cornea.
-        blocked: whether anything is in its way.
-        failed: whether the search for it did not converge.
+        blocked: whether anything blocks the path.
+        failed: whether the search did not converge.
     """
 
     gain: mi.Float
@@ -287,9 +287,9 @@ class LampPath:
         surfaces: tuple[Surface, ...] | None = None,
         ahead_mm: float = 0.0,
     ) -> LampPath:
-        """Find the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame).
+        """Solve for the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame).
 
-        ahead_mm: as for `connect`.
+        `ahead_mm` is as for `connect`.
         """
         # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
         scale, shift = frame.image.scale, frame.image.shift
@@ -302,7 +302,7 @@ class LampPath:
         blocked = lamp_blocked(frame, path.entry, source, True, False, enters)
         whole = dr.select(path.found, lamp.radiant_intensity(path.leaving) * path.transfer, 0)
         return cls(
-            # Where there is no path, its entry may not be a number.
+            # Without a path, its entry may not be a number.
             gain=dr.select(enters, whole * clear, 0), whole=whole, out=out, entry=path.entry, enters=enters,
             blocked=blocked, failed=path.failed,
         )  # fmt: skip

@@ -1,7 +1,7 @@
-"""Light other than that of the lamps: even light, emitting panels, and an environment map.
+"""Light other than that of the lamps: uniform light, emitting panels, and an environment map.
 
-The front cornea mirrors all of it along exact rays (those of the integrator). Matte surfaces are lit by its irradiance,
-from which `radiosity` takes what is hidden. A map is infinitely far away.
+The front cornea mirrors it along the integrator's exact rays. Matte surfaces receive its irradiance, from which
+`radiosity` subtracts what is hidden. A map is infinitely far away.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _KEPT = 4
 
 
 class Maps:
-    """The maps in use, on the device; each is read and sent there once."""
+    """Environment maps on the device; each is read and copied once."""
 
     def __init__(self) -> None:
         self._kept: dict[Any, tuple[Any, Any, EnvironmentMap]] = {}
         self._none = self._upload(environment_map(np.zeros((2, 4))))
 
     def of(self, spec: RadianceMap | None) -> tuple[Any, Any, EnvironmentMap]:
-        """Textures of radiance and irradiance, and map, of a spec (its path is absolute or from the current folder)."""
+        """Return the textures of radiance and irradiance, and the map, of a spec whose path is absolute or local."""
         if spec is None:
             return self._none
         key: tuple[Any, ...] = (spec.place, spec.place_seed)
@@ -65,13 +65,13 @@ def _texture(values: NDArray[np.float32]) -> Any:
 
 @dataclass(kw_only=True)
 class Ambience:
-    """Even light, panels and surroundings for the integrator; kernels do not depend on the numbers.
+    """Uniform light, panels and surroundings for the integrator; kernels do not depend on their number.
 
     Attributes:
         panels: the panels.
         texture: radiance of the map.
-        table: irradiance of its soft part and of the rest, over the normals.
-        even: irradiance of even light, mW/mm^2.
+        table: irradiance of its soft part and of the rest, by normal.
+        even: irradiance of uniform light, mW/mm^2.
         scale: radiance (mW/mm^2/sr) per value of the map.
         rows: number of rows of the map.
         ceiling: largest value of its soft part.
@@ -89,13 +89,13 @@ class Ambience:
 
     @classmethod
     def build(cls, even_mw_mm2: float, panels: Floats, spec: RadianceMap | None, maps: Maps) -> Ambience:
-        """Send the light to the device; it does not depend on the frame.
+        """Copy the light to the device; it does not depend on the frame.
 
         Args:
-            even_mw_mm2: irradiance of even light.
+            even_mw_mm2: irradiance of uniform light.
             panels: (n, 13) as from `frame.panel_table`.
             spec: the map, whose rays are in the world's axes; None for none.
-            maps: the maps that are kept.
+            maps: cache of maps.
         """
         texture, table, made = maps.of(spec)
         scale = 0.0 if spec is None else spec.scale_w_m2_sr * 1e-3
@@ -110,14 +110,14 @@ class Ambience:
         )  # fmt: skip
 
     def radiance(self, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Compute the radiance (mW/mm^2/sr) along rays of the scene's frame, without the even light.
+        """Compute the radiance (mW/mm^2/sr) along rays of the scene's frame, without the uniform light.
 
         Overlapping panels add up, and they do not hide the map behind them.
         """
         return self.panels.radiance(o, d, active) + self._mapped(d, active)
 
     def soft(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Radiance (mW/mm^2/sr) of even light and of the soft part of the map along directions of the scene's frame."""
+        """Compute the radiance (mW/mm^2/sr) of uniform light and the map's soft part in directions (scene's frame)."""
         value = self.texture.eval(self._place(d, self.rows), active)[0]
         return self.even * dr.inv_pi + self.scale * dr.minimum(value, self.ceiling)
 
@@ -125,28 +125,28 @@ class Ambience:
         return self.scale * self.texture.eval(self._place(d, self.rows), active)[0]
 
     def _place(self, v: mi.Vector3f, rows: mi.Float | float) -> mi.Point2f:
-        """Compute the place of directions (scene's frame) in a texture with so many rows, and one more at both ends."""
+        """Map directions (scene's frame) to a texture with `rows` rows, and one additional row at both ends."""
         w = mi.Vector3f(*(dr.dot(axis, v) for axis in self.axes))
         polar = dr.acos(dr.clip(w.z, -1, 1)) * dr.inv_pi
         return mi.Point2f(0.5 - dr.atan2(w.y, w.x) * (0.5 * dr.inv_pi), (1 + polar * rows) / (rows + 2))
 
     def at(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
-        """Irradiance (mW/mm^2) of a matte surface at points x with unit normals n of the scene's frame, unshadowed."""
+        """Compute the unshadowed irradiance (mW/mm^2) of matte points x with unit normals n of the scene's frame."""
         soft, hard = self.soft_and_hard(x, n)
         return soft + hard
 
     def soft_and_hard(self, x: mi.Vector3f, n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Irradiance of even light and of the soft part of the map, and of the rest of the map and of panels."""
+        """Compute irradiances: of uniform light and the map's soft part, and of the rest of the map and panels."""
         soft, rest = self.table.eval(self._place(n, float(NORMALS)))
         return self.even + self.scale * soft, self.scale * rest + self.panels.irradiance(x, n)
 
 
 def bright_lamps(spec: RadianceMap | None, maps: Maps, anchor_mm: Floats) -> tuple[Lamp, ...]:
-    """Return the light of a map that exceeds its soft part, as far lamps.
+    """Return the light of a map above its soft part, as distant lamps.
 
     Args:
         spec: the map.
-        maps: the maps that are kept.
+        maps: cache of maps.
         anchor_mm: origin of the scene's frame in the world.
     """
     if spec is None:

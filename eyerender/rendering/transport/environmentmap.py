@@ -1,8 +1,8 @@
-"""Environment maps on the host: reading files, and the irradiance that a map gives to matte surfaces.
+"""Environment maps on the host: read files, and compute the irradiance of matte surfaces.
 
-A map is the sum of two maps: the soft one ends at a ceiling, and the rest, which may be as bright and small as the sun,
-is represented by directions that stand for equal shares of its light (median cut: Debevec 2005). The irradiance of both
-is a table over the normals,
+A map is the sum of two parts. The soft part is clipped at a ceiling. The rest, which may be as bright and small as the
+sun, is represented by directions with equal shares of its light (median cut: Debevec 2005). The irradiance of both is a
+table over the normals,
 
     E(n) = sum_k max(0, n . V_k),    V_k = integral of L w dw over a block of texels,
 
@@ -32,7 +32,7 @@ from ..scene.exr import second_thread
 
 _WIDTH, _HEIGHT = 1024, 512
 _FINE, _BLOCKS, NORMALS = 256, 32, 48  # rows from which blocks are summed, and of blocks and normals
-_CEILING = 2.0  # of the soft part of a map, over its mean
+_CEILING = 2.0  # ceiling of a map's soft part, relative to its mean
 _CUTS = 6  # 2^6 directions
 _FORMATS = (".hdr", ".exr", ".pfm", ".npy")
 # Rec. 709.
@@ -48,14 +48,14 @@ _SIDES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EnvironmentMap(ArrayValue):
-    """A map made ready, in its own frame.
+    """A prepared environment map, in its own frame.
 
     Attributes:
         values: (h, 2 h) radiance, float32.
         ceiling: largest radiance of the soft part.
         irradiance: (rows, 2 rows, 2) irradiance of surfaces whose normal is the direction of a texel, from the soft
             part and from the rest, float32.
-        bright: (n, 3) directions that stand for the rest, times their irradiance of surfaces that face them.
+        bright: (n, 3) directions that represent the rest, times the irradiance of a surface that faces them.
     """
 
     values: Any
@@ -69,10 +69,10 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
 
     Args:
         path: Radiance .hdr, OpenEXR .exr, .pfm, or a NumPy array .npy of shape (h, w) or (h, w, channels).
-        channel: channel of a colour map that is used: red, green, blue, or luminance (Rec. 709).
+        channel: the channel of a colour map to use: red, green, blue, or luminance (Rec. 709).
 
     Raises:
-        InputError: it is missing, unreadable, of another shape, or holds negative or non-finite values.
+        InputError: the file is missing, unreadable, of another shape, or holds negative or non-finite values.
     """
     source, path = str(path), Path(path)
     if path.suffix.lower() not in _FORMATS:
@@ -92,7 +92,7 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
     except InputError:
         raise
     except Exception as error:
-        # For a broken file, image readers may raise any exception.
+        # Image readers may raise any exception for a broken file.
         detail = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"is not a readable map ({detail})", source=source) from None
     if data.dtype.kind not in "fiu" or data.ndim not in (2, 3):
@@ -121,7 +121,7 @@ def _channel(data: NDArray[Any], channel: str) -> NDArray[Any]:
 
 
 def _size(kind: str, head: bytes) -> int | None:
-    """Compute the number of pixels that the header of a map's file declares; None where it declares none.
+    """Return the number of pixels declared in the header of a map's file; None if it declares none.
 
     The reader allocates all of them before it notices that the file is too short.
     """
@@ -137,9 +137,9 @@ def _size(kind: str, head: bytes) -> int | None:
 
 
 def environment_map(values: Floats) -> EnvironmentMap:
-    """Prepare a map (h, 2 h): average it down to at most 1024 x 512, and compute its irradiance."""
+    """Prepare a map (h, 2 h): average it down to at most 1024 x 512 and compute its irradiance."""
     reduced = _reduce(values)
-    if not reduced.any():  # every renderer keeps such a map for scenes without one
+    if not reduced.any():  # every renderer keeps this map for scenes without one
         dark = np.zeros((NORMALS, 2 * NORMALS, 2))
         return EnvironmentMap(frozen(reduced, np.float32), 0.0, frozen(dark, np.float32), frozen(np.zeros((0, 3))))
     fold = max(1, -(-_FINE // len(reduced)))
@@ -160,7 +160,7 @@ def environment_map(values: Floats) -> EnvironmentMap:
     normals = _directions(NORMALS)[0]
     table = [[np.maximum(row @ flux.T, 0).sum(axis=1) for flux in (soft, rest, whole)] for row in normals]
     irradiance = np.moveaxis(np.asarray(table), 1, -1)
-    # Cut blocks are a little off, and by the known light of all directions most of that is taken away.
+    # Blocks cut by the horizon are slightly wrong; the known total light of all directions corrects most of that.
     irradiance = np.pi * irradiance[..., :2] / irradiance[..., 2:]
     return EnvironmentMap(
         frozen(reduced, np.float32), ceiling, frozen(irradiance, np.float32), frozen(_median_cut(rest, _CUTS))
@@ -177,7 +177,7 @@ def _directions(rows: int) -> tuple[Floats, Floats]:
 
 
 def _median_cut(flux: Floats, cuts: int) -> Floats:
-    """Sums (m, 3) of vectors (n, 3) in at most 2^cuts groups of neighbouring directions and like sums of lengths."""
+    """Group vectors (n, 3) by direction into at most 2^cuts groups of similar total length; return the sums (m, 3)."""
     length = np.linalg.norm(flux, axis=1)
     flux, length = flux[length > 0], length[length > 0]
     groups = [np.arange(len(flux))] if len(flux) else []
@@ -199,7 +199,7 @@ def _median_cut(flux: Floats, cuts: int) -> Floats:
 def map_rotation(spec: RadianceMap) -> Floats:
     """Compute the rotation M (3, 3) = Rz(az) Ry(-el) Rx(roll) from the map's frame to the world.
 
-    In the map's frame x is its middle, y to its left, z up.
+    In the map's frame, x points to its middle, y to its left, z up.
     """
     az, el, roll = np.radians([spec.azimuth_deg, spec.elevation_deg, spec.roll_deg])
     (ca, sa), (ce, se), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (az, el, roll))
@@ -210,7 +210,7 @@ def map_rotation(spec: RadianceMap) -> Floats:
 
 
 def map_values(spec: RadianceMap) -> Floats:
-    """Return values of a map: those of its file, or painted ones."""
+    """Return the values of a map, from its file or painted."""
     if spec.file is None:
         return paint(str(spec.place), spec.place_seed)
     if spec.sha256 is not None and file_digest(Path(spec.file)) != spec.sha256:
@@ -226,7 +226,7 @@ def _reduce(values: Floats) -> Floats:
 
 
 def _average(values: Floats, count: int) -> Floats:
-    """Compute means of rows over `count` equal intervals."""
+    """Average rows over `count` equal intervals."""
     running = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     at = np.linspace(0, len(values), count + 1)
     low = np.minimum(at.astype(int), len(values) - 1)

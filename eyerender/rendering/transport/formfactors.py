@@ -1,8 +1,7 @@
-"""Form factors between patches, from rays of a cosine-distributed pattern.
+"""Form factors between patches, from cosine-distributed rays.
 
-From every patch i, K rays find the patches j that it sees. The mean over its rays of the albedo at the points that are
-met, with the losses at the cornea where a ray goes through it, is rho_j F_ij. The rays of the iris are those that leave
-the eye, in bundles.
+From every patch i, K rays are traced to the patches j that it sees. The mean over its rays of the albedo at the hits,
+including losses at the cornea, is rho_j F_ij. The rays of the iris are the bundles that leave the eye.
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ _TOUCHING_MM = 0.3  # a patch most of whose rays are stopped this near is covere
 
 @dataclass(kw_only=True)
 class RayHits:
-    """What the rays of the patches meet, on the device, one number per ray.
+    """Hits of the patches' rays, on the device, one number per ray.
 
     Attributes:
-        target: the patch that is met.
+        target: the patch that is hit.
         weight: share of its irradiance that is sent back.
-        near: whether something is met very close.
-        open: whether nothing is met.
-        sky: irradiance from even light and the soft part of a map, where nothing is met.
-        free: the same as if nothing were met.
-        on_skin: whether the outer side of the sheet of skin is met.
-        point: where (eye frame).
+        near: whether the hit is very close.
+        open: whether nothing is hit.
+        sky: irradiance from uniform light and the soft part of a map, where nothing is hit.
+        free: the same, as if nothing were hit.
+        on_skin: whether the outer side of the sheet of skin is hit.
+        point: the hit (eye frame).
         normal: unit normal there.
     """
 
@@ -60,7 +59,7 @@ class RayHits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatchRays:
-    """The rays of all patches on the host, one number per ray.
+    """Rays of all patches on the host, one number per ray.
 
     Attributes:
         shares: (patches, rays) share of each ray in the mean over a patch's rays, sparse.
@@ -69,8 +68,8 @@ class PatchRays:
         near: as in `RayHits`.
         sky: as in `RayHits`.
         free: as in `RayHits`.
-        lit: irradiance straight from the lamps at the very point of the skin that is met, -1 where it is not known.
-        bare: the same if nothing stood in the way, -1 where no skin is met.
+        lit: direct irradiance from the lamps at the point of the skin that is hit, -1 where unknown.
+        bare: the same without shadows, -1 where no skin is hit.
     """
 
     shares: csr_array
@@ -84,7 +83,7 @@ class PatchRays:
 
     @classmethod
     def read(cls, patches: FramePatches, hits: RayHits, lit: mi.Float | None, bare: mi.Float | None) -> PatchRays:
-        """Read what rays have met; `lit` has the rays of globe and chamber alone."""
+        """Copy the rays' hits to the host; `lit` has only the rays of globe and chamber."""
         plan, globe = patches.plan, patches.on_globe * RAYS
         rays = plan.rays + patches.bundles
         at_hits = np.full(rays, -1.0, np.float32)
@@ -99,11 +98,11 @@ class PatchRays:
         )  # fmt: skip
 
     def mean(self, values: Reals) -> Floats:
-        """Compute means (patches,) over the rays of each patch."""
+        """Average values over the rays of each patch, (patches,)."""
         return np.asarray(self.shares @ values)
 
     def form_factors(self, stand_in: Ints) -> csr_array:
-        """Form factors times albedo, (patches, patches), between patches and those that are used for the others."""
+        """Compute form factors times albedo, (patches, patches); `stand_in` is the patch used for each."""
         part = self.shares
         return csr_array(
             (part.data * self.weight[part.indices], stand_in[self.target][part.indices], part.indptr),
@@ -111,10 +110,10 @@ class PatchRays:
         )
 
     def correction(self, direct: Floats, bare: Floats) -> Floats:
-        """Say what the lamps' light at the points that are met adds to that of the patches there, `direct`.
+        """Compute the difference between lamp light at the points that are hit and that of the patches there, `direct`.
 
-        `bare` is the lamps' light on the patches if nothing stood in the way. Where that at the very point is not
-        known, the same share of it arrives there.
+        `bare` is the unshadowed lamp light on the patches. Where the light at the point itself is unknown, the shadowed
+        share is assumed to be that of the patch.
         """
         if not np.any(self.bare >= 0):
             return np.zeros(self.shares.shape[0])
@@ -125,7 +124,7 @@ class PatchRays:
 
 @remembered
 def _shares(count: Ints, gain: csr_array) -> csr_array:
-    """Find shares as in `PatchRays`, from the number of rays of each patch and the gain of those that leave the eye."""
+    """Compute the shares of `PatchRays` from each patch's number of rays and the gain of those that leave the eye."""
     ends = np.append(0, np.cumsum(count))
     return csr_array(
         (
@@ -138,12 +137,12 @@ def _shares(count: Ints, gain: csr_array) -> csr_array:
 
 
 def share_of(part: Floats, whole: Floats) -> Floats:
-    """Compute the share that a part has of the whole, 1 where there is nothing."""
+    """Compute part / whole, 1 where the whole is zero."""
     return np.where(whole > 0, part / np.where(whole > 0, whole, 1), 1.0)
 
 
 def trace_rays(frame: Frame, field: RadiosityField, tables: PatchTables, lanes: int) -> RayHits:
-    """Find what the rays of patches meet. The first rays belong to patches outside; there are more lanes than rays."""
+    """Trace the rays of patches. Rays of outside patches come first; there may be more lanes than rays."""
     index, first = dr.arange(mi.UInt32, lanes), tables.rays_outside
     outside, inside = index < first, (index >= first) & (index < tables.rays)
     patch = dr.gather(mi.UInt32, tables.of_patch, index, outside)
@@ -175,13 +174,13 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
 def _meet(
     frame: Frame, field: RadiosityField, tables: PatchTables, o: mi.Vector3f, d: mi.Vector3f, index: mi.UInt32
 ) -> RayHits:
-    """Find what is met along rays with these numbers; `sky` and `free` are 0."""
+    """Compute the hits along rays with these numbers; `sky` and `free` are set to 0."""
     active = index < tables.rays
     view, hit = intersect(frame, o, d, active, coherent=False)
     view = appearance(frame, view, hit, d)
-    # One of the four patches about a point stands for it, each as often as linear interpolation gives it weight.
+    # One of the four patches around a point is chosen at random, by its weight in linear interpolation.
     s, t = sequence(index * mi.UInt32(SHUFFLED))
-    # Where nothing is met, the point is not a number, which would be read as an index far outside the tables.
+    # Where nothing is hit, the point is not a number, which would become an index far outside the tables.
     at = dr.select(view.met, frame.point_to_scene(view.point), 0)
     if frame.region is None:
         other, matte = _patch_on_background(frame, field, tables, view, at, s, t)
@@ -208,7 +207,7 @@ def _meet(
 def _patch_on_skin(
     frame: Frame, tables: PatchTables, view: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f, s: mi.Float
 ) -> tuple[mi.UInt32, mi.Bool, mi.Bool]:
-    """Find the patch of a region that is met, whether it sends light back, and whether it is the sheet's outer side."""
+    """Return the hit patch of a region, whether it sends light back, and whether it is the sheet's outer side."""
     face = frame.region.face(hit)
     inner = frame.region.from_behind(face, hit.prim_uv, d, view.other)
     corner = frame.region.corner(face, hit.prim_uv, s, view.other)
@@ -221,7 +220,7 @@ def _patch_on_background(
     frame: Frame, field: RadiosityField, tables: PatchTables, view: SurfaceInteraction, at: mi.Vector3f,
     s: mi.Float, t: mi.Float,
 ) -> tuple[mi.UInt32, mi.Bool]:  # fmt: skip
-    """Find the patch of the background that is met at points of the scene's frame, and whether it sends light back."""
+    """Return the hit patch of the background at points of the scene's frame, and whether it sends light back."""
     ring, turn = field.background_place(at)
     ring, turn = mi.UInt32(dr.clip(ring + s, 0, RINGS - 1)), mi.UInt32(dr.clip(turn + t, 0, TURNS))
     patch = tables.on_globe + ring * TURNS + dr.select(turn < TURNS, turn, 0)
@@ -229,7 +228,7 @@ def _patch_on_background(
 
 
 def _patch_of_iris(field: RadiosityField, view: SurfaceInteraction, s: mi.Float, t: mi.Float) -> mi.UInt32:
-    """Compute the patch of the iris that is met, by its number in the chamber."""
+    """Return the hit patch of the iris, by its number in the chamber."""
     ring, turn = field.iris_place(view.inner)
     turn = mi.UInt32(dr.clip(turn + t, 0, IRIS_TURNS))
     return mi.UInt32(dr.clip(ring + s, 0, IRIS_RINGS - 1)) * IRIS_TURNS + dr.select(turn < IRIS_TURNS, turn, 0)

@@ -1,4 +1,4 @@
-"""The patches of a frame on the host, and what a subject and an eye keep of them.
+"""The patches of a frame on the host, and what is cached per subject and per eye.
 
 The patches come in this order: the globe; skin, the inner sides of the lids, or the background; the limbus; the chamber
 behind the cornea. The first three are "outside".
@@ -39,21 +39,21 @@ from .patches import (
     skin_patches,
 )
 
-RAYS = 24  # from each patch on the globe or about it
-_SKIN_RAYS, _INNER_RAYS = 10, 2  # from patches on the skin, and on the lids' inner sides, which lie in the dark
-_HALVINGS = 14, 15  # of the rays that leave the eye into bundles, without and with light from afar
-LANES = 4096  # there are lanes for so many times as many rays, so that recordings serve many subjects
-_CLOSE_MM = 10.5  # from the cornea's centre to skin that it mirrors lamps to
+RAYS = 24  # rays from each patch on the globe or around it
+_SKIN_RAYS, _INNER_RAYS = 10, 2  # rays from patches on the skin, and on the dark inner sides of the lids
+_HALVINGS = 14, 15  # halvings that bundle the rays that leave the eye, without and with light from afar
+LANES = 4096  # numbers of lanes are multiples of this, so that recordings serve many subjects
+_CLOSE_MM = 10.5  # distance from the cornea's centre to skin onto which it mirrors lamps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interior:
-    """The chamber of an eye, and what does not depend on the eye's pose.
+    """The chamber of an eye, and everything about it that does not depend on the pose.
 
     Attributes:
         chamber: the chamber.
-        form_factors: shares of the irradiance of its patches by which they light each other.
-        limbus: shares of the irradiance of the limbus' sectors by which they light the patches.
+        form_factors: irradiance of its patches per irradiance of each other.
+        limbus: irradiance of its patches per irradiance of the limbus' sectors.
         rows: on the device, the patches, their normals, and whether they are in the eye.
         leaving: on the device, a ray for each bundle of those that leave the eye.
         gain: (patches, bundles) gain with which each bundle lights each patch, sparse.
@@ -68,7 +68,7 @@ class Interior:
 
     @classmethod
     def of(cls, eye: EyeModel, film_index: float, look: Look, halvings: int) -> Interior:
-        """Compute it for an eye with its pupil and a look; the leaving rays are halved the given number of times."""
+        """Compute the interior for an eye with its pupil and a look; `halvings` sets the number of ray bundles."""
         chamber = chamber_of(eye, film_index)
         albedo = patch_albedo(eye, chamber, look)
         limbus = through_limbus(eye, chamber, look.limbus_width_mm, look.limbus_aspect) * look.limbus_transmittance
@@ -87,14 +87,15 @@ def round_up(number: int, step: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RayPlan:
-    """The patches on the skin of a subject, and the rays of all patches outside the eye; the pose does not matter.
+    """Patches on the skin of a subject, and the rays of all patches outside the eye; independent of the pose.
 
     Attributes:
         skin: the patches, None for a bare eye.
         count: (patches,) number of rays of each patch outside the chamber.
-        of_patch: on the device, the patch of each ray, of some rays more than there are.
-        stands_for: on the device, the patches that stand for both sides of each vertex.
-        near: on the device, the patches about every vertex: first the first ones of all vertices, then the second ...
+        of_patch: on the device, the patch of each ray, padded.
+        stands_for: on the device, the patches that represent both sides of each vertex.
+        near: on the device, the patches around every vertex: first those of rank one for all vertices, then those of
+            rank two, ...
         weight: on the device, their weights there.
     """
 
@@ -107,7 +108,7 @@ class RayPlan:
 
     @classmethod
     def of(cls, on_globe: int, others: int, skin: SkinPatches | None) -> RayPlan:
-        """Plan for the given numbers of patches on the globe and of other patches before the limbus."""
+        """Plan the rays for given numbers of patches on the globe and of other patches before the limbus."""
         count = np.full(on_globe + others + IRIS_TURNS, RAYS)
         stands_for, near, weight = mi.Int32(0), mi.UInt32(0), mi.Float(0)
         if skin is not None:
@@ -132,7 +133,7 @@ class RayPlan:
         return int(self.count.sum())
 
     def at_vertices(self, patches: Floats) -> mi.Float:
-        """Interpolate the numbers of patches (n, 4), the last of which is the whole sky, at all vertices."""
+        """Interpolate the patches' numbers (n, 4), the last of which is the whole sky, at all vertices."""
         assert self.skin is not None
         vertices, each = self.skin.near.shape
         count = dr.opaque(mi.UInt32, vertices)
@@ -143,7 +144,7 @@ class RayPlan:
 def _at_vertices(
     patches: mi.Float, near: mi.UInt32, weight: mi.Float, count: mi.UInt32, vertices: int, each: int
 ) -> mi.Float:
-    """Return four numbers of every vertex from those of `each` patches about it."""
+    """Interpolate four numbers at every vertex from the `each` patches around it."""
     index = dr.arange(mi.UInt32, vertices)
     total = mi.Vector4f(0)
     for k in range(each):
@@ -164,7 +165,7 @@ class FramePatches:
     Attributes:
         job: the job.
         globe: patches of the globe.
-        interior: those of the chamber.
+        interior: patches of the chamber.
         plan: the rays.
         points: (n, 3) patches on skin and lids, or on the background.
         normals: (n, 3) unit normals there.
@@ -201,7 +202,7 @@ class FramePatches:
 
     @cached_property
     def near_cornea(self) -> Ints:
-        """Patches on skin and lids, by their numbers there, to which the cornea may mirror lamps."""
+        """Numbers of the patches on skin and lids onto which the cornea may mirror lamps."""
         job = self.job
         if self.plan.skin is None or not job.interreflection:
             return np.zeros(0, int)
@@ -220,10 +221,10 @@ class FramePatches:
 
 
 class Patches:
-    """Patches of frames; keeps what does not change between frames of a subject."""
+    """Cache of patches: keeps what does not change between frames of a subject."""
 
     def __init__(self) -> None:
-        self._plans: list[tuple[tuple[Any, ...], Globe, RayPlan]] = []  # of subjects
+        self._plans: list[tuple[tuple[Any, ...], Globe, RayPlan]] = []  # cached per subject
         self._bare: RayPlan | None = None
         self._interiors: EyeCache[Interior] = EyeCache()
 
@@ -236,14 +237,14 @@ class Patches:
         )
 
     def _interior(self, job: RenderJob) -> Interior:
-        """Return the chamber of a job's eye; more rays leave it where they look for light."""
+        """Return the chamber of a job's eye; with light from afar, more outgoing rays are used."""
         ambient = job.ambient
         halvings = _HALVINGS[ambient.map is not None or ambient.irradiance_w_m2 > 0]
         film, look = job.film_index, job.look
         return self._interiors.get(job.eye, (film, look, halvings), lambda: Interior.of(job.eye, film, look, halvings))
 
     def _plan(self, region: RegionScene | None, globe: Globe) -> RayPlan:
-        """Compute patches and rays, chosen with the eye straight ahead: no earlier pose may change a picture."""
+        """Compute patches and rays with the eye straight ahead, so that no earlier pose changes an image."""
         if region is None:
             self._bare = self._bare or RayPlan.of(MAP_SIDE * MAP_SIDE, RINGS * TURNS, None)
             return self._bare
@@ -260,7 +261,7 @@ class Patches:
 def _others(
     job: RenderJob, region: RegionScene | None, skin: SkinPatches | None
 ) -> tuple[Floats, Floats, tuple[float, float, float]]:
-    """Compute patches that are not on the eye, their normals, and the rings of the background."""
+    """Compute patches outside the eye, their normals, and the rings of the background."""
     if region is not None and skin is not None:
         vertices, normals = (a[skin.vertices] for a in (region.posed.vertices, region.posed.normals))
         both = np.concatenate([vertices, vertices[skin.lids]]), np.concatenate([normals, -normals[skin.lids]])

@@ -1,7 +1,7 @@
-"""What the pupil shows: the light of the lamps that the fundus returns, on a grid over the stop, once per frame.
+"""The light of the pupil: lamp light that the fundus returns, on a grid over the stop, once per frame.
 
-The fundus mixes the light of the whole pupil and changes it slowly from place to place, so a small grid gives it. Each
-of its points sums over the lamps the irradiance of the stop times the return factor of `eye.fundus`.
+The fundus mixes the light of the whole pupil, so the result varies slowly and a small grid suffices. Each of its points
+sums over the lamps the irradiance of the stop times the return factor of `eye.fundus`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .directlight import LampPath
 
 @dataclass(kw_only=True)
 class FundusIrradiance:
-    """Radiance in air (mW/mm^2/sr) that leaves the pupil, before the transmittance of the cornea, on a square grid."""
+    """Radiance in air (mW/mm^2/sr) out of the pupil, before the cornea's transmittance, on a square grid."""
 
     cells: mi.Float
 
@@ -29,14 +29,14 @@ class FundusIrradiance:
 
         Args:
             frame: the frame.
-            factors: the return factors of the lamps; None where nothing is returned.
+            factors: the return factors of the lamps; None if nothing is returned.
         """
         cells = dr.zeros(mi.Float, CELLS * CELLS) if factors is None else _radiance_of_cells(frame, factors)
         dr.make_opaque(cells)
         return cls(cells=cells)
 
     def at(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> mi.Float:
-        """Compute the radiance at coordinates of the stop in units of its semi-axes, bilinearly."""
+        """Interpolate the radiance bilinearly at coordinates of the stop, in units of its semi-axes."""
         x, y = (dr.clip((c * (1 / EDGE) + 1) * (CELLS / 2) - 0.5, 0, CELLS - 1.001) for c in (u, v))
         i, j = mi.UInt32(x), mi.UInt32(y)
         s, t = x - mi.Float(i), y - mi.Float(j)
@@ -47,7 +47,7 @@ class FundusIrradiance:
 
 @syntax
 def _radiance_of_cells(frame: Frame, factors: mi.Float) -> mi.Float:
-    """Sum the light of the lamps at the cells: irradiance of the stop times return factor."""
+    """Sum the lamps' light at the cells: irradiance of the stop times return factor."""
     index = dr.arange(mi.UInt32, CELLS * CELLS)
     row = index // CELLS
     column = index - row * CELLS

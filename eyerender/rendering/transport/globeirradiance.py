@@ -1,11 +1,11 @@
-"""Light of all lamps on a bare globe and on the plane about it, on grids that are filled once per frame.
+"""Lamp light on a bare globe and on the plane around it, on grids that are filled once per frame.
 
-A grid over the globe's front (azimuthal equidistant about its axis) holds the light of the lamps with that of other
-surfaces, and one over the plane holds it without that, which has finer structure there. Where a cell is not good enough
-(see `irradiancegrid`), every sample has its own rays to the lamps, as if there were no grid.
+A grid over the globe's front (azimuthal equidistant about its axis) holds the light of the lamps and of other surfaces.
+A grid over the plane holds only the light of the lamps, because that of other surfaces has finer structure there. Where
+a cell is too inaccurate (see `irradiancegrid`), every sample has its own rays to the lamps.
 
-A lamp is represented by its middle if it is small, else by four points whose mean is exact to the third order of its
-radius. Before lamps that are large and near, there is no grid.
+A small lamp is represented by its middle, a larger one by four points whose mean is exact to third order in its radius.
+For large and near lamps there is no grid.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from .directlight import irradiance, lamp_blocked
 
 _SIDE = 128
 _MIDDLE = 0.5 * (_SIDE - 1)
-_LOW, _SLOPE = 0.1, 0.6  # cosines: of a lamp about to set, and of one that the rim of the steepest cornea hides
+_LOW, _SLOPE = 0.1, 0.6  # cosines: of a lamp about to set, and of one hidden by the rim of the steepest cornea
 
 
 @dataclass(kw_only=True)
 class GlobeIrradiance:
-    """The light that matte surfaces of a bare eye receive from lamps, and the globe from other surfaces.
+    """Irradiance of matte surfaces of a bare eye from lamps, and of the globe from other surfaces.
 
     Attributes:
-        globe: over the globe's front.
-        plane: over the plane about it.
-        reach: half the width of the latter, mm.
+        globe: grid over the globe's front.
+        plane: grid over the plane around it.
+        reach: half the width of the plane's grid, mm.
     """
 
     globe: IrradianceGrid
@@ -48,9 +48,9 @@ class GlobeIrradiance:
 
         Args:
             frame: the frame.
-            reach: distance (mm) from the axis of the unrotated eye within which the plane is seen.
-            points: number of points that stand for a lamp.
-            gridded: whether the lamps may have grids.
+            reach: distance (mm) from the axis of the unrotated eye within which the plane is visible.
+            points: number of points that represent a lamp.
+            gridded: whether the lamps are small enough for grids.
         """
         if not gridded:
             return cls(globe=IrradianceGrid.unknown(_SIDE), plane=IrradianceGrid.unknown(_SIDE), reach=reach)
@@ -60,7 +60,7 @@ class GlobeIrradiance:
         share = dr.select(polar > 0, sine / polar, 0)
         normal = mi.Vector3f(cosine, a * share, b * share)
         x = frame.sclera.centre + frame.sclera.radius * normal
-        # Under the cornea the grid continues as if there were none, because cells at its rim have nodes there.
+        # Under the cornea the grid continues as if there were no cornea, because cells at its rim have nodes there.
         local = frame.surfaces[0].point_in(x)
         outside = (local.y * local.y + local.z * local.z > dr.square(frame.limbus.radius)) | (normal.x < 0)
         on_globe = _from_lamps(frame, points, x, normal, sphere=mi.Bool(False), cornea=outside)
@@ -76,7 +76,7 @@ class GlobeIrradiance:
 
     @syntax
     def at(self, frame: Frame, view: SurfaceInteraction) -> tuple[mi.Float, mi.Bool]:
-        """Irradiance (mW/mm^2) at points that are seen, and whether it is known: not on the rim of the cornea."""
+        """Interpolate the irradiance (mW/mm^2) at visible points, and whether it is known (not on the cornea's rim)."""
         if dr.hint(view.other, exclude=[self, frame, view]):
             found, left = self._on_plane(frame, view)
         else:
@@ -98,10 +98,10 @@ class GlobeIrradiance:
 def _from_lamps(
     frame: Frame, points: mi.UInt32, x: mi.Vector3f, normal: mi.Vector3f, *, sphere: mi.Bool, cornea: mi.Bool
 ) -> mi.Float:
-    """Irradiance of all lamps at points (eye frame), which the globe's sphere and the cornea may keep from them.
+    """Compute the irradiance of all lamps at points (eye frame); globe's sphere and cornea may block it.
 
-    Under the cornea, where that is not asked, a lamp that stands low may be hidden from points just beyond the rim.
-    Such points are not known: -1.
+    Under the cornea, where blocking is not tested, a low lamp may be hidden from points just beyond the rim. Such
+    points are unknown: -1.
     """
     count = frame.lights.count * points
     k, total, doubtful = mi.UInt32(0), mi.Float(0) * x.x, mi.Bool(False)

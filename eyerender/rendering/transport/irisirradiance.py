@@ -1,14 +1,14 @@
-"""Light of the lamps on the iris, on a grid in its plane that is filled once per frame (see `irradiancegrid`).
+"""Lamp light on the iris, on a grid in its plane that is filled once per frame (see `irradiancegrid`).
 
-A lamp is hidden where anything stands in its way at one of the nodes about a cell. In front of an eye region the nodes
-must also be far from all hairs and lids as the lamp sees them (`lampviews`), so that nothing can hide between them.
+A cell lacks a lamp if anything blocks it at one of the surrounding nodes. With an eye region, the nodes must also be
+far from all hairs and lids as seen from the lamp (`shadowmaps`), so that no occluder falls between them.
 
-The rim of the cornea clouds within a millimetre. Where light of a lamp passes it, a cell holds what a clear rim would
-let pass and the radius at which the light enters, both of which change slowly. Every sample computes what the rim
-lets pass.
+The rim of the cornea turns opaque within a millimetre. Where light passes the rim, a cell holds the irradiance behind a
+clear rim and the radius at which the light enters; both vary slowly. Every sample then applies the transmittance of the
+rim.
 
-A lamp is represented by its middle if it is small, else by four points whose mean is exact to the third order of its
-radius. Before lamps that are large and near, there is no grid.
+A small lamp is represented by its middle, a larger one by four points whose mean is exact to third order in its radius.
+For large and near lamps there is no grid.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ from .directlight import LampPath, behind
 
 _SIDE = 68
 _NODES = _SIDE * _SIDE
-_SPARE_MM = 0.45  # beyond the root of the iris: two cells
-_STEADY = 0.02  # as BENT, of what enters: without the edges of shadows, cubics are off by a hundredth of this
-_AHEAD_MM = 1.0  # before the back of the cornea, where nodes continue the light behind it
+_SPARE_MM = 0.45  # margin beyond the root of the iris: two cells
+_STEADY = 0.02  # like BENT, of the light that enters: without shadow edges, the error of cubics is a hundredth of it
+_AHEAD_MM = 1.0  # distance in front of the back of the cornea, within which nodes continue the light behind it
 
 
 @dataclass(kw_only=True)
 class IrisIrradiance:
-    """The light of the lamps in the plane of the iris.
+    """Irradiance of the lamps in the plane of the iris.
 
     Attributes:
-        grid: the light of the lamps that nothing clouds.
-        behind_rim: lamps of each cell whose light passes the rim of the cornea, as bits.
-        paths: for these, what passes a clear rim at four nodes in a row, and the radii (mm) where it enters.
+        grid: irradiance of the lamps that the rim does not attenuate.
+        behind_rim: bit mask per cell of lamps whose light passes the rim of the cornea.
+        paths: for these lamps, the irradiance behind a clear rim at four nodes in a row, and the radii (mm) where the
+            light enters.
     """
 
     grid: IrradianceGrid
@@ -51,8 +52,8 @@ class IrisIrradiance:
 
         Args:
             frame: the frame.
-            lamps: number of lamps; 0 where none may use a grid.
-            points: number of points that stand for a lamp.
+            lamps: number of lamps; 0 if none may use a grid.
+            points: number of points that represent a lamp.
         """
         if not lamps:
             none = dr.zeros(mi.UInt32, _NODES)
@@ -76,7 +77,7 @@ class IrisIrradiance:
 
     @syntax
     def at(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
-        """Irradiance (mW/mm^2) at points of the plane of the iris (eye frame), and the lamps that it lacks, as bits."""
+        """Interpolate the irradiance (mW/mm^2) at points of the iris plane (eye frame); also return missing lamps."""
         q = x - frame.stop.centre
         scale = 0.5 * (_SIDE - 1) / _half(frame)
         u, v = (dr.dot(q, axis) * scale + 0.5 * (_SIDE - 1) for axis in (frame.stop.u, frame.stop.v))
@@ -96,12 +97,12 @@ class IrisIrradiance:
 
 
 def _half(frame: Frame) -> mi.Float:
-    """Half the width of the grid, mm."""
+    """Return half the width of the grid, mm."""
     return frame.iris.root_radius + _SPARE_MM
 
 
 def _four_in_a_row(paths: list[mi.Float], lamps: int, count: mi.UInt32) -> mi.Float:
-    """Say what passes a clear rim, and the radii where it enters, at each node and the three beside it."""
+    """Arrange irradiances behind a clear rim, and radii of entry, for each node and the next three."""
     index = dr.arange(mi.UInt32, _NODES * lamps)
     rows = dr.zeros(mi.Float, 8 * _NODES * lamps)
     last = mi.Int32(dr.minimum(count, BITS) * _NODES) - 1
@@ -113,16 +114,16 @@ def _four_in_a_row(paths: list[mi.Float], lamps: int, count: mi.UInt32) -> mi.Fl
 
 
 def _rows(paths: mi.Float, node: mi.UInt32) -> tuple[mi.Vector4f, mi.Vector4f]:
-    """Say what passes a clear rim at nodes and the three beside them, and the radii where it enters."""
+    """Read irradiances behind a clear rim at nodes and the next three, and the radii of entry."""
     return dr.gather(mi.Vector4f, paths, 2 * node), dr.gather(mi.Vector4f, paths, 2 * node + 1)
 
 
 @syntax
 def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Compute the irradiance of lamps i at nodes, the same behind a clear rim, and the radius (mm) where it enters.
+    """Compute the irradiance of lamps i at nodes, that behind a clear rim, and the radius (mm) of entry.
 
-    Where anything may hide the lamps, or a path was not found, irradiances are negative. Behind a clear rim, that of a
-    lamp with several points is so, too.
+    Irradiances are negative where anything may hide the lamps, or a path was not found; behind a clear rim also for
+    lamps with several points.
     """
     half, lamp = _half(frame), frame.lights[i]
     row = node // _SIDE
@@ -144,7 +145,7 @@ def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) ->
 
 
 def _shadow(frame: Frame, lamp: mi.UInt32, path: LampPath) -> tuple[mi.Bool, mi.Bool]:
-    """Return whether a path is in a shadow or near one, or unknown, and whether a clear rim would let it pass."""
+    """Return whether a path is in, near or possibly in a shadow, and whether a clear rim would let it pass."""
     if frame.caches.shadow_maps is None:
         return path.failed, ~path.blocked
     free = frame.caches.shadow_maps.at(lamp, frame.point_to_scene(path.entry), path.whole > 0)

@@ -8,8 +8,8 @@ direction there, r the miss, and ya, yb the differentials of y:
     J = |w . (a x b)| = dA_perp / dOmega at the lamp,        E = I (1 - F) cos(theta) / J
     y <- y + ya w.(r x b)/det + yb w.(a x r)/det,            det = w . (a x b)
 
-Steps in y, and not in the direction at the lamp, keep the problem well scaled at grazing incidence, where oblique lamps
-light the far side of the iris.
+Stepping in y instead of the direction at the lamp keeps the problem well scaled at grazing incidence, where oblique
+lamps light the far side of the iris.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ TOLERANCE_MM = 1e-4  # changes the irradiance by less than 1e-4 of itself; float
 _STANDOFF_MM = 15.0
 _STEP_MM = 2.5
 _GRAZING = 0.01
-CORNEA_MM = 7.8  # radius of corneas, about
+CORNEA_MM = 7.8  # approximate radius of a cornea
 _BISECTIONS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Connection:
-    """The path: irradiance per radiant intensity (mm^-2), the entry point, the direction on leaving the lamp.
+    """A light path: irradiance per radiant intensity (mm^-2), entry point, and direction on leaving the lamp.
 
     `found` marks existing paths. `failed` marks those where Newton's method did not converge although it never left the
     part of the cornea that the lamp sees. Points in the cornea's own shadow have no path, and the steps towards them
@@ -49,7 +49,7 @@ class Connection:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Points that paths lead to, unit normals there towards the light, and where the line from the lamp aims at first.
+    """End points of paths, unit normals there towards the light, and where the line from the lamp aims at first.
 
     `aim` is near the image of the point seen from outside.
     """
@@ -70,16 +70,16 @@ def connect(
     mirror: bool = False,
     ahead_mm: float = 0.0,
 ) -> Connection:
-    """Find paths from `lamp` to `target` through all `surfaces`, all points in the eye frame (mm).
+    """Solve for paths from `lamp` to `target` through all `surfaces`; points in the eye frame (mm).
 
     Args:
         surfaces: refracting surfaces, from the front.
         lamp: points on the lamps.
         target: points behind the surfaces.
         reach: radius about the front surface's axis (mm) beyond which no path enters.
-        active: lanes that matter.
-        mirror: whether the light comes to points before the first surface, which mirrors it, the only one.
-        ahead_mm: how far before the last surface points may be that are met when a path is extended backwards.
+        active: active lanes.
+        mirror: whether the targets lie in front of a single surface that mirrors the light.
+        ahead_mm: how far in front of the last surface targets may lie; they are met by extending the path backwards.
     """
     front = surfaces[0]
     y = (_mirror_guess if mirror else _entry_guess)(front, lamp, target.aim)
@@ -94,7 +94,7 @@ def connect(
         b = Bundle(y=y, w=d, da=distance * e1, db=distance * e2, wa=e1, wb=e2)
         b, passed, cosine = front.bend(b, form, mirror=mirror)
         ya, yb = b.da, b.db
-        over = cosine < _GRAZING  # beyond the horizon, go half the way back
+        over = cosine < _GRAZING  # beyond the horizon, go back half way
         b, share, good = _refract_all(surfaces[1:], b)
         s = dr.dot(target.point - b.y, b.w)
         b = b.advance(s)
@@ -102,7 +102,7 @@ def connect(
         done = on & ~over & good & (s > -ahead_mm) & (dr.squared_norm(miss) < TOLERANCE_MM * TOLERANCE_MM)
         move, det = _newton_step(b, miss, ya, yb)
         transfer = dr.select(done, passed * share * dr.maximum(-dr.dot(b.w, target.normal), 0) / dr.abs(det), transfer)
-        after = dr.select(over, 0.5 * (y + last), y + move)  # the next step brings it to the surface
+        after = dr.select(over, 0.5 * (y + last), y + move)  # the next step returns it to the surface
         steps += 1
         local = front.point_in(y)
         out = local.y * local.y + local.z * local.z > dr.square(reach + 1)
@@ -116,7 +116,7 @@ def connect(
 
 
 def _refract_all(surfaces: tuple[Surface, ...], b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
-    """Refract a bundle at surfaces one after the other: the bundle behind them, the transmittance, and success."""
+    """Refract a bundle at all surfaces in order: the bundle behind them, the transmittance, and success."""
     passed, ok = mi.Float(1), mi.Bool(True)
     for surface in surfaces:
         b, share, good = surface.refract_bundle(b)
@@ -126,13 +126,13 @@ def _refract_all(surfaces: tuple[Surface, ...], b: Bundle) -> tuple[Bundle, mi.F
 
 
 def _newton_step(b: Bundle, miss: mi.Vector3f, ya: mi.Vector3f, yb: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
-    """Compute the motion of the entry point that takes the `miss` away, at most `_STEP_MM` long, and the determinant.
+    """Compute the step of the entry point that removes the `miss`, at most `_STEP_MM` long, and the determinant.
 
     Args:
         b: the bundle where it passes the target.
-        miss: from the ray to the target.
+        miss: vector from the ray to the target.
         ya: motion of the entry point with the first differential.
-        yb: the same with the second.
+        yb: motion of the entry point with the second.
     """
     det = dr.dot(b.w, dr.cross(b.da, b.db))
     inv = dr.rcp(dr.select(dr.abs(det) > 1e-9, det, 1e-9))
@@ -144,7 +144,7 @@ def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vect
     """Compute the first guess of the entry point: where the straight line to `aim` enters.
 
     Where that line misses the surface or enters at grazing incidence, the guess is the point whose normal halves the
-    angle between the lamp and the axis. Any lamp in front of the eye lights that point well.
+    angle between the lamp and the axis. Every lamp in front of the eye lights that point well.
     """
     d = dr.normalize(aim - lamp)
     o = lamp + dr.maximum(-dr.dot(lamp, d) - _STANDOFF_MM, 0) * d
@@ -159,9 +159,9 @@ def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vect
 
 
 def _mirror_guess(front: Surface, lamp: mi.Vector3f, x: mi.Vector3f) -> mi.Vector3f:
-    """First guess of the point that mirrors a lamp to `x`: that of a sphere, by bisection between both directions.
+    """Compute the first guess of the point that mirrors a lamp to `x`: for a sphere, by bisection of directions.
 
-    Of the two last points it is that nearer to the lamp, because Newton's method must not start in its shadow.
+    Of the last two points, the one nearer to the lamp is taken, because Newton's method must not start in its shadow.
     """
     centre = mi.Vector3f(-CORNEA_MM, 0, 0)
     a, b = front.point_in(lamp) - centre, front.point_in(x) - centre

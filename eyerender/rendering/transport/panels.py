@@ -25,7 +25,7 @@ _WIDTH = 13  # centre 3, normal 3, right 3 and up 3 over half sizes, radiance
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rectangle:
-    """One rectangle of the scene's frame; `right` and `up` are over the half sizes, so that |q . right| < 1 inside."""
+    """A rectangle in the scene's frame; `right` and `up` are divided by the half sizes, so |q . right| < 1 inside."""
 
     centre: mi.Vector3f
     normal: mi.Vector3f
@@ -40,7 +40,7 @@ class Panels:
 
     Attributes:
         count: number of rectangles.
-        rows: 13 numbers of each, as from `frame.panel_table`.
+        rows: 13 numbers per rectangle, as in `job.panel_table`.
     """
 
     count: mi.UInt32
@@ -48,7 +48,7 @@ class Panels:
 
     @classmethod
     def upload(cls, table: Floats) -> Panels:
-        """Send rectangles (n, 13) to the device."""
+        """Copy rectangles (n, 13) to the device."""
         return cls(count=dr.opaque(mi.UInt32, len(table)), rows=upload_array(table if len(table) else np.zeros(_WIDTH)))
 
     def __getitem__(self, i: mi.UInt32) -> Rectangle:
@@ -72,7 +72,7 @@ class Panels:
 
     @syntax
     def irradiance(self, x: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
-        """Compute the irradiance (mW/mm^2) at points x with unit normals n of the scene's frame, unshadowed."""
+        """Compute the unshadowed irradiance (mW/mm^2) at points x with unit normals n of the scene's frame."""
         i, total = mi.UInt32(0), mi.Float(0) * n.x
         while dr.hint(i < self.count, label="panel light", exclude=[self]):
             panel = self[i]
@@ -86,10 +86,9 @@ class Panels:
 
 
 def polygon_irradiance(corners: list[mi.Vector3f], n: mi.Vector3f) -> mi.Float:
-    """Irradiance per radiance of a convex polygon, its corners given from the lit point, on a surface of normal n.
+    """Compute the irradiance per radiance from a convex polygon, corners relative to the lit point of normal n.
 
-    The part below the horizon is cut off. The parts of the edges above it and the arc of the horizon between them
-    remain.
+    The polygon is clipped at the horizon: only the edges above it and the arc of the horizon between them contribute.
     """
     total = mi.Float(0)
     leave, enter = mi.Vector3f(0), mi.Vector3f(0)

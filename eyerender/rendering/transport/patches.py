@@ -1,4 +1,4 @@
-"""Patches of skin, globe and background between which light is exchanged, and interpolation between them (host)."""
+"""Patches of skin, globe and background that exchange light, and interpolation between them (host)."""
 
 from __future__ import annotations
 
@@ -11,32 +11,33 @@ from ...arrays import ArrayValue, Bools, Floats, Ints, Singles
 from ...region.globe import Globe
 from ...region.mesh import RegionMesh
 
-GLOBE_COLUMNS, GLOBE_ROWS = 40, 12  # between the lids
-MAP_SIDE = 26  # over the front of a bare globe
+GLOBE_COLUMNS, GLOBE_ROWS = 40, 12  # patches between the lids
+MAP_SIDE = 26  # grid over the front of a bare globe
 WIDEST = 0.55 * np.pi  # polar angle of the edge of that map
-_HALF_MM, _HIGH_MM = 14.0, 8.0  # of the opening of a head mesh, whose margins are unknown
+_HALF_MM, _HIGH_MM = 14.0, 8.0  # half width and half height of the opening of a head mesh, whose margins are unknown
 _FINE_MM, _NEAR_MM = (
     1.25,
     12.0,
 )  # distance of patches on skin this far from the middle of the fissure, and in proportion
 _NEIGHBOURS = 12
-_MARGIN_LEVEL = -2  # of the lids' margins: half the distance
+_MARGIN_LEVEL = -2  # level of the lid margins: half the distance
 # Across the margins light changes fast: so many times as fast with the height above the globe as along them. They are
 # between these heights: the conjunctiva is lower, and the lids' outer sides are higher.
 _STEEP, _LOW_MM, _TOP_MM = 4.0, 0.04, 1.6
-_LID_MM = 4.0  # from the sclera's sphere to the outside of a lid over the cornea
+_LID_MM = 4.0  # distance from the sclera's sphere to the outside of a lid over the cornea
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SkinPatches(ArrayValue):
-    """Vertices of a region that stand for the skin about them; they move with the tissue.
+    """Vertices of a region that represent the skin around them; they move with the tissue.
 
     Attributes:
         vertices: (n,) indices of the vertices.
-        nearest: (all vertices,) patch that stands for each vertex.
-        lids: (l,) patches on the skin right in front of the globe, whose inner sides close a space about the cornea.
-        behind: (all vertices,) index in `lids` of what stands for the inner side of each; -1 for none.
-        near: (all vertices, k) patches about every vertex.
+        nearest: (all vertices,) patch that represents each vertex.
+        lids: (l,) patches on the skin right in front of the globe, whose inner sides enclose the space around the
+            cornea.
+        behind: (all vertices,) index in `lids` of the patch for the inner side of each; -1 for none.
+        near: (all vertices, k) patches around every vertex.
         weight: (all vertices, k) their weights there.
     """
 
@@ -51,11 +52,11 @@ class SkinPatches(ArrayValue):
 def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
     """Choose patches on a region's mesh: one for each cell of a grid that grows with the distance from the eye.
 
-    On the margins of the lids cells are smaller, above all from edge to edge.
+    On the lid margins the cells are smaller, above all across the margin.
 
     Args:
         mesh: the region with the eye straight ahead and open lids.
-        globe: the globe there.
+        globe: the globe in that pose.
     """
     ends = mesh.layout.vertex_ends
     solid = np.arange(ends[0])
@@ -91,20 +92,20 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
 
 
 def _relative_to_globe(globe: Globe, points: Floats) -> Floats:
-    """Compute points (n, 3) of the scene's frame relative to the centre of a globe at rest."""
+    """Return points (n, 3) of the scene's frame relative to the centre of a globe at rest."""
     return np.asarray(points - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
 
 
 def _coordinates(mesh: RegionMesh, globe: Globe) -> Floats:
-    """Where vertices are (n, 4): their points (mm), and a fourth coordinate that grows across the lids' margins."""
+    """Return coordinates (n, 4) of vertices: their points (mm), and a fourth one that grows across the lid margins."""
     height = globe.clearance(mesh.vertices * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
     return np.column_stack([mesh.vertices, _STEEP * (np.clip(height, _LOW_MM, _TOP_MM) - _LOW_MM)])
 
 
 def _neighbours(normals: Floats, where: Floats, chosen: Ints, size: Floats) -> tuple[Ints, Singles]:
-    """Find the nearest patches at every vertex, and their weights.
+    """Return the nearest patches at every vertex, and their weights.
 
-    A patch has less weight with distance and where the skin faces another way.
+    A patch's weight falls with distance and with the angle between the normals.
     """
     k = min(_NEIGHBOURS, len(chosen))
     distance, index = cKDTree(where[chosen]).query(where, k=k)
@@ -119,14 +120,14 @@ def _neighbours(normals: Floats, where: Floats, chosen: Ints, size: Floats) -> t
 class GlobePatches(ArrayValue):
     """Points of the globe in the scene's frame, on a grid of `rows` by `columns`.
 
-    Between lids the columns have constant y, and the rows divide the opening there. On a bare globe the grid is its
-    front in azimuthal equidistant projection.
+    Between lids, columns have constant y and rows divide the opening. On a bare globe, the grid covers its front in
+    azimuthal equidistant projection.
 
     Attributes:
         points: (rows * columns, 3) mm.
         normals: (rows * columns, 3) unit normals of the sclera's sphere.
-        table: numbers from which the kernels find a point's place in the grid: centre 3, first y, columns per mm, then
-            the lower and upper end of each column (mm).
+        table: numbers from which the kernels compute a point's position in the grid: centre 3, first y, columns per mm,
+            then the lower and upper end of each column (mm).
         columns: number of columns.
         rows: number of rows.
     """
@@ -154,7 +155,7 @@ def globe_patches(globe: Globe, mesh: RegionMesh | None) -> GlobePatches:
 
 
 def _opening(globe: Globe, centre: Floats, mesh: RegionMesh) -> tuple[Floats, Floats, Floats]:
-    """Compute the columns y of the grid and the ends (z) of the opening there, mm."""
+    """Compute the columns y of the grid and the ends (z) of the lid opening there, mm."""
     if len(mesh.upper_margin) == 0:
         y = centre[1] + np.linspace(-0.9, 0.9, GLOBE_COLUMNS) * min(_HALF_MM, globe.radius_mm)
         return y, np.full_like(y, centre[2] - _HIGH_MM), np.full_like(y, centre[2] + _HIGH_MM)
@@ -204,9 +205,9 @@ def plane_patches(globe: Globe, plane_x: float) -> tuple[Floats, float]:
 def fill_gaps(
     values: Floats, valid: Bools, rows: int, columns: int, across: tuple[float, float] = (1.0, 1.0)
 ) -> Floats:
-    """Average the values (rows * columns, k) of a grid over valid neighbours; over farther ones where none is valid.
+    """Replace values (rows * columns, k) by averages over valid neighbours, or over farther ones if none is valid.
 
-    across: weight of each neighbour along columns and along rows, beside 2 for the patch itself.
+    `across` is the weight of each neighbour along columns and along rows; the patch itself has weight 2.
     """
     weight = valid.reshape(rows, columns).astype(float)[..., None]
     total = values.reshape(rows, columns, -1) * weight
@@ -222,7 +223,7 @@ def fill_gaps(
 
 
 def _blur(values: Floats, across: tuple[float, float]) -> Floats:
-    """Sum 3 x 3 neighbours with weights."""
+    """Sum the 3 x 3 neighbours with weights."""
     height, width, count = values.shape
     padded = np.zeros((height + 2, width + 2, count))
     padded[1:-1, 1:-1] = values

@@ -1,7 +1,7 @@
-"""Light onto patches straight from lamps, panels and surroundings: E0 of the radiosity equation.
+"""Direct light on patches from lamps, panels and surroundings: E0 of the radiosity equation.
 
-Patches outside the eye receive it directly, and those of skin near the cornea also by way of the cornea as a mirror: up
-to a sixth of the light on the lids' margins. Patches of the chamber receive it through the cornea.
+Patches outside the eye receive it directly. Skin near the cornea also receives light mirrored by the cornea: up to a
+sixth of the light on the lid margins. Patches of the chamber receive it through the cornea.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from .radiosityfield import RadiosityField
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatchLight:
-    """What is known of the light before the radiosity is solved for, on the host, and what the patches' rays meet.
+    """Light that is known before the radiosity is solved, on the host, and the hits of the patches' rays.
 
     Attributes:
-        direct: (outside,) irradiance of the patches outside the eye straight from the lamps.
+        direct: (outside,) direct irradiance of the patches outside the eye from the lamps.
         bare: (outside,) the same without shadows.
-        mirrored: (outside,) irradiance from the lamps by way of the cornea.
-        soft: (outside,) irradiance from even light and the soft part of a map, without shadows.
-        hard: (outside,) that of the rest of the map and of panels, without shadows.
-        hard_free: (outside,) the same from the parts of panels and map that stand for them.
-        hard_lit: (outside,) that with shadows.
-        lamps: (inside,) irradiance of the patches of the chamber straight from the lamps.
-        panels: (inside,) the same from the parts of panels and map.
-        rays: what the rays of all patches meet.
+        mirrored: (outside,) irradiance from lamps mirrored by the cornea.
+        soft: (outside,) irradiance from uniform light and the soft part of a map, without shadows.
+        hard: (outside,) irradiance from the rest of the map and from panels, without shadows.
+        hard_free: (outside,) the same, from the lamps that represent panels and map.
+        hard_lit: (outside,) the same, with shadows.
+        lamps: (inside,) direct irradiance of the patches of the chamber from the lamps.
+        panels: (inside,) the same, from the lamps that represent panels and map.
+        rays: hits of the rays of all patches.
     """
 
     direct: Floats
@@ -56,19 +56,19 @@ class PatchLight:
 
 @dataclass(kw_only=True)
 class Gathered:
-    """The fields of `PatchLight` on the device; those of lamps have an item for each point on the lamps' discs.
+    """The fields of `PatchLight` on the device; those of lamps have one item per point on the lamps' discs.
 
     Attributes:
         direct: irradiance with and without shadows.
-        mirrored: by way of the cornea.
-        soft: None without ambient light.
-        hard: None without ambient light.
-        panels_outside: irradiance of patches outside with and without shadows; None without panels.
-        lamps: of patches of the chamber, whose columns follow each other.
-        panels: the same.
-        hits: what the rays meet.
-        lit: irradiance at the points of the skin that rays of globe and chamber meet, None where that is not used.
-        bare: irradiance at the points of the skin that all rays meet, without shadows; None without skin.
+        mirrored: irradiance from lamps mirrored by the cornea.
+        soft: as in `PatchLight`; None without ambient light.
+        hard: as in `PatchLight`; None without ambient light.
+        panels_outside: irradiance of outside patches from panels, with and without shadows; None without panels.
+        lamps: irradiance of patches of the chamber, column after column.
+        panels: the same, from panels.
+        hits: hits of the rays.
+        lit: irradiance at the points of the skin hit by rays of globe and chamber; None if unused.
+        bare: unshadowed irradiance at the points of the skin hit by all rays; None without skin.
     """
 
     direct: list[tuple[mi.Float, mi.Float]]
@@ -83,7 +83,7 @@ class Gathered:
     bare: mi.Float | None
 
     def read(self, patches: FramePatches, lanes: Lanes) -> PatchLight:
-        """Read the light, which waits for all launches."""
+        """Copy the light to the host, after all launches have finished."""
         count, near = patches.outside, patches.near_cornea
         direct, bare = (part[:count] for part in np.split(_mean(self.direct, 2 * lanes.outside), 2))
         mirrored = np.zeros(count)
@@ -101,7 +101,7 @@ class Gathered:
 
 
 def _mean(found: Sequence[Sequence[mi.Float]], width: int) -> Floats:
-    """Mean (width,) over the points on the lamps' discs, each of which has some columns, one after the other."""
+    """Average over the points on the lamps' discs, each of which has `width` columns, (width,)."""
     total = np.zeros(width)
     for parts in found:
         total += np.concatenate([part.numpy() for part in parts])
@@ -110,7 +110,7 @@ def _mean(found: Sequence[Sequence[mi.Float]], width: int) -> Floats:
 
 @recorded
 def gather_light(frame: Frame, panels: Lights, field: RadiosityField, tables: PatchTables, lanes: Lanes) -> Gathered:
-    """Find the light that the patches of a frame receive straight from all lamps, and what they see of each other."""
+    """Compute the direct light of all lamps on the patches of a frame, and trace the rays between the patches."""
     # Shadows of panels are found with rays alone.
     of_panels = replace(frame, lights=panels, caches=Caches(ambience=frame.caches.ambience))
     direct = [_onto_outer(frame, tables, first, lanes.outside) for first in tables.outer_spots]
@@ -131,7 +131,7 @@ def gather_light(frame: Frame, panels: Lights, field: RadiosityField, tables: Pa
 
 
 def _ambient(frame: Frame, tables: PatchTables, count: int) -> tuple[mi.Float, mi.Float]:
-    """Compute the irradiance of the patches outside the eye from the soft and the hard part of the ambient light."""
+    """Compute the irradiance of the outside patches from the soft and the hard part of the ambient light."""
     n = gather_rows(tables.outer, 6, dr.arange(mi.UInt32, count))
     soft, hard = frame.caches.ambience.soft_and_hard(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
     dr.eval(soft, hard)
@@ -139,9 +139,9 @@ def _ambient(frame: Frame, tables: PatchTables, count: int) -> tuple[mi.Float, m
 
 
 def _onto_outer(frame: Frame, tables: PatchTables, first: mi.UInt32 | None, count: int) -> tuple[mi.Float, mi.Float]:
-    """Compute the irradiance of the patches outside the eye from lamps, with and without shadows; `count` lanes.
+    """Compute the irradiance of the outside patches from lamps, with and without shadows; `count` lanes.
 
-    Points on the lamps' discs begin with the number `first`; without it these are their middles.
+    Points on the lamps' discs are numbered from `first`; without it, they are the middles.
     """
     index = dr.arange(mi.UInt32, count)
     n = gather_rows(tables.outer, 6, index)
@@ -156,7 +156,7 @@ def _onto_outer(frame: Frame, tables: PatchTables, first: mi.UInt32 | None, coun
 
 
 def _off_cornea(frame: Frame, rows: mi.Float, first: mi.UInt32, count: int) -> mi.Float:
-    """Irradiance of patches from lamps by way of the cornea; points on their discs begin with the number `first`."""
+    """Compute the irradiance of patches from lamps mirrored by the cornea; disc points are numbered from `first`."""
     index = dr.arange(mi.UInt32, count)
     n = gather_rows(rows, 6, index)
     normal = mi.Vector3f(*n[3:])
@@ -167,7 +167,7 @@ def _off_cornea(frame: Frame, rows: mi.Float, first: mi.UInt32, count: int) -> m
 
 
 def _inside(frame: Frame, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
-    """Find the irradiance of the chamber's patches from lamps; points on their discs begin with the number `first`."""
+    """Compute the irradiance of the chamber's patches from lamps; disc points are numbered from `first`."""
 
     def of(begin: int, end: int, inner: bool) -> mi.Float:
         index = dr.arange(mi.UInt32, end - begin)
@@ -185,7 +185,7 @@ def _inside(frame: Frame, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
 
 @syntax
 def _bare_at_hits(lights: Lights, hits: RayHits) -> mi.Float:
-    """Irradiance straight from the lamps at points of the skin that rays meet if nothing stood in the way, else -1."""
+    """Compute the unshadowed irradiance from the lamps at points of the skin that rays hit, else -1."""
     on_skin, x, normal = hits.on_skin, hits.point, hits.normal
     u, v = sequence(dr.arange(mi.UInt32, dr.width(x)) * mi.UInt32(SHUFFLED))
     sine, cosine = dr.sincos(v * (2 * dr.pi))
@@ -201,10 +201,10 @@ def _bare_at_hits(lights: Lights, hits: RayHits) -> mi.Float:
 
 @syntax
 def _at_hits(frame: Frame, hits: RayHits, tables: PatchTables, count: int) -> mi.Float:
-    """Irradiance straight from the lamps at points of the skin that rays of globe and chamber have met, else -1.
+    """Compute the irradiance from the lamps at points of the skin hit by rays of globe and chamber, else -1.
 
-    What eye and lids send to each other in the narrow space between them comes from points close by, where the light
-    changes within a fraction of the distance of the patches.
+    In the narrow space between eye and lids, light comes from points close by and varies over a fraction of the
+    distance between patches.
     """
     index = dr.arange(mi.UInt32, count)
     globe = tables.on_globe * RAYS

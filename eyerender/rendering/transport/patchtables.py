@@ -1,4 +1,4 @@
-"""The patches of a frame on the device, and the numbers of lanes of the kernels that read them."""
+"""Patches of a frame on the device, and the numbers of lanes of the kernels that read them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _ALPHA = (0.7548776662466927, 0.5698402909980532)
 
 
 def sequence(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Compute the points i of a sequence that fills [0, 1)^2 evenly."""
+    """Return points i of a sequence that fills [0, 1)^2 evenly."""
     u, v = ((mi.Float((i * mi.UInt32(round(a * 2**32))) >> 8) * 2.0**-24) for a in _ALPHA)
     return u, v
 
 
 def gather_rows(buffer: mi.Float, width: int, i: mi.UInt32, active: mi.Bool | bool = True) -> list[mi.Float]:
-    """Gather rows i of a table with the given number of columns."""
+    """Read rows i of a table with `width` columns."""
     return [dr.gather(mi.Float, buffer, i * width + k, active) for k in range(width)]
 
 
@@ -35,21 +35,21 @@ class PatchTables:
     """The patches of a frame on the device.
 
     Attributes:
-        outer: points and normals of those outside the eye (scene's frame).
-        inside: those of the chamber, as in `Interior`.
-        near_cornea: patches on skin to which the cornea mirrors lamps, and some more; None for none.
+        outer: points and normals of patches outside the eye (scene's frame).
+        inside: points and normals of patches of the chamber, as in `Interior`.
+        near_cornea: patches on skin onto which the cornea mirrors lamps, padded; None for none.
         leaving: rays that leave the eye.
         of_patch: the patch of each ray outside the eye.
-        stands_for: the patches that stand for both sides of each vertex.
+        stands_for: the patches that represent both sides of each vertex.
         on_globe: number of patches on the globe.
         on_skin: number of patches on skin.
         before_limbus: number of patches outside the eye that are not on the limbus.
         outside: number of patches outside the eye.
         rays_outside: number of their rays.
         rays: number of all rays.
-        outer_spots: numbers with which the points on the lamps' discs begin, for patches outside the eye.
-        mirrored_spots: the same for those near the cornea.
-        inside_spots: the same for those in the chamber.
+        outer_spots: first numbers of the points on the lamps' discs, for patches outside the eye.
+        mirrored_spots: the same for patches near the cornea.
+        inside_spots: the same for patches of the chamber.
     """
 
     outer: mi.Float
@@ -70,7 +70,7 @@ class PatchTables:
 
     @classmethod
     def upload(cls, patches: FramePatches, lamps: LampTable, lanes: Lanes) -> PatchTables:
-        """Send the patches of a frame to the device."""
+        """Copy the patches of a frame to the device."""
         plan, interior, near = patches.plan, patches.interior, patches.near_cornea
         rows = None
         if lanes.near_cornea:
@@ -97,10 +97,10 @@ class Lanes:
     """Numbers of lanes of a frame's kernels, rounded up so that recordings serve many frames.
 
     Attributes:
-        outside: for patches outside the eye.
-        near_cornea: for those to which the cornea mirrors lamps.
-        rays: for rays.
-        at_hits: number of rays that look for the light at the very point of the skin that they meet.
+        outside: lanes for patches outside the eye.
+        near_cornea: lanes for patches onto which the cornea mirrors lamps.
+        rays: lanes for rays.
+        at_hits: lanes for rays that compute the light at the point of the skin that they hit.
         lamps: whether there are lamps.
         panels: whether there are parts of panels or bright parts of a map.
     """

@@ -1,4 +1,4 @@
-"""A grid of numbers with its reductions by 2, 4, ..., for reading means over areas of many cells (a mip map)."""
+"""A grid with its reductions by 2, 4, ... (a mip map), for means over areas of many cells."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-LEVELS = 5  # each half as fine as the one before
+LEVELS = 5  # largest number of levels, each half as fine as the one before
 
 
 @dataclass(kw_only=True)
@@ -17,8 +17,8 @@ class Pyramid:
     Attributes:
         rows: number of rows of the finest grid.
         columns: number of its columns.
-        closed: whether the columns close.
-        cells: for each cell of all levels its own number, and those to the right, below, and below to the right.
+        closed: whether the columns form a closed ring.
+        cells: for each cell of all levels, its own value and those to the right, below, and below right.
     """
 
     rows: mi.UInt32
@@ -28,7 +28,7 @@ class Pyramid:
 
     @classmethod
     def build(cls, values: mi.Float, rows: mi.UInt32, columns: mi.UInt32, *, closed: bool) -> Pyramid:
-        """Reduce a grid whose numbers are given row by row."""
+        """Build the reductions of a grid whose values are given row by row."""
         dr.eval(values)
         counts = [dr.width(values) >> 2 * level for level in range(LEVELS)]
         pyramid = cls(rows=rows, columns=columns, closed=closed, cells=dr.zeros(mi.Float, 4 * sum(counts)))
@@ -51,11 +51,11 @@ class Pyramid:
         return pyramid
 
     def _first(self, cells: mi.UInt32) -> mi.UInt32:
-        """Compute the number of the first cell of the level with this number of cells."""
+        """Return the index of the first cell of the level with this number of cells."""
         return (self.rows * self.columns - cells) // 3 * 4
 
     def at(self, row: mi.Float, column: mi.Float, level: mi.UInt32) -> mi.Float:
-        """List numbers of a level at places in units of the finest cells, whose middles are at integers."""
+        """Interpolate a level at positions in units of the finest cells, whose centres are at integers."""
         scale = dr.rcp(mi.Float(mi.UInt32(1) << level))
         rows, columns = self.rows >> level, self.columns >> level
         first = self._first(rows * columns)
@@ -73,5 +73,5 @@ class Pyramid:
 
 
 def level_of(size_mm: mi.Float, cell_mm: mi.Float) -> mi.UInt32:
-    """Compute the level whose cells are about so large, where the finest have `cell_mm`."""
+    """Return the level whose cells are about `size_mm`, given the finest cells of `cell_mm`."""
     return mi.UInt32(dr.clip(dr.log2(dr.maximum(size_mm / cell_mm, 1)) + 0.5, 0, LEVELS - 1))

@@ -1,13 +1,13 @@
-"""Radiosity: light that surfaces send to each other, of globe, lids, face or background, and the iris in its chamber.
+"""Radiosity: interreflection of globe, lids, face or background, and of the iris in its chamber.
 
-It varies slowly, so its irradiance is computed at some hundred patches per pose, and pixels interpolate between them.
-With the albedo rho_j of patch j and the form factors F_ij, the irradiance is
+Interreflected light varies slowly, so it is computed at some hundred patches per pose, and pixels interpolate. With the
+albedo rho_j of patch j and the form factors F_ij, the irradiance is
 
     E_i = E0_i + sum_j rho_j F_ij E_j        (so that the radiosity B = rho E obeys B_i = rho_i (E0_i + sum_j F_ij B_j))
 
 where a patch sends the radiance B_j / pi. `patches` and `framepatches` choose the patches, `patchlight` gathers E0,
 `formfactors` traces the rays between patches, `chamber` holds the form factors behind the cornea, and `radiosityfield`
-is what kernels look up. The equations are solved by iteration, so every number of reflections is included.
+is the lookup for kernels. The equations are solved by iteration, so all orders of reflection are included.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _UNLIT = (0.0, 1.0, 0.0, 0.0)  # numbers of a patch without interreflection, as 
 
 
 class RadiositySolver:
-    """Computes the radiosity field of a frame; keeps what does not change between frames of a subject."""
+    """Solver of the radiosity of a frame; caches what does not change between frames of a subject."""
 
     def __init__(self) -> None:
         self._patches = Patches()
@@ -45,7 +45,7 @@ class RadiositySolver:
         self, frame: Frame, job: RenderJob, lamps: LampTable, panels: LampTable, globe: GlobePatches,
         place: Background | RegionScene,
     ) -> PendingField:  # fmt: skip
-        """Begin to gather the direct light on the patches of a frame, and the form factors between them.
+        """Start computing the direct light on the patches of a frame, and the form factors between them.
 
         Args:
             frame: the frame, with the region and the ambient light.
@@ -68,7 +68,7 @@ class RadiositySolver:
 
 @dataclass(slots=True, kw_only=True)
 class PendingField:
-    """A radiosity field that is still dark: the device may be at work until `read`, and may work on during `solve`."""
+    """A radiosity field without light yet: the device may be busy until `read`, and may work on during `solve`."""
 
     region: RegionScene | None
     patches: FramePatches
@@ -77,11 +77,11 @@ class PendingField:
     gathered: Gathered | None
 
     def read(self) -> PatchLight | None:
-        """Read what the device has gathered; None without light between surfaces and from surroundings."""
+        """Copy the device's results; None if there is neither interreflection nor light from surroundings."""
         return None if self.gathered is None else self.gathered.read(self.patches, self.lanes)
 
     def solve(self, light: PatchLight | None) -> RadiosityField:
-        """Solve for all light, on the host, and set what the skin receives."""
+        """Solve for all light on the host, and set the light that the skin receives."""
         patches, region = self.patches, self.region
         if light is None:
             count = len(patches.points) if region is None else len(region.posed.vertices)
@@ -109,7 +109,7 @@ class PendingField:
 
 @dataclass(frozen=True, slots=True)
 class _Ambient:
-    """Irradiance of all patches from the soft part of the ambient light, and of the outer ones from all of it."""
+    """Irradiance of all patches from the soft part of the ambient light, and of the outside ones from all of it."""
 
     sky: Floats
     arriving: Floats
@@ -117,7 +117,7 @@ class _Ambient:
 
 @dataclass(frozen=True, slots=True)
 class _Solution:
-    """Irradiance of all patches (`total`), its parts from others by rays (`gathered`) and within the chamber."""
+    """Irradiance of all patches (`total`), and its parts from others by rays (`gathered`) and within the chamber."""
 
     total: Floats
     gathered: Floats
@@ -127,7 +127,7 @@ class _Solution:
 def _ambient(patches: FramePatches, light: PatchLight) -> _Ambient:
     """Compute the ambient light that arrives at the patches.
 
-    Rays between patches give the visible share of its soft part, and shadow rays that of the rest.
+    Rays between patches determine the visible share of the soft part, shadow rays that of the rest.
     """
     rays, outside = light.rays, patches.outside
     arriving = light.hard * share_of(light.hard_lit, light.hard_free)
@@ -156,7 +156,7 @@ def _solve(patches: FramePatches, light: PatchLight, ambient: _Ambient, valid: B
 
 
 def _stand_in(patches: FramePatches, valid: Bools) -> Ints:
-    """Compute the patch that is used for each patch: itself, or the nearest one on the globe that is not covered."""
+    """Return the patch used for each patch: itself, or the nearest uncovered one on the globe."""
     out, points = np.arange(patches.outside + PATCHES), patches.globe.points
     if np.any(valid) and not np.all(valid):
         nearest = cKDTree(points[valid]).query(points[~valid])[1]
@@ -167,7 +167,7 @@ def _stand_in(patches: FramePatches, valid: Bools) -> Ints:
 def _outer_tables(
     patches: FramePatches, light: PatchLight, ambient: _Ambient, solution: _Solution, valid: Bools
 ) -> tuple[Floats, Floats]:
-    """Tables of the globe and of patches off the eye: light from others, of the sky, all light, and the whole sky."""
+    """Assemble tables of globe and background: light from others, from the sky, in total, and of the whole sky."""
     job, outside = patches.job, patches.outside
     in_region = patches.plan.skin is not None
     table = np.zeros((outside, 4))
@@ -176,14 +176,14 @@ def _outer_tables(
     table[:, 2] = solution.total[:outside] if job.interreflection else 0
     if not in_region:
         table[patches.on_globe :, 2] *= job.look.backdrop_albedo
-    # Between lids the light changes fast from lid to lid, so it is averaged along them only.
+    # Between lids the light varies fast from lid to lid, so it is averaged only along them.
     across = (1.0, 0.0 if in_region else 1.0)
     globe = fill_gaps(table[: patches.on_globe], valid, patches.globe.rows, patches.globe.columns, across)
     return globe, table[patches.on_globe : outside - IRIS_TURNS]
 
 
 def _smooth_on_iris(patches: FramePatches, values: Floats, along: float) -> Floats:
-    """Values of the patches in the plane of the iris, filled where it is outside the chamber and smooth in turn."""
+    """Fill and smooth the patches' values in the plane of the iris: outside the chamber and along the turns."""
     known = patches.interior.chamber.valid[:IRIS]
     grids = (values[:IRIS].reshape(IRIS_RINGS, IRIS_TURNS), known.reshape(IRIS_RINGS, IRIS_TURNS))
     closed = [np.concatenate([g[:, -2:], g, g[:, :2]], axis=1).ravel() for g in grids]

@@ -1,4 +1,4 @@
-"""The radiosity field: what the patches receive, as kernels look it up between them."""
+"""The radiosity field: light received by the patches, interpolated for kernels."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from .patches import (
 
 @dataclass(kw_only=True)
 class RadiosityField:
-    """Irradiance of surfaces by way of other surfaces, and the share of open sky.
+    """Irradiance of surfaces from other surfaces, and the visible share of the sky.
 
-    The patches of globe and background have four numbers each: irradiance from other surfaces, share of the sky that is
-    open, whole irradiance (what a mirror image of the patch shows), and 0. Without interreflection all of it is dark
-    and open. The numbers of the skin are stored at its vertices (`SkinGeometry.received`).
+    Patches of globe and background have four numbers each: irradiance from other surfaces, visible share of the sky,
+    total irradiance (for mirror images of the patch), and 0. Without interreflection, surfaces give no light and the
+    whole sky is visible. The numbers of the skin are stored at its vertices (`SkinGeometry.received`).
 
     Attributes:
-        on: whether surfaces send light to each other.
+        on: whether there is interreflection.
         between: whether the grid of patches on the globe lies between lids.
-        columns: of that grid.
-        rows: of that grid.
-        centre: of the globe (scene's frame, mm).
+        columns: columns of that grid.
+        rows: rows of that grid.
+        centre: centre of the globe (scene's frame, mm).
         first: y (mm) of the first column between lids.
         per_mm: columns per mm.
         ends: lower and upper end of each column (mm).
         root2: squared radius of the root of the iris, mm^2.
         reach2: squared reach of the chamber, mm^2.
-        plane: y and z of the middle of the background's rings, and the radius of the first (mm).
+        plane: y and z of the centre of the background's rings, and the radius of the first (mm).
         globe: four numbers for each patch of the globe.
         background: four numbers for each patch of the background's plane.
         iris: one number for each patch of the iris.
@@ -67,10 +67,10 @@ class RadiosityField:
 
     @classmethod
     def dark(cls, on: bool, chamber: Chamber, globe: GlobePatches, plane: tuple[float, float, float]) -> RadiosityField:
-        """Send the patches to the device; they receive nothing.
+        """Copy the patches to the device, without any light.
 
         Args:
-            on: whether surfaces send light to each other.
+            on: whether there is interreflection.
             chamber: the chamber of the eye.
             globe: the patches of the globe.
             plane: as the attribute.
@@ -89,12 +89,12 @@ class RadiosityField:
         return replace(self, globe=upload_array(globe), background=upload_array(background), iris=upload_array(iris))
 
     def at_globe(self, x: mi.Vector3f) -> mi.Vector4f:
-        """List numbers of points of the globe, given in the scene's frame."""
-        beyond = 0.5 if self.between else 0.0  # the last rows are half a row from the lids, where light changes fast
+        """Interpolate the patches' numbers at points of the globe, given in the scene's frame."""
+        beyond = 0.5 if self.between else 0.0  # the last rows are half a row from the lids, where light varies fast
         return _bilinear(self.globe, *self.globe_place(x), self.columns, self.rows, beyond)
 
     def globe_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Compute the column and row of points of the globe in the grid of its patches."""
+        """Compute column and row, in the patch grid, of points of the globe."""
         if self.between:
             column = dr.clip((x.y - self.first) * self.per_mm, 0, GLOBE_COLUMNS - 1)
             i = mi.UInt32(dr.minimum(column, GLOBE_COLUMNS - 1.001))
@@ -109,11 +109,11 @@ class RadiosityField:
         return middle * (1 + polar * r.y * inv), middle * (1 + polar * r.z * inv)
 
     def at_iris(self, x: mi.Vector3f) -> mi.Float:
-        """Irradiance of points in the plane of the iris (eye frame), without the light straight from the lamps."""
+        """Interpolate the indirect irradiance at points in the plane of the iris (eye frame)."""
         return _around(self.iris, *self.iris_place(x), IRIS_RINGS, IRIS_TURNS, mi.Float)
 
     def iris_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Compute the ring and turn of points in the plane of the iris among the patches of the chamber."""
+        """Compute ring and turn, among the chamber's patches, of points in the plane of the iris."""
         turn = dr.atan2(x.z, x.y) * (IRIS_TURNS * 0.5 * dr.inv_pi) - 0.5
         r2 = x.y * x.y + x.z * x.z
         beyond = dr.maximum(r2 - self.root2, 0) * ((IRIS_RINGS - ROOT_RINGS) / (self.reach2 - self.root2))
@@ -121,11 +121,11 @@ class RadiosityField:
         return ring, dr.select(turn < 0, turn + IRIS_TURNS, turn)
 
     def at_background(self, x: mi.Vector3f) -> mi.Vector4f:
-        """List numbers of points of the background's plane, given in the scene's frame."""
+        """Interpolate the patches' numbers at points of the background's plane, given in the scene's frame."""
         return _around(self.background, *self.background_place(x), RINGS, TURNS, mi.Vector4f)
 
     def background_place(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Compute the ring and turn of points of the background's plane among its patches."""
+        """Compute ring and turn, among its patches, of points of the background's plane."""
         y, z, inner = self.plane
         dy, dz = x.y - y, x.z - z
         out = dr.maximum(dr.sqrt(dy * dy + dz * dz) - inner, 0) / PLANE_FIRST_MM
@@ -135,7 +135,7 @@ class RadiosityField:
 
 
 def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, rows: int, beyond: float) -> mi.Vector4f:
-    """Interpolate between columns and rows, and extrapolate by a number of rows beyond the last ones."""
+    """Interpolate bilinearly between columns and rows; extrapolate by up to `beyond` rows."""
     column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, -beyond, rows - 1.001 + beyond)
     i, j = mi.UInt32(column), mi.UInt32(dr.clip(row, 0, rows - 1.001))
     s, t = column - mi.Float(i), row - mi.Float(j)
@@ -146,7 +146,7 @@ def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, r
 
 
 def _around(buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any) -> Any:
-    """Interpolate between rings and turns; the turns close."""
+    """Interpolate between rings and turns; the turns form a closed ring."""
     ring, turn = dr.clip(ring, 0, rings - 1.001), dr.clip(turn, 0, turns - 0.001)
     i, j = mi.UInt32(ring), mi.UInt32(turn)
     s, t = ring - mi.Float(i), turn - mi.Float(j)

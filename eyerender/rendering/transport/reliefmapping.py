@@ -1,17 +1,17 @@
-"""The relief of the iris: heights above its plane, parallax of camera rays, and the lamps' light on its slopes.
+"""Relief mapping of the iris: heights above its plane, parallax of camera rays, and lamp light on its slopes.
 
 The height h(y, z) above the plane of the stop is that of the pattern (`region.iris`), which stretches with the iris
-when the pupil changes, and of a gentle convexity. It is 0 at the pupil's margin and at the root, so outlines and labels
-are those of the plane. Once per frame it is put on a square grid. A ray meets it where X(z) = X(0) + z t, with t its
-lateral motion per mm of height, has the height z = h(X(z)); fixed-point steps find the place.
+when the pupil changes, and of a gentle convexity. The height is 0 at the pupil's margin and at the root, so outlines
+and labels are those of the plane. It is sampled once per frame on a square grid. With t the lateral motion of a ray per
+mm of height, X(z) = X(0) + z t, the ray meets the relief at z = h(X(z)), which is solved by fixed-point iteration.
 
 The irradiance of a slope is that of the plane times
 
     q = sum_l (E_l + h E'_l) V_l max(0, 1 - t_l . grad h) / (sqrt(1 + |grad h|^2) sum_l E_l)
 
 with E_l the lamp's irradiance of the plane, E'_l its change per mm of height (light converges behind the cornea), t_l
-the lamp's direction there as lateral motion per mm of height, and V_l whether it is seen over the heights beside. E_l,
-E'_l and t_l change slowly and are computed on a coarse grid.
+the lamp's direction there as lateral motion per mm of height, and V_l its visibility over the surrounding heights. E_l,
+E'_l and t_l vary slowly and are computed on a coarse grid.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from .directlight import LampPath, behind
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
 _CELL_PX, _LEAST, _MOST = 0.6, 320, 448  # size of a cell in the picture, cells across: fewer would flatten slopes
-_STEP = 16  # in the number of cells across: a new number has Dr.Jit record anew
-_STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for what stands before a lamp
+_STEP = 16  # the number of cells across is a multiple of this, because Dr.Jit records anew for each number
+_STEPS, _REACH_MM, _SOFT = 8, 0.32, 0.2  # of the search for occluders of a lamp: steps, reach, and softness
 _BLOCK, _SLANT = 4, 0.6  # cells of a block across; lateral motion per mm of light that is not very slanting
 _FIXED_POINT_STEPS = 4
 _SPARE_MM, _RAISED_MM = 0.1, 0.2
@@ -45,12 +45,12 @@ class ReliefShape:
     """The heights of an iris on a grid, which do not depend on the pose.
 
     Attributes:
-        heights: of the cells, mm.
+        heights: heights of the cells, mm.
         corners: the heights of the four corners of every cell, side by side.
-        slopes: of the cells along the grid's rows and columns.
+        slopes: slopes of the cells along the grid's rows and columns.
         steepest: largest slope.
         highest: largest height, mm.
-        near: largest height about each block of cells, as far as light comes from that is not very slanting, mm.
+        near: largest height around each block of cells, as far as all but very slanting light comes from, mm.
     """
 
     heights: mi.Float
@@ -76,18 +76,18 @@ class ReliefGrid:
     count: mi.UInt32
 
     def nodes(self, number: int) -> tuple[mi.UInt32, mi.UInt32]:
-        """List the columns and rows of all nodes, row by row."""
+        """Return the columns and rows of all nodes, row by row."""
         index = dr.arange(mi.UInt32, number)
         row = index // self.count
         return index - row * self.count, row
 
     def point(self, column: mi.Float, row: mi.Float) -> mi.Vector3f:
-        """Compute the point of the plane (eye frame) at a place of the grid."""
+        """Return the point of the plane (eye frame) at a column and row of the grid."""
         per = 2 * self.half / mi.Float(self.count - 1)
         return self.stop.centre + (column * per - self.half) * self.stop.u + (row * per - self.half) * self.stop.v
 
     def cell(self, x: mi.Vector3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float]:
-        """Compute the column and row of the cell of a point of the plane, and the place in it."""
+        """Return the column and row of the cell of a point of the plane, and the position in it."""
         q, most = x - self.stop.centre, mi.Float(self.count) - 1.001
         scale = 0.5 * mi.Float(self.count - 1) / self.half
         u, v = (dr.clip((dr.dot(q, axis) + self.half) * scale, 0, most) for axis in (self.stop.u, self.stop.v))
@@ -95,13 +95,13 @@ class ReliefGrid:
         return i, j, u - mi.Float(i), v - mi.Float(j)
 
     def interpolate(self, corners: mi.Float, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Interpolate what `corners_of` returned at points of the plane."""
+        """Interpolate the result of `corners_of` at points of the plane."""
         i, j, s, t = self.cell(x)
         c = dr.gather(mi.Vector4f, corners, j * self.count + i, active)
         return dr.lerp(dr.lerp(c.x, c.y, s), dr.lerp(c.z, c.w, s), t)
 
     def corners_of(self, values: mi.Float, column: mi.UInt32, row: mi.UInt32) -> mi.Float:
-        """Put the values at the four corners of every cell side by side."""
+        """Arrange the values at the four corners of every cell side by side."""
         last = self.count - 1
         right, below = dr.minimum(column + 1, last), dr.minimum(row + 1, last)
         places = [j * self.count + i for i, j in ((column, row), (right, row), (column, below), (right, below))]
@@ -112,13 +112,13 @@ class ReliefGrid:
 
 @dataclass(kw_only=True)
 class IrisRelief:
-    """Height of the iris above its plane and the lamps' light on it, on a grid over the plane.
+    """Height of the iris above its plane, and lamp light on it, on a grid over the plane.
 
     Attributes:
         count: number of nodes along a side of the grid.
         raised: whether the iris has any heights.
-        heights: at the corners of the cells, mm.
-        shades: there, the q of the module's docstring.
+        heights: heights at the corners of the cells, mm.
+        shades: the q of the module's docstring at the corners.
     """
 
     count: mi.UInt32
@@ -130,13 +130,13 @@ class IrisRelief:
     def build(
         cls, frame: Frame, shape: ReliefShape | None, side: mi.UInt32, each: mi.UInt32, size: tuple[int, int]
     ) -> IrisRelief:
-        """Compute the lamps' light on the heights of an iris.
+        """Compute the lamp light on the heights of an iris.
 
         Args:
             frame: the frame.
             shape: the heights; None for a flat iris.
             side: number of nodes along a side.
-            each: number of points that stand for a lamp.
+            each: number of points that represent a lamp.
             size: numbers of nodes, and of points of lamps.
         """
         if shape is None:
@@ -153,13 +153,13 @@ class IrisRelief:
         return cls(count=side, raised=dr.opaque(mi.Bool, True), heights=shape.corners, shades=shades)
 
     def hit(self, frame: Frame, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-        """Compute the foot in the plane (eye frame) of the place that rays meet.
+        """Compute where rays meet the relief, as the foot of that point in the plane (eye frame).
 
         Args:
             frame: the frame.
-            x: where they would meet the plane.
+            x: points where the rays would meet the plane.
             slant: their lateral motion per mm of height above it.
-            active: the lanes that matter.
+            active: active lanes.
         """
         active &= self.raised
         grid, z = relief_grid(frame, self.count), mi.Float(0)
@@ -174,7 +174,7 @@ class IrisRelief:
 
 
 class ReliefSize(NamedTuple):
-    """Numbers of a grid for a job, on the host: nodes along a side, blocks along a side, and blocks near a block."""
+    """Grid sizes of a job, on the host: nodes per side, blocks per side, and blocks near a block."""
 
     side: int
     blocks: int
@@ -182,7 +182,7 @@ class ReliefSize(NamedTuple):
 
     @classmethod
     def of(cls, job: RenderJob) -> ReliefSize:
-        """Choose them by the size of the iris in the picture."""
+        """Choose the grid sizes by the size of the iris in the image."""
         half_mm = float(np.float32(job.eye.iris_root_radius_mm) + np.float32(_SPARE_MM))
         across = 2 * half_mm * float(job.camera.scale_at(job.t)) / _CELL_PX
         side = int(min(max(_STEP * np.ceil(across / _STEP), _LEAST), _MOST))
@@ -190,7 +190,7 @@ class ReliefSize(NamedTuple):
 
 
 def relief_grid(frame: Frame, count: mi.UInt32) -> ReliefGrid:
-    """Make the grid over the iris with the given number of nodes along a side."""
+    """Create the grid over the iris with the given number of nodes along a side."""
     return ReliefGrid(stop=frame.stop, half=frame.iris.root_radius + _SPARE_MM, count=count)
 
 
@@ -205,7 +205,7 @@ def relief_shape(
         pattern: the map of heights.
         side: number of nodes along a side, on the device.
         about: number of blocks on each side that are near a block, on the device.
-        size: the same numbers on the host, of which only sizes of arrays depend.
+        size: the same numbers on the host, for the sizes of arrays only.
     """
     grid = relief_grid(frame, side)
     column, row = grid.nodes(size.side**2)
@@ -233,9 +233,9 @@ def relief_shape(
 
 @syntax
 def _highest_nearby(heights: mi.Float, side: mi.UInt32, about: mi.UInt32, blocks: int) -> mi.Float:
-    """Compute the largest of the heights in and about every block of cells."""
+    """Compute the largest height in and around every block of cells."""
     index, last = dr.arange(mi.UInt32, blocks * blocks), side - 1
-    count = last // _BLOCK + 1  # the same as `blocks`, but no kernel is compiled for it
+    count = last // _BLOCK + 1  # equal to `blocks`, but not compiled into the kernel
     down = index // count
     across = index - down * count
     largest = mi.Float(0)
@@ -255,7 +255,7 @@ def _highest_nearby(heights: mi.Float, side: mi.UInt32, about: mi.UInt32, blocks
 
 
 def _arriving(frame: Frame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi.Float:
-    """E, E t_u, E t_v and E' of points of the lamps at coarse places, in rows."""
+    """Compute E, E t_u, E t_v and E' for points of the lamps at coarse positions, in rows."""
     count = mi.UInt32(_COARSE)
     coarse = ReliefGrid(stop=grid.stop, half=grid.half, count=count)
     index = dr.arange(mi.UInt32, lanes)
@@ -266,7 +266,7 @@ def _arriving(frame: Frame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi
     lamp = frame.lights[spot // each]
     source = lamp.node(spot - (spot // each) * each, each)
     normal = frame.stop.normal
-    # The search for paths to other points is long, and in vain.
+    # To other points the path search is long and fails.
     reached = (frame.lights.count > 0) & behind(frame.surfaces[-1], x)
     path = LampPath.find(frame, lamp, source, x, reached)
     above = LampPath.find(frame, lamp, source, x + _RAISED_MM * normal, reached)
@@ -284,7 +284,7 @@ def _arriving(frame: Frame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi
 def _shades(
     spots: mi.UInt32, rows: mi.Float, shape: ReliefShape, grid: ReliefGrid, column: mi.UInt32, row: mi.UInt32
 ) -> mi.Float:
-    """The q of the module's docstring at nodes of the grid; `rows` as from `_arriving` for so many points of lamps."""
+    """Compute the q of the module's docstring at nodes of the grid; `rows` is the result of `_arriving`."""
     node = row * grid.count + column
     x = grid.point(mi.Float(column), mi.Float(row))
     h, hu, hv = (dr.gather(mi.Float, values, node) for values in (shape.heights, *shape.slopes))
@@ -317,9 +317,9 @@ def _shades(
 def _hidden(
     grid: ReliefGrid, corners: mi.Float, x: mi.Vector3f, h: mi.Float, way: mi.Vector3f, above: mi.Float
 ) -> mi.Float:
-    """Compute the share by which heights beside points hide what lies in the direction `way`, 0 to 1.
+    """Compute the share, 0 to 1, by which nearby heights hide the direction `way` from points.
 
-    above: how much higher than the points these heights are at most, mm.
+    `above` is the largest height (mm) of the neighbourhood above the points.
     """
     k, hidden = mi.UInt32(0), mi.Float(0) * h
     while dr.hint((k < _STEPS) & (_rise(k) < above), label="shadows of the relief", exclude=[grid, corners]):
@@ -339,7 +339,7 @@ def _rise(k: mi.UInt32) -> mi.Float:
 def _arrival(
     surfaces: tuple[Surface, ...], source: mi.Vector3f, entry: mi.Vector3f, normal: mi.Vector3f
 ) -> mi.Vector3f:
-    """Direction to a lamp behind the surfaces, as lateral motion per mm along `normal`, of light from `entry`."""
+    """Compute the direction of light that arrives from `entry`, as lateral motion per mm along `normal`."""
     w = dr.normalize(entry - source)
     x = entry - w
     for surface in surfaces:

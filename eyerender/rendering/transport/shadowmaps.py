@@ -1,13 +1,13 @@
-"""Shadow maps of an eye region: where a lamp's light is certain to reach the skin, so that no ray is needed.
+"""Shadow maps of an eye region: where a lamp certainly reaches the skin, so that no shadow ray is needed.
 
 The map of every lamp holds the directions from its middle in stereographic projection, divided into cells. A cell is
-marked if it may show a hair, an end of the sheet of skin, or a triangle of the sheet that turns its back to any point
+marked if it may contain a hair, an end of the sheet of skin, or a triangle of the sheet that faces away from any point
 of the lamp. A ray through a cell without marks meets the sheet from its front only. The crossings from the front, less
 those from the back, are at most one, because the sheet is one surface with a hole (see `pixels`). So a point of the
 sheet in such a cell is the only one there, and the lamp lights it.
 
-A lamp of radius r is more than its middle. Seen from another of its points, an occluder at the distance a shifts
-against a receiver at the distance b by r (1 / a - 1 / b) at most. The marks are as much wider.
+Seen from another point of a lamp of radius r, an occluder at distance a shifts relative to a receiver at distance b by
+at most r (1 / a - 1 / b). The marks are enlarged by this amount.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from ..records.frame import quotient, upload_array
 from ..records.recording import recorded, syntax
 from ..scene.region import RegionScene, SkinGeometry
 
-_CELLS = 256  # along each side of a map
+_CELLS = 256  # cells along each side of a map
 _WIDTH = 16  # numbers of a lamp
-_REACH_MM = 72.0  # of the sheet about the apex of the eye
-_HAIR_MM = 0.06  # half the thickness of hairs at most, with some to spare
+_REACH_MM = 72.0  # radius of the sheet about the apex of the eye
+_HAIR_MM = 0.06  # half the thickness of hairs, with a margin
 _LARGEST = 0.85  # half the width of a map: tan of half the angle to the axis
 
 
 @dataclass(kw_only=True)
 class ShadowMaps:
-    """The maps of all lamps for one pose of a region, on the device.
+    """Shadow maps of all lamps for one pose of a region, on the device.
 
     Attributes:
         table: numbers of the lamps' views (see `shadow_map_table`).
-        known: whether the sheet is known to be one surface; else every cell counts as marked.
-        marks: 1 for the marked cells of each map, else 0.
+        known: whether the sheet is known to be one surface; otherwise every cell counts as marked.
+        marks: 1 for marked cells of each map, else 0.
     """
 
     table: mi.Float
@@ -51,7 +51,7 @@ class ShadowMaps:
 
     @classmethod
     def build(cls, region: RegionScene, table: Singles) -> ShadowMaps:
-        """Draw the maps of lamps before a posed region; `table` as from `shadow_map_table`."""
+        """Draw the shadow maps of a posed region; `table` as from `shadow_map_table`."""
         # Without lamps nothing reads the table, but kernels cannot be compiled for an empty one.
         views = upload_array(table if len(table) else np.zeros(_WIDTH))
         skin, known = region.skin, dr.opaque(mi.Bool, region.skin.is_sheet)
@@ -64,7 +64,7 @@ class ShadowMaps:
         return cls(table=views, known=known, marks=_marked(views, skin, hairs, on_device, counts, len(table)))
 
     def at(self, lamp: mi.UInt32, x: mi.Vector3f, active: mi.Bool) -> mi.Bool:
-        """Whether nothing of the region stands between points of the sheet (scene's frame) and any point of a lamp."""
+        """Return whether the region leaves points of the sheet (scene's frame) in view of every point of a lamp."""
         place = _View.of(self.table, lamp).place(x)
         u, v = place.u, place.v
         inside = active & self.known & (u >= 0) & (v >= 0) & (u < _CELLS) & (v < _CELLS)
@@ -77,9 +77,9 @@ def _marked(
     table: mi.Float, skin: SkinGeometry, hairs: mi.Float, on_device: tuple[mi.UInt32, mi.UInt32],
     counts: tuple[int, int], lamps: int,
 ) -> mi.UInt8:  # fmt: skip
-    """Return the marks of all lamps, from triangles of the sheet and from pieces of hairs.
+    """Compute the marks of all lamps, from triangles of the sheet and from pieces of hairs.
 
-    Their `counts` are on the device, too, else they would be compiled into the kernels.
+    Their `counts` are passed on the device too, otherwise they would be compiled into the kernels.
     """
     marks = dr.zeros(mi.UInt8, max(lamps, 1) * _CELLS * _CELLS)
     for count, number, mark in zip(counts, on_device, (_mark_triangles, _mark_hairs), strict=True):
@@ -93,7 +93,7 @@ def _marked(
 def _mark_triangles(
     marks: mi.UInt8, lamp: mi.UInt32, view: _View, index: mi.UInt32, skin: SkinGeometry, _: mi.Float
 ) -> None:
-    """Mark the cells that triangles of the sheet may cover, where they can shade."""
+    """Mark the cells that triangles of the sheet may cover, if they can cast shadows."""
     a, b, c, special = skin.corners(index)
     normal = dr.cross(b - a, c - a)
     limit = view.radius * dr.norm(normal)
@@ -109,7 +109,7 @@ def _mark_triangles(
 def _mark_hairs(
     marks: mi.UInt8, lamp: mi.UInt32, view: _View, index: mi.UInt32, _: SkinGeometry, hairs: mi.Float
 ) -> None:
-    """Mark the cells that straight pieces of hairs, two ends of four numbers each, may cover."""
+    """Mark the cells that straight pieces of hairs may cover; each piece is two ends of four numbers."""
     four = [dr.gather(mi.Vector4f, hairs, 2 * index + k) for k in (0, 1)]
     p, q = (view.place(mi.Vector3f(e.x, e.y, e.z)) for e in four)
     thick = _HAIR_MM * dr.maximum(p.per_mm, q.per_mm)
@@ -127,7 +127,7 @@ def _mark(
     scale: mi.Float,
     marked: mi.Bool,
 ) -> None:
-    """Mark the cells within `thick` and the lamp's own size of bodies with these corners, where `marked`."""
+    """Mark the cells within `thick`, plus the lamp's size, of bodies with these corners, where `marked`."""
     corners = [mi.Point2f(p.u, p.v) for p in places]
     lowest, highest = reduce(dr.minimum, corners), reduce(dr.maximum, corners)
     # Straight edges are arcs in a map, of a radius of one unit at least.
@@ -137,7 +137,7 @@ def _mark(
     last = mi.Point2i(dr.clip(dr.floor(highest + slack + thick), -1, _CELLS))
     columns, rows = mi.Point2u(dr.maximum(last - first + 1, 0))
     count = dr.select(marked, columns * rows, 0)
-    # What is thin covers few of the cells about it: those near the longest edge.
+    # A thin triangle covers few of the cells around it: those near the longest edge.
     reach = edge.width + slack + 0.71
     k = mi.UInt32(0)
     while dr.hint(k < count, label="marks", exclude=[marks, edge, places]):
@@ -152,7 +152,7 @@ def _mark(
 
 
 def _pieces(region: RegionMesh) -> Singles:
-    """Compute straight pieces (n, 2, 4) of the hairs of a region, whose ends have a 0 as a fourth number."""
+    """Return straight pieces (n, 2, 4) of the hairs of a region; the fourth number of each end is 0."""
     curves = [c for c in region.strands[:HAIRS] if c.size]
     pieces = np.zeros((sum(c.shape[0] * (c.shape[1] - 1) for c in curves), 2, 4), np.float32)
     first = 0
@@ -165,7 +165,7 @@ def _pieces(region: RegionMesh) -> Singles:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Place of a point in a map: cells across and down, cells by which the lamp's size moves it, cells per mm."""
+    """Position in a map: cells across and down, shift in cells by the lamp's size, cells per mm."""
 
     u: mi.Float
     v: mi.Float
@@ -174,7 +174,7 @@ class _Place:
 
 
 class _View:
-    """One lamp's view: its place, two axes across its axis, the axis, cells per unit, radius, and farthest distance."""
+    """One lamp's projection: position, two axes across its axis, the axis, cells per unit, radius, largest distance."""
 
     def __init__(
         self, origin: mi.Vector3f, e1: mi.Vector3f, e2: mi.Vector3f, axis: mi.Vector3f, *scalars: mi.Float
@@ -184,13 +184,13 @@ class _View:
 
     @classmethod
     def of(cls, table: mi.Float, lamp: mi.UInt32) -> _View:
-        """Read the view of lamps from the table of all."""
+        """Read the projections of lamps from the table."""
         four = [dr.gather(mi.Vector4f, table, lamp * (_WIDTH // 4) + k) for k in range(_WIDTH // 4)]
         row = [n for part in four for n in (part.x, part.y, part.z, part.w)]
         return cls(*(mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9)), *row[12:15])
 
     def place(self, x: mi.Vector3f) -> _Place:
-        """Place of points of the scene's frame. The map keeps angles, so its scale is the same in all directions."""
+        """Project points of the scene's frame. The map is conformal, so its scale is the same in all directions."""
         p = x - self.origin
         distance = dr.norm(p)
         ahead = dr.maximum(dr.dot(p, self._axis) + distance, 1e-3 * distance)
@@ -202,7 +202,7 @@ class _View:
 
 
 class _Edge:
-    """A straight line in a map, like the longest edge of a triangle; `width` is how far the rest is from it."""
+    """A straight line in a map, such as the longest edge of a triangle; `width` is the extent of the rest from it."""
 
     def __init__(self, u: mi.Float, v: mi.Float, du: mi.Float, dv: mi.Float, width: mi.Float) -> None:
         self._u, self._v, self._du, self._dv, self.width = u, v, du, dv, width
@@ -227,7 +227,7 @@ class _Edge:
 
 
 def shadow_map_table(lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float) -> Singles:
-    """List numbers of the views of lamps (lamps, 16), with NumPy alone.
+    """Compute the projections of lamps (lamps, 16) on the host.
 
     Args:
         lights: the lamps.
@@ -239,7 +239,7 @@ def shadow_map_table(lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float)
 
 
 def _frame(lamp: Lamp, anchor_mm: Floats, reach_mm: float) -> list[float]:
-    """List numbers of a lamp's view, in the scene's frame."""
+    """Compute the numbers of a lamp's projection, in the scene's frame."""
     origin = np.asarray(lamp.position_mm - anchor_mm, dtype=float)
     distance = float(np.linalg.norm(origin))
     axis = -origin / distance if distance > 0 else np.array([-1.0, 0.0, 0.0])

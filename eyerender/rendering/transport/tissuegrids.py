@@ -1,8 +1,8 @@
-"""Grids over skin and globe on the device: where their cells are, and interpolation between them.
+"""Grids over skin and globe on the device: positions of their cells, and interpolation between them.
 
-The grid over the skin is fixed to the tissue: its rows run around the opening between the lids, and its columns close.
-The grid over the globe is fixed to the head, in Lambert's equal-area projection. `scene.diffusiongrids` chooses the
-cells that matter.
+The grid over the skin is fixed to the tissue: its rows run around the opening between the lids, and its columns form a
+closed ring. The grid over the globe is fixed to the head, in Lambert's equal-area projection. `scene.diffusiongrids`
+selects the cells that matter.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from ..records.frame import aligned_copy
 from ..scene.diffusiongrids import SIDE, WIDTH, GlobeCells, SheetCells
 from ..scene.region import SHEET_COLUMNS, SkinGeometry
 
-_FINEST_MM = 0.02  # of a cell; about the corners of the eye they are smaller
+_FINEST_MM = 0.02  # smallest size of a cell; at the corners of the eye cells are smaller
 
 
 @dataclass(frozen=True, slots=True)
 class Bilinear:
-    """The four cells of a grid about places, row by row, and the shares of the way across and down between them."""
+    """The four cells of a grid around positions, row by row, and the shares of the way across and down."""
 
     numbers: tuple[mi.UInt32, ...]
     across: mi.Float
     down: mi.Float
 
     def interpolate(self, kind: Any, buffer: mi.Float, each: mi.UInt32 | int = 1, which: mi.UInt32 | int = 0) -> Any:
-        """Interpolate the numbers of cells; each cell has the same number of them."""
+        """Interpolate the numbers of cells; every cell has `each` numbers."""
         a, b, c, d = (dr.gather(kind, buffer, n * each + which) for n in self.numbers)
         high, low = a + self.across * (b - a), c + self.across * (d - c)
         return high + self.down * (low - high)
@@ -41,7 +41,7 @@ class Bilinear:
 def _between_rows(
     row: mi.Float, rows: mi.UInt32 | int, columns: mi.UInt32 | int, beside: tuple[mi.UInt32, mi.UInt32], s: mi.Float
 ) -> Bilinear:
-    """Find the cells between rows, at a share s of the way from the first to the second of two columns."""
+    """Return the cells between rows, at a share s of the way from the first to the second of two columns."""
     v = dr.clip(row, 0, mi.Float(rows) - 1.001)
     i = mi.UInt32(v)
     return Bilinear(tuple(p * columns + q for p in (i, i + 1) for q in beside), s, v - mi.Float(i))
@@ -49,7 +49,7 @@ def _between_rows(
 
 @dataclass(frozen=True, slots=True)
 class SheetSize:
-    """Numbers of rows and columns of a grid over the skin, on the device; the columns close."""
+    """Numbers of rows and columns of a grid over the skin, on the device; the columns form a closed ring."""
 
     rows: mi.UInt32
     columns: mi.UInt32
@@ -60,7 +60,7 @@ class SheetSize:
         return v * ((SHEET_ROWS + BANDS) / SHEET_ROWS) * rows - 0.5, u * columns - 0.5
 
     def cells(self, row: mi.Float, column: mi.Float, level: int) -> Bilinear:
-        """Return cells of the grid reduced by 2^level, about places in units of its finest cells."""
+        """Return cells of the grid reduced by 2^level, around positions in units of its finest cells."""
         rows, columns, scale = self.rows >> level, self.columns >> level, 1 / (1 << level)
         u = (column + 0.5) * scale - 0.5
         u = dr.select(u < 0, u + mi.Float(columns), u)
@@ -75,11 +75,11 @@ class SheetGrid:
 
     Attributes:
         rows: number of its rows.
-        columns: number of its columns, which close.
-        size: the same on the device.
-        cells: numbers of its cells that matter, and of the cells about them on the grid reduced by 2 and by 4.
+        columns: number of its columns, which form a closed ring.
+        size: rows and columns on the device.
+        cells: numbers of its cells that matter, and of the surrounding cells on the grid reduced by 2 and by 4.
         edges: row of the sheet's vertices at the edges of the grid's rows.
-        middles: the same in their middles.
+        middles: row of the sheet's vertices in the middles of the grid's rows.
     """
 
     rows: int
@@ -91,14 +91,14 @@ class SheetGrid:
 
     @classmethod
     def upload(cls, cells: SheetCells) -> SheetGrid:
-        """Send the cells of a pose to the device."""
+        """Copy the cells of a pose to the device."""
         size = SheetSize(dr.opaque(mi.UInt32, cells.rows), dr.opaque(mi.UInt32, cells.columns))
         edges, middles = (mi.Float(aligned_copy(at)) for at in (cells.edges, cells.middles))
         numbers = tuple(_numbers(n) for n in cells.numbers)
         return cls(rows=cells.rows, columns=cells.columns, size=size, cells=numbers, edges=edges, middles=middles)
 
     def vertex_row(self, row: mi.UInt32, share: mi.Float) -> mi.Float:
-        """Return the row of the sheet's vertices at a share of the grid's rows."""
+        """Return the row of the sheet's vertices at the share `share` of a row of the grid."""
         a, b = (dr.gather(mi.Float, self.edges, row + k) for k in (0, 1))
         return a + share * (b - a)
 
@@ -110,7 +110,8 @@ class SheetMetric:
     Attributes:
         size: size of the grid.
         table: for each row and column of vertices: columns per mm along the row, a, rows per mm across it, size of a
-            cell (mm). A place x mm along and y mm across is y per-mm rows and (x - a rows) per-mm columns away.
+            cell (mm). A point x mm along and y mm across is y * (rows per mm) rows and (x - a * rows) * (columns per
+            mm) columns away.
     """
 
     size: SheetSize
@@ -141,7 +142,7 @@ class SheetMetric:
         return cls(grid.size, table)
 
     def step(self, row: mi.Float, column: mi.Float, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Go x mm along a row and y mm across: the new row and column, and the size of a cell (mm)."""
+        """Move x mm along a row and y mm across: the new row and column, and the size of a cell (mm)."""
         columns, around = SHEET_COLUMNS - 1, mi.Float(self.size.columns)
         i = mi.UInt32(row + 0.5)
         j = mi.UInt32((column + 0.5) * (columns / around) + 0.5)
@@ -157,10 +158,10 @@ class GlobeGrid:
     """Numbers of cells of the grid over the globe.
 
     Attributes:
-        between: those between the lids.
-        under: those under the lids whose light gets there.
-        coarse: cells of the grid reduced by 2 that hold the latter.
-        over: the one of these for each of `under`.
+        between: cells between the lids.
+        under: cells under the lids from which light gets there.
+        coarse: cells of the grid reduced by 2 that contain those of `under`.
+        over: index in `coarse` for each cell of `under`.
     """
 
     between: mi.UInt32
@@ -170,26 +171,26 @@ class GlobeGrid:
 
     @classmethod
     def upload(cls, cells: GlobeCells) -> GlobeGrid:
-        """Send the cells of a pose to the device."""
+        """Copy the cells of a pose to the device."""
         return cls(*(_numbers(numbers) for numbers in (cells.between, cells.under, cells.coarse, cells.over)))
 
 
 def globe_cells(row: mi.Float, column: mi.Float) -> Bilinear:
-    """Return cells of the grid over the globe about places."""
+    """Return cells of the grid over the globe around positions."""
     u = dr.clip(column, 0, SIDE - 1.001)
     j = mi.UInt32(u)
     return _between_rows(row, SIDE, SIDE, (j, j + 1), u - mi.Float(j))
 
 
 def globe_place(n: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-    """Row and column of the grid over the globe in directions (scene's frame) from its centre, of any length."""
+    """Return row and column in the globe's grid of directions (scene's frame) from its centre, of any length."""
     n = dr.normalize(n)
     scale = dr.sqrt(2 * dr.rcp(dr.maximum(1 + n.x, 0.1))) * (SIDE / WIDTH)
     return scale * n.z + 0.5 * (SIDE - 1), scale * n.y + 0.5 * (SIDE - 1)
 
 
 def globe_direction(row: mi.Float, column: mi.Float) -> mi.Vector3f:
-    """Compute directions (scene's frame) of places of the grid over the globe."""
+    """Compute directions (scene's frame) of positions in the globe's grid."""
     a, b = ((k - 0.5 * (SIDE - 1)) * (WIDTH / SIDE) for k in (column, row))
     q = a * a + b * b
     k = dr.sqrt(dr.maximum(1 - 0.25 * q, 0))
@@ -197,5 +198,5 @@ def globe_direction(row: mi.Float, column: mi.Float) -> mi.Vector3f:
 
 
 def _numbers(cells: Ints) -> mi.UInt32:
-    """Send numbers of cells to the device, at least one of them."""
+    """Copy numbers of cells to the device, at least one of them."""
     return mi.UInt32(aligned_copy((cells if cells.size else np.zeros(1)).astype(np.uint32)))

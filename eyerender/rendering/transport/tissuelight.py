@@ -1,11 +1,11 @@
-"""Light that falls on skin and globe straight from the lamps, and on the globe through the lids, on their grids.
+"""Direct lamp light on skin and globe, and light through the lids on the globe, on their grids.
 
-On the skin, light is found at points within each cell of a coarse grid, with its shadows, as a vector F: the irradiance
-of a surface with the normal n is F . n, so it gives that of the finer relief too. On the globe it is found for each
-cell between the lids. Where a lid lies on the globe, the globe receives what the lid transmits: exp(-k t) of the
-irradiance of its skin, after a way t through the tissue.
+On the skin, shadowed light is computed in each cell of a coarse grid as a vector F: the irradiance of a surface with
+normal n is F . n, which also serves the finer relief. On the globe it is computed for each cell between the lids. Under
+a lid, the globe receives transmitted light: exp(-k t) of the irradiance of the lid's skin, after a path t through the
+tissue.
 
-The grids also tell which share of each lamp every cell sees, for the highlights.
+For the highlights, the grids also hold the share of each lamp that every cell sees.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from .directlight import irradiance, lamp_blocked
 from .tissuegrids import GlobeGrid, SheetGrid, SheetSize, globe_direction
 
 _LID_MM = 4.5  # thicker than any lid
-_BETWEEN_MM = 0.05  # between the two surfaces of a lid, at least
-_JOINT_MM, _ABOVE_MM = 0.05, 0.15  # above the globe, where the light on conjunctiva and globe is found
+_BETWEEN_MM = 0.05  # smallest distance between the two surfaces of a lid
+_JOINT_MM, _ABOVE_MM = 0.05, 0.15  # height above the globe at which the light on conjunctiva and globe is computed
 _KEYS = (0x51CA, 0x1A3B)
 _ALPHA = (0.7548776662466927, 0.5698402909980532)
 
 
 @dataclass(kw_only=True)
 class TissueScene:
-    """What the light on the tissues of a frame is computed from.
+    """Input of the light on the tissues of a frame.
 
     Attributes:
         frame: the frame.
         relief: slopes of the cells of the skin's grid.
         wide: whether some lamp is too wide for one point.
         skin_rays: number of rays to each lamp from cells of the skin.
-        globe_rays: the same from cells of the globe.
-        lid_loss_per_mm: loss of light on its way through a lid.
+        globe_rays: number of rays to each lamp from cells of the globe.
+        lid_loss_per_mm: attenuation of light in a lid.
         lamps: number of lamps, at least 1.
     """
 
@@ -66,7 +66,7 @@ class _Cells:
 
 
 def light_on_skin(scene: TissueScene, grid: SheetGrid) -> tuple[mi.Float, mi.Float]:
-    """Find the irradiance of the grid over the skin, and the share of each lamp that coarse cells see, cell by cell."""
+    """Compute the irradiance of the skin's grid, and the share of each lamp that coarse cells see."""
     flux, seen = _flux_on_skin(scene, grid)
     skin, index, columns = scene.frame.region, grid.cells[0], grid.size.columns
     row, column = index // columns, index % columns
@@ -82,7 +82,7 @@ def light_on_skin(scene: TissueScene, grid: SheetGrid) -> tuple[mi.Float, mi.Flo
 
 @syntax
 def _flux_on_skin(scene: TissueScene, grid: SheetGrid) -> tuple[mi.Float, mi.Float]:
-    """Vectors F at coarse cells (three of four numbers for each, scene's frame), and shares of each lamp they see."""
+    """Compute vectors F at coarse cells (scene's frame, four numbers each), and the shares of each lamp they see."""
     frame, count = scene.frame, grid.rows * grid.columns // 4
     flux, seen = dr.zeros(mi.Float, 4 * count), dr.zeros(mi.Float, scene.lamps * count)
     cells = _coarse_cells(frame, grid)
@@ -101,7 +101,7 @@ def _flux_on_skin(scene: TissueScene, grid: SheetGrid) -> tuple[mi.Float, mi.Flo
 
 
 def _coarse_cells(frame: Frame, grid: SheetGrid) -> _Cells:
-    """Find the cells of two by two cells of the skin's grid."""
+    """Return the coarse cells of the skin's grid, of two by two cells each."""
     index, columns = grid.cells[1], grid.size.columns // 2
     row, column = index // columns, index % columns
     middle, normal = _skin_point(frame, grid, row, column, mi.Float(0.5), mi.Float(0.5))
@@ -150,15 +150,15 @@ def _lamp_on_skin(scene: TissueScene, grid: SheetGrid, cells: _Cells, i: mi.UInt
 
 
 def light_on_globe(scene: TissueScene, grid: GlobeGrid, size: SheetSize, skin: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Compute the irradiance of the grid over the globe, and the share of each lamp that cells see, cell by cell.
+    """Compute the irradiance of the globe's grid, and the share of each lamp that cells see.
 
     Args:
         scene: the scene.
         grid: the grid.
         size: size of the grid over the skin.
-        skin: irradiance of that grid after its way through the skin.
+        skin: irradiance of that grid after diffusion in the skin.
     """
-    # What comes through a lid varies slowly, so it is found for two by two cells.
+    # Light through a lid varies slowly, so it is computed for two by two cells.
     coarse = dr.zeros(mi.Float, SIDE * SIDE // 4)
     dr.scatter(coarse, _through_lids(scene, grid.coarse, size, skin), grid.coarse)
     cells = dr.zeros(mi.Float, SIDE * SIDE)
@@ -170,7 +170,7 @@ def light_on_globe(scene: TissueScene, grid: GlobeGrid, size: SheetSize, skin: m
 
 @syntax
 def _lamps_on_globe(scene: TissueScene, index: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Irradiance of cells of the grid over the globe straight from the lamps, and shares of each lamp that they see."""
+    """Compute the direct irradiance of cells of the globe, and the share of each lamp that they see."""
     lights = scene.frame.lights
     seen = dr.zeros(mi.Float, scene.lamps * SIDE * SIDE)
     i, total = mi.UInt32(0), mi.Float(0) * mi.Float(index)
@@ -220,7 +220,7 @@ def _globe_surface(frame: Frame, n: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector
 
 
 def _through_lids(scene: TissueScene, index: mi.UInt32, size: SheetSize, lit: mi.Float) -> mi.Float:
-    """Irradiance of two by two cells of the globe by way of lids on them: exp(-k t) of that on the lid's skin."""
+    """Compute the irradiance of two by two cells of the globe through lids: exp(-k t) of that on the lid's skin."""
     frame, skin, half = scene.frame, scene.frame.region, SIDE // 2
     n = globe_direction(2 * mi.Float(index // half) + 0.5, 2 * mi.Float(index % half) + 0.5)
     start = frame.point_to_scene(_globe_surface(frame, n)[0])
@@ -246,7 +246,7 @@ def _next_surface(
 
 
 def _sequence(index: mi.UInt32, key: int, k: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Return the k-th of places in [0, 1)^2 that fill it evenly, shifted from cell to cell."""
+    """Return point k of a sequence that fills [0, 1)^2 evenly, shifted from cell to cell."""
     shift = mi.sample_tea_32(index, mi.UInt32(_KEYS[key]))
     u, v = (
         mi.Float((s + k * mi.UInt32(round(a * 2**32))) >> 8) * (2.0**-24) for s, a in zip(shift, _ALPHA, strict=True)
