@@ -53,7 +53,7 @@ class LabelsSpec(Spec):
 
 
 class DatasetSpec(FileSpec):
-    """A dataset file; see the documentation for draws, which may replace any value of `scene`.
+    """Content of a dataset file. Draws may replace any value of `scene`; see the documentation.
 
     Its format is that of `scene`, unless the scene states its own.
     """

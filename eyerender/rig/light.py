@@ -97,7 +97,8 @@ class Led(Spec):
         right, left = np.linalg.norm(_EYES_MM - np.asarray(place_mm, dtype=float), axis=1)
         if abs(right - left) < 1e-9:
             return np.zeros(3)
-        return _EYES_MM[0 if right < left else 1]
+        nearest: Floats = _EYES_MM[0 if right < left else 1]
+        return nearest
 
     def build(self, cameras: tuple[PinholeCamera, ...]) -> tuple[Lamp, ...]:
         """Build the numeric lights of this entry."""

@@ -222,7 +222,7 @@ LIFTED = ("eye", "person", "look", "region")
 
 
 class SceneSpec(FileSpec):
-    """A scene file.
+    """Content of a scene file.
 
     In format 2 a light without `aim_mm` aims at the nearest eye, in format 1 midway between the eyes; nothing else
     differs.
