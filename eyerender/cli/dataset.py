@@ -26,6 +26,7 @@ def generate(
     eye: EyeModel = None,
     seed: Seed = None,
     count: int | None = None,
+    scenes: str | None = None,
     changes: Annotated[PlanOptions, Parameter(name="*")] = PlanOptions(),
     options: Annotated[RunOptions, Parameter(name="*")] = RunOptions(),
     strict: Strict = False,
@@ -38,7 +39,7 @@ def generate(
     command ignore Ctrl-C there.
 
     Args:
-        spec: A dataset file, or the name of a shipped one.
+        spec: A dataset file, the name of a shipped one, or MODULE:FUNCTION, which gives the scene of (seed, i).
         output: The folder to write.
         shard: K/N: make only every N-th shard, starting with the K-th (1 <= K <= N). Use it for array jobs that write
             to one folder.
@@ -46,6 +47,7 @@ def generate(
         measure: With --dry-run, make a few samples to measure the rate.
         count: Make COUNT samples of the spec's plan, spread over its subjects. Beyond the plan, new subjects are added.
             A folder that holds more or fewer samples keeps those that are wanted.
+        scenes: MODULE:FUNCTION, which gives the scenes in place of those of the spec.
     """
     part = part_of(shard)
     if measure and not dry_run:
@@ -59,7 +61,7 @@ def generate(
     from ..dataset.plan import Plan
 
     heed = Heed(strict)
-    plan = Plan.load(spec, eye=eye, seed=seed, count=count, changes=changes)
+    plan = Plan.load(spec, scenes=scenes, eye=eye, seed=seed, count=count, changes=changes)
     if output is None or dry_run:
         from ..dataset.estimate import estimate
 
@@ -96,10 +98,11 @@ def sample(
     """
     import yaml
 
-    from ..dataset.plan import Plan
+    from ..dataset.plan import Plan, is_function
     from ..dataset.realise import sample as drawn
 
-    found = drawn(Plan.load(spec, eye=eye, seed=seed, changes=changes), index)
+    count = max(index, 0) + 1 if is_function(spec) else None
+    found = drawn(Plan.load(spec, eye=eye, seed=seed, count=count, changes=changes), index)
     heed = Heed(strict)
     heed(found.warnings())
     if output is not None:

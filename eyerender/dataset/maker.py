@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
+from ..errors import InputError
 from ..imaging.capture import BegunImage, EyeImage, begin_each, make_renderer, noiseless
 from ..imaging.images import settled_exposure_ms
 from ..imaging.labels import image_labels
@@ -115,8 +116,24 @@ class Maker:
         time_ms = self._settled[1]
         return found if time_ms is None else found.exposed(time_ms)
 
+    def made_of(self, index: int, images: Sequence[EyeImage]) -> MadeSample:
+        """Make sample `index` of images that are rendered already, one for each row of its frames.
+
+        Raises:
+            InputError: they are not the images of its scene.
+        """
+        found = realise(self.plan, index, self.frames)
+        if found.frames is None:
+            return MadeSample(index, (), found.rejections)
+        if [image.row for image in images] != list(range(len(found.frames))):
+            raise InputError(f"must be {len(found.frames)}, one for each eye in each frame, in order", path="images")
+        return MadeSample(index, tuple(self._labelled(found, images)), found.rejections)
+
     def _images(self, found: Realised, begun: tuple[BegunImage, ...]) -> Iterator[MadeImage]:
-        for image in (b.image() for b in begun):
+        return self._labelled(found, (b.image() for b in begun))
+
+    def _labelled(self, found: Realised, images: Iterable[EyeImage]) -> Iterator[MadeImage]:
+        for image in images:
             assert found.observations is not None
             labels = image_labels(image, found.observations)
             name, line = image_line(found, image.row, self.frames, image.window, labels)

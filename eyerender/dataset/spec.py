@@ -25,7 +25,7 @@ from .selection import Selection
 MAX_COUNT = 10**9
 _LEAST_SHARDS = 16
 PACKED_SHARD = 1000  # samples of a packed shard by default, so that millions of images make some thousand files
-_SPLIT = re.compile(r"[a-z][a-z0-9]*")
+SPLIT_NAME = re.compile(r"[a-z][a-z0-9]*")
 
 
 class LabelsSpec(Spec):
@@ -139,7 +139,7 @@ class DatasetSpec(FileSpec):
         if not self.splits:
             raise ValueError("splits: give at least one")
         for name in self.splits:
-            if not _SPLIT.fullmatch(name):
+            if not SPLIT_NAME.fullmatch(name):
                 raise ValueError(f"splits.{name}: a name must consist of lower-case letters and digits")
         return self
 

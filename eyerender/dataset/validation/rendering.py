@@ -43,6 +43,7 @@ def render_again(
     for row in rows:
         entry = folder.entries[row]
         entries.setdefault(int(entry.line["sample"]), []).append(entry)
+    truth.remember({sample: own[0].line for sample, own in entries.items()})
     maker = Maker(truth.plan, truth.frames, backend=backend, threads=threads)
     notes = [f"{len(rows)} images are rendered again"]
     for k, made in enumerate(maker.make_all(entries)):
