@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from ..scene import Frames
 
 
+_SUBJECTS = 64  # whose exposure times are kept
+
+
 @dataclass(frozen=True)
 class MadeImage:
     """An image of a sample.
@@ -63,7 +66,7 @@ class Maker:
         self.frames = frames
         self.renderer: Renderer = make_renderer(backend, threads)
         self._beside = ThreadPoolExecutor(1, "sample")
-        self._settled: tuple[int, float | None] | None = None
+        self._settled: dict[int, float | None] = {}  # exposure times of the last subjects
 
     @property
     def backend(self) -> dict[str, Any]:
@@ -90,7 +93,8 @@ class Maker:
                 if found := waiting[-1].frames:
                     yield found
 
-        images = begin_each(frames(), self.renderer, highlights=self.plan.spec.labels.highlights)
+        labels = self.plan.spec.labels
+        images = begin_each(frames(), self.renderer, highlights=labels.highlights, geometry=bool(labels.geometry))
         for first in images:
             while not waiting[0].frames:
                 yield self._rest(waiting.popleft(), ())
@@ -107,13 +111,15 @@ class Maker:
         if level is None or found.sample is None:
             return found
         subject = found.sample.turn.subject
-        if self._settled is None or self._settled[0] != subject:
+        if subject not in self._settled:
             # Whatever sample of a subject is made, the first that can be made decides.
             before = (realise(self.plan, k, self.frames) for k in range(self.plan.first_of(subject), found.index))
             first = next((r.scene for r in before if r.scene is not None), found.scene)
             assert first is not None
-            self._settled = subject, settled_exposure_ms(first, level, self.renderer)
-        time_ms = self._settled[1]
+            if len(self._settled) >= _SUBJECTS:
+                self._settled.clear()
+            self._settled[subject] = settled_exposure_ms(first, level, self.renderer)
+        time_ms = self._settled[subject]
         return found if time_ms is None else found.exposed(time_ms)
 
     def made_of(self, index: int, images: Sequence[EyeImage]) -> MadeSample:
@@ -154,10 +160,22 @@ def _highlights(image: EyeImage) -> Bytes:
     return found.astype(np.uint8)
 
 
+def _geometry(name: str) -> Callable[[EyeImage], NDArray[Any]]:
+    def take(image: EyeImage) -> NDArray[Any]:
+        found: NDArray[Any] = getattr(image.rendered.geometry, name)
+        return found
+
+    return take
+
+
 _PICTURES: dict[str, Callable[[EyeImage], NDArray[Any]]] = {
     "images": lambda image: image.counts,
     "masks": lambda image: image.parts,
     "amodal_masks": _amodal,
     "noiseless": noiseless,
     "highlights": _highlights,
+    "depth": _geometry("depth"),
+    "normals": _geometry("normals"),
+    "iris_coordinates": _geometry("iris"),
+    "instances": _geometry("instances"),
 }

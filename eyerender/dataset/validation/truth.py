@@ -27,7 +27,7 @@ from ...rendering.records.job import film_index, globe_of
 from ...scene import Frames, Scene
 from ...scene.spec import SceneSpec
 from ...storage.files import parse_json, shown
-from ..done import KINDS
+from ..done import KINDS, picture_file
 from ..line import image_line, image_name
 from ..ownscenes import GivenScene
 from ..plan import Plan, mapping_digest, plan_digest
@@ -128,7 +128,7 @@ class DatasetTruth:
         subject, sequence = self.plan.subject_of(sample)
         name = image_name(sample, record["frame"] - sample * self.frames, self.frames, record["eye"])
         shard = shard_name(self.plan.spec.selection.shard_of(sample))
-        files = {KINDS[kind]: f"{kind}/{shard}/{name}.png" for kind in self.plan.spec.labels.pictures}
+        files = {KINDS[kind]: f"{kind}/{shard}/{picture_file(kind, name)}" for kind in self.plan.spec.labels.pictures}
         if self.plan.scenes is not None and not self.plan.scenes.reference:
             return files  # the user's code said the rest
         return {**files, "subject": subject, "sequence_index": sequence, "split": self.plan.split_of(subject)}
