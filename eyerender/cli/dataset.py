@@ -224,7 +224,9 @@ def export_dataset(
     /,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     *,
-    format: Literal["webdataset", "imagefolder", "coco", "csv", "parquet", "openeds", "ellseg", "teyed"],
+    format: Literal[
+        "webdataset", "imagefolder", "coco", "yolo-seg", "yolo-pose", "csv", "parquet", "openeds", "ellseg", "teyed"
+    ],
     bits: Literal[8, 16] = 8,
     encoding: Literal["linear", "gamma"] | None = None,
     gain: float | None = None,
