@@ -17,6 +17,7 @@ from .dataset.run import generate as generate
 from .dataset.sheet import preview as preview
 from .dataset.spec import DatasetSpec as DatasetSpec
 from .dataset.validate import validate as validate
+from .dataset.writer import DatasetWriter as DatasetWriter
 from .design.choice import SiteInformation as SiteInformation
 from .design.choice import choose_lights as choose_lights
 from .design.choice import noise_of_some as noise_of_some

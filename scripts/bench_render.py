@@ -544,8 +544,8 @@ class Bench:
             start = time.perf_counter()
             with Writer() as writer:
                 for image in render_windows(scene.frames(), renderer=self.renderer):
-                    writer.png(folder / f"{image.name}.png", image.counts)
-                    writer.png(folder / f"{image.name}.mask.png", image.parts)
+                    writer.put(folder / f"{image.name}.png", image.counts)
+                    writer.put(folder / f"{image.name}.mask.png", image.parts)
             return time.perf_counter() - start
 
         with tempfile.TemporaryDirectory() as folder, dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -369,8 +369,8 @@ def test_a_writer_writes_all_and_tells_its_errors(tmp_path):
     images = [np.full((5, 6), k, np.uint8) for k in range(30)]
     with Writer() as writer:
         for k, image in enumerate(images):
-            writer.png(tmp_path / f"{k}.png", image)
+            writer.put(tmp_path / f"{k}.png", image)
     for k, image in enumerate(images):
         assert np.array_equal(read_image(tmp_path / f"{k}.png")[0], image)
     with pytest.raises(EyerenderError, match="cannot be written"), Writer() as writer:
-        writer.png(tmp_path / "missing" / "a.png", images[0])
+        writer.put(tmp_path / "missing" / "a.png", images[0])

@@ -26,6 +26,7 @@ def generate(
     eye: EyeModel = None,
     seed: Seed = None,
     count: int | None = None,
+    scenes: str | None = None,
     changes: Annotated[PlanOptions, Parameter(name="*")] = PlanOptions(),
     options: Annotated[RunOptions, Parameter(name="*")] = RunOptions(),
     strict: Strict = False,
@@ -38,14 +39,15 @@ def generate(
     ignore Ctrl-C.
 
     Args:
-        spec: A dataset file, or the name of a shipped one.
+        spec: A dataset file, the name of a shipped one, or MODULE:FUNCTION, which gives the scene of (seed, i).
         output: The folder to write.
         shard: K/N: make only every N-th shard, starting with the K-th (1 <= K <= N). Use it for array jobs that write
             to one folder.
         dry_run: Only estimate the time and the disk space, from the last measured rate of this spec on this machine.
         measure: With --dry-run, make a few samples to measure the rate.
         count: Make COUNT samples of the spec's plan, spread over its subjects. Beyond the plan, new subjects are added.
-            If the folder has more or fewer samples, the required ones are kept.
+            A folder that holds more or fewer samples keeps those that are wanted.
+        scenes: MODULE:FUNCTION, which gives the scenes in place of those of the spec.
     """
     part = part_of(shard)
     if measure and not dry_run:
@@ -59,7 +61,7 @@ def generate(
     from ..dataset.plan import Plan
 
     heed = Heed(strict)
-    plan = Plan.load(spec, eye=eye, seed=seed, count=count, changes=changes)
+    plan = Plan.load(spec, scenes=scenes, eye=eye, seed=seed, count=count, changes=changes)
     if output is None or dry_run:
         from ..dataset.estimate import estimate
 
@@ -96,10 +98,11 @@ def sample(
     """
     import yaml
 
-    from ..dataset.plan import Plan
+    from ..dataset.plan import Plan, is_function
     from ..dataset.realise import sample as drawn
 
-    found = drawn(Plan.load(spec, eye=eye, seed=seed, changes=changes), index)
+    count = max(index, 0) + 1 if is_function(spec) else None
+    found = drawn(Plan.load(spec, eye=eye, seed=seed, count=count, changes=changes), index)
     heed = Heed(strict)
     heed(found.warnings())
     if output is not None:
@@ -221,7 +224,9 @@ def export_dataset(
     /,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     *,
-    format: Literal["webdataset", "imagefolder", "coco", "csv", "parquet", "openeds", "ellseg", "teyed"],
+    format: Literal[
+        "webdataset", "imagefolder", "coco", "yolo-seg", "yolo-pose", "csv", "parquet", "openeds", "ellseg", "teyed"
+    ],
     bits: Literal[8, 16] = 8,
     encoding: Literal["linear", "gamma"] | None = None,
     gain: float | None = None,

@@ -38,6 +38,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
             "eyerender generate dataset_quick --dry-run --measure",
             "eyerender generate dataset_quick -o data --count 100",
             "eyerender generate people_openeds -o data --count 1000000 --layout webdataset",
+            "eyerender generate my_scenes:scene -o data --count 1000 --seed 7",
         ),
         "live": ("eyerender live quickstart --browser",),
         "merge": ("eyerender merge part1 part2 part3 -o data",),

@@ -1,4 +1,5 @@
 from .options import RunOptions as RunOptions
+from .ownscenes import GivenScene as GivenScene
 from .plan import Plan as Plan
 from .plan import Sample as Sample
 from .realise import Realised as Realised
@@ -10,5 +11,6 @@ from .spec import DatasetSpec as DatasetSpec
 from .spec import LabelsSpec as LabelsSpec
 from .spec import find_dataset as find_dataset
 from .spec import shipped_datasets as shipped_datasets
+from .writer import DatasetWriter as DatasetWriter
 
 __all__: list[str]

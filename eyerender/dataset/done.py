@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..folders.imagefolder import DONE, SHARDS, shard_name, versions
+from ..folders.imagefolder import ARRAY_KEYS, DONE, SHARDS, shard_name, versions
 from ..storage.files import MAX_FILE_BYTES, inside, read_json
 from ..versions import package_version
 
@@ -21,7 +21,16 @@ KINDS = {
     "amodal_masks": "amodal_mask_file_name",
     "noiseless": "noiseless_file_name",
     "highlights": "highlight_mask_file_name",
+    "depth": "depth_file_name",
+    "normals": "normals_file_name",
+    "iris_coordinates": "iris_coordinates_file_name",
+    "instances": "instance_mask_file_name",
 }
+
+
+def picture_file(kind: str, name: str) -> str:
+    """Name of the file of a picture of an image: arrays of real numbers are .npy, others .png."""
+    return f"{name}{'.npy' if KINDS[kind] in ARRAY_KEYS else '.png'}"
 
 
 def _is_count(value: object) -> bool:

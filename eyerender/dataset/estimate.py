@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import Warn
-from ..folders.imagefile import png_bytes
+from ..folders.imagefile import picture_bytes
 from .maker import Maker
 from .options import RunOptions
 from .plan import Plan
@@ -140,7 +140,7 @@ def _timed(maker: Maker, samples: Iterable[int]) -> list[_Timed]:
     """Make samples in memory like a worker, which traces one sample while it finishes the previous one."""
     found, began = [], time.perf_counter()
     for made in maker.make_all(samples):
-        size = sum(len(png_bytes(picture)) for image in made.images for picture in image.pictures.values())
+        size = sum(len(picture_bytes(picture)) for image in made.images for picture in image.pictures.values())
         # Metadata is stored in the shards and in the assembled file.
         size += 2 * sum(len(json.dumps(image.line)) for image in made.images)
         began, last = time.perf_counter(), began

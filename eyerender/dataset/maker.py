@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Bytes
 from ..backends.choose import BackendChoice
+from ..errors import InputError
 from ..imaging.capture import BegunImage, EyeImage, begin_each, make_renderer, noiseless
 from ..imaging.images import settled_exposure_ms
 from ..imaging.labels import image_labels
@@ -26,6 +27,9 @@ from .realise import Realised, Rejection, realise
 if TYPE_CHECKING:
     from ..rendering.renderer import Renderer
     from ..scene import Frames
+
+
+_SUBJECTS = 64  # whose exposure times are kept
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class Maker:
         self.frames = frames
         self.renderer: Renderer = make_renderer(backend, threads)
         self._beside = ThreadPoolExecutor(1, "sample")
-        self._settled: tuple[int, float | None] | None = None
+        self._settled: dict[int, float | None] = {}  # exposure times of the last subjects
 
     @property
     def backend(self) -> dict[str, Any]:
@@ -89,7 +93,8 @@ class Maker:
                 if found := waiting[-1].frames:
                     yield found
 
-        images = begin_each(frames(), self.renderer, highlights=self.plan.spec.labels.highlights)
+        labels = self.plan.spec.labels
+        images = begin_each(frames(), self.renderer, highlights=labels.highlights, geometry=bool(labels.geometry))
         for first in images:
             while not waiting[0].frames:
                 yield self._rest(waiting.popleft(), ())
@@ -106,17 +111,35 @@ class Maker:
         if level is None or found.sample is None:
             return found
         subject = found.sample.turn.subject
-        if self._settled is None or self._settled[0] != subject:
-            # Whichever sample of a subject comes first, its first sample that can be made decides.
+        if subject not in self._settled:
+            # Whatever sample of a subject is made, the first that can be made decides.
             before = (realise(self.plan, k, self.frames) for k in range(self.plan.first_of(subject), found.index))
             first = next((r.scene for r in before if r.scene is not None), found.scene)
             assert first is not None
-            self._settled = subject, settled_exposure_ms(first, level, self.renderer)
-        time_ms = self._settled[1]
+            if len(self._settled) >= _SUBJECTS:
+                self._settled.clear()
+            self._settled[subject] = settled_exposure_ms(first, level, self.renderer)
+        time_ms = self._settled[subject]
         return found if time_ms is None else found.exposed(time_ms)
 
+    def made_of(self, index: int, images: Sequence[EyeImage]) -> MadeSample:
+        """Make sample `index` of images that are rendered already, one for each row of its frames.
+
+        Raises:
+            InputError: they are not the images of its scene.
+        """
+        found = realise(self.plan, index, self.frames)
+        if found.frames is None:
+            return MadeSample(index, (), found.rejections)
+        if [image.row for image in images] != list(range(len(found.frames))):
+            raise InputError(f"must be {len(found.frames)}, one for each eye in each frame, in order", path="images")
+        return MadeSample(index, tuple(self._labelled(found, images)), found.rejections)
+
     def _images(self, found: Realised, begun: tuple[BegunImage, ...]) -> Iterator[MadeImage]:
-        for image in (b.image() for b in begun):
+        return self._labelled(found, (b.image() for b in begun))
+
+    def _labelled(self, found: Realised, images: Iterable[EyeImage]) -> Iterator[MadeImage]:
+        for image in images:
             assert found.observations is not None
             labels = image_labels(image, found.observations)
             name, line = image_line(found, image.row, self.frames, image.window, labels)
@@ -137,10 +160,22 @@ def _highlights(image: EyeImage) -> Bytes:
     return found.astype(np.uint8)
 
 
+def _geometry(name: str) -> Callable[[EyeImage], NDArray[Any]]:
+    def take(image: EyeImage) -> NDArray[Any]:
+        found: NDArray[Any] = getattr(image.rendered.geometry, name)
+        return found
+
+    return take
+
+
 _PICTURES: dict[str, Callable[[EyeImage], NDArray[Any]]] = {
     "images": lambda image: image.counts,
     "masks": lambda image: image.parts,
     "amodal_masks": _amodal,
     "noiseless": noiseless,
     "highlights": _highlights,
+    "depth": _geometry("depth"),
+    "normals": _geometry("normals"),
+    "iris_coordinates": _geometry("iris"),
+    "instances": _geometry("instances"),
 }

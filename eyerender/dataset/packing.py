@@ -34,7 +34,8 @@ from .done import KINDS, PACKED_SHARD_SCHEMA, SHARD_SCHEMA, sum_of
 from .interleaving import scrambled
 
 ENDINGS = {
-    "images": "", "masks": ".mask", "amodal_masks": ".amodal", "noiseless": ".noiseless", "highlights": ".highlights"
+    "images": "", "masks": ".mask", "amodal_masks": ".amodal", "noiseless": ".noiseless", "highlights": ".highlights",
+    "depth": ".depth", "normals": ".normals", "iris_coordinates": ".iris_coordinates", "instances": ".instances",
 }  # fmt: skip
 _SHARD = "shard"  # folder of the lines of a partial shard
 
@@ -129,7 +130,7 @@ def _write_tar(stage: Path, lines: list[dict[str, Any]], file: Any) -> None:
                     continue
                 path = PurePosixPath(line[key])
                 data = read_bytes(stage / kind / path.name)
-                member = tarfile.TarInfo(f"{path.stem}{ENDINGS[kind]}.png")  # no times or owners
+                member = tarfile.TarInfo(f"{path.stem}{ENDINGS[kind]}{path.suffix}")  # no times or owners
                 member.size = len(data)
                 own[key] = [tar.offset + tarfile.BLOCKSIZE, len(data)]  # behind the header
                 tar.addfile(member, io.BytesIO(data))

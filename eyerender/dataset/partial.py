@@ -27,7 +27,17 @@ from ..errors import InputError
 from ..folders.imagefile import Writer
 from ..folders.imagefolder import DONE, IMAGE_SCHEMA, LINES, SHARDS, STAGE, shard_name
 from ..storage.files import inside, make_folder, opened, parse_json, remove_file, sync_files, sync_folder, write_json
-from .done import KINDS, PACKED_SHARD_SCHEMA, SHARD_SCHEMA, cpu_family, described, read_done_file, run_versions, sum_of
+from .done import (
+    KINDS,
+    PACKED_SHARD_SCHEMA,
+    SHARD_SCHEMA,
+    cpu_family,
+    described,
+    picture_file,
+    read_done_file,
+    run_versions,
+    sum_of,
+)
 from .maker import MadeSample
 from .packing import pack, unpack
 from .plan import Plan
@@ -96,11 +106,12 @@ class PartialShard:
         if not sample.images:
             self._given_up.append(sample.index)
         for image in sample.images:
-            file = f"{image.name}.png"
+            files = {kind: picture_file(kind, image.name) for kind in image.pictures}
             for kind, picture in image.pictures.items():
-                self._writer.png(self.stage / kind / file, picture)
+                file = files[kind]
+                self._writer.put(self.stage / kind / file, picture)
                 self._new.append(f"{kind}/{file}")
-            names = {KINDS[kind]: self._place(kind, file) for kind in image.pictures}
+            names = {KINDS[kind]: self._place(kind, file) for kind, file in files.items()}
             line = {"schema": IMAGE_SCHEMA, **names, **image.line}
             self._add_line(sample.index, (json.dumps(line, allow_nan=False) + "\n").encode())
             self._saturated += [sample.index] * image.saturated

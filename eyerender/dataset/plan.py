@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -28,6 +28,7 @@ from ..eye.spec import EyeSpec
 from ..eye.topography import topography_files
 from ..observation import EYES
 from ..population.people import PersonChoice, choice_of
+from ..references import is_reference
 from ..scene import Scene
 from ..scene.spec import SceneSpec
 from ..spec import read_yaml
@@ -35,11 +36,14 @@ from .draws import Unit, is_draw, unit_number
 from .files import check_files, sum_of_file, sums_of_files
 from .gathering import aliased_draws
 from .options import PlanOptions
+from .ownscenes import OwnScenes
 from .spec import DatasetSpec, find_dataset
 from .template import Template, Turn, possible
 
 # Beyond this many subjects, splits are drawn without sorting them.
 RANKED_SUBJECTS = 1_000_000
+# Of a function without a spec, whose number of samples may grow: samples of a block of its plan, and of a shard.
+_PLANNED, _SHARD = 16_000, 16
 _LOOKED_AT = 16  # samples that `Plan.warnings` checks for probable mistakes
 
 
@@ -98,8 +102,9 @@ class Sample:
 class Plan:
     """A dataset spec with its eyes, and the checksums of all files that it names, including eye files.
 
-    `files` maps names, relative to the folder `base`, to SHA-256. `aliases` are pairs of paths in the spec's file that
-    share one draw.
+    `files` maps names, relative to the folder `base`, to SHA-256. Workers of a run find the files there, wherever they
+    run. `aliases` are pairs of places of the spec's file in which one draw stands. `scenes` is what gives the scenes in
+    place of the spec, if anything does.
     """
 
     spec: DatasetSpec
@@ -108,12 +113,14 @@ class Plan:
     base: Path
     source: str = ""
     aliases: tuple[tuple[str, str], ...] = ()
+    scenes: OwnScenes | None = None
 
     @classmethod
     def load(
         cls,
-        given: str | Path | DatasetSpec | Plan,
+        given: str | Path | DatasetSpec | Plan | None,
         *,
+        scenes: str | Callable[..., Any] | None = None,
         eye: str | None = None,
         seed: int | None = None,
         count: int | None = None,
@@ -121,27 +128,29 @@ class Plan:
     ) -> Plan:
         """Load a plan from a file, the bare name of a shipped dataset, or a spec; a plan is returned as it is.
 
-        `eye` and `seed` replace those of the spec; parameters of other eye models are then dropped. `count` is the
-        number of samples of the plan, or of its continuation (see `DatasetSpec.first`). `changes` replaces subjects,
-        splits and the image size.
+        `scenes`, or `module:function` instead of a file, is a function that gives the scenes (`OwnScenes`). It replaces
+        what the spec says of them; without a spec, `count` is needed. `eye` and `seed` replace those of the spec;
+        parameters of other eye models are then dropped. `count` requests so many samples of the plan, or of its
+        continuation (see `DatasetSpec.first`). `changes` replaces subjects, splits and the size of the pictures.
 
         Raises:
             InputError: the spec cannot be read, or a value does not fit.
         """
         if isinstance(given, Plan):
-            if (eye, seed, count, changes) != (None, None, None, PlanOptions()):
+            if (scenes, eye, seed, count, changes) != (None, None, None, None, PlanOptions()):
                 raise InputError("a plan has its eye, seed and count already; give its spec", path="spec")
             return given
-        if isinstance(given, DatasetSpec):
-            file, spec = None, given
-        else:
-            file = find_dataset(given)
-            spec = DatasetSpec.load(file)
+        if is_function(given):
+            given, scenes = None, str(given)
+        own = None if scenes is None else OwnScenes.of(scenes)
+        file, spec = _spec_of(given, own, count, changes)
         if seed is not None:
             spec = spec.replaced("--seed", {"seed": seed})
         spec = changes.apply(spec)
         if count is not None:
             spec = spec.first(count)
+        if own is not None:
+            return _of_function(spec, own, eye)
         if eye is not None:
             spec = spec.replaced("--eye", _with_eye(spec, eye))
         if file is None:
@@ -223,14 +232,28 @@ class Plan:
     def to_mapping(self) -> dict[str, Any]:
         """Convert to the mapping that `from_mapping` reads, without the eye files; `files` only if there are any."""
         data: dict[str, Any] = {"spec": self.spec.to_mapping(), "eyes": self.eyes}
-        return dict(_sorted(data | ({"files": self.files} if self.files else {})))
+        own = {} if self.scenes is None else {"scenes": self.scenes.to_mapping()}
+        return dict(_sorted(data | own | ({"files": self.files} if self.files else {})))
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any], base: Path) -> Plan:
-        """Restore the plan of another process, with its files relative to `base`."""
+        """Make the plan of another process, its files relative to `base`; a function of scenes is not loaded."""
+        own = data.get("scenes")
         return cls(
-            spec=DatasetSpec.from_mapping(data["spec"]), eyes=data["eyes"], files=data.get("files", {}), base=base
+            spec=DatasetSpec.from_mapping(data["spec"]),
+            eyes=data["eyes"],
+            files=data.get("files", {}),
+            base=base,
+            scenes=None if own is None else OwnScenes.from_mapping(own),
         )
+
+    def loaded(self) -> Plan:
+        """Load the function of the scenes in a worker process, if there is one.
+
+        Raises:
+            InputError: it cannot be loaded, or has changed.
+        """
+        return self if self.scenes is None else replace(self, scenes=self.scenes.loaded())
 
     def warnings(self) -> list[InputWarning]:
         """Return probable mistakes in the scenes of some samples, spread over the dataset; each is reported once."""
@@ -341,22 +364,25 @@ class Plan:
         subject, sequence = self.subject_of(sample)
         subject_attempt = self.identity(subject)[0]
         turn = Turn(sample=sample, subject=subject, sequence=sequence, attempt=attempt, subject_attempt=subject_attempt)
-        tree, drawn = self._scene_of(turn)
-        tree.setdefault("format", spec.format)
+        own = None if self.scenes is None else self.scenes.at(spec.seed, turn, self.base)
+        if own is not None and own.subject is not None:
+            turn = replace(turn, subject=own.subject, sequence=0)
+        tree, drawn = self._scene_of(turn) if own is None else (dict(own.tree), own.draws)
+        tree.setdefault("format", 1)
         if spec.population is not None:
             tree["population"] = self.person_of(subject, subject_attempt).to_mapping()
         tree.setdefault("name", f"{spec.name} {sample}")
         if "seed" not in tree:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
-        eye, eye_drawn, modified = self._eye_of(tree, turn)
+        eye, eye_drawn, modified = self._eye_of(tree, turn) if own is None else (own.eye, {}, False)
         return Sample(
             turn=turn,
-            split=self.split_of(subject),
+            split=self.split_of(subject) if own is None or own.split is None else own.split,
             scene=tree,
             eye=eye,
             modified=modified,
-            draws=drawn | eye_drawn,
-            base=self.base,
+            draws={**drawn, **eye_drawn},
+            base=self.base if own is None or own.base is None else own.base,
         )
 
     def _scene_of(self, turn: Turn) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -373,6 +399,8 @@ class Plan:
 
     def identity(self, subject: int) -> tuple[int, tuple[str, ...]]:
         """Return the first attempt in which a subject's eye can be made, and the reasons why earlier ones failed."""
+        if self.scenes is not None:
+            return 0, ()
         if subject not in self._identities:
             if len(self._identities) >= 1024:
                 self._identities.clear()
@@ -425,6 +453,50 @@ class Plan:
         # The parameters of the other eyes were not used.
         asked = {k: v if k.startswith(f"eye_parameters.{model}.") else None for k, v in drawn.items()}
         return eye, asked, bool(mine)
+
+
+def is_function(given: object) -> bool:
+    """Whether a user gave `module:function` in the place of a spec's file."""
+    return isinstance(given, str) and is_reference(given) and not os.path.exists(given)
+
+
+def _spec_of(
+    given: str | Path | DatasetSpec | None, own: OwnScenes | None, count: int | None, changes: PlanOptions
+) -> tuple[Path | None, DatasetSpec]:
+    """Return the file and the spec that a user gave; for a function alone a spec with default settings.
+
+    Raises:
+        InputError: the file cannot be read, or there is neither spec nor number of samples.
+    """
+    if isinstance(given, DatasetSpec):
+        return None, given
+    if given is not None:
+        file = find_dataset(given)
+        return file, DatasetSpec.load(file)
+    if own is None:
+        raise InputError("give a dataset file, the name of a shipped one, or a function of scenes", source="spec")
+    if count is None:
+        raise InputError("needs the number of samples", source="--count")
+    # The number of samples may grow later, which must not change the plan.
+    planned = count if changes.subjects is not None else _PLANNED
+    name = own.reference.rpartition(":")[2]
+    return None, DatasetSpec(kind="dataset", format=1, name=name, count=planned, shard_size=_SHARD, scene={})
+
+
+def _of_function(spec: DatasetSpec, own: OwnScenes, eye: str | None) -> Plan:
+    """Return the plan whose scenes a function gives; their files are relative to the current folder.
+
+    Raises:
+        InputError: an eye is given, too, or the function gives two different scenes for one sample.
+    """
+    if eye is not None:
+        raise InputError("the scenes of a function have their eyes", source="--eye")
+    bare: dict[str, Any] = {"scene": {}, "variables": None, "eye_parameters": {}, "population": None}
+    spec = spec.model_copy(update=bare)
+    plan = replace(Plan.of(spec), eyes={}, scenes=own)
+    subject, sequence = plan.subject_of(0)
+    own.check(spec.seed, Turn(sample=0, subject=subject, sequence=sequence, attempt=0, subject_attempt=0), plan.base)
+    return plan
 
 
 def plan_digest(mapping: Mapping[str, Any]) -> str:

@@ -18,7 +18,7 @@ from ..imaging.capture import check_windows
 from ..observation import Observations
 from ..rig.camera import Window, in_window
 from ..scene import Frames, Scene
-from .plan import Plan, Sample
+from .plan import Plan, Sample, is_function
 from .spec import DatasetSpec
 
 
@@ -105,7 +105,7 @@ def sample(
     Raises:
         InputError: there is no such sample, or it was given up.
     """
-    plan = Plan.load(spec, eye=eye, seed=seed)
+    plan = Plan.load(spec, eye=eye, seed=seed, count=max(index, 0) + 1 if is_function(spec) else None)
     end = plan.spec.selection.end
     if not 0 <= index < end:
         name = spec if isinstance(spec, str | Path) else plan.spec.name
@@ -142,26 +142,49 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
         rejections += [Rejection(index, k, reason, "subject") for k, reason in enumerate(reasons)]
     last = None
     for attempt in range(spec.attempts):
-        sample = plan.draw(index, attempt)
-        if last is not None and sample.draws == last.draws:
+        try:
+            sample = plan.draw(index, attempt)
+        except InputError as error:
+            if plan.scenes is None:
+                raise
+            rejections.append(Rejection(index, attempt, str(error)))
+            if not plan.scenes.takes_attempt:
+                break
+            continue
+        if last is not None and not _drawn_again(plan, last, sample):
             break
         last = sample
         try:
-            scene = sample.build()
-            check_windows(scene)
-            posed = scene.frames()
-            found = trace(posed, boundary_points=spec.labels.boundary_points)
-            count = int(found.index.frame.max()) + 1
-            if frames is not None and count != frames:
-                raise InputError(f"has {count} frames, sample 0 has {frames}")
-            if spec.require == "pupil":
-                _require_pupils(scene, found)
+            posed, found = _observed(plan, sample, frames)
         except InputError as error:
             reason = f"{error.path}: {error.reason}" if error.path else error.reason
             rejections.append(Rejection(index, attempt, reason))
             continue
         return Realised(index=index, sample=sample, frames=posed, observations=found, rejections=tuple(rejections))
     return Realised(index=index, sample=None, frames=None, observations=None, rejections=tuple(rejections))
+
+
+def _observed(plan: Plan, sample: Sample, frames: int | None) -> tuple[Frames, Observations]:
+    """Trace a sample that was drawn.
+
+    Raises:
+        InputError: its scene is not as the dataset requires.
+    """
+    scene = sample.build()
+    check_windows(scene)
+    posed = scene.frames()
+    found = trace(posed, boundary_points=plan.spec.labels.boundary_points)
+    count = int(found.index.frame.max()) + 1
+    if frames is not None and count != frames:
+        raise InputError(f"has {count} frames, sample 0 has {frames}")
+    if plan.spec.require == "pupil":
+        _require_pupils(scene, found)
+    return posed, found
+
+
+def _drawn_again(plan: Plan, last: Sample, sample: Sample) -> bool:
+    """Whether an attempt may differ from the last one."""
+    return last.draws != sample.draws if plan.scenes is None else plan.scenes.takes_attempt
 
 
 def frames_of(plan: Plan) -> int:

@@ -7,7 +7,8 @@ import os
 import shutil
 import socket
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,10 +43,11 @@ MEMORY_A_WORKER = 0.9e9  # bytes, measured resident size with head-room
 
 
 def generate(
-    spec: str | Path | DatasetSpec | Plan,
-    path: str | Path,
+    spec: str | Path | DatasetSpec | Plan | None = None,
+    path: str | Path | None = None,
     options: RunOptions = RunOptions(),
     *,
+    scenes: str | Callable[..., Any] | None = None,
     eye: str | None = None,
     seed: int | None = None,
     count: int | None = None,
@@ -57,12 +59,16 @@ def generate(
 ) -> dict[str, Any]:
     """Make a labelled dataset, or complete one in a folder where an earlier run was stopped.
 
-    The bytes of the dataset depend on the spec, `eye`, `seed` and `count` alone.
+    The bytes of the dataset depend on the spec or function, `eye`, `seed` and `count` alone.
 
     Args:
-        spec: a dataset file, the name of a shipped one, a spec built in Python, or a plan.
+        spec: a dataset file, the name of a shipped one, a spec built in Python, or a plan; not needed beside `scenes`.
         path: the folder to write.
         options: workers, engine, backend and the like.
+        scenes: a function, or its name as `module:function`, that gives the scene of a sample in place of the spec's:
+            called with (seed, i), and by name with those of `subject`, `sequence` and `attempt` that it takes. It
+            returns a `Scene`, a `SceneSpec` or a mapping as in a scene's file, or one of them and a mapping of draws to
+            store with the image. Workers import it, and its result must depend on the arguments alone.
         eye: replaces the eye model of the spec: a name of the catalogue or an eye file.
         seed: replaces the seed of the spec.
         count: number of samples of the spec's plan, spread over its subjects; beyond the plan it continues with new
@@ -83,7 +89,9 @@ def generate(
         BackendError: no backend can render.
         EyerenderError: the disk is full or not writable, or shards were given up after repeated tries.
     """
-    plan = Plan.load(spec, eye=eye, seed=seed, count=count)
+    if path is None:
+        raise InputError("give the folder to write", source="path")
+    plan = Plan.load(spec, scenes=scenes, eye=eye, seed=seed, count=count)
     options = replace(options, **changes)
     if warn is not None:
         warn(plan.warnings())
@@ -97,6 +105,23 @@ def generate(
 def _generate(
     plan: Plan, path: str | Path, options: RunOptions, part: tuple[int, int], progress: Progress, say: Say
 ) -> dict[str, Any]:
+    with opened_run(plan, path, options, part, progress, say) as (run, resumed):
+        return run.make(resumed)
+
+
+@contextmanager
+def opened_run(
+    plan: Plan, path: str | Path, options: RunOptions, part: tuple[int, int], progress: Progress, say: Say
+) -> Iterator[tuple[Run, bool]]:
+    """Claim a folder for a run while the block works on it.
+
+    Yields:
+        The run, and whether the folder was claimed for the same plan before.
+
+    Raises:
+        InputError: as for `generate`. If it comes from the block, a folder in which nothing is finished is cleared.
+        EyerenderError: the folder cannot be written.
+    """
     folder = Path(path)
     k, n = part
     if not 1 <= k <= n:
@@ -107,18 +132,18 @@ def _generate(
         refuse_non_empty(folder, True)
     else:
         refuse_taken(folder)
-    frames = frames_of(plan)
+    frames = plan.scenes.frames if plan.scenes is not None and plan.scenes.frames else frames_of(plan)
     created = False
     try:
         created = make_folder(folder)
         with run_lock(folder, part, say):
             if options.overwrite and n == 1:
                 clear(folder)
-            run = _Run(plan=plan, folder=folder, options=options, part=part, frames=frames, progress=progress, say=say)
+            run = Run(plan=plan, folder=folder, options=options, part=part, frames=frames, progress=progress, say=say)
             with final_lock(folder, say):
                 resumed = begin(folder, plan, run.repaired)
             try:
-                return run.make(resumed)
+                yield run, resumed
             except InputError:
                 if not resumed and n == 1 and not finished(folder):
                     with suppress(InputError):
@@ -158,8 +183,8 @@ def worker_count(options: RunOptions, shards: int) -> tuple[int, int]:
 
 
 @dataclass(kw_only=True)
-class _Run:
-    """One run; receives the engine's reports."""
+class Run:
+    """One run, which also receives the engine's reports."""
 
     plan: Plan
     folder: Path
@@ -187,42 +212,53 @@ class _Run:
     seen: set[str] = field(default_factory=set)
     logged: float = 0.0  # when the log was last written
     verified: set[int] = field(default_factory=set)  # shards whose checksums this run has verified
+    todo: list[int] = field(default_factory=list)  # the shards to make
+    intact: bool = False  # whether the dataset is assembled already
 
     def make(self, resumed: bool) -> dict[str, Any]:
-        """Make the missing shards of this part, and assemble the dataset if no shard is missing."""
-        mine = self._mine()
+        """Make this part's missing shards, and assemble the dataset when none is missing."""
+        self.prepare(resumed)
+        if self.todo:
+            self._render(self.todo, self.mine())
+        return self.finish()
+
+    def prepare(self, resumed: bool) -> None:
+        """Find the shards to make, `todo`, after a check of those that are finished."""
+        mine = self.mine()
         done = self._sorted_out(mine)
         # The first images of a run come from subjects that are far apart.
-        todo = in_spread_order(sorted(mine - done))
+        self.todo = in_spread_order(sorted(mine - done))
         problem: str | None = DATASET
         if resumed:
             remove_leftovers(self.folder, mine, done)
             problem = next(damage(self.folder, self.plan.digest, quick=not self._verifies), None)
-            if problem is not None and ((self.folder / DATASET).exists() or not todo):
+            if problem is not None and ((self.folder / DATASET).exists() or not self.todo):
                 self.repaired(f"the dataset is assembled again: {problem}")
-        if todo:
-            remove_file(self.folder / DATASET)  # a folder that has this file is complete
-        self.total = sum(len(self.plan.spec.shard_samples(s)) for s in todo)
-        if todo:
+        self.intact = not self.todo and problem is None and not self._verifies
+        self.total = sum(len(self.plan.spec.shard_samples(s)) for s in self.todo)
+        if self.todo:
+            remove_file(self.folder / DATASET)  # a folder that has one is complete
             for shard in sorted(done) if self._verifies else ():
                 with suppress(InputError):  # a damaged shard of another part
                     self._mixed(read_done(self.folder, shard), old=True)
             self._log(
                 "start",
-                shards=len(todo),
+                shards=len(self.todo),
                 finished=len(done & mine),
                 engine=self.options.engine,
                 options=flags(self.options),
                 source_sha256=environment()["source_sha256"],
                 cpu=cpu_family(),
             )
-            self._render(todo, mine)
-        missing, statistics = self._assembled(not todo and problem is None and not self._verifies)
+
+    def finish(self) -> dict[str, Any]:
+        """Assemble the dataset if no shard is missing, and return the summary of the run."""
+        missing, statistics = self._assembled(self.intact)
         summary: dict[str, Any] = {
             "schema": "eyerender/generate/1",
             "path": str(self.folder),
             "complete": not missing,
-            "shards_made": len(todo),
+            "shards_made": len(self.todo),
             "shards_missing": len(missing),
             "images_made": self.images,
             "seconds": round(time.monotonic() - self.start, 3),
@@ -233,8 +269,8 @@ class _Run:
             summary |= {"statistics": statistics}
         return summary
 
-    def _mine(self) -> set[int]:
-        """Return the shards of this part."""
+    def mine(self) -> set[int]:
+        """Shards of this part."""
         k, n = self.part
         return set(self.plan.spec.shards[k - 1 :: n])
 

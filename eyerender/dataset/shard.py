@@ -75,15 +75,19 @@ def write_shard(
         if len(partial.made) < len(samples):
             partial.checkpoint()
             raise Stopped
-        done = partial.finish()
-        seconds = partial.seconds
+        return staged(partial)
+
+
+def staged(partial: PartialShard) -> Staged:
+    """Finish a shard whose samples are all made; it may then be put in place."""
+    done = partial.finish()
     return Staged(
-        shard=shard,
+        shard=partial.shard,
         stage=str(partial.stage),
         images=done["images"],
         rejected=len(done["rejections"]),
         given_up=len(done["given_up"]),
-        seconds=seconds,
+        seconds=partial.seconds,
         bytes=sum(entry["bytes"] * (1 + name.endswith(LINES)) for name, entry in done["files"].items()),
     )
 

@@ -19,7 +19,7 @@ from ..progress import Progress
 from ..scene import Scene, is_dataset, load_scene, refuse_folder, shipped_files
 from ..storage.files import written
 from .maker import Maker
-from .plan import Plan
+from .plan import Plan, is_function
 from .realise import frames_of
 from .spec import DatasetSpec, shipped_datasets
 
@@ -84,6 +84,8 @@ def preview(
 def _found(given: str | Path | DatasetSpec | Plan | Scene, eye: str | None, seed: int | None) -> Plan | Scene:
     if isinstance(given, Scene):
         return given
+    if is_function(given):
+        return Plan.load(str(given), eye=eye, seed=seed, count=TILES)
     if isinstance(given, str | Path):
         if str(given) not in shipped_files():
             refuse_folder(Path(given), "a scene or dataset file, or the name of a shipped one")

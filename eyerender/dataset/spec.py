@@ -24,8 +24,11 @@ from .selection import Selection
 # Largest number of samples of a run; a Sobol sequence has no more points.
 MAX_COUNT = 10**9
 _LEAST_SHARDS = 16
-PACKED_SHARD = 1000  # samples of a packed shard by default, so that millions of images take a few thousand files
-_SPLIT = re.compile(r"[a-z][a-z0-9]*")
+PACKED_SHARD = 1000  # samples of a packed shard by default, so that millions of images make some thousand files
+SPLIT_NAME = re.compile(r"[a-z][a-z0-9]*")
+
+
+GeometryKind = Literal["depth", "normals", "iris_coordinates", "instances"]
 
 
 class LabelsSpec(Spec):
@@ -45,11 +48,24 @@ class LabelsSpec(Spec):
         "are no glints",
     )
 
+    geometry: tuple[GeometryKind, ...] | None = Field(
+        default=None,
+        description="also write what each pixel's centre shows: `depth` (mm along the camera's axis), `normals` (in "
+        "the camera's frame), `iris_coordinates` (mm toward the nose and up in the plane of the iris, from the centre "
+        "of the pupil, as seen through the cornea) and `instances` (masks in which lids, lashes, brow, skin and "
+        "background differ); all but the last are .npy files; default: none",
+    )
+
     @property
     def pictures(self) -> tuple[str, ...]:
         """Kinds of images that every sample has; each kind has its own folder."""
         more = {"amodal_masks": self.amodal_masks, "noiseless": self.noiseless, "highlights": self.highlights}
-        return ("images", "masks", *(kind for kind, wanted in more.items() if wanted))
+        return (
+            "images",
+            "masks",
+            *(kind for kind, wanted in more.items() if wanted),
+            *sorted(set(self.geometry or ())),
+        )
 
 
 class DatasetSpec(FileSpec):
@@ -144,7 +160,7 @@ class DatasetSpec(FileSpec):
         if not self.splits:
             raise ValueError("splits: give at least one")
         for name in self.splits:
-            if not _SPLIT.fullmatch(name):
+            if not SPLIT_NAME.fullmatch(name):
                 raise ValueError(f"splits.{name}: a name must consist of lower-case letters and digits")
         return self
 

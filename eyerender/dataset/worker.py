@@ -51,8 +51,8 @@ class Job:
         )
 
     def maker(self) -> Maker:
-        """Create the worker's maker."""
-        plan = Plan.from_mapping(self.plan, Path(self.base))
+        """Make the worker's maker."""
+        plan = Plan.from_mapping(self.plan, Path(self.base)).loaded()
         return Maker(plan, self.frames, backend=self.backend, threads=self.threads)  # type: ignore[arg-type]
 
 
@@ -65,13 +65,13 @@ def work(pipe: Connection, job: Job) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group, and the parent decides
     ending = _Ending()
     threading.Thread(target=_die_with_parent, daemon=True).start()
+    folder = Path(job.folder)
     try:
         maker = job.maker()
-    except BackendError as error:
-        pipe.send(("failed", "backend", str(error)))
+    except (BackendError, InputError) as error:
+        pipe.send(("failed", *failure(error, folder)))
         return
     pipe.send(("ready", maker.backend))
-    folder = Path(job.folder)
     while True:
         try:
             shard = pipe.recv()

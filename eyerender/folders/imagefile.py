@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..arrays import Bytes
+from ..arrays import Bytes, Singles
 from ..errors import InputError
 from ..storage.files import opened, written
 
@@ -63,8 +63,42 @@ def png_bytes(image: NDArray[Any]) -> bytes:
     return data.tobytes()
 
 
+def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
+    """Write a picture as `picture_bytes` encodes it, completely or not at all."""
+    with written(path, sync=False) as file:
+        file.write(picture_bytes(picture))
+
+
+def picture_bytes(picture: NDArray[Any]) -> bytes:
+    """Encode integers as PNG (`png_bytes`), and real numbers as NumPy's .npy, float32."""
+    if picture.dtype.kind == "u":
+        return png_bytes(picture)
+    file = io.BytesIO()
+    np.save(file, np.ascontiguousarray(picture, dtype=np.float32), allow_pickle=False)
+    return file.getvalue()
+
+
+def array_of(data: bytes, shape: tuple[int, ...], source: str) -> Singles:
+    """Read the content of an .npy file of float32.
+
+    Raises:
+        InputError: it is another kind of file, or of another shape.
+    """
+    try:
+        file = io.BytesIO(data)
+        if np.lib.format.read_magic(file) != (1, 0):
+            raise ValueError
+        found, by_columns, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=1000)
+    except (ValueError, SyntaxError, TypeError, EOFError):
+        raise InputError("is no array of float32", source=source) from None
+    if found != shape or by_columns or dtype != np.dtype("<f4") or len(data) - file.tell() != 4 * int(np.prod(shape)):
+        wanted = " x ".join(map(str, shape))
+        raise InputError(f"must be an array {wanted} of float32", source=source)
+    return np.frombuffer(data, dtype="<f4", offset=file.tell()).reshape(shape)
+
+
 class Writer:
-    """Writes PNG files in a second thread while the next image is rendered; a context manager.
+    """Writes pictures in a second thread, while the next image is rendered; a context manager.
 
     At most a few images wait. An error of a write is raised by the next call, or at the end of the block.
     """
@@ -88,11 +122,11 @@ class Writer:
         while self._waiting:
             self._waiting.popleft().result()
 
-    def png(self, path: Path, image: NDArray[Any]) -> None:
-        """Queue an image for writing, as in `write_png`."""
+    def put(self, path: Path, image: NDArray[Any]) -> None:
+        """Write an image like `write_picture`, later."""
         while len(self._waiting) >= _WAITING:
             self._waiting.popleft().result()
-        self._waiting.append(self._thread.submit(write_png, path, image))
+        self._waiting.append(self._thread.submit(write_picture, path, image))
 
 
 def compressed(image: Bytes, quality: int) -> Bytes:

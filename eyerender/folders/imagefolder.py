@@ -19,7 +19,7 @@ from typing import Any, NoReturn, TypeGuard, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bytes, Ints
+from ..arrays import Bytes, Ints, Singles
 from ..errors import InputError, Refuse, UnfinishedRunWarning
 from ..observation import EYES, Observations, concatenate, count_heads
 from ..rig.camera import Window
@@ -35,7 +35,7 @@ from ..storage.files import (
 )
 from ..storage.jsonlines import JsonLines, LineFiles
 from ..versions import package_version
-from .imagefile import MAX_IMAGE_BYTES, image_of
+from .imagefile import MAX_IMAGE_BYTES, array_of, image_of
 from .packed import INDEX, INDEX_TYPE, MEMBERS, PackedLines, read_member
 
 IMAGE_SCHEMA, RENDERED_SCHEMA = "eyerender/image/4", "eyerender/image/3"
@@ -69,10 +69,13 @@ CONVENTIONS = {
 }
 
 
+# Keys of a line that name arrays of real numbers, with the number of channels of each (0: none).
+ARRAY_KEYS = {"depth_file_name": 0, "normals_file_name": 3, "iris_coordinates_file_name": 2}
 # Keys of a line that name files of the folder.
 FILE_KEYS = (
     *("file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name", "highlight_mask_file_name"),
-    "lens_reflections_mask_file_name",
+    *("lens_reflections_mask_file_name", "instance_mask_file_name"),
+    *ARRAY_KEYS,
 )
 
 
@@ -181,6 +184,39 @@ class ImageEntry:
     def highlight_mask(self) -> Bytes | None:
         """Read the mask of lamp highlights on wet and oily surfaces (1, else 0); like `mask`."""
         return self._parts("highlight_mask_file_name")
+
+    def instance_mask(self) -> Bytes | None:
+        """Read what each pixel shows, with lids, lashes, brow and skin apart (docs/formats.md); like `mask`."""
+        return self._parts("instance_mask_file_name")
+
+    def depth(self) -> Singles | None:
+        """Read the depth (h, w), mm along the camera's axis to the first surface, NaN where there is none.
+
+        Returns:
+            The depth, None where the line names no such file.
+
+        Raises:
+            InputError: as for `file`; the file is no array of the window's size.
+        """
+        return self.array("depth_file_name")
+
+    def normals(self) -> Singles | None:
+        """Read the unit normals of the first surface (h, w, 3) in the camera's frame; like `depth`."""
+        return self.array("normals_file_name")
+
+    def iris_coordinates(self) -> Singles | None:
+        """Read places in the plane of the iris (h, w, 2), mm toward the nose and up; like `depth`."""
+        return self.array("iris_coordinates_file_name")
+
+    def array(self, key: str) -> Singles | None:
+        """Read the array that one of `ARRAY_KEYS` names; like `depth`."""
+        data = self.data(key)
+        if data is None:
+            return None
+        width, height = self.window[2:]
+        channels = ARRAY_KEYS[key]
+        shape = (height, width, channels) if channels else (height, width)
+        return array_of(data, shape, str(self.folder / self.line[key]))
 
     def noiseless(self) -> NDArray[Any] | None:
         """Read the counts without the sensor's noise, like `image`; None if the metadata names no such file."""
@@ -422,6 +458,20 @@ class ImageFolder:
             return lines.of_split(split), list(lines.splits)
         splits = [str(entry.line.get("split")) for entry in self]
         return np.flatnonzero(np.array(splits) == split), sorted(set(splits))
+
+    def samples(self) -> Ints:
+        """Numbers of the samples of the entries, (n,); the index of packed shards tells them without reading lines.
+
+        Raises:
+            InputError: a line or the index is wrong, or the folder is not that of a dataset.
+        """
+        lines = self.entries.lines
+        if isinstance(lines, PackedLines):
+            return np.asarray(lines.rows["sample"])
+        try:
+            return np.array([entry.line["sample"] for entry in self], dtype=np.int64)
+        except KeyError:
+            raise InputError("has images without a sample", source=str(self.path)) from None
 
     def truth(self) -> Observations:
         """Read the records of the analytic observer for every image, in order.

@@ -36,11 +36,12 @@ _SIGNS = {
 }
 _SIGN_BYTES = 2**30
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp", ".exr", ".hdr")
-_FOLDERS = re.compile(r"(images/)?((images|masks|amodal_masks|noiseless|highlights|shards)(/[0-9]+)?)|images|layouts")
+_KINDS = "images|masks|amodal_masks|noiseless|highlights|depth|normals|iris_coordinates|instances"
+_FOLDERS = re.compile(rf"(images/)?(({_KINDS}|shards)(/[0-9]+)?)|images|layouts")
 _FILES = re.compile(
     r"(images/)?("  # a study's images are a dataset in their own folder
     r"(dataset|run|croissant)\.json|(metadata|failures|log)\.jsonl|README\.md|report\.html|"
-    r"(images|masks|amodal_masks|noiseless|highlights)/([0-9]+/)?[^/]+\.(png|exr)|"
+    rf"({_KINDS})/([0-9]+/)?[^/]+\.(png|exr|npy)|"
     r"shards/[0-9]+/(lines\.jsonl|lines\.jsonl\.gz|images\.tar|done\.json)|index\.npy)"
     r"|(study|summary|findings|results|times)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
 )

@@ -132,21 +132,24 @@ class BegunImage:
         )
 
 
-def begin_each(many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False) -> Iterator[BegunImage]:
-    """Trace the rows of many frames in order; a second thread completes each image while the next row is traced.
+def begin_each(
+    many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False, geometry: bool = False
+) -> Iterator[BegunImage]:
+    """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
 
     The next frames are fetched before the last ones are traced, so that a second thread can prepare them. If fetching
     fails, the frames at hand are traced first.
 
     Args:
         many: the frames, one scene after the other.
-        renderer: the renderer.
-        highlights: whether to label the highlights of wet and oily surfaces.
+        renderer: what traces them.
+        highlights: whether to find the highlights of wet and oily surfaces.
+        geometry: whether to find depth, normals, coordinates on the iris and instances.
 
     Raises:
         InputError: a scene's windows cannot be rendered.
     """
-    steps = _steps(many, highlights)
+    steps = _steps(many, {"highlights": highlights, "geometry": geometry})
     step = next(steps, None)
     while step is not None:
         failed: Exception | None = None
@@ -172,12 +175,12 @@ class _Step:
     moments: tuple[RenderJob, ...]
 
 
-def _steps(many: Iterable[Frames], highlights: bool) -> Iterator[_Step]:
-    """Yield the jobs to trace, one after the other."""
+def _steps(many: Iterable[Frames], wanted: dict[str, Any]) -> Iterator[_Step]:
+    """Make the jobs to trace, one after the other; `wanted` are fields of theirs."""
     for frames in many:
         check_windows(frames.scene)
         for row in range(len(frames)):
-            job = replace(render_job(frames, row), highlights=highlights)
+            job = replace(render_job(frames, row), **wanted)
             yield _Step(frames, row, job, moments(frames, row, job))
 
 

@@ -159,8 +159,8 @@ def render_folder(
                     **scene.person_numbers(records[image.row]["eye"]),
                 },
             }
-            writer.png(folder / line["file_name"], image.counts)
-            writer.png(folder / line["mask_file_name"], image.parts)
+            writer.put(folder / line["file_name"], image.counts)
+            writer.put(folder / line["mask_file_name"], image.parts)
             if exr:
                 from ..rendering.scene.exr import write_exr
 

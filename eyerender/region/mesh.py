@@ -20,7 +20,7 @@ from .contour import COLUMNS, Contour, contour
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, tube_faces
 from .lashes import lashes
-from .lids import FINE, ROWS, grid_normals, halved, sheet
+from .lids import CONJUNCTIVA, FINE, LID, MARGIN, ROWS, grid_normals, halved, sheet
 from .skin import BROW, LASH, LASH_U, TEAR, band_row, sheet_v
 from .tears import ROWS as TEAR_ROWS
 from .tears import meniscus, on_globe
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     import trimesh
 
 PARTS = ("skin", "lashes", "brow", "tears")
+LID_MARKS = 17  # landmarks of a lid in labels
 HAIRS = 2  # the first of a mesh's strands, which are hairs
 
 
@@ -212,6 +213,22 @@ def sheet_ends() -> Bools:
     """Return whether each triangle of the sheet of skin is in its first or last row, which no other row continues."""
     within = (sheet_vertices(1, 0) <= sheet_faces()) & (sheet_faces() < sheet_vertices(ROWS - 1, 0))
     return frozen(~within.all(axis=1), np.bool_)
+
+
+@lru_cache(maxsize=1)
+def sheet_codes() -> Ints:
+    """Say what each triangle of the sheet is: 0 conjunctiva and caruncle, 1 upper lid, 2 lower lid, 3 face.
+
+    A lid reaches from the inner edge of its margin to its crease.
+    """
+    i, j = np.meshgrid(np.arange(ROWS), np.arange(COLUMNS + 1), indexing="ij")
+    row, column = (np.zeros(int(sheet_vertices(ROWS - 1, COLUMNS)) + 1, np.int64) for _ in range(2))
+    even = (i <= FINE) | (j % 2 == 0)
+    row[sheet_vertices(i, j)[even]], column[sheet_vertices(i, j)[even]] = i[even], j[even]
+    first = row[sheet_faces()].min(axis=1)
+    lid = np.where(column[sheet_faces()].max(axis=1) <= COLUMNS // 2, 1, 2)
+    beyond = np.where(first < CONJUNCTIVA + MARGIN + LID, lid, 3)
+    return frozen(np.where(first < CONJUNCTIVA, 0, beyond), np.int64)
 
 
 @lru_cache(maxsize=1)

@@ -16,6 +16,7 @@ from .integrator.film import mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
 from .integrator.hostdata import HostData
 from .integrator.request import BoundFrame
+from .output.geometry import Hits, window_hits
 from .output.labels import PartLabels, highlights, part_labels
 from .output.window import RawFrame, RenderedWindow
 from .records.job import RenderJob
@@ -101,8 +102,8 @@ class Renderer:
             film = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
             if shot is shots[len(shots) // 2]:
                 around = CoarseSensor.begin(bound)
-            # The device is busy until something is read, so host work comes first.
-            found = _marks(bound, job) if shot.M is job.M and shot.t is job.t else None
+            # The device works until something is read, so host work comes first.
+            found = _marks(bound, job, surroundings) if shot.M is job.M and shot.t is job.t else None
             self._builder.prepare()
             mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / len(shots))
             glints += shines
@@ -114,12 +115,12 @@ class Renderer:
         assert blur is not None
         if marks is None:  # no sub-frame is at mid-exposure
             bound, surroundings = self.bind(job, lit=False)
-            marks = self._mirror_images(bound.host).seen(surroundings, blur)[0], *_marks(bound, job)()
-        mirrored, labels, margins, bright = marks
+            marks = self._mirror_images(bound.host).seen(surroundings, blur)[0], *_marks(bound, job, surroundings)()
+        mirrored, labels, margins, bright, hits = marks
         picture = np.mean(pictures, axis=0) if moments else pictures[0]
         return RawFrame(
             job=job, picture=picture, glints=tuple(glints), blur=blur, mirrored=mirrored, labels=labels, failed=failed,
-            lid_margins_px=margins, highlights=bright, around=None if around is None else around.picture(),
+            lid_margins_px=margins, highlights=bright, hits=hits, around=None if around is None else around.picture(),
         )  # fmt: skip
 
     def _mirror_images(self, host: HostData) -> MirrorImages:
@@ -146,9 +147,12 @@ class Renderer:
         return self._builder.set(job, lit=lit)
 
 
-def _marks(bound: BoundFrame, job: RenderJob) -> Callable[[], tuple[PartLabels | None, Any, Bools | None]]:
-    """Start computing the labels, lid margins (px) and highlights that the job requests."""
+def _marks(
+    bound: BoundFrame, job: RenderJob, surroundings: Background | RegionScene
+) -> Callable[[], tuple[PartLabels | None, Any, Bools | None, Hits | None]]:
+    """Start computing labels, margins of the lids (px), highlights and geometry, as far as the job wants them."""
     labels = part_labels(bound, job.window) if job.labels else lambda: None
+    hits = window_hits(bound, job.window, surroundings) if job.geometry else lambda: None
     return lambda: (
-        labels(), bound.host.lid_margins_px, highlights(bound, job.window) if job.highlights else None
+        labels(), bound.host.lid_margins_px, highlights(bound, job.window) if job.highlights else None, hits()
     )  # fmt: skip

@@ -253,7 +253,7 @@ def test_bad_arguments_are_one_line(folder, spec, tmp_path):
             lambda: FolderDataset(folder, split="val"),
             "no image is of the split 'val'; there are test, train, validation",
         ),
-        (lambda: FolderDataset(folder, parts=("depth",)), "parts: must be some of image, noiseless, mask"),
+        (lambda: FolderDataset(folder, parts=("colour",)), "parts: must be some of image, noiseless, mask"),
         (lambda: FolderDataset(folder, parts=("amodal_mask",))[0], "line 1: has no part 'amodal_mask'"),
         (lambda: StreamDataset("no_such_spec"), "no such dataset file"),
         (lambda: StreamDataset(spec, batch_size=0), "batch_size: must be >= 1, not 0"),

@@ -21,7 +21,7 @@ from ...progress import Progress
 from ...storage.files import write_json, write_text
 from ..assemble import verify_dataset, verify_finished
 from ..validation.problems import WRONG
-from . import coco, ellseg, imagefolder, openeds, parquet, table, teyed, webdataset
+from . import coco, ellseg, imagefolder, openeds, parquet, table, teyed, webdataset, yolo
 from .card import export_card
 from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
 from .item import Item, Items
@@ -35,6 +35,8 @@ FORMATS: dict[str, Writer] = {
     "webdataset": webdataset.write,
     "imagefolder": imagefolder.write,
     "coco": coco.write,
+    "yolo-seg": yolo.write_segments,
+    "yolo-pose": yolo.write_poses,
     "csv": table.write,
     "parquet": parquet.write,
     "openeds": openeds.write,

@@ -1,7 +1,10 @@
-"""COCO: SPLIT/*.png (8 bits) and annotations/instances_SPLIT.json; pupil, iris and sclera as run-length masks.
+"""COCO: SPLIT/*.png and annotations/instances_SPLIT.json, annotations/keypoints_SPLIT.json.
 
-Each image has its gaze (`line_of_sight`, `optic_axis`, ...) and the diameters of its pupil. Each glint is a separate
-instance with one keypoint [x, y, v]: v is 2 if visible, 1 if hidden.
+Instances are run-length masks of pupil, iris and sclera. Keypoints are the pupil's centre, the glints and nine
+landmarks of each lid from the temple to the nose, of one eye per image: x, y, v with v 2 visible, 1 hidden, 0 none.
+
+Each image has its gaze (`line_of_sight`, `optic_axis`, ...), the diameters of its pupil, and `camera`, `camera_name`.
+Among the instances, glints are instances of their own with one keypoint each: [x, y, v], v 2 visible, 1 hidden.
 """
 
 from __future__ import annotations
@@ -19,7 +22,8 @@ from ...arrays import Bools
 from ...folders.imagefile import write_png
 from ...geometry.ellipse import Ellipse
 from .gaze import DIRECTIONS, gaze_of, pupil_of
-from .item import Items
+from .item import Item, Items
+from .keypoints import box, keypoints, names
 
 # Except for the glints, a category's id is the part's value in the mask.
 CATEGORIES: list[dict[str, Any]] = [
@@ -34,15 +38,24 @@ def write(items: Items, out: Path) -> None:
     """Write images and annotations of every split."""
     (out / "annotations").mkdir()
     with ExitStack() as stack:
-        files = {split: stack.enter_context(_Annotations(items, out, split)) for split in items.splits}
+        eye = {"id": 1, "name": "eye", "supercategory": "eye", "keypoints": names(items.lights), "skeleton": []}
+        files: dict[str, _Annotations] = {}
+        points: dict[str, _Annotations] = {}
+        for split in items.splits:
+            (out / split).mkdir()
+            files[split] = stack.enter_context(_Annotations(items, out, f"instances_{split}", CATEGORIES))
+            points[split] = stack.enter_context(_Annotations(items, out, f"keypoints_{split}", [eye]))
         for number, item in enumerate(items, start=1):
             mask, line, file = item.mask, item.line, files[item.split]
             write_png(out / item.split / f"{item.name}.png", item.encoded)
             h, w = mask.shape
             size = {"width": w, "height": h}
-            file.add_image(
-                {"id": number, "file_name": f"{item.name}.png", **size, "subject": line["subject"], **_gaze(line)}
-            )
+            about = {"subject": line["subject"], **item.camera, **_gaze(line)}
+            image = {"id": number, "file_name": f"{item.name}.png", **size, **about}
+            file.add_image(image)
+            points[item.split].add_image(image)
+            if (mark := _eye(item, items.lights)) is not None:
+                points[item.split].add_mark(number, mark)
             for value, part in ((1, "sclera"), (2, "iris"), (3, "pupil")):
                 inside = mask == value
                 if inside.any():
@@ -59,11 +72,10 @@ def _gaze(line: dict[str, Any]) -> dict[str, Any]:
 
 
 class _Annotations:
-    """Writer of annotations/instances_SPLIT.json: images at once, annotations to a second file until the end."""
+    """Writer of annotations/NAME.json: images at once, annotations to a second file until the end."""
 
-    def __init__(self, items: Items, out: Path, split: str) -> None:
-        (out / split).mkdir()
-        self._path = out / "annotations" / f"instances_{split}.json"
+    def __init__(self, items: Items, out: Path, name: str, categories: list[dict[str, Any]]) -> None:
+        self._path = out / "annotations" / f"{name}.json"
         self._beside = self._path.with_suffix(".annotations")
         self._images: IO[str] = open(self._path, "w", encoding="utf-8")  # noqa: SIM115  (closed by __exit__)
         self._marks: IO[str] = open(self._beside, "w+", encoding="utf-8")  # noqa: SIM115
@@ -71,7 +83,7 @@ class _Annotations:
         head = {
             "info": {"description": items.name, "version": "1", "image": items.encoding.to_mapping()},
             "licenses": [] if items.licence is None else [{"id": 1, "name": items.licence}],
-            "categories": CATEGORIES,
+            "categories": categories,
         }
         self._images.write(json.dumps(head)[:-1] + ', "images": [')
 
@@ -120,6 +132,22 @@ def _instance(category: int, inside: Bools, ellipse: Ellipse | None) -> dict[str
         "bbox": box,
         "iscrowd": 0,
         "ellipse": None if ellipse is None else ellipse.numbers(),
+    }
+
+
+def _eye(item: Item, lights: int) -> dict[str, Any] | None:
+    """Annotation of the eye's keypoints; None where nothing of the eye is in the image."""
+    places = keypoints(item, lights)
+    found = box(places, item)
+    if found is None:
+        return None
+    return {
+        "category_id": 1,
+        "keypoints": [value for place in places for value in place],
+        "num_keypoints": sum(v > 0 for _, _, v in places),
+        "bbox": found,
+        "area": found[2] * found[3],
+        "iscrowd": 0,
     }
 
 

@@ -10,10 +10,10 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from ...folders.imagefolder import METADATA
+from ...folders.imagefolder import ARRAY_KEYS, METADATA
 from ...storage.files import write_bytes
 from ..columns import type_first
-from ..done import KINDS
+from ..done import KINDS, picture_file
 from .item import Items
 
 
@@ -24,9 +24,10 @@ def write(items: Items, out: Path) -> None:
         for item in items:
             line = item.exported_line()
             for kind, key in KINDS.items():
-                data = item.entry.data(key) if "mask" in key else item.encode(key)
+                is_kept = "mask" in key or key in ARRAY_KEYS
+                data = item.entry.data(key) if is_kept else item.encode(key)
                 if data is not None:
-                    line[key] = f"{kind}/{item.name}.png"
+                    line[key] = f"{kind}/{picture_file(kind, item.name)}"
                     (out / kind).mkdir(exist_ok=True)
                     write_bytes(out / line[key], data, sync=False)
             file.write(json.dumps(line) + "\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -124,6 +125,15 @@ class Item:
         x0, y0 = self.entry.window[:2]
         x, y = found["centre_px"]
         return Ellipse(np.array([x - x0, y - y0]), np.array(found["semi_axes_px"]), found["angle_rad"])
+
+    @property
+    def camera(self) -> dict[str, Any]:
+        """Number and name of the camera, by column; the name is that of the scene."""
+        parameters = self.line["parameters"]
+        number = int(parameters.get("camera", 0))
+        cameras = json.loads(parameters["scene_json"]).get("rig", {}).get("cameras", [])
+        name = cameras[number].get("name", "camera") if number < len(cameras) else "camera"
+        return {"camera": number, "camera_name": str(name)}
 
     def visible(self, part: str) -> bool:
         """Return whether any part of the pupil or the iris is visible."""

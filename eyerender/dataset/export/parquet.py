@@ -30,8 +30,17 @@ _PICTURES = {
     "noiseless": "noiseless_file_name",
     "highlight_mask": "highlight_mask_file_name",
 }
-_TEXTS = ("split", "encoding", "eye", "eye_model", "line_json")
-_WHOLE = ("sample", "subject", "sequence_index", "bit_depth", "source_bit_depth", "window_x0_px", "window_y0_px")
+_TEXTS = ("split", "encoding", "eye", "eye_model", "camera_name", "line_json")
+_WHOLE = (
+    "sample",
+    "subject",
+    "sequence_index",
+    "camera",
+    "bit_depth",
+    "source_bit_depth",
+    "window_x0_px",
+    "window_y0_px",
+)
 _SIZES = (
     (1e3, "n<1K"),
     (1e4, "1K<n<10K"),

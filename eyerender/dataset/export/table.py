@@ -46,6 +46,7 @@ def row_of(item: Item, lights: int) -> dict[str, Any]:
         **{key: line[key] for key in _COLUMNS},
         "eye": record["eye"],
         "eye_model": record["eye_model"],
+        **item.camera,
         "window_x0_px": x0,
         "window_y0_px": y0,
     }

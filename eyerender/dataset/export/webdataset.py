@@ -1,7 +1,7 @@
 """WebDataset: tar files of at most 1000 images per split; NAME.png, NAME.mask.png and NAME.json form a sample.
 
-If the dataset has amodal masks, masks of highlights or noiseless images, a sample also has NAME.amodal.png,
-NAME.highlights.png or NAME.noiseless.png.
+Where the dataset has them, there are NAME.amodal.png, NAME.highlights.png, NAME.noiseless.png, NAME.instances.png,
+NAME.depth.npy, NAME.normals.npy and NAME.iris_coordinates.npy, too.
 """
 
 from __future__ import annotations
@@ -14,7 +14,15 @@ from pathlib import Path
 from .item import Items
 
 SAMPLES = 1000
-_MASKS = {"mask": "mask_file_name", "amodal": "amodal_mask_file_name", "highlights": "highlight_mask_file_name"}
+_AS_THEY_ARE = {
+    ".mask.png": "mask_file_name",
+    ".amodal.png": "amodal_mask_file_name",
+    ".highlights.png": "highlight_mask_file_name",
+    ".instances.png": "instance_mask_file_name",
+    ".depth.npy": "depth_file_name",
+    ".normals.npy": "normals_file_name",
+    ".iris_coordinates.npy": "iris_coordinates_file_name",
+}
 
 
 def write(items: Items, out: Path) -> None:
@@ -30,7 +38,7 @@ def write(items: Items, out: Path) -> None:
                 tars[split] = _open(out / f"{split}-{k // SAMPLES:06d}.tar")
             counts[split] = k + 1
             files = {".png": item.encode()}
-            files |= {f".{ending}.png": item.entry.data(key) for ending, key in _MASKS.items()}
+            files |= {ending: item.entry.data(key) for ending, key in _AS_THEY_ARE.items()}
             files[".noiseless.png"] = item.encode("noiseless_file_name")
             for ending, data in files.items():
                 if data is not None:

@@ -17,6 +17,8 @@ from .problems import differences
 
 SKIN, SCLERA = 0, 1
 _VISIBLE = 1e-8  # relative; numbers of packed lines are rounded to 5e-9
+_UNIT, _FACING = 1e-5, 1e-3  # of normals
+_EDGES = 1e-3  # share of pixels in which two rays through one place may meet different sides of an edge
 Mask = NDArray[Any]
 
 
@@ -74,6 +76,30 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
         yield "its mask of highlights has another shape or values above 1"
     if mask is not None:
         yield from _masks(entry, mask, whole, limbus_px)
+    yield from _geometry(entry, mask)
+
+
+def _geometry(entry: ImageEntry, mask: Mask | None) -> Iterator[str]:
+    """Compare arrays of geometry with each other and with the mask."""
+    depth, normals, iris, instances = entry.depth(), entry.normals(), entry.iris_coordinates(), entry.instance_mask()
+    if depth is not None and np.nanmin(depth, initial=1.0) <= 0:
+        yield "its depth holds values <= 0"
+    if normals is not None:
+        length = np.linalg.norm(normals, axis=2)
+        if np.nanmax(np.abs(length - 1), initial=0.0) > _UNIT or np.nanmax(normals[..., 2], initial=-1.0) > _FACING:
+            yield "its normals are no unit vectors to the camera"
+    if instances is None:
+        return
+    if mask is not None and instances.shape == mask.shape:
+        own = np.where(instances > FRAME, SKIN, instances)
+        if np.count_nonzero(own != mask) > _EDGES * mask.size:
+            yield "its mask of instances differs from its mask"
+    for name, values, there in (
+        ("depth", depth, (instances != SKIN) & (instances != FRAME)),
+        ("iris coordinates", iris, (instances == IRIS) | (instances == PUPIL)),
+    ):
+        if values is not None and np.any(np.isnan(values if values.ndim == 2 else values[..., 0]) == there):
+            yield f"its {name} are not where its mask of instances says"
 
 
 def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats | None) -> Iterator[str]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backends.choose import BackendChoice
-from ...folders.imagefolder import ImageEntry, ImageFolder
+from ...folders.imagefolder import ARRAY_KEYS, ImageEntry, ImageFolder
 from ...progress import Progress
 from ...storage.files import shown
 from ..done import KINDS, cpu_family, read_done, run_versions
@@ -43,6 +43,7 @@ def render_again(
     for row in rows:
         entry = folder.entries[row]
         entries.setdefault(int(entry.line["sample"]), []).append(entry)
+    truth.remember({sample: own[0].line for sample, own in entries.items()})
     maker = Maker(truth.plan, truth.frames, backend=backend, threads=threads)
     notes = [f"{len(rows)} images are rendered again"]
     for k, made in enumerate(maker.make_all(entries)):
@@ -61,19 +62,29 @@ def render_again(
 
 def _differences(entry: ImageEntry, made: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     for kind, key in KINDS.items():
-        found = entry.picture(key)
+        found = _pixels(entry, key)
         if found is None:
             continue
-        if kind not in made or made[kind].shape != found[0].shape:
+        if kind not in made or made[kind].shape != found.shape:
             yield f"{entry.line[key]}: rendered again: there is no such picture"
             continue
-        gap = np.abs(made[kind].astype(np.int64) - found[0].astype(np.int64))
+        gap = np.abs(made[kind].astype(float) - found)
+        gap[np.isnan(made[kind]) & np.isnan(found)] = 0.0
+        gap[np.isnan(gap)] = np.inf
+        gap = gap.max(axis=2) if gap.ndim == 3 else gap
         if gap.any():
             v, u = np.unravel_index(int(gap.argmax()), gap.shape)
             yield (
-                f"{entry.line[key]}: rendered again: {np.count_nonzero(gap)} pixels differ, by up to {gap.max()} "
+                f"{entry.line[key]}: rendered again: {np.count_nonzero(gap)} pixels differ, by up to {gap.max():g} "
                 f"at x = {u}, y = {v}"
             )
+
+
+def _pixels(entry: ImageEntry, key: str) -> NDArray[Any] | None:
+    if key in ARRAY_KEYS:
+        return entry.array(key)
+    found = entry.picture(key)
+    return None if found is None else found[0]
 
 
 def other_maker(folder: ImageFolder, truth: DatasetTruth, entry: ImageEntry, backend: Mapping[str, Any]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,9 @@ from ...rendering.records.job import film_index, globe_of
 from ...scene import Frames, Scene
 from ...scene.spec import SceneSpec
 from ...storage.files import parse_json, shown
-from ..done import KINDS
+from ..done import KINDS, picture_file
 from ..line import image_line, image_name
+from ..ownscenes import GivenScene
 from ..plan import Plan, mapping_digest, plan_digest
 from ..realise import Realised, frames_of, realise
 from .problems import WRONG, Problems, differences
@@ -57,32 +58,68 @@ class Again:
 
 
 @dataclass
+class StoredScenes:
+    """The scenes that lines of metadata hold, in the place of the user's code that made them."""
+
+    lines: dict[int, dict[str, Any]] = field(default_factory=dict)
+    is_told: bool = False  # whether the lines say whose the images are, which otherwise follows from the plan
+
+    def __call__(self, _seed: int, sample: int, attempt: int) -> GivenScene:
+        """Return the scene of a sample, whose line must be in `lines`; raises one of `WRONG`."""
+        line = self.lines[sample]
+        parameters = line["parameters"]
+        if attempt < parameters["attempt"]:
+            raise InputError("an earlier attempt, which was rejected")
+        tree, eye = parse_json(parameters["scene_json"]), parse_json(parameters["eye_json"])
+        drawn = tree.get("person") is not None or tree.get("population") is not None
+        whose: dict[str, Any] = {"subject": line["subject"], "split": line["split"]} if self.is_told else {}
+        return GivenScene(tree=tree, eye={} if drawn else eye, draws=parameters["draws"], **whose)
+
+
+@dataclass(kw_only=True)
 class DatasetTruth:
     """Reference for the metadata of a generated dataset, from its plan; `frames` is the number of frames per sample.
 
-    `stale` is the reason why records and labels cannot be recomputed, None if they can.
+    Where a user's code gave the scenes, those of the lines are used, and `stored` must hold the lines.
+    `stale` is the reason why records and labels cannot be computed again, None where they can.
     """
 
     plan: Plan
     frames: int
     stale: str | None
+    stored: StoredScenes | None = None
     _last: Realised | None = field(default=None, init=False)
 
     @classmethod
-    def of(cls, dataset: Mapping[str, Any], problems: Problems) -> DatasetTruth | None:
-        """Read the plan in dataset.json, and add what is wrong with it to the problems."""
+    def of(
+        cls, dataset: Mapping[str, Any], problems: Problems, first: Mapping[str, Any] | None = None
+    ) -> DatasetTruth | None:
+        """Read the plan in dataset.json, whose first line is `first`; what is wrong is added to the problems."""
         try:
             plan = Plan.from_mapping(dataset, Path())
             mapping = {k: dataset[k] for k in plan.to_mapping()}
             # Earlier versions included the number of samples in the digest.
             if dataset["digest"] not in (plan_digest(mapping), mapping_digest(mapping)):
                 problems.add(f"{DATASET}: its digest does not match its spec, eyes and files")
-            return cls(plan, frames_of(plan), _other_results(dataset))
+            if plan.scenes is not None and first is not None:
+                return cls._of_stored(plan, dict(first), _other_results(dataset))
+            return cls(plan=plan, frames=frames_of(plan), stale=_other_results(dataset))
         except InputError as error:
             problems.add(f"{DATASET}: its plan cannot be used: {error}")
         except WRONG as error:
             problems.add(f"{DATASET}: holds no plan ({type(error).__name__}: {error})")
         return None
+
+    @classmethod
+    def _of_stored(cls, plan: Plan, first: dict[str, Any], stale: str | None) -> DatasetTruth:
+        """Use the scenes of the lines; raises one of `WRONG`, `InputError`."""
+        assert plan.scenes is not None
+        stored = StoredScenes({int(first["sample"]): first}, is_told=not plan.scenes.reference)
+        # The exposure that a subject got is in its scenes.
+        spec = plan.spec.model_copy(update={"auto_exposure": None})
+        plan = replace(plan, spec=spec, scenes=replace(plan.scenes, function=stored))
+        frames = plan.draw(first["sample"], first["parameters"]["attempt"]).build().frames()
+        return cls(plan=plan, frames=int(frames.index.frame.max()) + 1, stale=stale, stored=stored)
 
     def whose(self, line: dict[str, Any]) -> dict[str, Any]:
         """Return the subject, split and file names that a line must have; raise one of `WRONG` or `InputError`."""
@@ -90,12 +127,16 @@ class DatasetTruth:
         subject, sequence = self.plan.subject_of(sample)
         name = image_name(sample, record["frame"] - sample * self.frames, self.frames, record["eye"])
         shard = shard_name(self.plan.spec.selection.shard_of(sample))
-        files = {KINDS[kind]: f"{kind}/{shard}/{name}.png" for kind in self.plan.spec.labels.pictures}
+        files = {KINDS[kind]: f"{kind}/{shard}/{picture_file(kind, name)}" for kind in self.plan.spec.labels.pictures}
+        if self.plan.scenes is not None and not self.plan.scenes.reference:
+            return files  # the user's code said the rest
         return {**files, "subject": subject, "sequence_index": sequence, "split": self.plan.split_of(subject)}
 
     def again(self, line: dict[str, Any]) -> Again:
         """Recompute a line; raise one of `WRONG` if it is not a line of a dataset."""
         number, record = line["sample"], line["records"][0]
+        if self.stored is not None:
+            self.stored.lines = {number: line}
         if self._last is None or self._last.index != number:
             self._last = self._exposed(realise(self.plan, number, self.frames), line)
         found = self._last
@@ -113,6 +154,11 @@ class DatasetTruth:
         problems = _differences(_open(expected, texts), _open(line, texts))
         problems += [*_spots(scene, view, line), *_lids(scene, observations, view, line)]
         return Again(tuple(problems), _limbus(scene, view))
+
+    def remember(self, lines: Mapping[int, dict[str, Any]]) -> None:
+        """Keep the lines of some samples, where their scenes are needed."""
+        if self.stored is not None:
+            self.stored.lines = dict(lines)
 
     def _exposed(self, found: Realised, line: dict[str, Any]) -> Realised:
         """Return the sample with the exposure in its line, because automatic exposure depends on the pixels."""
@@ -190,7 +236,7 @@ class SceneTruth:
 def truth_of(folder: ImageFolder, problems: Problems) -> DatasetTruth | SceneTruth | None:
     """Return the reference for a folder's metadata; None if dataset.json is damaged. Raises `NoTruth`."""
     if folder.dataset.get("kind") == "dataset":
-        return DatasetTruth.of(folder.dataset, problems)
+        return DatasetTruth.of(folder.dataset, problems, folder.entries[0].line)
     return SceneTruth.of(folder.dataset, problems)
 
 

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...arrays import Bools, Floats
-from ...region.mesh import LidMargins, RegionMesh
+from ...region.mesh import LID_MARKS, LidMargins, RegionMesh
 from ...rig.camera import PinholeCamera
 
 _BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
-_MARKS = 17
 
 
 def glint_reason(there: Bools, open_: Bools, blockers: Sequence[str | None]) -> str:
@@ -44,6 +43,6 @@ def lid_margins_px(
     if len(region.upper_margin) == 0:
         return None
     both = region.upper_margin, region.lower_margin
-    marks = [margin[np.linspace(0, len(margin) - 1, _MARKS).round().astype(int)] for margin in both]
+    marks = [margin[np.linspace(0, len(margin) - 1, LID_MARKS).round().astype(int)] for margin in both]
     xy, front = camera.project(np.stack(marks) + anchor_mm)
     return dict(zip(("upper", "lower"), np.round(xy, 4).tolist(), strict=True)) if np.all(front) else None

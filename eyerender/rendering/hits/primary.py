@@ -127,7 +127,7 @@ def region_interaction(
     """Compute the interaction of rays along d (scene's frame) with triangles of an eye region."""
     skin = frame.region.surface(face, uv, active)
     si = _matte(frame, skin.point, skin.normal, d, active)
-    level = _facing(frame, skin.smooth, d) if frame.structure.scattering else None
+    level = facing(frame, skin.smooth, d) if frame.structure.scattering else None
     return replace(si, albedo=skin.albedo, gloss=skin.gloss, received=skin.received, level=level)
 
 
@@ -136,10 +136,10 @@ def _matte(
 ) -> SurfaceInteraction:
     """Compute the interaction with matte points of the scene, with normals turned to the viewer."""
     place = frame.point_to_eye(point)
-    return replace(SurfaceInteraction.blank(), other=active, point=place, normal=_facing(frame, normal, d))
+    return replace(SurfaceInteraction.blank(), other=active, point=place, normal=facing(frame, normal, d))
 
 
-def _facing(frame: Frame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
-    """Turn normals (scene's frame) to the viewer and convert them to the eye frame."""
+def facing(frame: Frame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
+    """Compute normals (eye frame) turned to the viewer; normals and rays are given in the scene's frame."""
     normal = frame.vector_to_eye(normal)
     return dr.normalize(dr.select(dr.dot(normal, frame.vector_to_eye(d)) > 0, -normal, normal))

@@ -16,6 +16,7 @@ from ..glints.splatting import Mirrored, Shine, add_shines
 from ..glints.tracing import GlintTable, Spots
 from ..records.job import RenderJob
 from ..scene.blur import Blur
+from .geometry import Geometry, Hits, geometry_of
 from .labels import PartLabels
 
 
@@ -33,8 +34,9 @@ class RenderedWindow(ArrayValue):
         purkinje: (order, table) of the other mirror images that were requested.
         failed_paths: number of light paths that did not converge; they are missing from the irradiance.
         glint_reasons: for each glint, whether it is visible or what hides it.
-        lid_margins_px: landmarks along the lids, if there are any.
-        highlights: (height, width) mask of highlights of wet and oily surfaces, if requested.
+        lid_margins_px: landmarks along the lids, where there are any.
+        highlights: (height, width) pixels with highlights of wet and oily surfaces, if they were requested.
+        geometry: depth, normals, coordinates on the iris and instances, if they were requested.
     """
 
     window: Window
@@ -48,6 +50,7 @@ class RenderedWindow(ArrayValue):
     glint_reasons: tuple[str, ...] = ()
     lid_margins_px: dict[str, list[list[float]]] | None = None
     highlights: Bools | None = None
+    geometry: Geometry | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -64,7 +67,8 @@ class RawFrame(ArrayValue):
         failed: number of light paths that did not converge.
         lid_margins_px: landmarks along the lids, where there are any.
         highlights: (height, width) highlights of wet and oily surfaces, if they were requested.
-        around: mean radiance of the whole sensor in blocks (`CoarseSensor`), if light scatters from there into the
+        hits: hits of the rays through the centres of pixels, if geometry was requested.
+        around: mean radiance of the whole sensor in blocks (`CoarseSensor`), where light from there strays into the
             window; else None.
     """
 
@@ -77,6 +81,7 @@ class RawFrame(ArrayValue):
     failed: int
     lid_margins_px: dict[str, list[list[float]]] | None
     highlights: Bools | None
+    hits: Hits | None = None
     around: Singles | None = None
 
     def develop(self) -> RenderedWindow:
@@ -91,11 +96,13 @@ class RawFrame(ArrayValue):
             raise InputError("the numbers of the scene are too extreme: its image is not finite")
         # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
         dn = exposure.recorded(job.sensor, job.camera, job.window, irradiance, job.wavelength_nm, job.seed)
+        geometry = None if self.hits is None else geometry_of(job, self.hits)
         covered = stray.covered(job.lens, job.sensor, job.camera, job.window)
         if covered is not None:
             labels = labels.behind(covered) if labels is not None else None
             mirrored = mirrored.behind(covered, job.window)
             highlights = None if highlights is None else frozen(highlights & ~covered, np.bool_)
+            geometry = None if geometry is None else geometry.behind(covered)
         return RenderedWindow(
             window=job.window,
             irradiance=irradiance,
@@ -108,6 +115,7 @@ class RawFrame(ArrayValue):
             glint_reasons=mirrored.reasons,
             lid_margins_px=self.lid_margins_px,
             highlights=highlights,
+            geometry=geometry,
         )
 
     def _irradiance(self) -> Singles:

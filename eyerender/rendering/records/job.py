@@ -62,10 +62,11 @@ class RenderJob(ArrayValue):
         wavelength_nm: wavelength in vacuum.
         seed: seed of samples and noise.
         labels: whether to compute raster labels.
-        highlights: whether to label the highlights of wet and oily surfaces.
-        purkinje: orders of the lamps' mirror images to render, from 1 (the glint) to 4.
-        apex_mm: (3,) apex of the unrotated eye in the world, to which the background is fixed. The default assumes a
-            rotation about a point 13.5 mm behind the apex.
+        highlights: whether to find the highlights of wet and oily surfaces.
+        geometry: whether to find depth, normals, coordinates on the iris and instances.
+        purkinje: mirror images of the lamps to show, from 1 (the glint) to 4.
+        apex_mm: (3,) apex of the unrotated eye in the world, to which the surround is fixed. By default it follows from
+            a turn about a point 13.5 mm behind the apex.
         region: the eye region; None for the bare eye.
         lens: focus and vignetting.
         ambient: light other than that of the lamps.
@@ -94,6 +95,7 @@ class RenderJob(ArrayValue):
     mesh_edge_mm: float | None = None
     interreflection: bool = True
     highlights: bool = False
+    geometry: bool = False
 
     @property
     def anchor_mm(self) -> Floats:

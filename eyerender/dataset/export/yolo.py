@@ -1,0 +1,100 @@
+"""YOLO (Ultralytics): images/SPLIT/*.png, labels/SPLIT/*.txt and data.yaml; places are shares of the image's size.
+
+yolo-seg: a line `class x1 y1 x2 y2 ...` for each connected part of more than a few pixels. Polygons have no holes, so
+the classes contain each other: 0 eye (all that is visible between the lids), 1 iris with the pupil, 2 pupil.
+yolo-pose: one object per image, the eye: `0 x y w h` of its box, then x, y and visibility (2 visible, 1 hidden, 0 none)
+of the pupil's centre, the glints and nine landmarks of each lid from the temple to the nose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy import ndimage
+
+from ...arrays import Bools, Floats
+from ...folders.imagefile import write_png
+from ...folders.imagefolder import IRIS, PUPIL, SCLERA
+from .item import Item, Items
+from .keypoints import box, keypoints, names
+
+CLASSES = ("eye", "iris", "pupil")
+_FROM = (SCLERA, IRIS, PUPIL)  # the first part of a mask that belongs to each class
+_LEAST_PX = 20
+_TOLERANCE_PX = 0.25  # of polygons
+# What the splits are called in data.yaml.
+_SPLITS = {"validation": "val", "valid": "val"}
+
+
+def write_segments(items: Items, out: Path) -> None:
+    """Write images and polygons of every split."""
+    _write(items, out, lambda item: list(_segments(item)), {})
+
+
+def write_poses(items: Items, out: Path) -> None:
+    """Write images and keypoints of every split."""
+    points = names(items.lights)
+    # A mirrored image shows the other eye, whose landmarks have the same names.
+    more = {"kpt_shape": [len(points), 3], "flip_idx": list(range(len(points))), "kpt_names": {0: points}}
+    _write(items, out, lambda item: list(_pose(item, items.lights)), more)
+
+
+def _write(items: Items, out: Path, lines: Callable[[Item], list[str]], more: dict[str, Any]) -> None:
+    for split in items.splits:
+        (out / "images" / split).mkdir(parents=True)
+        (out / "labels" / split).mkdir(parents=True)
+    for item in items:
+        write_png(out / "images" / item.split / f"{item.name}.png", item.encoded)
+        text = "".join(f"{line}\n" for line in lines(item))
+        (out / "labels" / item.split / f"{item.name}.txt").write_text(text, encoding="utf-8")
+    classes = ("eye",) if more else CLASSES
+    data = {**{_SPLITS.get(split, split): f"images/{split}" for split in items.splits}, **more}
+    data["names"] = dict(enumerate(classes))
+    (out / "data.yaml").write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+
+
+def _segments(item: Item) -> Iterator[str]:
+    mask = item.mask
+    for number, first in enumerate(_FROM):
+        for polygon in polygons(mask >= first):
+            yield " ".join([str(number), *_shares(polygon, mask.shape)])
+
+
+def _pose(item: Item, lights: int) -> Iterator[str]:
+    places = keypoints(item, lights)
+    found = box(places, item)
+    if found is None:
+        return
+    h, w = item.mask.shape
+    left, top, width, height = found
+    numbers = [(left + width / 2 + 0.5) / w, (top + height / 2 + 0.5) / h, width / w, height / h]
+    text = [f"{n:.6f}" for n in numbers]
+    for x, y, v in places:
+        text += [*_shares(np.array([[x, y]]), (h, w)), str(v)] if v else ["0", "0", "0"]
+    yield " ".join(["0", *text])
+
+
+def _shares(points: Floats, shape: tuple[int, ...]) -> Iterator[str]:
+    """Places (n, 2) in pixels, centres at integers, as shares of the image's width and height."""
+    shares = np.clip((points + 0.5) / [shape[1], shape[0]], 0.0, 1.0)
+    return (f"{number:.6f}" for number in shares.ravel())
+
+
+def polygons(inside: Bools) -> list[Floats]:
+    """Outline each connected part of a mask as a polygon (n, 2), x and y in pixels; holes are filled."""
+    from skimage.measure import approximate_polygon, find_contours
+
+    parts, count = ndimage.label(inside)
+    out = []
+    for number in range(1, count + 1):
+        part = ndimage.binary_fill_holes(parts == number)
+        if np.count_nonzero(part) <= _LEAST_PX:
+            continue
+        outline = max(find_contours(np.pad(part, 1).astype(float), 0.5), key=len) - 1.0  # type: ignore[no-untyped-call]
+        polygon = approximate_polygon(outline, _TOLERANCE_PX)[:-1]  # type: ignore[no-untyped-call]
+        out.append(np.asarray(polygon[:, ::-1]))
+    return out

@@ -1,0 +1,126 @@
+"""Exports of keypoints and of YOLO's layouts: places, visibility, polygons, and the names of cameras."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from skimage.draw import polygon2mask
+
+from eyerender.dataset.export import export
+from eyerender.dataset.export.item import Item
+from eyerender.dataset.export.keypoints import box, keypoints, names
+from eyerender.dataset.export.yolo import polygons
+from eyerender.folders.imagefolder import ImageEntry, ImageFolder
+
+
+def item_of(mask, **labels):
+    """An image of 40 x 30 px whose window begins at (100, 50)."""
+    missing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
+    line = {
+        "file_name": "images/0.png",
+        "window_px": {"x0": 100, "y0": 50, "width": 40, "height": 30},
+        "labels": {"pupil": {"amodal": missing}, "glints": [], "lid_margins_px": None, **labels},
+        "parameters": {"camera": 1, "scene_json": json.dumps({"rig": {"cameras": [{}, {"name": "left one"}]}})},
+    }
+    found = Item(ImageEntry(Path(), line))
+    found.__dict__["mask"] = mask
+    return found
+
+
+def test_keypoints_have_places_in_the_image_and_are_visible_hidden_or_unknown():
+    mask = np.zeros((30, 40), np.uint8)
+    mask[10:20, 10:30] = 1
+    mask[14:17, 18:21] = 3
+    pupil = {"amodal": {"centre_px": [119.2, 65.1], "semi_axes_px": [2.0, 1.5], "angle_rad": 0.0}}
+    glints = [
+        {"light": 0, "xy_px": [118.0, 64.5], "visible": True},
+        {"light": 1, "xy_px": [121.0, 66.0], "visible": False},
+        {"light": 2, "xy_px": None, "visible": False},
+        {"light": 3, "xy_px": [150.0, 66.0], "visible": False},
+    ]
+    along = [[105.0 + 2 * k, 60.0] for k in range(17)]
+    item = item_of(mask, pupil=pupil, glints=glints, lid_margins_px={"upper": along, "lower": along[::-1]})
+    found = dict(zip(names(4), keypoints(item, 4), strict=True))
+    assert found["pupil_centre"] == pytest.approx((19.2, 15.1, 2))
+    assert [found[f"glint_{k}"] for k in range(4)] == [(18.0, 14.5, 2), (21.0, 16.0, 1), (0, 0, 0), (0, 0, 0)]
+    assert found["upper_lid_0"] == (5.0, 10.0, 2)
+    assert found["upper_lid_8"] == (37.0, 10.0, 2)
+    assert found["lower_lid_0"] == (37.0, 10.0, 2)
+    assert box(list(found.values()), item) == [4.5, 9.5, 33.0, 10.0]
+    assert item.camera == {"camera": 1, "camera_name": "left one"}
+    covered = item_of(np.zeros((30, 40), np.uint8), pupil=pupil)
+    assert keypoints(covered, 0)[0][2] == 1
+    assert box(keypoints(item_of(np.zeros((30, 40), np.uint8)), 2), covered) is None
+
+
+def test_polygons_enclose_the_pixels_of_each_part():
+    v, u = np.mgrid[:60, :80]
+    inside = ((u - 30) ** 2 + (v - 25) ** 2 < 400) | ((u - 68) ** 2 + (v - 45) ** 2 < 60)
+    inside[24:27, 29:32] = False  # a hole, such as a glint of another class
+    inside[2, 70] = True  # a speck
+    found = polygons(inside)
+    assert len(found) == 2
+    again = np.zeros_like(inside)
+    for polygon in found:
+        again |= polygon2mask(inside.shape, polygon[:, ::-1])
+    inside[24:27, 29:32], inside[2, 70] = True, False
+    assert np.count_nonzero(again & inside) / np.count_nonzero(again | inside) > 0.97
+
+
+@pytest.mark.render
+def test_coco_has_keypoints_of_the_eye(tiny, tmp_path):
+    from pycocotools import coco
+
+    export(tiny, "coco", tmp_path / "out")
+    lines = {entry.path.stem: entry.line for entry in ImageFolder.load(tiny).entries}
+    seen = 0
+    for path in sorted((tmp_path / "out" / "annotations").glob("keypoints_*.json")):
+        data = coco.COCO(path)
+        (category,) = data.loadCats(data.getCatIds())
+        assert category["keypoints"][:3] == ["pupil_centre", "glint_0", "glint_1"]
+        for number, image in data.imgs.items():
+            (mark,) = data.loadAnns(data.getAnnIds(imgIds=[number]))
+            line = lines[Path(image["file_name"]).stem]
+            assert len(mark["keypoints"]) == 3 * len(category["keypoints"])
+            assert mark["num_keypoints"] == sum(v > 0 for v in mark["keypoints"][2::3])
+            centre = np.array(line["labels"]["pupil"]["amodal"]["centre_px"])
+            window = line["window_px"]
+            np.testing.assert_allclose(mark["keypoints"][:2], centre - [window["x0"], window["y0"]])
+            assert (image["camera"], image["camera_name"]) == (0, "camera")
+            seen += 1
+    assert seen == 24
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("format", ["yolo-seg", "yolo-pose"])
+def test_yolo_reads_its_folder(tiny, tmp_path, format):
+    out = tmp_path / "out"
+    export(tiny, format, out)
+    data = yaml.safe_load((out / "data.yaml").read_text())
+    assert (data["train"], data["val"], data["test"]) == ("images/train", "images/validation", "images/test")
+    for entry in ImageFolder.load(tiny).entries:
+        name, split = entry.path.stem, entry.line["split"]
+        width, height = Image.open(out / "images" / split / f"{name}.png").size
+        assert (width, height) == entry.window[2:]
+        rows = [row.split() for row in (out / "labels" / split / f"{name}.txt").read_text().splitlines()]
+        numbers = np.array([float(n) for row in rows for n in row[1:]])
+        assert rows
+        if format == "yolo-seg":
+            assert numbers.min() >= 0
+            assert numbers.max() <= 1
+            assert {row[0] for row in rows} == {"0", "1", "2"}
+            (pupil,) = (np.array(row[1:], dtype=float).reshape(-1, 2) for row in rows if row[0] == "2")
+            again = polygon2mask((height, width), (pupil * [width, height] - 0.5)[:, ::-1])
+            assert np.count_nonzero(again != (entry.mask() == 3)) <= 0.06 * again.sum() + 4
+        else:
+            points, _ = data["kpt_shape"]
+            (row,) = rows
+            assert len(row) == 5 + 3 * points
+            x, y = float(row[5]) * width - 0.5, float(row[6]) * height - 0.5
+            centre = entry.line["labels"]["pupil"]["amodal"]["centre_px"]
+            np.testing.assert_allclose([x, y], np.array(centre) - entry.window[:2], atol=1e-3)
