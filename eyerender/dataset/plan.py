@@ -368,7 +368,7 @@ class Plan:
         if own is not None and own.subject is not None:
             turn = replace(turn, subject=own.subject, sequence=0)
         tree, drawn = self._scene_of(turn) if own is None else (dict(own.tree), own.draws)
-        tree.setdefault("format", 1)
+        tree.setdefault("format", spec.format)
         if spec.population is not None:
             tree["population"] = self.person_of(subject, subject_attempt).to_mapping()
         tree.setdefault("name", f"{spec.name} {sample}")
