@@ -25,8 +25,10 @@ RESAMPLES = 1000
 def overlaps(path: Path) -> dict[str, Any]:
     """IoU of every image that shows a pupil, by detector; 0 where a detector gives no ellipse."""
     with_pupil = ("right", "wrong", "none", "error")
-    out = {}
-    for entry in read_results(path)["extractors"]:
+    out, data = {}, read_results(path)
+    if data.get("centres_only"):
+        raise InputError("labels only the centres of pupils, so it has no IoU", source=str(path))
+    for entry in data["extractors"]:
         # An error on an image without a pupil has the same outcome, but then all detectors know none there.
         shown = [a for a in entry["answers"] if a["outcome"] in with_pupil]
         out[entry["name"]] = {a["image"]: a["iou"] or 0.0 for a in shown}

@@ -25,16 +25,18 @@ def curves_of(scores: Sequence[Score]) -> dict[str, Any]:
         `iou`: share of images with at least this overlap; `centre_px` and `centre_radii`: share with at most this error
         of the centre, in px and in radii sqrt(a b) of the true pupil; `confidence`: of the answers with at least this
         confidence, the share of right ones, and the share of images that get such an answer (null without confidences).
+        Where only centres are known, the shares of `iou` and `centre_radii` are null.
     """
     shown = [s for s in scores if s.with_pupil]
     found = [s for s in shown if s.centre_px is not None]
+    outlined = sum(not s.by_centre for s in shown)
     overlap = np.array([s.iou for s in found], dtype=np.float64)
     centre = np.array([s.centre_px for s in found], dtype=np.float64)
     radii = centre / np.array([s.radius_px or np.nan for s in found], dtype=np.float64)
     return {
-        "iou": _curve(IOU, [int(np.sum(overlap >= x)) for x in IOU], len(shown)),
+        "iou": _curve(IOU, [int(np.sum(overlap >= x)) for x in IOU], outlined),
         "centre_px": _curve(CENTRE_PX, [int(np.sum(centre <= x)) for x in CENTRE_PX], len(shown)),
-        "centre_radii": _curve(CENTRE_RADII, [int(np.sum(radii <= x)) for x in CENTRE_RADII], len(shown)),
+        "centre_radii": _curve(CENTRE_RADII, [int(np.sum(radii <= x)) for x in CENTRE_RADII], outlined),
         "confidence": _confidence(scores),
     }
 

@@ -48,7 +48,7 @@ class LabelledImage:
         path: file.
         bit_depth: bits of the file.
         size: (width, height).
-        pupil: the true pupil; None if the image shows none.
+        pupil: None where the image shows none, or only its centre is known.
         outline_px: (n, 2) outline of the pupil.
         visible: visible share of the pupil; None if unknown.
         glints: glints that the image shows.
@@ -61,7 +61,8 @@ class LabelledImage:
         mask_path: file of the classes of the pixels; None if unknown.
         hidden_glints_px: positions of glints that are hidden in the image.
         conditions: hard conditions (`conditions.CONDITIONS`).
-        gamma_from: source of the gamma: the folder, an option (`given`), or neither (`assumed`).
+        centre_px: (x, y) of a pupil of which only the centre is known.
+        gamma_from: where the gamma of the hints comes from: the folder, an option (`given`), or nowhere (`assumed`).
     """
 
     name: str
@@ -82,6 +83,12 @@ class LabelledImage:
     mask_path: Path | None = None
     conditions: tuple[str, ...] = ()
     hidden_glints_px: tuple[tuple[float, float], ...] = ()
+    centre_px: tuple[float, float] | None = None
+
+    @property
+    def shows_pupil(self) -> bool:
+        """Whether the image shows a pupil, of which the ellipse or only the centre is known."""
+        return self.pupil is not None or self.centre_px is not None
 
     def classes(self) -> Bytes | None:
         """Read the class of each pixel (0 skin, 1 sclera, 2 iris, 3 pupil, 4 a frame); None if unknown."""
@@ -123,7 +130,9 @@ def load_labelled(
 def _described(image: LabelledImage) -> LabelledImage:
     """Add measured properties of the glints, and the conditions that features and pixels show."""
     spots = np.array([g.xy_px for g in image.glints]).reshape(-1, 2)
-    conditions = [set(image.conditions), of_shape(image.pupil, image.visible, image.size, spots)]
+    conditions = [set(image.conditions)]
+    if image.centre_px is None:
+        conditions.append(of_shape(image.pupil, image.visible, image.size, spots))
     glints, mask = image.glints, image.classes()
     if mask is not None or glints:
         grey = read_any_image(image.path)[0]
@@ -174,7 +183,8 @@ def _with_hints(folder: Path, labels: Iterable[Labelled], gamma: float | None) -
         pupil = None if label.visible == 0.0 else label.pupil
         more: dict[str, Any] = {"visible": label.visible, "glints": label.glints}
         found = _without_rig(label.name, label.path, (depth, image.shape), pupil, **more)
-        out.append(replace(found, hints=hints, gamma_from=source, subject=label.subject))
+        found = replace(found, hints=hints, gamma_from=source, subject=label.subject, centre_px=label.centre_px)
+        out.append(found)
     if not out:
         raise InputError("holds no labelled images", source=str(folder))
     return out

@@ -1,5 +1,7 @@
 """Read public layouts: OpenEDS (segmentation), COCO and TEyeD, written by other programs or `export-dataset`.
 
+LPW and ExCuSe, which label only centres, are in `centrelabels`.
+
     SPLIT/images/NAME.png, SPLIT/labels/NAME.npy       OpenEDS 2019: 0 background, 1 sclera, 2 iris, 3 pupil
     annotations/*.json with images and annotations     COCO: the category `pupil`, an instance per image
     VIDEOS/NAME.mp4, ANNOTATIONS/NAME.mp4pupil_eli.txt TEyeD: FRAME;ANGLE;CENTER X;CENTER Y;WIDTH;HEIGHT;
@@ -25,6 +27,7 @@ from ..folders.exported import EXPORT, exported_gamma
 from ..folders.video import unpacked
 from ..geometry.ellipse import Ellipse
 from ..storage.files import inside, read_json, read_text
+from .centrelabels import is_excuse, is_lpw, read_excuse, read_lpw
 from .glintlabels import TrueGlint
 from .own import MAX_IMAGES, SUFFIXES, Labelled, ellipse_of_mask
 
@@ -34,14 +37,16 @@ _MOST_PIXELS = 2**26
 
 
 def layout_of(folder: Path) -> str | None:
-    """Return the layout of a folder: openeds, coco or teyed; None for any other."""
+    """Name of the layout that a folder has: openeds, coco, teyed, lpw or excuse, None for any other."""
     if (folder / "VIDEOS").is_dir() and (folder / "ANNOTATIONS").is_dir():
         return "teyed"
     if any((folder / "annotations").glob("*.json")):
         return "coco"
     if any(folder.glob("labels/*.npy")) or any(folder.glob("*/labels/*.npy")):
         return "openeds"
-    return None
+    if is_lpw(folder):
+        return "lpw"
+    return "excuse" if is_excuse(folder) else None
 
 
 def read_layout(folder: Path, layout: str) -> Iterator[Labelled]:
@@ -50,7 +55,8 @@ def read_layout(folder: Path, layout: str) -> Iterator[Labelled]:
     Raises:
         InputError: a label cannot be used, or names a missing image.
     """
-    return {"openeds": _openeds, "coco": _coco, "teyed": _teyed}[layout](folder)
+    readers = {"openeds": _openeds, "coco": _coco, "teyed": _teyed, "lpw": read_lpw, "excuse": read_excuse}
+    return readers[layout](folder)
 
 
 def stated_gamma(folder: Path) -> float | None:

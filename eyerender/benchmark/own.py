@@ -7,7 +7,8 @@
     masks/a.png, masks/b.png, ...        the pupil (its visible part, or all of it), or classes
     hints.json                           information for the extractors (`hints`); optional
 
-A line without numbers, or an empty mask, means that the image shows no pupil.
+A line without numbers, and an empty mask, say that the image shows no pupil. An image `clip.mp4/12` is the twelfth
+frame of a video.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..folders.imagefile import read_any_image
 from ..folders.imagefolder import DATASET, RUN
+from ..folders.video import unpacked
 from ..geometry.ellipse import Ellipse, fit_ellipse_direct, signed_distance
 from ..storage.files import inside, read_text
 from .glintlabels import TrueGlint
@@ -32,6 +34,7 @@ from .glintlabels import TrueGlint
 LABELS, MASKS, IMAGES = "labels.csv", "masks", "images"
 COLUMNS = ("centre_x_px", "centre_y_px", "semi_axis_a_px", "semi_axis_b_px", "angle_deg")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
+VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
 MAX_IMAGES = 100_000
 GLINTS = "glints.csv"
 _TRIALS, _NEAR_PX, _OUTSIDE_PX = 200, 0.7, 1.2
@@ -44,15 +47,17 @@ class Labelled:
     Attributes:
         name: name of the image.
         path: file.
-        pupil: the true pupil; None if the image shows none.
-        visible: visible share of the pupil; None if unknown.
-        glints: glints that the image shows.
-        subject: the person; "" if unknown.
+        pupil: None where the image shows none, or only its centre is known.
+        centre_px: (x, y) of a pupil of which only the centre is known.
+        visible: visible share of the pupil, None where it is unknown.
+        glints: those that the image shows.
+        subject: whose eye it is, "" where that is unknown.
     """
 
     name: str
     path: Path
-    pupil: Ellipse | None
+    pupil: Ellipse | None = None
+    centre_px: tuple[float, float] | None = None
     visible: float | None = None
     glints: tuple[TrueGlint, ...] = ()
     subject: str = ""
@@ -109,17 +114,33 @@ def _of_table(folder: Path) -> Iterator[Labelled]:
     missing = sorted({"image", *COLUMNS} - set(lines.fieldnames or ()))
     if missing:
         raise InputError(f"has no column {missing[0]}", source=source)
+    videos: dict[Path, list[Path]] = {}
     for k, line in enumerate(lines):
         where = f"line {k + 2}"
         if k >= MAX_IMAGES:
             raise InputError(f"has more than {MAX_IMAGES} lines", source=source)
         name = line["image"]
         home = folder / IMAGES if (folder / IMAGES).is_dir() and not (name or "").startswith(f"{IMAGES}/") else folder
-        path = inside(home, name, source=source, path=where)
+        path = _image_or_frame(home, str(name), videos, (source, where))
         cells = [line[column] for column in COLUMNS]
         pupil = _ellipse(cells, source, where) if any(cells) else None
         visible = _share(line.get("visible"), source, where)
         yield Labelled(name=str(name), path=path, pupil=pupil, visible=visible, subject=str(line.get("subject") or ""))
+
+
+def _image_or_frame(home: Path, name: str, videos: dict[Path, list[Path]], at: tuple[str, str]) -> Path:
+    """Return the file of an image, or of a frame `VIDEO/NUMBER`; `videos` collects the frames that are unpacked."""
+    source, where = at
+    video, _, number = name.rpartition("/")
+    if Path(video).suffix.lower() not in VIDEOS or not number.isdecimal():
+        return inside(home, name, source=source, path=where)
+    path = inside(home, video, source=source, path=where)
+    frames = videos.setdefault(path, [])
+    if not frames:
+        frames += unpacked(path)
+    if not 1 <= int(number) <= len(frames):
+        raise InputError(f"{video} has frames 1 to {len(frames)}", source=source, path=where)
+    return frames[int(number) - 1]
 
 
 def _share(cell: str | None, source: str, where: str) -> float | None:

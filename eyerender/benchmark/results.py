@@ -130,7 +130,9 @@ def times_of(runs: Sequence[Run], images: Sequence[LabelledImage]) -> dict[str, 
 def digest_of(image: LabelledImage, key: str) -> str:
     """Compute the digest of an image, its hints and its truth, by which benchmarks recognise the same task."""
     pupil = None if image.pupil is None else image.pupil.numbers()
-    truth = [key, pupil, image.visible, [[g.light, *g.xy_px] for g in image.glints]]
+    truth: list[Any] = [key, pupil, image.visible, [[g.light, *g.xy_px] for g in image.glints]]
+    if image.centre_px is not None:
+        truth.append(list(image.centre_px))
     return hashlib.sha256(json.dumps(truth).encode()).hexdigest()[:16]
 
 

@@ -132,7 +132,8 @@ def _results(
         "schema": RESULTS_SCHEMA,
         "folder": folder.absolute().name or str(folder),
         "images": len(images),
-        "with_pupil": sum(image.pupil is not None for image in images),
+        "with_pupil": sum(image.shows_pupil for image in images),
+        "centres_only": sum(image.centre_px is not None for image in images),
         "gamma": gammas_of(images),
         "image_digests": {image.name: digest_of(image, key) for image, key in zip(images, keys, strict=True)},
         "versions": versions(),
@@ -165,7 +166,7 @@ def _classified(run: Run, images: Sequence[LabelledImage]) -> Run:
     """Add to every wrong ellipse the kind of object that it shows."""
     scores = []
     for s, image in zip(run.scores, images, strict=True):
-        if s.outcome in ("wrong", "false") and s.ellipse is not None:
+        if s.outcome in ("wrong", "false") and s.ellipse is not None and not s.by_centre:
             s = replace(s, kind=kind_of(s.ellipse, image, read_any_image(image.path)[0], image.classes()))
         scores.append(s)
     return replace(run, scores=tuple(scores))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -14,10 +14,11 @@ from .folder import LabelledImage
 from .glintlabels import TrueGlint, false_kind
 from .protocol import Reply
 
-# right: IoU > 0.9. wrong: another ellipse. none: no pupil reported. error: no usable answer. If the image shows no
-# pupil: absent if none was reported, else false.
+# right: IoU > 0.9, or a centre within 5 px where only that is known. wrong: another ellipse. none: no pupil reported.
+# error: no usable answer. Where the image shows no pupil: absent when none was reported, else false.
 Outcome = Literal["right", "wrong", "none", "error", "absent", "false"]
 RIGHT_IOU = 0.9
+RIGHT_PX = 5.0  # the limit that the authors of sets with centres only use
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +70,7 @@ class Score:
         subject: the person; "" if unknown.
         kind: what a wrong ellipse shows instead of the pupil (`failurekinds`).
         radius_px: sqrt(a b) of the true pupil.
+        by_centre: whether only the centre of the true pupil is known.
     """
 
     outcome: Outcome
@@ -88,6 +90,7 @@ class Score:
     subject: str = ""
     kind: str | None = None
     radius_px: float | None = None
+    by_centre: bool = False
 
     @property
     def centre_px(self) -> float | None:
@@ -102,6 +105,8 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
     if reply.error is not None:
         return failed(image, reply.error, "glints" in reports)
     found, true = reply.ellipse, image.pupil
+    if image.centre_px is not None:
+        return _score_of_centre(image.centre_px, reply, glints, trip_s)
     if true is None:
         outcome: Outcome = "absent" if found is None else "false"
         return Score(
@@ -130,11 +135,25 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
     )
 
 
+def _score_of_centre(true_px: tuple[float, float], reply: Reply, glints: GlintScore | None, trip_s: float) -> Score:
+    """Score an answer by the distance of its centre, where no more is known."""
+    known: dict[str, Any] = {"confidence": reply.confidence, "glints": glints, "by_centre": True}
+    known |= {"cpu_s": reply.cpu_s, "wall_s": reply.wall_s, "trip_s": trip_s}
+    if reply.ellipse is None:
+        return Score("none", reply.reason or "gave no reason", **known)
+    dx, dy = (reply.ellipse.centre_px - np.array(true_px)).tolist()
+    distance = math.hypot(dx, dy)
+    right = distance <= RIGHT_PX
+    reason = None if right else f"is {distance:.1f} px from the pupil's centre"
+    return Score("right" if right else "wrong", reason, (dx, dy), ellipse=reply.ellipse, **known)
+
+
 def failed(image: LabelledImage, reason: str, reports_glints: bool) -> Score:
     """Return the score of an image without a usable answer."""
     missed = tuple((False, glint) for glint in image.glints)
     glints = GlintScore(true=len(missed), matches=missed) if reports_glints else None
-    return Score("error", reason, glints=glints, with_pupil=image.pupil is not None)
+    centre = image.centre_px is not None
+    return Score("error", reason, glints=glints, with_pupil=image.shows_pupil, by_centre=centre)
 
 
 def score_glints(image: LabelledImage, reply: Reply) -> GlintScore:

@@ -52,7 +52,7 @@ def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], report
     outcomes = {**{o: counts[o] for o in ("right", "wrong", "none")}, "error": errors}
     right = [s for s in scores if s.outcome == "right"]
     offsets = np.array([s.offset_px for s in right]).reshape(-1, 2)
-    axes = np.array([s.axes_px for s in right]).reshape(-1, 2)
+    axes = np.array([s.axes_px for s in right if s.axes_px is not None]).reshape(-1, 2)
     found = [c for s in scores if (c := s.centre_px) is not None]
     return {
         "images": len(scores),

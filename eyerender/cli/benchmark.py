@@ -43,7 +43,8 @@ def bench_extractors(
     gained (exact McNemar test, p < 0.05).
 
     Args:
-        folder: A folder of labelled images written by quickstart, render or generate, or a folder of ideal images.
+        folder: A folder of labelled images: written by quickstart, render or generate, your own with labels.csv or
+            masks, or in the layout of OpenEDS, TEyeD, COCO, LPW or ExCuSe.
         output: The folder to write.
         extractor: The name of an installed extractor (own-fast, own-refined, opencv-contour, pupil-detectors, or a
             plug-in), a Python module:callable, or a command that speaks the protocol. NAME=... names it in the report.
@@ -79,6 +80,8 @@ def bench_extractors(
     for entry in data["gamma"]:
         if entry["from"] == "assumed":
             say(f"{entry['images']} images state no gamma; {entry['gamma']:g} (linear) is assumed (--gamma)")
+    if data["centres_only"]:
+        say(f"{data['centres_only']} images have labels of the pupil's centre only; there, right is within 5 px of it")
     emit(data, f"{_table(data, read_json(output / TIMES, limit=2**30))}\n\nreport: {output / REPORT}", json)
     for problem in data["problems"]:
         say(f"error: {problem}")

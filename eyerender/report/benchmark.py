@@ -44,13 +44,6 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
     """Write one self-contained HTML file from the benchmark's JSON, its rows (extractor and image), and thumbnails."""
     entries, cards = data["extractors"], _cards(data)
     varying = [name for name in data["factors"] if any(e["breakdown"].get(name) for e in entries)]
-    lead = [
-        "Every extractor ran in its own process, on the same images and with the same information: the image, its bit "
-        "depth and, if the folder has a rig, the rig and the range of likely pupil sizes, but never the truth.",
-        "A pupil is right if the intersection over union of its ellipse and the true one is above 0.9, and wrong for "
-        "another ellipse. None means that the extractor reported no pupil, and error that it gave no usable answer. "
-        "The errors are those of the right pupils.",
-    ]
     sections = [
         Section(
             "Results",
@@ -100,7 +93,7 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
             wide=(1,),
         )
         sections[6] = replace(sections[6], tables=(_failure_table(entries), table))
-    write_page(path, Page(f"{data['folder']}: extractors compared", lead, cards, sections))
+    write_page(path, Page(f"{data['folder']}: extractors compared", _lead(data), cards, sections))
 
 
 def _cards(data: Row) -> list[Card]:
@@ -497,6 +490,23 @@ def _how(data: Row) -> list[str]:
         "images, the true outline is not exactly an ellipse and the renderer adds noise, so other errors "
         "dominate.",
     ]
+
+
+def _lead(data: Row) -> list[str]:
+    """What is compared, and when a pupil counts as right."""
+    lead = [
+        "Every extractor ran in its own process, on the same images and with the same information: the image, its bit "
+        "depth and, if the folder has a rig, the rig and the range of likely pupil sizes, but never the truth.",
+        "A pupil is right if the intersection over union of its ellipse and the true one is above 0.9, and wrong for "
+        "another ellipse. None means that the extractor reported no pupil, and error that it gave no usable answer. "
+        "The errors are those of the right pupils.",
+    ]
+    if data.get("centres_only"):
+        lead.append(
+            f"{data['centres_only']} images have labels of the pupil's centre only. There, a pupil is right if its "
+            "centre is within 5 px, and overlap, axes and boundary are unknown."
+        )
+    return lead
 
 
 def _px(value: float | None) -> str:
