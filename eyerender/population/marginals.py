@@ -30,7 +30,7 @@ class Fixed(Spec):
         return np.full(np.shape(z), self.value)
 
     def latent(self, x: Floats) -> Floats:
-        """Return the standard normal numbers of values."""
+        """Map values to standard normal numbers, the inverse of `at`."""
         return np.zeros(np.shape(x))
 
     @property

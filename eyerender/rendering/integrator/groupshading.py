@@ -165,7 +165,7 @@ class _LitPoint:
         return lamp.point(self.spot.x, *dr.sincos(self.spot.y * (2 * dr.pi)))
 
     def radiance(self, lamp: Lamp, albedo: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Compute the radiance towards the viewer from an unblocked lamp, and the irradiance (mW/mm^2)."""
+        """Compute what an unblocked lamp adds to the radiance towards the viewer, and its irradiance of the point."""
         irradiance, shine = direct_light(lamp, self.source(lamp), self.si, (self.normal, self.to_camera))
         return direct(self.si, albedo, irradiance, shine), irradiance
 

@@ -25,7 +25,13 @@ _FINEST_MM = 0.02  # smallest size of a cell; at the corners of the eye cells ar
 
 @dataclass(frozen=True, slots=True)
 class Bilinear:
-    """The four cells of a grid around positions, row by row, and the shares of the way across and down."""
+    """Bilinear interpolation in a grid: the four cells around each position, and its place between them.
+
+    Attributes:
+        numbers: upper left, upper right, lower left and lower right cell.
+        across: 0 at the left cells to 1 at the right ones.
+        down: 0 at the upper cells to 1 at the lower ones.
+    """
 
     numbers: tuple[mi.UInt32, ...]
     across: mi.Float

@@ -101,7 +101,7 @@ def _flux_on_skin(scene: TissueScene, grid: SheetGrid) -> tuple[mi.Float, mi.Flo
 
 
 def _coarse_cells(frame: Frame, grid: SheetGrid) -> _Cells:
-    """Return the coarse cells of the skin's grid, of two by two cells each."""
+    """Return the cells of a grid over the skin that is half as fine as `grid` in both directions."""
     index, columns = grid.cells[1], grid.size.columns // 2
     row, column = index // columns, index % columns
     middle, normal = _skin_point(frame, grid, row, column, mi.Float(0.5), mi.Float(0.5))
