@@ -108,7 +108,7 @@ class Measured(GraphSurface):
         )
 
     def likeness(self) -> tuple[Floats, Floats]:
-        """Return the curvature (1/mm) and 1 + Q of a similar conic: the means over the outer biconic's two meridians."""
+        """Return curvature (1/mm) and 1 + Q of a similar conic: the means over the outer biconic's meridians."""
         return np.mean(1.0 / self.outer[..., :2], axis=-1), 1.0 + np.mean(self.outer[..., 2:4], axis=-1)
 
     def _share(self, y: Floats, z: Floats) -> tuple[Floats, FloatLike]:
