@@ -94,7 +94,7 @@ class Maker:
                     yield found
 
         labels = self.plan.spec.labels
-        images = begin_each(frames(), self.renderer, highlights=labels.highlights, geometry=bool(labels.geometry))
+        images = begin_each(frames(), self.renderer, highlights=labels.highlights, geometry=labels.geometry or ())
         for first in images:
             while not waiting[0].frames:
                 yield self._rest(waiting.popleft(), ())
@@ -176,6 +176,6 @@ _PICTURES: dict[str, Callable[[EyeImage], NDArray[Any]]] = {
     "highlights": _highlights,
     "depth": _geometry("depth"),
     "normals": _geometry("normals"),
-    "iris_coordinates": _geometry("iris"),
+    "iris_coordinates": _geometry("iris_coordinates"),
     "instances": _geometry("instances"),
 }

@@ -133,7 +133,7 @@ class BegunImage:
 
 
 def begin_each(
-    many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False, geometry: bool = False
+    many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False, geometry: tuple[str, ...] = ()
 ) -> Iterator[BegunImage]:
     """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
 
@@ -144,7 +144,7 @@ def begin_each(
         many: the frames, one scene after the other.
         renderer: what traces them.
         highlights: whether to find the highlights of wet and oily surfaces.
-        geometry: whether to find depth, normals, coordinates on the iris and instances.
+        geometry: kinds of geometry to find: depth, normals, iris_coordinates, instances.
 
     Raises:
         InputError: a scene's windows cannot be rendered.

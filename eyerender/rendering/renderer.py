@@ -152,7 +152,7 @@ def _marks(
 ) -> Callable[[], tuple[PartLabels | None, Any, Bools | None, Hits | None]]:
     """Start computing labels, margins of the lids (px), highlights and geometry, as far as the job wants them."""
     labels = part_labels(bound, job.window) if job.labels else lambda: None
-    hits = window_hits(bound, job.window, surroundings) if job.geometry else lambda: None
+    hits = window_hits(bound, job, surroundings) if job.geometry else lambda: None
     return lambda: (
         labels(), bound.host.lid_margins_px, highlights(bound, job.window) if job.highlights else None, hits()
     )  # fmt: skip

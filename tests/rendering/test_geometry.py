@@ -15,13 +15,14 @@ from eyerender.rendering.renderer import FRAME, IRIS, PUPIL, SCLERA
 from tests.support.render_rigs import eye_of, head_rig, job_of, remote_rig
 
 pytestmark = pytest.mark.render
+ALL = ("depth", "normals", "iris_coordinates", "instances")
 DISTORTED = (-0.2, 0.05, 0.001, -0.002, 0.0)
 
 
 def turned(model, rig, side="right", **changes):
     """A job of a turned eye in a window that holds its iris."""
     window = rig.window(160, 120) if rig.camera.K[0, 0] > 2000 else rig.window(320, 240)
-    return job_of(eye_of(model, side), rig, window, (11.0, -7.0), geometry=True, **changes)
+    return job_of(eye_of(model, side), rig, window, (11.0, -7.0), geometry=ALL, **changes)
 
 
 def rays(job):
@@ -80,13 +81,15 @@ def test_iris_coordinates_are_those_of_refracted_rays(renderer, side):
     n = np.asarray(stop.normal)
     place = x + ((np.asarray(stop.centre_mm) - x) @ n / (w @ n))[..., None] * w - np.asarray(stop.centre_mm)
     seen = (found.instances == IRIS) | (found.instances == PUPIL)
-    np.testing.assert_array_equal(np.isfinite(found.iris[..., 0]), seen)
-    own, wanted = (np.linalg.norm(v[seen], axis=-1) for v in (found.iris, place))
+    np.testing.assert_array_equal(np.isfinite(found.iris_coordinates[..., 0]), seen)
+    own, wanted = (np.linalg.norm(v[seen], axis=-1) for v in (found.iris_coordinates, place))
     np.testing.assert_allclose(own, wanted, atol=5e-4)
     nasal = -1 if side == "left" else 1
-    np.testing.assert_allclose(found.iris[seen][:, 0], nasal * place[seen][:, 1], atol=0.02)  # planes are tilted
+    np.testing.assert_allclose(
+        found.iris_coordinates[seen][:, 0], nasal * place[seen][:, 1], atol=0.02
+    )  # planes are tilted
     pupil = found.instances == PUPIL
-    assert np.linalg.norm(found.iris[pupil], axis=-1).max() <= stop.semi_axes_mm.max() + 1e-3
+    assert np.linalg.norm(found.iris_coordinates[pupil], axis=-1).max() <= stop.semi_axes_mm.max() + 1e-3
 
 
 def test_instances_tell_lids_lashes_brow_and_skin_from_the_background(renderer):
@@ -141,8 +144,11 @@ def test_depth_of_the_skin_is_that_of_its_triangles(renderer):
 
 def test_geometry_changes_no_pixel_and_hides_behind_a_frame(renderer):
     job = turned("E2", head_rig())
-    plain, more = renderer.render(replace(job, geometry=False), spp=4), renderer.render(job, spp=4)
+    plain, more = renderer.render(replace(job, geometry=()), spp=4), renderer.render(job, spp=4)
     assert plain.geometry is None
+    alone = renderer.render(replace(job, geometry=("depth",)), spp=4).geometry
+    assert alone.normals is alone.iris_coordinates is None
+    np.testing.assert_array_equal(alone.depth, more.geometry.depth)
     np.testing.assert_array_equal(plain.dn, more.dn)
     covered = np.zeros(more.dn.shape, dtype=bool)
     covered[:10] = True

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import ArrayValue, Bools, Bytes, Floats, Singles, frozen, sealed
+from ...arrays import ArrayValue, Bools, Bytes, Floats, Indices, Singles, frozen, sealed
 from ...eye.model import EyeModel
 from ...folders.imagefolder import FRAME, IRIS, PUPIL, SCLERA
-from ...geometry.surfaces import Surface
+from ...geometry.surfaces import Surface, Xyz
+from ...optics.interface import dot
 from ...region.mesh import sheet_codes
 from ...rig.camera import PinholeCamera, Window
 from ..hits.primary import facing, intersect
@@ -30,77 +32,80 @@ from ..scene.region import RegionScene
 NOTHING, SKIN, UPPER_LID, LOWER_LID, LASHES, BROW, CARUNCLE, TEARS = 0, 5, 6, 7, 8, 9, 10, 11
 """Instances in addition to the parts of a mask."""
 _PARTS = {"skin": SKIN, "head": SKIN, "lashes": LASHES, "brow": BROW, "tears": TEARS}
+_STEPS = 2  # of Newton's method, which rays at a grazing angle need
 _SHEET = np.array([CARUNCLE, UPPER_LID, LOWER_LID, SKIN], dtype=np.uint8)
-_STEPS = 2  # of Newton's method
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Geometry(ArrayValue):
-    """What the centres of pixels show; NaN where there is none.
+    """What the centres of pixels show; NaN where there is none, None where a kind was not requested.
 
     Attributes:
         depth: (height, width) mm along the camera's axis to the first surface.
         normals: (height, width, 3) its unit normals, in the camera's frame (x right, y down, z forward), to the camera.
-        iris: (height, width, 2) mm toward the nose and up in the plane of the iris, from the centre of the stop, of
-            what the pixel shows through the cornea.
+        iris_coordinates: (height, width, 2) mm toward the nose and up in the plane of the iris, from the centre of the
+            stop, of what the pixel shows through the cornea.
         instances: (height, width) parts of the eye as in a mask, or `SKIN`, `UPPER_LID`, ...
     """
 
-    depth: Singles
-    normals: Singles
-    iris: Singles
+    depth: Singles | None
+    normals: Singles | None
+    iris_coordinates: Singles | None
     instances: Bytes
 
     def behind(self, covered: Bools) -> Geometry:
         """Return it where what frames the camera's view covers the pixels (height, width)."""
-        values = {name: getattr(self, name).copy() for name in ("depth", "normals", "iris", "instances")}
-        for name, value in values.items():
-            value[covered] = FRAME if name == "instances" else np.nan
+        values: dict[str, Any] = {}
+        for name in ("depth", "normals", "iris_coordinates", "instances"):
+            own = getattr(self, name)
+            if own is not None:
+                values[name] = own.copy()
+                values[name][covered] = FRAME if name == "instances" else np.nan
         return replace(self, **{name: sealed(value) for name, value in values.items()})
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Hits(ArrayValue):
-    """Hits of the rays through the n centres of pixels, in the eye's frame.
+    """Hits of the rays through the n centres of pixels, in the eye's frame; None where no kind needs them.
 
     Attributes:
-        point: (n, 3) mm.
-        normal: (n, 3) normals of the surface without its relief.
-        inner: (n, 3) mm in the plane of the iris.
+        point: (3, n) mm.
+        normal: (3, n) normals of the surface without its relief.
+        inner: (3, n) mm in the plane of the iris.
         part: (n,) part of the eye, `SKIN` for the surroundings.
         cornea: (n,) whether the cornea is met, also where its rim is opaque.
         instance: (n,) code of the instance.
     """
 
-    point: Singles
-    normal: Singles
-    inner: Singles
+    point: Singles | None
+    normal: Singles | None
+    inner: Singles | None
     part: Bytes
     cornea: Bools
     instance: Bytes
 
 
-def window_hits(bound: BoundFrame, window: Window, scene: object) -> Callable[[], Hits]:
+def window_hits(bound: BoundFrame, job: RenderJob, scene: object) -> Callable[[], Hits]:
     """Begin to find what the centres of a window's pixels show; the result waits for it.
 
     Args:
         bound: the frame.
-        window: (x0, y0, width, height) in full-sensor pixels.
+        job: its job, whose kinds of geometry are wanted.
         scene: the surroundings of the eye.
     """
-    count = window[2] * window[3]
-    point, normal, inner, (part, cornea, face) = _hits(bound.frame.bare(), Pixels.of(window), count)
+    count = job.window[2] * job.window[3]
+    wanted = "depth" in job.geometry or "normals" in job.geometry, "iris_coordinates" in job.geometry
+    surface, inner, (part, cornea, face) = _hits(bound.frame.bare(), Pixels.of(job.window), count, wanted)
 
     def read() -> Hits:
         parts, numbers = part.numpy().astype(np.uint8), face.numpy()
         instance = parts.copy()
         if isinstance(scene, RegionScene):
-            other = parts == SKIN
-            instance[other] = _codes(scene)[numbers[other]]
-        places = (np.ascontiguousarray(v.numpy().T) for v in (point, normal, inner))
-        names = ("point", "normal", "inner")
-        rays = {name: sealed(v) for name, v in zip(names, places, strict=True)}
+            np.copyto(instance, _codes(scene)[numbers], where=parts == SKIN)
+        point, normal = (None, None) if surface is None else (sealed(v.numpy()) for v in surface)
         met = frozen(cornea.numpy() > 0, np.bool_)
+        within = None if inner is None else sealed(inner.numpy())
+        rays = {"point": point, "normal": normal, "inner": within}
         return Hits(**rays, part=sealed(parts), cornea=met, instance=sealed(instance))
 
     return read
@@ -108,9 +113,9 @@ def window_hits(bound: BoundFrame, window: Window, scene: object) -> Callable[[]
 
 @recorded
 def _hits(
-    frame: Frame, pixels: Pixels, count: int
-) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f, tuple[mi.UInt8, mi.UInt8, mi.UInt32]]:
-    """Return points, normals and places in the plane of the iris; parts, whether on the cornea, and triangles."""
+    frame: Frame, pixels: Pixels, count: int, wanted: tuple[bool, bool]
+) -> tuple[tuple[mi.Vector3f, mi.Vector3f] | None, mi.Vector3f | None, tuple[mi.UInt8, mi.UInt8, mi.UInt32]]:
+    """Return points with normals, and places in the plane of the iris, if wanted; parts, on cornea, triangles."""
     u, v = pixels.at(dr.arange(mi.UInt32, count))
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
     si, hit = intersect(frame, o, d, mi.Bool(True))
@@ -120,13 +125,16 @@ def _hits(
     point, normal, face = si.point, si.normal, mi.UInt32(0)
     if frame.region is not None:
         face = frame.region.face(hit)
-        skin = frame.region.surface(face, hit.prim_uv, si.other)
         part = dr.select(si.other, mi.UInt8(SKIN), part)
-        point = dr.select(si.other, frame.point_to_eye(skin.point), point)
-        normal = dr.select(si.other, facing(frame, skin.smooth, d), normal)
+        if wanted[0]:
+            skin = frame.region.surface(face, hit.prim_uv, si.other)
+            point = dr.select(si.other, frame.point_to_eye(skin.point), point)
+            normal = dr.select(si.other, facing(frame, skin.smooth, d), normal)
+    surface = (point, normal) if wanted[0] else None
+    inner = si.inner if wanted[1] else None
     cornea = dr.select(si.cornea, mi.UInt8(1), mi.UInt8(0))
-    dr.eval(point, normal, si.inner, part, cornea, face)
-    return point, normal, si.inner, (part, cornea, face)
+    dr.eval(surface, inner, part, cornea, face)
+    return surface, inner, (part, cornea, face)
 
 
 def _codes(scene: RegionScene) -> Bytes:
@@ -142,32 +150,44 @@ def _codes(scene: RegionScene) -> Bytes:
 
 def geometry_of(job: RenderJob, hits: Hits) -> Geometry:
     """Compute the geometry of a window from its hits."""
-    width, height = job.window[2:]
-    camera, eye = job.camera, job.eye
-    origin = job.M.T @ (camera.nodal_point_mm - job.t)
-    ways = _ways(camera, job.window) @ (camera.sensor_axes @ job.M)  # one mm along the camera's axis
-    depth = np.full(len(ways), np.nan)
-    normals = np.full((len(ways), 3), np.nan)
-    there = np.flatnonzero(hits.instance != NOTHING)
-    normal = hits.normal[there].astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach = _dot(hits.point[there] - origin, normal) / _dot(ways[there], normal)
-    if job.mesh_edge_mm is None:
-        cornea = hits.cornea[there]
-        sclera = (hits.part[there] == SCLERA) & ~cornea
-        for rows, surface in ((cornea, eye.front[0]), (sclera, _Sphere.of(eye))):
-            if rows.any():
-                reach[rows], normal[rows] = _refined(origin, ways[there[rows]], reach[rows], surface)
-    normal *= -np.sign(_dot(ways[there], normal))[:, None]
-    depth[there] = reach
-    normals[there] = normal @ (camera.sensor_axes @ job.M).T
-    shape = (height, width)
+    shape = job.window[3], job.window[2]
+    depth, normals = (None, None) if hits.point is None else _surface(job, hits)
     return Geometry(
-        depth=frozen(depth.reshape(shape), np.float32),
-        normals=frozen(normals.reshape(*shape, 3), np.float32),
-        iris=frozen(_on_iris(job, hits).reshape(*shape, 2), np.float32),
+        depth=depth if "depth" in job.geometry else None,
+        normals=normals if "normals" in job.geometry else None,
+        iris_coordinates=None if hits.inner is None else _on_iris(job, hits),
         instances=frozen(hits.instance.reshape(shape), np.uint8),
     )
+
+
+def _surface(job: RenderJob, hits: Hits) -> tuple[Singles, Singles | None]:
+    """Compute depth, and normals if they are wanted."""
+    assert hits.point is not None
+    assert hits.normal is not None
+    shape = job.window[3], job.window[2]
+    axes = job.camera.sensor_axes @ job.M  # eye's frame to that of the picture
+    origin = job.M.T @ (job.camera.nodal_point_mm - job.t)
+    ways = _ways(job.camera, job.window, axes)
+    x, y, z = (c.astype(float) for c in hits.normal)
+    normal = x, y, z
+    a, b, c = (p - o for p, o in zip(hits.point, origin, strict=True))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = dot(ways, normal)
+        reach = dot((a, b, c), normal) / along
+    if job.mesh_edge_mm is None:
+        sclera = (hits.part == SCLERA) & ~hits.cornea
+        for met, surface in ((hits.cornea, job.eye.front[0]), (sclera, _Sphere.of(job.eye))):
+            _refine(origin, ways, np.flatnonzero(met), surface, (reach, normal))
+        along = dot(ways, normal)
+    nothing = hits.instance == NOTHING
+    reach[nothing] = np.nan
+    depth = sealed(reach.astype(np.float32).reshape(shape))
+    if "normals" not in job.geometry:
+        return depth, None
+    turned = -np.sign(along)
+    turned[nothing] = np.nan
+    both = (axes @ np.stack(normal)) * turned
+    return depth, sealed(np.ascontiguousarray(both.T, dtype=np.float32).reshape(*shape, 3))
 
 
 class _Sphere:
@@ -181,49 +201,66 @@ class _Sphere:
         """Take that of an eye."""
         return cls(np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm))
 
-    def implicit(self, x: Floats) -> Floats:
-        """Like `Surface.implicit`."""
-        return np.asarray(_dot(x - self._centre, x - self._centre) - self._radius**2)
+    def value_at(self, point: Xyz) -> Floats:
+        """Like `Surface.value_at`."""
+        g = self.gradient_at(point)
+        return np.asarray(dot(g, g) - self._radius**2)
 
-    def gradient(self, x: Floats) -> Floats:
-        """Like `Surface.gradient`."""
-        return np.asarray(2 * (x - self._centre))
+    def gradient_at(self, point: Xyz) -> Xyz:
+        """Like `Surface.gradient_at`: half of the gradient."""
+        x, y, z = (p - c for p, c in zip(point, self._centre, strict=True))
+        return x, y, z
 
 
-def _refined(origin: Floats, ways: Floats, reach: Floats, surface: Surface | _Sphere) -> tuple[Floats, Floats]:
-    """Improve distances along rays to a surface by Newton's method; returns them with the unit normals there."""
+def _refine(origin: Floats, ways: Xyz, rows: Indices, surface: Surface | _Sphere, found: tuple[Floats, Xyz]) -> None:
+    """Improve some distances along rays to a surface by Newton's method, and set the unit normals there."""
+    reach, normal = found
+    way = (ways[0][rows], ways[1][rows], ways[2][rows])
+    t = reach[rows]
     for _ in range(_STEPS):
-        x = origin + reach[:, None] * ways
-        reach = reach - surface.implicit(x) / _dot(ways, surface.gradient(x))
-    normal = surface.gradient(origin + reach[:, None] * ways)
-    return reach, normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        point = _along(origin, way, t)
+        t = t - surface.value_at(point) / (2 * dot(way, surface.gradient_at(point)))
+    gradient = surface.gradient_at(_along(origin, way, t))
+    length = np.sqrt(dot(gradient, gradient))
+    reach[rows] = t
+    for own, g in zip(normal, gradient, strict=True):
+        own[rows] = g / length
 
 
-def _on_iris(job: RenderJob, hits: Hits) -> Floats:
-    """Places (n, 2) in the plane of the iris, toward the nose and up; NaN where neither iris nor pupil is seen."""
+def _along(origin: Floats, way: Xyz, t: Floats) -> Xyz:
+    return origin[0] + t * way[0], origin[1] + t * way[1], origin[2] + t * way[2]
+
+
+def _on_iris(job: RenderJob, hits: Hits) -> Singles:
+    """Places (h, w, 2) in the plane of the iris, toward the nose and up; NaN where neither iris nor pupil is seen."""
+    assert hits.inner is not None
     stop = job.eye.stop
-    nasal = np.array([0.0, -1.0 if job.eye.side == "left" else 1.0, 0.0])
     normal = np.asarray(stop.normal)
+    nasal = np.array([0.0, -1.0 if job.eye.side == "left" else 1.0, 0.0])
     u = nasal - normal * float(normal @ nasal)
     u /= np.linalg.norm(u)
-    up = np.array([0.0, 0.0, 1.0])
-    up -= normal * float(normal @ up)
-    v = up - u * float(u @ up)
+    v = np.array([0.0, 0.0, 1.0]) - normal * normal[2]
+    v -= u * float(u @ v)
     v /= np.linalg.norm(v)
-    out = (hits.inner - np.asarray(stop.centre_mm)) @ np.stack([u, v], axis=1)
-    out[(hits.part != IRIS) & (hits.part != PUPIL)] = np.nan
-    return np.asarray(out)
+    seen = np.flatnonzero((hits.part == IRIS) | (hits.part == PUPIL))
+    out = np.full((hits.part.size, 2), np.nan, dtype=np.float32)
+    out[seen] = (hits.inner.T[seen] - np.asarray(stop.centre_mm)) @ np.stack([u, v], axis=1)
+    return sealed(out.reshape(job.window[3], job.window[2], 2))
 
 
-def _ways(camera: PinholeCamera, window: Window) -> Floats:
-    """Directions (n, 3) through the centres of pixels, in the picture's frame, of length 1 along the camera's axis."""
+def _ways(camera: PinholeCamera, window: Window, axes: Floats) -> Xyz:
+    """Directions through the centres of pixels, three arrays (n,), of length 1 along the camera's axis.
+
+    axes: rows are right, down and forward of the picture.
+    """
     x0, y0, width, height = window
-    v, u = np.mgrid[y0 : y0 + height, x0 : x0 + width]
-    pixels = camera.ideal(np.stack([u.ravel(), v.ravel()], axis=-1))
-    x = (pixels[:, 0] - camera.K[0, 2]) / camera.K[0, 0]
-    y = (pixels[:, 1] - camera.K[1, 2]) / camera.K[1, 1]
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
-
-
-def _dot(a: Floats, b: Floats) -> Floats:
-    return np.asarray(np.einsum("ij,ij->i", a, b))
+    u, v = np.arange(x0, x0 + width, dtype=float), np.arange(y0, y0 + height, dtype=float)
+    if np.any(camera.distortion):
+        pixels = camera.ideal(np.stack(np.meshgrid(u, v), axis=-1))
+        u, v = pixels[..., 0], pixels[..., 1]
+    else:
+        v = v[:, None]
+    x = (u - camera.K[0, 2]) / camera.K[0, 0]
+    y = (v - camera.K[1, 2]) / camera.K[1, 1]
+    one, two, three = ((x * axes[0, k] + (y * axes[1, k] + axes[2, k])).ravel() for k in range(3))
+    return one, two, three

@@ -63,7 +63,7 @@ class RenderJob(ArrayValue):
         seed: seed of samples and noise.
         labels: whether to compute raster labels.
         highlights: whether to find the highlights of wet and oily surfaces.
-        geometry: whether to find depth, normals, coordinates on the iris and instances.
+        geometry: kinds of geometry to find: depth, normals, iris_coordinates, instances.
         purkinje: mirror images of the lamps to show, from 1 (the glint) to 4.
         apex_mm: (3,) apex of the unrotated eye in the world, to which the surround is fixed. By default it follows from
             a turn about a point 13.5 mm behind the apex.
@@ -95,7 +95,7 @@ class RenderJob(ArrayValue):
     mesh_edge_mm: float | None = None
     interreflection: bool = True
     highlights: bool = False
-    geometry: bool = False
+    geometry: tuple[str, ...] = ()
 
     @property
     def anchor_mm(self) -> Floats:
