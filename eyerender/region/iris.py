@@ -10,6 +10,7 @@ eye colour. Albedo varies little; the map is darker where light is trapped (cryp
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -33,7 +34,9 @@ class IrisPattern(Spec):
 
     crypts: _Strength | None = Field(default=None, description="depth and number of the crypts")
     furrows: _Strength | None = Field(default=None, description="depth of the contraction furrows")
-    collarette: _Strength | None = Field(default=None, description="height of the collarette and of the step at it")
+    collarette: _Strength | None = Field(
+        default=None, description="height of the collarette and of the step at it, depth of the small gaps along it"
+    )
     fibres: _Strength | None = Field(default=None, description="height and contrast of the radial fibres")
     relief: Annotated[float, Field(ge=0, le=2)] = Field(
         default=1.0, description="scale of all heights but that of the convexity; 0 is flat"
@@ -91,8 +94,8 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     Rows run from the pupil's margin (0) to the root (1), columns once around. The mean albedo over the iris' area is 1;
     heights are above the plane of the iris, 0 at margin and root.
     """
-    # Every part has its own random numbers, so that it does not change with the strength of another.
-    rng, fibrous, furrowed, holed, grained = (np.random.default_rng((0x1815, k, iris.seed)) for k in range(5))
+    # Every part has its own numbers, so that it stays when the strength of another changes.
+    rng, fibrous, furrowed, holed, grained, fringed = (np.random.default_rng((0x1815, k, iris.seed)) for k in range(6))
     shape = (RADIAL, ANGULAR)
     s = ((np.arange(RADIAL, dtype=np.float32) + 0.5) / RADIAL)[:, None]
     turn = ((np.arange(ANGULAR, dtype=np.float32) + 0.5) / ANGULAR)[None, :]
@@ -102,27 +105,31 @@ def iris_maps(iris: DrawnPattern) -> Singles:
         + 0.019 * _noise(rng, (1, ANGULAR), (0, 1), (9, 30), True)
     )
     off = s - collarette
-    ciliary = step(off, -0.02, 0.05)
+    ciliary = step(off, -0.06, 0.07)
     # Fibres are angular noise that is elongated along the radius; a slow sideways warp bends its columns.
     warp = 3.0 * _noise(rng, shape, (0, 2.2), (0, 14)) + 0.8 * _noise(rng, shape, (0, 6), (0, 60))
-    albedo, height = _fibres(fibrous, np.float32(rng.uniform(0.3, 1.6)) * warp, ciliary, iris.fibres)
+    albedo, height = _fibres(fibrous, np.float32(rng.uniform(0.15, 0.9)) * warp, ciliary, iris.fibres)
 
     # The stroma is thinner inside the collarette, which is a ridge of varying height.
     along = np.clip(1 + 0.8 * _noise(rng, (1, ANGULAR), (0, 1), (3, 30), True), 0, 2.4)
-    crest = np.exp(-((off / rng.uniform(0.015, 0.04)) ** 2)) * along
-    height += iris.collarette * (0.06 * crest - 0.06 * (1 - ciliary) + 0.03 * np.exp(-((off / 0.12) ** 2)))
-    albedo += iris.collarette * (0.13 * crest + 0.08 * (1 - ciliary))
+    crest = np.exp(-((off / rng.uniform(0.025, 0.06)) ** 2)) * along
+    height += iris.collarette * (0.035 * crest - 0.05 * (1 - ciliary) + 0.03 * np.exp(-((off / 0.12) ** 2)))
+    albedo += iris.collarette * (0.09 * crest + 0.06 * (1 - ciliary))
     slow = _noise(rng, shape, (0, 2.0), (0, 5))
-    albedo += 0.045 * slow + 0.035 * _noise(rng, shape, (0, 14), (0, 60)) - 0.04 * step(s, 0.72, 1.0)
+    albedo += 0.045 * slow + 0.03 * _noise(rng, shape, (0, 8), (0, 60)) - 0.04 * step(s, 0.72, 1.0)
     height += 0.02 * slow
-    # The stroma is a felt of collagen, whose grain shows more in some irises than in others.
-    albedo += grained.uniform(0.02, 0.075) * _noise(grained, shape, (8, 32), (50, 200))
-    albedo += 0.042 * _noise(grained, shape, (3, 12), (20, 70))
+    # The stroma is a felt of collagen, drawn out along the radius, whose grain shows more in some irises than others.
+    albedo += grained.uniform(0.01, 0.045) * _noise(grained, shape, (4, 20), (60, 200))
+    albedo += grained.uniform(0.01, 0.04) * _noise(grained, shape, (2, 9), (20, 80))
 
     grooves = iris.furrows * _furrows(furrowed, s, turn)
-    depth, trabeculae = _crypts(holed, iris.crypts, s=s, off=off, turn=turn, warp=warp)
-    height += 0.03 * trabeculae - 0.07 * grooves - 0.25 * depth
-    albedo = albedo * (1 + 0.45 * trabeculae) * (1 - 0.24 * grooves) * (1 - 0.85 * depth)
+    polar = _Polar(s=s, off=off, turn=turn, warp=warp)
+    depth, trabeculae = _crypts(holed, iris.crypts, polar)
+    gaps, rims = _fringe(fringed, iris.collarette, polar)
+    depth, trabeculae = np.maximum(depth, gaps), np.maximum(trabeculae, rims)
+    specks = _specks(fringed)
+    height += 0.03 * trabeculae - 0.07 * grooves - 0.2 * depth - 0.03 * specks
+    albedo = albedo * (1 + 0.45 * trabeculae) * (1 - 0.24 * grooves) * (1 - 0.65 * depth) * (1 - 0.4 * specks)
 
     # The ruff is the pigment epithelium turned over the margin, a dark beaded seam.
     beads = np.maximum(0.018 * (1 + 0.35 * _noise(rng, (1, ANGULAR), (0, 1), (30, 75), True)), 0.006)
@@ -165,51 +172,109 @@ def _fibres(rng: np.random.Generator, warp: Singles, ciliary: Singles, strength:
 def _furrows(rng: np.random.Generator, s: NDArray[Any], turn: NDArray[Any]) -> Singles:
     """Compute the depth 0 to 1 of the contraction furrows: arcs in the outer half, each over a part of the circle."""
     out = np.zeros(np.broadcast_shapes(s.shape, turn.shape), np.float32)
-    count = int(rng.integers(2, 6))
-    for place in np.linspace(rng.uniform(0.5, 0.64), rng.uniform(0.82, 0.93), count) + rng.uniform(-0.03, 0.03, count):
-        start, span = rng.uniform(0, 1), rng.uniform(0.35, 0.95)
-        wave = 0.008 * np.sin(2 * np.pi * (turn * rng.integers(2, 6) + rng.uniform()))
+    count = int(rng.integers(2, 9))
+    common = 0.012 * _noise(rng, (1, ANGULAR), (0, 1), (0, 6), True)
+    for place in np.linspace(rng.uniform(0.5, 0.7), rng.uniform(0.84, 0.95), count) + rng.uniform(-0.03, 0.03, count):
+        start, span = rng.uniform(0, 1), rng.uniform(0.15, 0.8)
+        wave = common + 0.006 * _noise(rng, (1, ANGULAR), (0, 1), (2, 16), True)
+        uneven = np.clip(0.7 + 0.4 * _noise(rng, (1, ANGULAR), (0, 1), (3, 24), True), 0, 1.4)
         along = np.mod(turn - start, 1.0)
-        mask = step(along, 0.0, 0.08) * (1 - step(along, span - 0.08, span))
-        d = (s - place - wave) / rng.uniform(0.010, 0.024)
-        out += mask * rng.uniform(0.4, 1.0) * (np.exp(-(d**2)) - 0.4 * np.exp(-((d - 1.8) ** 2)))
+        mask = step(along, 0.0, 0.08) * (1 - step(along, span - 0.08, span)) * uneven
+        d = (s - place - wave) / rng.uniform(0.008, 0.022)
+        out += mask * rng.uniform(0.3, 1.0) * (np.exp(-(d**2)) - 0.4 * np.exp(-((d - 1.8) ** 2)))
     return out
 
 
-def _crypts(
-    rng: np.random.Generator, strength: float, *, s: NDArray[Any], off: NDArray[Any], turn: NDArray[Any], warp: Singles
-) -> tuple[Singles, Singles]:
+@dataclass(frozen=True, kw_only=True)
+class _Polar:
+    """Places on the iris, for rows s and columns of the map.
+
+    Attributes:
+        s: share of the way from margin to root, (RADIAL, 1).
+        off: s outside of the collarette, (RADIAL, ANGULAR).
+        turn: share of a turn, (1, ANGULAR).
+        warp: how far the fibres swing aside, columns, (RADIAL, ANGULAR).
+    """
+
+    s: NDArray[Any]
+    off: NDArray[Any]
+    turn: NDArray[Any]
+    warp: Singles
+
+    def lattice(
+        self, rng: np.random.Generator, rows: NDArray[Any], cell_mm: float, long_by: float
+    ) -> tuple[Singles, NDArray[np.intp], int]:
+        """Cover rows of the map with random cells that are `long_by` times as long, along the radius, as wide.
+
+        Returns the difference (mm) of the distances to the two nearest cells' middles, which is 0 on the walls, the
+        numbers (2, rows, ANGULAR) of these cells, and the number of cells.
+        """
+        # The lattice is in mm of an iris of 3.8 mm from margin to root.
+        around, along = 2 * np.pi * 3.2, WIDTH_MM / long_by
+        low, high = (float(self.s[row, 0]) * along for row in (rows[0], rows[-1]))
+        count = max(int(around * (high - low + 2 * cell_mm) / cell_mm**2), 8)
+        seeds = np.stack([rng.uniform(0, around, count), rng.uniform(low - cell_mm, high + cell_mm, count)], axis=-1)
+        copies = np.concatenate([seeds + np.array([shift, 0.0]) for shift in (-around, 0.0, around)])
+        some = slice(rows[0], rows[0] + -(-len(rows) // 8) * 8)  # a few rows more, as `nearest_two` requires
+        # The cells bend like the fibres beside them.
+        x = (self.turn + 0.0025 * self.warp[some]) * around
+        y = np.broadcast_to(self.s[some] * along, x.shape) + 0.02 * np.roll(self.warp[some], 97, axis=1)
+        first, second, *cells = (v[: len(rows)] for v in nearest_two(copies, x, y, which=True))
+        return np.asarray(second - first), np.stack(cells).astype(np.intp) % count, count
+
+    def empty(self) -> Singles:
+        """Zeros over the map."""
+        return np.zeros(self.off.shape, np.float32)
+
+
+def _crypts(rng: np.random.Generator, strength: float, polar: _Polar) -> tuple[Singles, Singles]:
     """Compute Fuchs' crypts, lens-shaped gaps in the front layer, as depth 0 to 1, and the trabeculae between them.
 
-    They form a lattice along the collarette that is deep in some sectors and closed in others, with a few single crypts
-    towards the root.
+    They form a lattice outside the collarette that is deep in some sectors and closed in others, with a few single
+    crypts towards the root.
     """
-    out = np.zeros(np.broadcast_shapes(s.shape, turn.shape), np.float32)
+    depth, walls = polar.empty(), polar.empty()
     if strength == 0:
-        return out, out.copy()
-    # The lattice is in mm of an iris of 3.8 mm from margin to root, elongated along the radius.
-    long_by = rng.uniform(1.5, 2.6)
-    around, along = 2 * np.pi * 3.2, WIDTH_MM / long_by
-    count = int(rng.integers(70, 420))
-    seeds = np.stack([rng.uniform(0, around, count), rng.uniform(0, along, count)], axis=-1)
-    copies = np.concatenate([seeds + np.array([shift, 0.0]) for shift in (-around, 0.0, around)])
-    share = rng.uniform(0.2, 0.55)
-    deep = np.where(rng.uniform(size=count) < share, rng.uniform(0.2, 0.65, count), rng.uniform(0, 0.06, count))
-    pale = rng.uniform(0.05, 0.42, count) * (rng.uniform(size=count) < 0.7)
-    deep, pale = deep.astype(np.float32), pale.astype(np.float32)
-    rows = np.flatnonzero((s[:, 0] > 0.12) & (s[:, 0] < 0.88))
-    # Trabeculae bend like the fibres beside them.
-    some = slice(rows[0], rows[0] + -(-len(rows) // 8) * 8)  # a few more rows, as `nearest_two` requires
-    x = (turn + 0.0035 * warp[some]) * around
-    y = np.broadcast_to(s[some] * along, x.shape) + 0.02 * np.roll(warp[some], 97, axis=1)
-    first, second, one, two = (v[: len(rows)] for v in nearest_two(copies, x, y, which=True))
-    gap = second - first
-    sector = np.clip(0.72 + 0.5 * _noise(rng, (1, turn.shape[1]), (0, 1), (0, 5), True), 0.05, 1.35)
-    away, spread = off[rows], rng.uniform(0.07, 0.2)
-    zone = np.exp(-(((away - 0.05) / spread) ** 2)) * sector + 0.2 * step(away, 0.08, 0.2) * (s[rows] < 0.8)
-    nearest, next_ = one.astype(np.intp) % count, two.astype(np.intp) % count
-    trabeculae = np.maximum(pale[nearest], pale[next_]) * np.exp(-((gap / 0.055) ** 2))
-    depth = out.copy()
-    depth[rows] = np.clip(strength * zone * deep[nearest] * step(gap, 0.02, 0.16), 0, 0.85)
-    out[rows] = min(strength, 1.0) * zone * trabeculae
-    return depth, out
+        return depth, walls
+    rows = np.flatnonzero((polar.s[:, 0] > 0.12) & (polar.s[:, 0] < 0.88))
+    gap, cells, count = polar.lattice(rng, rows, rng.uniform(0.28, 0.6), rng.uniform(1.3, 2.4))
+    open_ = rng.uniform(size=count) < rng.uniform(0.35, 0.8)
+    deep = np.where(open_, rng.uniform(0.12, 0.6, count), rng.uniform(0, 0.06, count)).astype(np.float32)
+    pale = (rng.uniform(0.1, 0.5, count) * (rng.uniform(size=count) < 0.8)).astype(np.float32)
+    sector = np.clip(0.72 + 0.5 * _noise(rng, (1, ANGULAR), (0, 1), (0, 5), True), 0.05, 1.35)
+    away, spread = polar.off[rows], rng.uniform(0.08, 0.24)
+    zone = np.exp(-(((away - 0.08) / spread) ** 2)) * sector + 0.2 * step(away, 0.08, 0.2) * (polar.s[rows] < 0.8)
+    ridge = np.maximum(pale[cells[0]], pale[cells[1]]) * np.exp(-((gap / 0.06) ** 2))
+    depth[rows] = np.clip(strength * zone * deep[cells[0]] * step(gap, 0.02, 0.2), 0, 0.85)
+    walls[rows] = min(strength, 1.0) * zone * ridge
+    return depth, walls
+
+
+def _fringe(rng: np.random.Generator, strength: float, polar: _Polar) -> tuple[Singles, Singles]:
+    """Compute the small long gaps that line the collarette in most irises, as depth 0 to 1, and their pale rims."""
+    depth, walls = polar.empty(), polar.empty()
+    spread = rng.uniform(0.035, 0.08)
+    near = np.flatnonzero(np.any(np.abs(polar.off) < 2.5 * spread, axis=1) & (polar.s[:, 0] > 0.05))
+    rows = np.arange(near[0], min(near[-1] + 1, RADIAL - 8))
+    gap, cells, count = polar.lattice(rng, rows, rng.uniform(0.13, 0.26), rng.uniform(1.6, 3.0))
+    deep = (rng.uniform(0.1, 0.75, count) * (rng.uniform(size=count) < rng.uniform(0.4, 0.9))).astype(np.float32)
+    sector = np.clip(0.7 + 0.4 * _noise(rng, (1, ANGULAR), (0, 1), (0, 8), True), 0, 1.2)
+    zone = np.exp(-(((polar.off[rows] - 0.02) / spread) ** 2)) * sector
+    depth[rows] = np.clip(strength * zone * deep[cells[0]] * step(gap, 0.01, 0.09), 0, 0.7)
+    walls[rows] = min(strength, 1.0) * zone * 0.22 * np.exp(-((gap / 0.035) ** 2))
+    return depth, walls
+
+
+def _specks(rng: np.random.Generator) -> Singles:
+    """Compute the depth 0 to 1 of small round pits, from none to dozens, anywhere outside the pupillary zone."""
+    out = np.zeros((RADIAL, ANGULAR), np.float32)
+    for _ in range(int(rng.integers(0, 12) * rng.integers(0, 5))):
+        at, radius, depth = rng.uniform(0.35, 0.95), rng.uniform(0.02, 0.07), rng.uniform(0.2, 1.0)
+        row, column = int(at * RADIAL), int(rng.integers(ANGULAR))
+        row_mm, column_mm = WIDTH_MM / RADIAL, 2 * np.pi * (MARGIN_MM + at * WIDTH_MM) / ANGULAR
+        rows = np.arange(max(row - 14, 0), min(row + 15, RADIAL))
+        columns = np.arange(-14, 15)
+        far = np.square((rows - row) * row_mm)[:, None] + np.square(columns * column_mm)
+        place = np.ix_(rows, (column + columns) % ANGULAR)
+        out[place] = np.maximum(out[place], depth * np.exp(-far / radius**2))
+    return out

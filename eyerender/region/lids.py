@@ -173,7 +173,7 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     corner = step(t, 0.6, 1.05)
     z_start = z + (1 - corner) * 0.8 * on_globe * c.away[:, 2] + corner * (z_line - z)
     y_start = np.sign(y) * line * (1.2 * t - np.log1p(np.exp(12 * (1.2 * t - 1))) / 12)
-    y_start = y_start - 0.02 * corner * z_start**2 * (y > 0)
+    y_start = y_start - _bend(spec) * corner * z_start**2 * np.where(z_start < 0, 1.4, 1.0) * (y > 0)
     x_start = np.sqrt(np.maximum(globe.radius_mm**2 - y_start**2 - z_start**2, (0.4 * globe.radius_mm) ** 2))
     reach = unit(np.array([x_start, y_start, z_start]).T)
     reach = globe.centre + reach * (globe.radial(reach) - _DIP_MM)[:, None]
@@ -191,6 +191,11 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     film = spec.lids.film_mm * on_globe + 0.05 * (1 - on_globe) + sag
     clear = globe.pushed_out(rows, np.where(u[..., 0] > 0, film, -_DIP_MM))
     return np.asarray(clear)
+
+
+def _bend(spec: Region) -> float:
+    """Curvature (1/mm) of the plica's free edge, a crescent about the cornea, which differs between people."""
+    return float(np.random.default_rng((0x911C, spec.seed)).uniform(0.035, 0.085))
 
 
 def _spread(c: Contour, y: Floats, z: Floats, y_line: float, nasal: bool) -> Floats:

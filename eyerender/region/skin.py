@@ -342,14 +342,23 @@ class _Strip:
         self.level = z + 0.017 * np.minimum(y * y, 480.0) * np.tanh(z * 0.25)
         self.places, self.along = _places(y, z), _places(y, self.level)
         self.within = 1 - step(rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
-        # The plica gradually darkens the conjunctiva towards the caruncle.
-        self.flesh = step(np.cos(self.turn).astype(np.float32), 0.55, 0.95) * self.within * step(rows, 0.0, 5.0)
+        # The plica darkens the conjunctiva little by little towards the caruncle.
+        self.flesh = step(np.cos(self.turn).astype(np.float32), 0.55, 0.95) * self.within * step(rows, 0.0, 6.0)
         self.lids = _hill(y, z, 19.0, 13.0) * self.near
         self.roots = _bell(self.out_mm, 0.9, 2.4)  # roots of the lashes
 
     def field(self, number: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
         """Sample a band of noise at the positions of the strip."""
         return self.tiles.at(number, self.places, across, up)
+
+    @cached_property
+    def nodules(self) -> Singles:
+        """Rounded lumps of the caruncle, about 0 on average, most of them half a millimetre wide; 0 elsewhere."""
+        out: Singles = np.zeros_like(self.y)
+        some = self.flesh > 1e-3
+        if np.any(some):
+            out[some] = 0.8 - np.abs(self.tiles.at(7, _places(self.y[some], self.z[some]), (30, 75), (30, 75)))
+        return out
 
     def slowly(self, name: str) -> Singles:
         """Return a slowly varying field."""
@@ -364,8 +373,9 @@ class _Strip:
         dry = self.lid * (1 - np.minimum(wet * (1 / 0.7), 1))
         height = height * dry + spec.tears.unevenness * self.lumps()
         if np.any(self.flesh):
-            bumps = 0.075 + 0.25 * spec.tears.unevenness
-            height = height + bumps * self.flesh * self.field(6, (10, 36), (10, 36))
+            # The plica is nearly smooth, and the caruncle a cluster of nodules.
+            low = 0.075 + 0.25 * spec.tears.unevenness
+            height = height + self.flesh * (low * self.field(6, (10, 36), (10, 36)) + 0.05 * self.nodules)
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
         open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
         # Oil stands in a thin film on the plateaus, more of it near the glands of the lash roots.
@@ -513,7 +523,7 @@ class _Strip:
         # Where the conjunctiva lies on the globe, it is as white as the adjacent sclera.
         white = Look().sclera_albedo
         moist = white + step(rows, 1.0, CONJUNCTIVA - 1.0) * (skin.wet_albedo - white)
-        moist = moist * (1 - 0.40 * self.flesh) * (1 + 0.25 * mottled)
+        moist = moist * (1 - self.flesh * (0.3 - 0.08 * self.nodules)) * (1 + 0.25 * mottled)
         s = step(rows, CONJUNCTIVA + 1.5, CONJUNCTIVA + MARGIN)
         return np.asarray(np.clip(moist + s * (outer - moist), 0.02, 0.95))
 
