@@ -1,14 +1,16 @@
-"""Describe what bench_world samples, from its plan and ray optics alone: shares of the hard cases, and spans.
+"""Describe what bench_world samples: shares of the hard cases, and spans of size, contrast, blur and noise.
 
-    python scripts/describe_bench_world.py [SPEC] [--count N]
-
-Nothing is rendered, so what lids hide and how much a sensor clips is not in it: the blink stands for the visible share.
+python scripts/describe_bench_world.py [SPEC] [--count N]    from its plan and ray optics; the blink stands for lids
+python scripts/describe_bench_world.py --bench DIR           as measured in the images of a bench, of any folder
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import math
+from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +20,11 @@ from eyerender.dataset.realise import sample
 from eyerender.errors import EyerenderError
 
 
-def intensities(spec: Any) -> list[float]:
-    """Radiant intensities of the lamps, mW/sr."""
-    return [light.intensity_mw_sr for light in spec.rig.lights]
+def exposure(spec: Any) -> float:
+    """Exposure of the eye over the full well, with lamps as far away as the single one (413 mm)."""
+    eye = np.array([0.0, -31.5, 0.0])
+    lamps = [light.intensity_mw_sr * (413 / np.linalg.norm(light.position_mm - eye)) ** 2 for light in spec.rig.lights]
+    return float(spec.sensor.exposure_ms * sum(lamps) / spec.sensor.full_well_e)
 
 
 def describe(found: Any) -> dict[str, float]:
@@ -42,7 +46,7 @@ def describe(found: Any) -> dict[str, float]:
         "px_per_mm": float(scale),
         "speed_deg_s": math.hypot(*spec.motion.eye_deg_s) if spec.motion else 0.0,
         "window": float(bool(spec.ambient and spec.ambient.panels)),
-        "exposure": spec.sensor.exposure_ms * sum(intensities(spec)) / spec.sensor.full_well_e,
+        "exposure": exposure(spec),
         "psf_px": spec.sensor.psf_sigma_px,
         "jpeg": spec.sensor.jpeg_quality or 100,
         "full_well_e": spec.sensor.full_well_e,
@@ -54,12 +58,33 @@ def describe(found: Any) -> dict[str, float]:
     return out
 
 
+def describe_bench(folder: Path) -> None:
+    """Print what a bench measured in its images: conditions, edges along the true outline, and spans."""
+    with open(folder / "results.csv", encoding="utf-8") as file:
+        images = {row["image"]: row for row in csv.DictReader(file)}.values()
+    shown = [row for row in images if row["pupil_px"]]
+    known = [row for row in shown if row["noise_dn"]]
+    print(f"{len(images)} images; {len(shown)} show a pupil, {len(known)} of them have figures of its edge")
+    counts = Counter(name for row in images for name in row["conditions"].split("; "))
+    for name, count in counts.most_common():
+        print(f"{100 * count / len(images):5.1f} %  {name}")
+    for name, bar in (("contrast_to_noise", None), ("blur_px", 1.2), ("noise_dn", 1.0), ("pupil_px", None)):
+        values = np.array([float(row[name]) for row in shown if row[name]])
+        if len(values):
+            above = "" if bar is None else f"   above {bar:g}: {np.mean(values > bar):.2f}"
+            print(f"{name:20}", *(f"{v:9.3g}" for v in np.percentile(values, (5, 50, 95))), above)
+
+
 def main() -> None:
     """Print shares and spans."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--bench", type=Path, help="folder that bench-extractors wrote")
     parser.add_argument("spec", nargs="?", default="bench_world")
     parser.add_argument("--count", type=int, default=100, help="number of samples, spread over the plan")
     args = parser.parse_args()
+    if args.bench is not None:
+        describe_bench(args.bench)
+        return
     plan = Plan.load(args.spec)
     rows, failed = [], []
     for index in np.linspace(0, plan.spec.count - 1, args.count).astype(int):
@@ -81,7 +106,7 @@ def main() -> None:
         "a glint within 3 px of the edge": table["glint_from_edge_px"] < 3,
         "a window": table["window"] > 0,
         "motion": table["speed_deg_s"] > 50,
-        "clipped skin (exposure x power > 1.5 wells)": table["exposure"] > 1.5,
+        "clipped skin (exposure > 1)": table["exposure"] > 1.0,
     }
     print(f"{len(rows)} samples, {len(failed)} cannot be made")
     for line in failed[:5]:

@@ -18,9 +18,13 @@ def drawn():
 
 
 def exposure(scene):
-    """Exposure time by the power of all lamps, mW ms / sr, over the full well."""
-    power = sum(light["intensity_mw_sr"] for light in scene["rig"]["lights"])
-    return scene["sensor"]["exposure_ms"] * power / scene["sensor"]["full_well_e"]
+    """Exposure of the eye over the full well, of lamps that all are as far away as the single one (413 mm)."""
+    eye = np.array([0, -31.5, 0])
+    lamps = [
+        lamp["intensity_mw_sr"] * (413 / np.linalg.norm(np.array(lamp["position_mm"]) - eye)) ** 2
+        for lamp in scene["rig"]["lights"]
+    ]
+    return scene["sensor"]["exposure_ms"] * sum(lamps) / scene["sensor"]["full_well_e"]
 
 
 def test_there_are_many_subjects_and_no_pair_is_mirrored(drawn):
@@ -46,8 +50,8 @@ def test_every_hard_case_has_its_share(drawn):
         "entrance pupil above 6.5 mm": stop > 5.75,
         "motion": speed > 50,
         "window": np.array(["panels" in s["ambient"] for s in scenes]),
-        # In rendered samples, skin clips from 1.2 to 1.5 on.
-        "clipped skin": np.array([exposure(s) > 1.5 for s in scenes]),
+        # In rendered samples, skin clips from 1 on.
+        "clipped skin": np.array([exposure(s) > 1.0 for s in scenes]),
     }
     shares = {name: float(np.mean(holds)) for name, holds in cases.items()}
     assert min(shares.values()) >= 0.08, shares
@@ -57,12 +61,16 @@ def test_every_hard_case_has_its_share(drawn):
 def test_images_vary_in_size_blur_noise_and_compression(drawn):
     _, scenes = drawn
     sensor = [s["sensor"] for s in scenes]
+    # Radius of the pupil in px, seen from the front: the entrance pupil is 1.13 times as wide as the stop, 400 mm away.
+    # Published frames have 24, 35 and 58 px; tilt takes a tenth off.
     focal = np.array([s["rig"]["cameras"][0]["focal_length_px"] for s in scenes])
-    assert focal.max() / focal.min() > 1.9
-    assert np.mean([s["psf_sigma_px"] > 1.2 for s in sensor]) == pytest.approx(0.55, abs=0.08)
+    radius = np.array([0.565 * s["eye"]["pupil_diameter_mm"] for s in scenes]) * focal / 400
+    assert np.percentile(radius, (5, 50, 95)) == pytest.approx([25, 40, 60], rel=0.15)
+    assert np.mean([s["psf_sigma_px"] > 0.8 for s in sensor]) == pytest.approx(0.58, abs=0.08)
     assert {s["gamma"] for s in sensor} == {1.0, 2.2}
-    quality = np.array([s["jpeg_quality"] for s in sensor])
-    assert quality.min() < 20
+    assert np.mean([s["jpeg_quality"] is None for s in sensor]) == pytest.approx(0.5, abs=0.1)
+    quality = np.array([s["jpeg_quality"] for s in sensor if s["jpeg_quality"] is not None])
+    assert quality.min() < 25
     assert quality.max() > 95
     well = np.array([s["full_well_e"] for s in sensor])
-    assert well.max() / well.min() > 20
+    assert well.max() / well.min() > 6

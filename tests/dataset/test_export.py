@@ -17,6 +17,7 @@ import yaml
 from PIL import Image
 from scipy.io import loadmat
 
+from eyerender.benchmark.folder import load_labelled
 from eyerender.cli.main import run
 from eyerender.dataset.columns import type_first
 from eyerender.dataset.export import FORMATS, export, parquet
@@ -26,6 +27,7 @@ from eyerender.dataset.export.video import LosslessVideo
 from eyerender.errors import InputError
 from eyerender.folders.imagefile import read_image, write_png
 from eyerender.folders.imagefolder import ImageFolder
+from eyerender.geometry.ellipse import Ellipse, iou
 
 pytestmark = pytest.mark.render
 SPLITS = {"train": 12, "validation": 6, "test": 6}
@@ -315,6 +317,24 @@ def test_teyed_reads_it(tiny, exported, lines):
             assert rows["validity_pupil"][k] == [k + 1, 1]
             assert len(rows["pupil_lm_2D"][k]) == 2 + 16
         assert not stream.read()[0]
+
+
+@pytest.mark.parametrize("format", ["coco", "teyed"])
+def test_a_bench_scores_answers_about_an_export_as_about_the_dataset(tiny, exported, format):
+    """The truth is the same, so the overlap of any answer is."""
+    folders = [load_labelled(folder) for folder in (tiny, exported(format))]
+    outlines = [
+        sorted((i.pupil.numbers() for i in images if i.pupil is not None), key=lambda p: np.round(p[:2], 3).tolist())
+        for images in folders
+    ]
+    assert len(outlines[0]) == len(outlines[1]) > 10
+    scores = [[], []]
+    for kept, numbers in zip(scores, outlines, strict=True):
+        for x, y, a, b, angle in numbers:
+            # An answer that is about a pixel off; rounded, it is the same for both.
+            answer = Ellipse(np.round([x + 1.5, y - 1.0]), np.round([1.1 * a + 2, b + 1]), 0.0)
+            kept.append(iou(answer, Ellipse(np.array([x, y]), np.array([a, b]), angle)))
+    np.testing.assert_allclose(scores[1], scores[0], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(("width", "height"), [(62, 46), (63, 46), (62, 47), (63, 47), (1, 1)])
