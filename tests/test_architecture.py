@@ -22,6 +22,7 @@ FLOORS = {
     "references": 0,
     "jit": 0,
     "progress": 0,
+    "processes": 0,
     "status": 0,
     "spec": 0,
     "versions": 0,
@@ -47,6 +48,7 @@ FLOORS = {
     "study": 10,
     "benchmark": 10,
     "applications": 10,
+    "inspection": 10,
     "realism": 10,
     "torch": 10,
     "live": 10,
@@ -59,6 +61,7 @@ ORDER = [
     "errors",
     "arrays",
     "progress",
+    "processes",
     "status",
     "storage",
     "jit",
@@ -180,6 +183,7 @@ def test_no_circle_of_imports_inside_packages():
 LARGE = {
     # Every option of a public call is a keyword, and the command line gives them by name.
     "dataset.run.generate": "options of a run",
+    "dataset.export.__init__.export": "options of an export",
     "torch.__init__": "options of a loader",
     "analytic.features.features": "options of an observation",
     # Kernels take arrays, not records.

@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EyerenderError, InputError
+from ..processes import caller_hidden, signals_held
 from .done import cpu_family
-from .pool import RECYCLE_IMAGES, TRIES, Events, caller_hidden, end_of, signals_held
+from .pool import RECYCLE_IMAGES, TRIES, Events, end_of
 from .shard import Staged, write_shard
 from .worker import FAILURES, Job, failure
 

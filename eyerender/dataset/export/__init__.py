@@ -24,7 +24,7 @@ from ..validation.problems import WRONG
 from . import coco, ellseg, imagefolder, openeds, parquet, table, teyed, webdataset
 from .card import export_card
 from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
-from .item import Item, Items
+from .item import Item, Items, wrong_labels
 
 # Returns what README.md begins with, if anything.
 Writer = Callable[[Items, Path], str | None]
@@ -43,6 +43,7 @@ FORMATS: dict[str, Writer] = {
 }
 # The other layouts have 8 bits by definition.
 _SIXTEEN_BITS = ("webdataset", "imagefolder", "coco", "csv", "parquet")
+_ORDERED = ("teyed",)
 
 
 def export(
@@ -53,6 +54,8 @@ def export(
     bits: int = 8,
     encoding: Curve | None = None,
     gain: float | None = None,
+    workers: int = 1,
+    shuffle: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -65,6 +68,9 @@ def export(
         bits: bits of the images, 8 or 16 (webdataset, imagefolder, coco, csv and parquet).
         encoding: `linear` or `gamma`; by default gamma for 8 bits, linear for 16.
         gain: factor for all values; by default it is measured on a sample of the images, but is 1 for 16 bits, linear.
+        workers: processes that read and encode the images; the bytes do not depend on their number.
+        shuffle: seed of a random order of the images; by default they are in the order of the samples. The layout
+            teyed, whose videos have an order, has none.
         overwrite: replace what `out` holds.
         progress: called with images done, images in all and "".
 
@@ -78,6 +84,10 @@ def export(
     check(bits, encoding, gain)
     if bits == 16 and format not in _SIXTEEN_BITS:
         raise InputError(f"the layout {format} holds 8 bits; {', '.join(_SIXTEEN_BITS)} can hold 16", source="--bits")
+    if workers < 1:
+        raise InputError("must be >= 1", source="--workers")
+    if shuffle is not None and format in _ORDERED:
+        raise InputError(f"the frames of {format} have an order", source="--shuffle")
     folder = ImageFolder.load(path)
     if folder.dataset.get("kind") != "dataset":
         raise InputError("is not a generated dataset (its kind is not 'dataset')", source=str(Path(path) / DATASET))
@@ -91,7 +101,7 @@ def export(
             progress(done, total, "")
 
     step(0)
-    items = Items(folder, step)
+    items = Items(folder, step, workers=workers, shuffle=shuffle)
     with staged(out, overwrite=overwrite) as stage, _labels_as_made(items):
         items.survey()
         items.encoding = _encoding(items, bits, encoding or ("gamma" if bits == 8 else "linear"), gain)
@@ -127,9 +137,7 @@ def _labels_as_made(items: Items) -> Iterator[None]:
     try:
         yield
     except WRONG as error:
-        reason = f"cannot be exported, for it is not as this version writes it ({type(error).__name__}: {error})"
-        source, number = items.place
-        raise InputError(reason, source=str(source), path=f"line {number}") from error
+        raise wrong_labels(error, items.place) from error
 
 
 __all__ = ["FORMATS", "Encoding", "Item", "Items", "export"]

@@ -16,10 +16,11 @@ from typing import IO, Any
 import numpy as np
 
 from ...arrays import Bools
-from ...folders.imagefile import write_png
+from ...folders.imagefile import png_bytes
 from ...geometry.ellipse import Ellipse
+from ...storage.files import write_bytes
 from .gaze import DIRECTIONS, gaze_of, pupil_of
-from .item import Items
+from .item import Item, Items
 
 # Except for the glints, a category's id is the part's value in the mask.
 CATEGORIES: list[dict[str, Any]] = [
@@ -35,21 +36,26 @@ def write(items: Items, out: Path) -> None:
     (out / "annotations").mkdir()
     with ExitStack() as stack:
         files = {split: stack.enter_context(_Annotations(items, out, split)) for split in items.splits}
-        for number, item in enumerate(items, start=1):
-            mask, line, file = item.mask, item.line, files[item.split]
-            write_png(out / item.split / f"{item.name}.png", item.encoded)
-            h, w = mask.shape
-            size = {"width": w, "height": h}
-            file.add_image(
-                {"id": number, "file_name": f"{item.name}.png", **size, "subject": line["subject"], **_gaze(line)}
-            )
-            for value, part in ((1, "sclera"), (2, "iris"), (3, "pupil")):
-                inside = mask == value
-                if inside.any():
-                    ellipse = item.ellipse(part) if part != "sclera" else None
-                    file.add_mark(number, _instance(value, inside, ellipse))
-            for light, x, y, visible in item.glints():
-                file.add_mark(number, _glint(light, x, y, visible))
+        for number, (split, picture, image, marks) in enumerate(items.map(_annotated), start=1):
+            write_bytes(out / split / image["file_name"], picture, sync=False)
+            files[split].add_image({"id": number, **image})
+            for mark in marks:
+                files[split].add_mark(number, mark)
+
+
+def _annotated(item: Item) -> tuple[str, bytes, dict[str, Any], list[dict[str, Any]]]:
+    """Return the split of an image, its file, its keys and its annotations."""
+    mask, line = item.mask, item.line
+    h, w = mask.shape
+    size = {"width": w, "height": h}
+    image = {"file_name": f"{item.name}.png", **size, "subject": line["subject"], **_gaze(line)}
+    marks = []
+    for value, part in ((1, "sclera"), (2, "iris"), (3, "pupil")):
+        inside = mask == value
+        if inside.any():
+            marks.append(_instance(value, inside, item.ellipse(part) if part != "sclera" else None))
+    marks += [_glint(*glint) for glint in item.glints()]
+    return item.split, png_bytes(item.encoded), image, marks
 
 
 def _gaze(line: dict[str, Any]) -> dict[str, Any]:

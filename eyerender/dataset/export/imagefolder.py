@@ -14,22 +14,18 @@ from ...folders.imagefolder import METADATA
 from ...storage.files import write_bytes
 from ..columns import type_first
 from ..done import KINDS
-from .item import Items
+from .item import Item, Items
 
 
 def write(items: Items, out: Path) -> None:
     """Write the pictures and metadata.jsonl."""
     unsorted = out / f"{METADATA}.unsorted"
     with open(unsorted, "w", encoding="utf-8") as file:
-        for item in items:
-            line = item.exported_line()
-            for kind, key in KINDS.items():
-                data = item.entry.data(key) if "mask" in key else item.encode(key)
-                if data is not None:
-                    line[key] = f"{kind}/{item.name}.png"
-                    (out / kind).mkdir(exist_ok=True)
-                    write_bytes(out / line[key], data, sync=False)
-            file.write(json.dumps(line) + "\n")
+        for text, files in items.map(_files):
+            for name, data in files.items():
+                (out / name).parent.mkdir(exist_ok=True)
+                write_bytes(out / name, data, sync=False)
+            file.write(text)
 
     def lines() -> Iterator[str]:
         with open(unsorted, encoding="utf-8") as file:
@@ -38,3 +34,14 @@ def write(items: Items, out: Path) -> None:
     with open(out / METADATA, "w", encoding="utf-8") as file:
         file.writelines(type_first(lines, lambda _line: None))
     unsorted.unlink()
+
+
+def _files(item: Item) -> tuple[str, dict[str, bytes]]:
+    """Return the line of an image and its files by name."""
+    line, files = item.exported_line(), {}
+    for kind, key in KINDS.items():
+        data = item.entry.data(key) if "mask" in key else item.encode(key)
+        if data is not None:
+            line[key] = f"{kind}/{item.name}.png"
+            files[line[key]] = data
+    return json.dumps(line) + "\n", files
