@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+import sys
+import threading
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
 from functools import partial
-from multiprocessing import active_children, get_context
-from typing import Any
+from multiprocessing import active_children, get_context, parent_process
+from multiprocessing.connection import wait
+from typing import Any, TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_PENDING = 3  # tasks per process of `ordered` that are at work or wait, which limits what is in memory
 
 
 @contextmanager
@@ -25,15 +36,26 @@ def signals_held() -> Iterator[None]:
 
 
 @contextmanager
-def process_pool(processes: int, initializer: Callable[[], Any] | None = None) -> Iterator[ProcessPoolExecutor]:
+def process_pool(
+    processes: int, initializer: Callable[[], Any] | None = None, *, alone: bool = False
+) -> Iterator[ProcessPoolExecutor]:
     """Open a pool of new processes; forked ones would inherit threads of other libraries in a broken state.
 
     Ctrl-C reaches the whole group of processes, so the children never see it and this process decides. When the caller
     fails or is interrupted, the children end at once, whatever they are doing.
+
+    Args:
+        processes: their number.
+        initializer: called in each of them first.
+        alone: whether they do without the caller's script (`caller_hidden`), and with one thread for numerical
+            libraries.
     """
     before = active_children()
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=initializer) as pool:
-        with signals_held():
+        with signals_held(), ExitStack() as around:
+            if alone:
+                around.enter_context(caller_hidden())
+                around.enter_context(environment(threads_of_libraries(1)))
             for _ in range(processes):
                 pool.submit(int)  # a task starts a process while none is idle
         try:
@@ -58,3 +80,80 @@ def mapper(
         return
     with process_pool(processes, initializer) as pool:
         yield partial(pool.map, chunksize=chunksize)
+
+
+def ordered(job: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
+    """Yield `job(task)` of each task in the order of the tasks.
+
+    With one worker, this process does each task when its result is requested. Otherwise a few tasks per process are
+    fetched ahead, so that neither tasks nor results fill the memory.
+
+    Args:
+        job: can be pickled with all that it holds, and so can the tasks and the results.
+        tasks: are fetched as results are requested.
+        workers: number of processes.
+
+    Raises:
+        Exception: what the job raises for the first task that fails.
+    """
+    if workers <= 1:
+        yield from map(job, tasks)
+        return
+    pending: deque[Future[Result]] = deque()
+    with process_pool(workers, _begin, alone=True) as pool:
+        for task in tasks:
+            pending.append(pool.submit(job, task))
+            if len(pending) >= _PENDING * workers:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+
+
+def _begin() -> None:
+    warnings.simplefilter("ignore")  # the parent has given them
+    threading.Thread(target=die_with_parent, daemon=True).start()
+
+
+def die_with_parent() -> None:
+    """End this process when the one that started it ends, however it does."""
+    parent = parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+@contextmanager
+def environment(values: dict[str, str]) -> Iterator[None]:
+    """Set variables of the environment while the block runs."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def threads_of_libraries(threads: int) -> dict[str, str]:
+    """Variables that limit numerical libraries to a number of threads; they read them when they are imported."""
+    return dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
+
+
+@contextmanager
+def caller_hidden() -> Iterator[None]:
+    """Keep a spawned process from running the caller's script again.
+
+    Python imports the main module in each spawned process, so a script without `if __name__ == "__main__"` would start
+    its work again there. A worker needs nothing of that module.
+    """
+    main = vars(sys.modules["__main__"])
+    before: dict[str, Any] = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+    main.pop("__file__", None)
+    main["__spec__"] = None
+    try:
+        yield
+    finally:
+        main.update(before)

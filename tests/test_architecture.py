@@ -48,6 +48,7 @@ FLOORS = {
     "study": 10,
     "benchmark": 10,
     "applications": 10,
+    "inspection": 10,
     "realism": 10,
     "torch": 10,
     "live": 10,
@@ -60,6 +61,7 @@ ORDER = [
     "errors",
     "arrays",
     "progress",
+    "processes",
     "status",
     "storage",
     "jit",
@@ -181,6 +183,7 @@ def test_no_circle_of_imports_inside_packages():
 LARGE = {
     # Every option of a public call is a keyword, and the command line gives them by name.
     "dataset.run.generate": "options of a run",
+    "dataset.export.__init__.export": "options of an export",
     "torch.__init__": "options of a loader",
     "analytic.features.features": "options of an observation",
     # Kernels take arrays, not records.

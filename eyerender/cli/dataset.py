@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from ..dataset.options import PlanOptions, RunOptions
 from ..errors import EyerenderError, InputError
 from .app import app
-from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads
+from .options import AtLeastOne, Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads
 from .output import Heed, emit, progress, say
 
 
@@ -230,6 +230,8 @@ def export_dataset(
     bits: Literal[8, 16] = 8,
     encoding: Literal["linear", "gamma"] | None = None,
     gain: float | None = None,
+    workers: AtLeastOne = 1,
+    shuffle: int | None = None,
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
@@ -242,12 +244,23 @@ def export_dataset(
         bits: Bits per pixel of the images: 8, or 16 for webdataset, imagefolder, coco, csv and parquet.
         encoding: Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16 bits).
         gain: Exposure gain of all images (default: measured on a sample of the images; 1 for 16-bit linear images).
+        workers: Number of processes that read and encode images. The bytes do not depend on it.
+        shuffle: Write the images in a random order with this seed, instead of the order of the samples (not teyed).
     """
     from ..dataset.export import export
 
     with progress("exporting") as steps:
         done = export(
-            folder, format, output, bits=bits, encoding=encoding, gain=gain, overwrite=overwrite, progress=steps
+            folder,
+            format,
+            output,
+            bits=bits,
+            encoding=encoding,
+            gain=gain,
+            workers=workers or 1,
+            shuffle=shuffle,
+            overwrite=overwrite,
+            progress=steps,
         )
     image = done["image"]
     how = f"{bits} bits, {image['encoding']}, gain {image['gain']:g}"

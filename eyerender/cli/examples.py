@@ -40,6 +40,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
             "eyerender generate people_openeds -o data --count 1000000 --layout webdataset",
             "eyerender generate my_scenes:scene -o data --count 1000 --seed 7",
         ),
+        "inspect": (
+            "eyerender inspect data -o page.html",
+            "eyerender inspect data older_data -o page.html --json found.json",
+        ),
         "live": ("eyerender live quickstart --browser",),
         "merge": ("eyerender merge part1 part2 part3 -o data",),
         "population": ("eyerender population adults -o people --faces 0",),

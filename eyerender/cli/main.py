@@ -27,6 +27,7 @@ from . import (  # noqa: F401
     fit_eye,
     gaze,
     images,
+    inspect,
     live,
     observe,
     population,

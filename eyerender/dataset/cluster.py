@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EyerenderError, InputError
-from ..processes import signals_held
+from ..processes import caller_hidden, signals_held
 from .done import cpu_family
-from .pool import RECYCLE_IMAGES, TRIES, Events, caller_hidden, end_of
+from .pool import RECYCLE_IMAGES, TRIES, Events, end_of
 from .shard import Staged, write_shard
 from .worker import FAILURES, Job, failure
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
-import sys
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
 from ..errors import EyerenderError
-from ..processes import signals_held
+from ..processes import caller_hidden, environment, signals_held, threads_of_libraries
 from .shard import Staged
 from .worker import FAILURES, Job, work
 
@@ -140,7 +138,7 @@ class LocalPool:
     def _start(self) -> None:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=work, args=(theirs, self.job), daemon=True)
-        with _environment(self.job.threads), signals_held(), caller_hidden():
+        with environment(threads_of_libraries(self.job.threads)), signals_held(), caller_hidden():
             process.start()
         theirs.close()
         self._workers.append(_Worker(process=process, pipe=ours, name=f"{process.pid}", heard=time.monotonic()))
@@ -204,39 +202,3 @@ def end_of(code: int | None, who: str = "the worker") -> str:
         except ValueError:
             return f"{who} was ended by signal {-code}"
     return f"{who} ended with exit code {code}"
-
-
-@contextmanager
-def _environment(threads: int) -> Iterator[None]:
-    """Set the environment variables that limit a worker's numerical libraries to its number of threads.
-
-    The libraries read these variables when they are imported.
-    """
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, str(threads)))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-@contextmanager
-def caller_hidden() -> Iterator[None]:
-    """Prevent a spawned process from running the caller's script again.
-
-    Python imports the main module in each spawned process, so a script without `if __name__ == "__main__"` would start
-    its work again there. A worker does not need that module.
-    """
-    main = vars(sys.modules["__main__"])
-    before: dict[str, Any] = {name: main[name] for name in ("__file__", "__spec__") if name in main}
-    main.pop("__file__", None)
-    main["__spec__"] = None
-    try:
-        yield
-    finally:
-        main.update(before)

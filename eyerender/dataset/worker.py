@@ -8,13 +8,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from multiprocessing import parent_process
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from ..errors import BackendError, EyerenderError, InputError
+from ..processes import die_with_parent
 from .maker import Maker
 from .plan import Plan
 from .shard import write_shard
@@ -64,7 +64,7 @@ def work(pipe: Connection, job: Job) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group, and the parent decides
     ending = _Ending()
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    threading.Thread(target=die_with_parent, daemon=True).start()
     folder = Path(job.folder)
     try:
         maker = job.maker()
@@ -119,10 +119,3 @@ def failure(error: Exception, folder: Path) -> tuple[str, str]:
     if isinstance(error, EyerenderError):
         return next(kind for kind, known in FAILURES.items() if isinstance(error, known)), str(error)
     return "error", f"{type(error).__name__}: {error}"
-
-
-def _die_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)

@@ -27,6 +27,7 @@ from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageFolder, finished
 from eyerender.gaze.records import load_observations
 from eyerender.imaging.imageobserver import scene_of
+from eyerender.inspection import inspect
 from tests.support.dataset_specs import make, plan
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
@@ -34,7 +35,7 @@ SECRET = b"the secret of another folder"
 JSON = ("dataset.json", "run.json", "shards/00000/done.json")
 LINES = ("metadata.jsonl", "shards/00000/lines.jsonl")
 FILES = (*JSON, *LINES, "images/00000", "masks/00000", "README.md")
-ACTIONS = ("read", "validate", "deep", "resume", "compare", "records", *FORMATS)
+ACTIONS = ("read", "validate", "deep", "resume", "compare", "records", "inspect", *FORMATS)
 HARMS = ("json", "json", "line", "line", "line", "bytes", "link", "link up", "pipe", "folder", "gone")
 
 
@@ -137,6 +138,12 @@ def signed(folder: Path) -> None:
             path.write_text(json.dumps(data), encoding="utf-8")
 
 
+def inspected(folder: Path, out: Path) -> Any:
+    """What an inspection finds, with its page."""
+    out.mkdir(exist_ok=True)
+    return inspect(folder, output=out / "page.html")
+
+
 def use(folder: Path, action: str, out: Path) -> Any:
     """Do with a folder what a command would do."""
     if action == "read":
@@ -160,8 +167,8 @@ def use(folder: Path, action: str, out: Path) -> Any:
         if {0, 1} <= finished(folder):
             strict_json(assemble(made, folder))
         return None
-    if action == "compare":
-        strict_json(compare_folder(folder).to_mapping())
+    if action in ("compare", "inspect"):
+        strict_json(compare_folder(folder).to_mapping() if action == "compare" else inspected(folder, out))
         return None
     if action == "records":
         return load_observations(folder / "metadata.jsonl", "guestrin2006")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 from dataclasses import replace
+from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
@@ -138,3 +139,39 @@ def test_a_full_disk_while_a_shard_is_unpacked_loses_nothing(samples, tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     with PartialShard(made, BACKEND, out, 1) as partial:
         assert set(partial.made) == set(made.spec.shard_samples(1))
+
+
+def test_webdataset_reads_the_tars_of_shards(samples, tmp_path):
+    """The library's own loader, without decoding: one sample for each image, with the bytes of its pictures."""
+    import webdataset as wds
+
+    made = plan(**PACKED)
+    make(tmp_path / "out", made, samples)
+    tars = sorted(str(path) for path in (tmp_path / "out" / "shards").glob("*/images.tar"))
+    found = list(wds.WebDataset(tars, shardshuffle=False))
+    entries = list(ImageFolder.load(tmp_path / "out"))
+    assert [sample["__key__"] for sample in found] == [PurePosixPath(entry.name).stem for entry in entries]
+    for sample, entry in zip(found, entries, strict=True):
+        assert sample["png"] == entry.data("file_name")
+        assert sample["mask.png"] == entry.data("mask_file_name")
+
+
+@pytest.mark.packaging
+def test_hugging_face_reads_the_tars_of_shards(samples, tmp_path, monkeypatch):
+    """`load_dataset("webdataset")` streams the pictures, one row for each image."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    import datasets
+
+    made = plan(**PACKED)
+    make(tmp_path / "out", made, samples)
+    tars = sorted(str(path) for path in (tmp_path / "out" / "shards").glob("*/images.tar"))
+    files = {"train": tars}
+    rows = datasets.load_dataset(
+        "webdataset", data_files=files, split="train", cache_dir=str(tmp_path / "cache"), streaming=True
+    )
+    entries = list(ImageFolder.load(tmp_path / "out"))
+    found = list(rows)
+    assert [row["__key__"] for row in found] == [PurePosixPath(entry.name).stem for entry in entries]
+    for row, entry in zip(found, entries, strict=True):
+        assert np.array_equal(np.asarray(row["png"]), entry.image())
+        assert np.array_equal(np.asarray(row["mask.png"]), entry.mask())

@@ -24,7 +24,7 @@ from ..validation.problems import WRONG
 from . import coco, ellseg, imagefolder, openeds, parquet, table, teyed, webdataset, yolo
 from .card import export_card
 from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
-from .item import Item, Items
+from .item import Item, Items, wrong_labels
 
 # Returns the head of README.md, or None.
 Writer = Callable[[Items, Path], str | None]
@@ -45,6 +45,7 @@ FORMATS: dict[str, Writer] = {
 }
 # The other layouts have 8 bits by definition.
 _SIXTEEN_BITS = ("webdataset", "imagefolder", "coco", "csv", "parquet")
+_ORDERED = ("teyed",)
 
 
 def export(
@@ -55,6 +56,8 @@ def export(
     bits: int = 8,
     encoding: Curve | None = None,
     gain: float | None = None,
+    workers: int = 1,
+    shuffle: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -67,6 +70,9 @@ def export(
         bits: bits of the images, 8 or 16 (webdataset, imagefolder, coco, csv and parquet).
         encoding: `linear` or `gamma`; by default gamma for 8 bits, linear for 16.
         gain: factor for all values; by default 1 for 16 bits linear, otherwise measured on a sample of the images.
+        workers: number of processes that read and encode the images; the bytes do not depend on it.
+        shuffle: seed of a random order of the images; by default they are in the order of the samples. It is refused
+            for `teyed`, whose videos have an order.
         overwrite: replace the contents of `out`.
         progress: called with images done, images in all and "".
 
@@ -80,6 +86,10 @@ def export(
     check(bits, encoding, gain)
     if bits == 16 and format not in _SIXTEEN_BITS:
         raise InputError(f"the layout {format} holds 8 bits; {', '.join(_SIXTEEN_BITS)} can hold 16", source="--bits")
+    if workers < 1:
+        raise InputError("must be >= 1", source="--workers")
+    if shuffle is not None and format in _ORDERED:
+        raise InputError(f"the frames of {format} have an order", source="--shuffle")
     folder = ImageFolder.load(path)
     if folder.dataset.get("kind") != "dataset":
         raise InputError("is not a generated dataset (its kind is not 'dataset')", source=str(Path(path) / DATASET))
@@ -93,7 +103,7 @@ def export(
             progress(done, total, "")
 
     step(0)
-    items = Items(folder, step)
+    items = Items(folder, step, workers=workers, shuffle=shuffle)
     with staged(out, overwrite=overwrite) as stage, _labels_as_made(items):
         items.survey()
         items.encoding = _encoding(items, bits, encoding or ("gamma" if bits == 8 else "linear"), gain)
@@ -129,9 +139,7 @@ def _labels_as_made(items: Items) -> Iterator[None]:
     try:
         yield
     except WRONG as error:
-        reason = f"cannot be exported, for it is not as this version writes it ({type(error).__name__}: {error})"
-        source, number = items.place
-        raise InputError(reason, source=str(source), path=f"line {number}") from error
+        raise wrong_labels(error, items.place) from error
 
 
 __all__ = ["FORMATS", "Encoding", "Item", "Items", "export"]

@@ -12,6 +12,8 @@ from __future__ import annotations
 import json
 import shutil
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -19,8 +21,9 @@ from typing import IO, Any
 import numpy as np
 
 from ...arrays import Bools
-from ...folders.imagefile import write_png
+from ...folders.imagefile import png_bytes
 from ...geometry.ellipse import Ellipse
+from ...storage.files import write_bytes
 from .gaze import DIRECTIONS, gaze_of, pupil_of
 from .item import Item, Items
 from .keypoints import box, keypoints, names
@@ -45,24 +48,50 @@ def write(items: Items, out: Path) -> None:
             (out / split).mkdir()
             files[split] = stack.enter_context(_Annotations(items, out, f"instances_{split}", CATEGORIES))
             points[split] = stack.enter_context(_Annotations(items, out, f"keypoints_{split}", [eye]))
-        for number, item in enumerate(items, start=1):
-            mask, line, file = item.mask, item.line, files[item.split]
-            write_png(out / item.split / f"{item.name}.png", item.encoded)
-            h, w = mask.shape
-            size = {"width": w, "height": h}
-            about = {"subject": line["subject"], **item.camera, **_gaze(line)}
-            image = {"id": number, "file_name": f"{item.name}.png", **size, **about}
-            file.add_image(image)
-            points[item.split].add_image(image)
-            if (mark := _eye(item, items.lights)) is not None:
-                points[item.split].add_mark(number, mark)
-            for value, part in ((1, "sclera"), (2, "iris"), (3, "pupil")):
-                inside = mask == value
-                if inside.any():
-                    ellipse = item.ellipse(part) if part != "sclera" else None
-                    file.add_mark(number, _instance(value, inside, ellipse))
-            for light, x, y, visible in item.glints():
-                file.add_mark(number, _glint(light, x, y, visible))
+        for number, made in enumerate(items.map(partial(_annotated, lights=items.lights)), start=1):
+            write_bytes(out / made.split / made.image["file_name"], made.picture, sync=False)
+            for annotations in (files, points):
+                annotations[made.split].add_image({"id": number, **made.image})
+            for mark in made.marks:
+                files[made.split].add_mark(number, mark)
+            if made.eye is not None:
+                points[made.split].add_mark(number, made.eye)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Annotated:
+    """An image with its annotations.
+
+    Attributes:
+        split: its split.
+        picture: its file.
+        image: its keys without `id`.
+        marks: its instances.
+        eye: its keypoints, if it shows an eye.
+    """
+
+    split: str
+    picture: bytes
+    image: dict[str, Any]
+    marks: list[dict[str, Any]]
+    eye: dict[str, Any] | None
+
+
+def _annotated(item: Item, lights: int) -> _Annotated:
+    """Encode and annotate an image of a dataset with up to `lights` glints."""
+    mask, line = item.mask, item.line
+    h, w = mask.shape
+    size = {"width": w, "height": h}
+    about = {"subject": line["subject"], **item.camera, **_gaze(line)}
+    marks = []
+    for value, part in ((1, "sclera"), (2, "iris"), (3, "pupil")):
+        inside = mask == value
+        if inside.any():
+            marks.append(_instance(value, inside, item.ellipse(part) if part != "sclera" else None))
+    marks += [_glint(*glint) for glint in item.glints()]
+    image = {"file_name": f"{item.name}.png", **size, **about}
+    eye = _eye(item, lights)
+    return _Annotated(split=item.split, picture=png_bytes(item.encoded), image=image, marks=marks, eye=eye)
 
 
 def _gaze(line: dict[str, Any]) -> dict[str, Any]:

@@ -65,16 +65,12 @@ def write(items: Items, out: Path) -> None:
             files[split] = _Archive(out / "All" / f"{items.name}_{split}.h5")
             archives[split] = h5py.File(files[split], "w")
             _lay_out(archives[split], (n, h, w), items.file_name_bytes)
-        for item in items:
-            file, k = archives[item.split], done[item.split]
-            done[item.split] += 1
-            file["Images"][k], file["Masks"][k], file["Masks_noSkin"][k] = item.encoded, item.mask, item.amodal
-            fits = {name: fit_of(item, name) for name in ("pupil", "iris")}
-            for name, fit in fits.items():
-                file[f"Fits/{name}"][k] = fit
-            file["pupil_loc"][k] = fits["pupil"][:2]
-            file["Info"][k] = item.entry.name.encode()
-            files[item.split].check()
+        for split, values in items.map(_values):
+            k = done[split]
+            done[split] += 1
+            for name, value in values.items():
+                archives[split][name][k] = value
+            files[split].check()
         for split, file in archives.items():
             _write_key(out / "MasterKey", file, items.name, split)
     finally:
@@ -84,6 +80,14 @@ def write(items: Items, out: Path) -> None:
             raw.close()
     for raw in files.values():
         raw.check()
+
+
+def _values(item: Item) -> tuple[str, dict[str, Any]]:
+    """Return the split of an image, and its values of each array of an archive."""
+    fits = {part: fit_of(item, part) for part in ("pupil", "iris")}
+    pictures = {"Images": item.encoded, "Masks": item.mask, "Masks_noSkin": item.amodal}
+    places = {**{f"Fits/{part}": fit for part, fit in fits.items()}, "pupil_loc": fits["pupil"][:2]}
+    return item.split, {**pictures, **places, "Info": item.entry.name.encode()}
 
 
 def _lay_out(file: Any, shape: tuple[int, int, int], name_bytes: int) -> None:

@@ -14,23 +14,18 @@ from ...folders.imagefolder import ARRAY_KEYS, METADATA
 from ...storage.files import write_bytes
 from ..columns import type_first
 from ..done import KINDS, picture_file
-from .item import Items
+from .item import Item, Items
 
 
 def write(items: Items, out: Path) -> None:
     """Write the images and metadata.jsonl."""
     unsorted = out / f"{METADATA}.unsorted"
     with open(unsorted, "w", encoding="utf-8") as file:
-        for item in items:
-            line = item.exported_line()
-            for kind, key in KINDS.items():
-                is_kept = "mask" in key or key in ARRAY_KEYS
-                data = item.entry.data(key) if is_kept else item.encode(key)
-                if data is not None:
-                    line[key] = f"{kind}/{picture_file(kind, item.name)}"
-                    (out / kind).mkdir(exist_ok=True)
-                    write_bytes(out / line[key], data, sync=False)
-            file.write(json.dumps(line) + "\n")
+        for text, files in items.map(_files):
+            for name, data in files.items():
+                (out / name).parent.mkdir(exist_ok=True)
+                write_bytes(out / name, data, sync=False)
+            file.write(text)
 
     def lines() -> Iterator[str]:
         with open(unsorted, encoding="utf-8") as file:
@@ -39,3 +34,15 @@ def write(items: Items, out: Path) -> None:
     with open(out / METADATA, "w", encoding="utf-8") as file:
         file.writelines(type_first(lines, lambda _line: None))
     unsorted.unlink()
+
+
+def _files(item: Item) -> tuple[str, dict[str, bytes]]:
+    """Return the line of an image and its files by name."""
+    line, files = item.exported_line(), {}
+    for kind, key in KINDS.items():
+        is_kept = "mask" in key or key in ARRAY_KEYS
+        data = item.entry.data(key) if is_kept else item.encode(key)
+        if data is not None:
+            line[key] = f"{kind}/{picture_file(kind, item.name)}"
+            files[line[key]] = data
+    return json.dumps(line) + "\n", files

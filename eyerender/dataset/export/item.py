@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Bytes, Floats, Ints
-from ...errors import InputError
+from ...errors import InputError, UnfinishedRunWarning
 from ...folders.imagefile import image_of, png_bytes
-from ...folders.imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
+from ...folders.imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, Entries, ImageEntry, ImageFolder
 from ...geometry.ellipse import Ellipse, signed_distance
+from ...processes import ordered
+from ..interleaving import scrambled
+from ..validation.problems import WRONG
 from .encoding import RAW, Encoding
+
+Prepared = TypeVar("Prepared")
+LinePlace = tuple[Path, int]
+_CHUNK = 16  # images that a process prepares at a time
 
 
 @dataclass(frozen=True)
@@ -162,14 +170,16 @@ def _integers(image: NDArray[Any], path: Path) -> NDArray[Any]:
 
 
 class Items:
-    """Images of a dataset in sample order; iterating reports progress.
+    """Images of a dataset in sample order, or shuffled.
 
     `survey` reads all metadata once, for totals that are needed before the first image is written. During iteration
     each line is read again, so memory stays small.
 
     Attributes:
+        workers: number of processes that read and encode images.
+        shuffle: seed of the order of the images; None: sample order.
         encoding: encoding of the export.
-        order: (n,) row in metadata.jsonl of each image, in sample order.
+        order: (n,) row in metadata.jsonl of each image, in the order of the export.
         images_by_split: number of images of each split, by name.
         bit_depths: bit depths of the images.
         sizes: (width, height) of the images.
@@ -178,8 +188,10 @@ class Items:
         place: file and number of the line that is being read, for messages.
     """
 
-    def __init__(self, folder: ImageFolder, step: Callable[[int], None]) -> None:
-        self.folder, self.step = folder, step
+    def __init__(
+        self, folder: ImageFolder, step: Callable[[int], None], *, workers: int = 1, shuffle: int | None = None
+    ) -> None:
+        self.folder, self.step, self.workers, self.shuffle = folder, step, workers, shuffle
         self.encoding = RAW
         self.order: Ints = np.arange(len(folder.entries))
         self.images_by_split: dict[str, int] = {}
@@ -197,31 +209,43 @@ class Items:
         splits: Counter[str] = Counter()
         samples = np.empty(len(self), dtype=np.int64)
         names = np.empty(len(self), dtype=np.int64)
-        for row, entry in enumerate(self.folder.entries):
-            self.place, item = (entry.source, entry.number), Item(entry)
-            samples[row], names[row] = entry.line["sample"], hash(item.name)
-            splits[item.split] += 1
-            self.bit_depths.add(item.bit_depth)
-            self.sizes.add(entry.window[2:])
-            self.lights = max(self.lights, len(entry.line["labels"]["glints"]))
-            self.file_name_bytes = max(self.file_name_bytes, len(entry.name.encode()))
+        for row, own in enumerate(self._each(_surveyed)):
+            samples[row], names[row] = own.sample, hash(own.name)
+            splits[own.split] += 1
+            self.bit_depths.add(own.bit_depth)
+            self.sizes.add(own.size)
+            self.lights = max(self.lights, own.lights)
+            self.file_name_bytes = max(self.file_name_bytes, own.file_name_bytes)
         if len(np.unique(names)) < len(names):
             raise InputError("two images have the same file name", source=str(self.folder.path / METADATA))
-        self.order = np.argsort(samples, kind="stable")
+        # Images of one sample keep their order in both cases.
+        self.order = np.argsort(samples if self.shuffle is None else scrambled(samples, self.shuffle), kind="stable")
         self.images_by_split = dict(sorted(splits.items()))
 
     def __len__(self) -> int:
         return len(self.order)
 
-    def __iter__(self) -> Iterator[Item]:
-        done = 0
-        # Neighbouring rows of the file are read together.
-        for rows in np.split(self.order, np.flatnonzero(np.diff(self.order) != 1) + 1):
-            for entry in self.folder.entries[int(rows[0]) : int(rows[-1]) + 1]:
-                self.place = entry.source, entry.number
-                yield Item(entry, self.encoding)
-                done += 1
-                self.step(done)
+    def map(self, prepare: Callable[[Item], Prepared]) -> Iterator[Prepared]:
+        """Yield what a function makes of each image, in the order of the export, and report the progress.
+
+        Args:
+            prepare: reads and encodes an image; it runs in the processes, so it and its results can be pickled.
+        """
+        for done, result in enumerate(self._each(prepare), start=1):
+            yield result
+            self.step(done)
+
+    def _each(self, prepare: Callable[[Item], Prepared]) -> Iterator[Prepared]:
+        if self.workers <= 1:
+            for item in _items(self.folder.entries, self.order, self.encoding):
+                self.place = item.entry.source, item.entry.number
+                yield prepare(item)
+            return
+        job = _Preparation(str(self.folder.path), self.encoding, prepare)
+        tasks = (self.order[k : k + _CHUNK] for k in range(0, len(self.order), _CHUNK))
+        for part in ordered(job, tasks, self.workers):
+            for self.place, result in part:
+                yield result
 
     def sample(self, count: int) -> Iterator[Item]:
         """Yield at most `count` images, spread evenly over the samples."""
@@ -246,3 +270,68 @@ class Items:
         """Name of the dataset, in letters, digits and underscores."""
         name = str(self.folder.dataset["spec"]["name"])
         return "".join(c if c.isalnum() else "_" for c in name)
+
+
+def _items(entries: Entries, rows: Ints, encoding: Encoding) -> Iterator[Item]:
+    """Images in some rows; consecutive rows of the file are read together."""
+    for part in np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1):
+        for entry in entries[int(part[0]) : int(part[-1]) + 1]:
+            yield Item(entry, encoding)
+
+
+@dataclass(frozen=True, slots=True)
+class _Preparation(Generic[Prepared]):
+    """Work of a process: read and encode the images in some rows."""
+
+    folder: str
+    encoding: Encoding
+    prepare: Callable[[Item], Prepared]
+
+    def __call__(self, rows: Ints) -> list[tuple[LinePlace, Prepared]]:
+        found = []
+        for item in _items(_entries(self.folder), rows, self.encoding):
+            place = item.entry.source, item.entry.number
+            try:
+                found.append((place, self.prepare(item)))
+            except WRONG as error:
+                raise wrong_labels(error, place) from None
+        return found
+
+
+@lru_cache(maxsize=1)
+def _entries(folder: str) -> Entries:
+    """Images of a folder, which each process opens once."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnfinishedRunWarning)  # the export has given it
+        return ImageFolder.load(folder).entries
+
+
+def wrong_labels(error: Exception, place: LinePlace) -> InputError:
+    """Make the error for labels that are not as this package writes them: a line was changed by hand."""
+    reason = f"cannot be exported, for it is not as this version writes it ({type(error).__name__}: {error})"
+    return InputError(reason, source=str(place[0]), path=f"line {place[1]}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Surveyed:
+    """What must be known of an image before the first one is written."""
+
+    sample: int
+    name: str
+    split: str
+    bit_depth: int
+    size: tuple[int, int]
+    lights: int
+    file_name_bytes: int
+
+
+def _surveyed(item: Item) -> _Surveyed:
+    return _Surveyed(
+        sample=item.line["sample"],
+        name=item.name,
+        split=item.split,
+        bit_depth=item.bit_depth,
+        size=item.entry.window[2:],
+        lights=len(item.line["labels"]["glints"]),
+        file_name_bytes=len(item.entry.name.encode()),
+    )

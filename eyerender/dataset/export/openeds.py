@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...folders.imagefile import write_png
-from .item import Items
+from ...arrays import Bytes
+from ...folders.imagefile import png_bytes
+from ...storage.files import write_bytes
+from .item import Item, Items
 
 
 def write(items: Items, out: Path) -> None:
@@ -23,11 +25,15 @@ def write(items: Items, out: Path) -> None:
     with open(out / "files.csv", "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["file", "from", "subject"])
-        for item in items:
-            # The names consist of digits only, because some readers strip the letters of '.png' from both ends of a
-            # name.
-            name = f"{counts.get(item.split, 0):06d}"
-            counts[item.split] = counts.get(item.split, 0) + 1
-            write_png(out / item.split / "images" / f"{name}.png", item.encoded)
-            np.save(out / item.split / "labels" / f"{name}.npy", item.mask)
-            table.writerow([f"{item.split}/images/{name}.png", item.entry.name, item.line["subject"]])
+        for split, picture, mask, source, subject in items.map(_files):
+            # The names have digits only, because readers strip letters of '.png' off both ends of a name.
+            name = f"{counts.get(split, 0):06d}"
+            counts[split] = counts.get(split, 0) + 1
+            write_bytes(out / split / "images" / f"{name}.png", picture, sync=False)
+            np.save(out / split / "labels" / f"{name}.npy", mask)
+            table.writerow([f"{split}/images/{name}.png", source, subject])
+
+
+def _files(item: Item) -> tuple[str, bytes, Bytes, str, int]:
+    """Return the split of an image, its file, its mask, its name in the dataset and its subject."""
+    return item.split, png_bytes(item.encoded), item.mask, item.entry.name, item.line["subject"]

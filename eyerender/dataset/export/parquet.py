@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from contextlib import ExitStack
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -63,25 +64,27 @@ def write(items: Items, out: Path) -> str:
     (out / "data").mkdir()
     first = next(iter(items.sample(1)))
     pictures = [name for name, key in _PICTURES.items() if first.line.get(key) is not None]
-    types = dict.fromkeys(pictures, "image") | {name: _type(name) for name in _row(first, items)}
+    types = dict.fromkeys(pictures, "image") | {name: _type(name) for name in _row(first, items.lights)}
     schema = _schema(pa, types)
     files: dict[str, _File] = {}
     with ExitStack() as stack:
-        for item in items:
-            file = files.get(item.split)
-            if file is None:
-                file = stack.enter_context(
-                    _File(parquet, pa, schema, out, item.split, items.images_by_split[item.split])
-                )
-                files[item.split] = file
-            file.add({**{name: _picture(item, name) for name in pictures}, **_row(item, items)})
+        for row in items.map(partial(_whole_row, pictures=pictures, lights=items.lights)):
+            split = row["split"]
+            if split not in files:
+                file = _File(parquet, pa, schema, out, split, items.images_by_split[split])
+                files[split] = stack.enter_context(file)
+            files[split].add(row)
     return _head(items, types, out)
 
 
-def _row(item: Item, items: Items) -> dict[str, Any]:
-    row = row_of(item, items.lights)
+def _whole_row(item: Item, pictures: list[str], lights: int) -> dict[str, Any]:
+    return {**{name: _picture(item, name) for name in pictures}, **_row(item, lights)}
+
+
+def _row(item: Item, lights: int) -> dict[str, Any]:
+    row = row_of(item, lights)
     del row["file_name"], row["mask_file_name"]
-    for k in range(items.lights):
+    for k in range(lights):
         row[f"glint{k}_visible"] = bool(row[f"glint{k}_visible"])
     return {**row, "line_json": json.dumps(item.exported_line(), sort_keys=True)}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +24,20 @@ def write(items: Items, out: Path) -> None:
     (out / "masks").mkdir()
     writer = None
     with open(out / "labels.csv", "w", newline="", encoding="utf-8") as file:
-        for item in items:
-            files = {"images": item.encode(), "masks": item.entry.data("mask_file_name")}
-            for kind, data in files.items():
-                if data is not None:
-                    write_bytes(out / kind / f"{item.name}.png", data, sync=False)
-            row = row_of(item, items.lights)
+        for files, row in items.map(partial(_files, lights=items.lights)):
+            for name, data in files.items():
+                write_bytes(out / name, data, sync=False)
             if writer is None:
                 writer = csv.DictWriter(file, list(row))
                 writer.writeheader()
             writer.writerow(row)
+
+
+def _files(item: Item, lights: int) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Return the files of an image by name, and its row."""
+    files = {"images": item.encode(), "masks": item.entry.data("mask_file_name")}
+    named = {f"{kind}/{item.name}.png": data for kind, data in files.items() if data is not None}
+    return named, row_of(item, lights)
 
 
 def row_of(item: Item, lights: int) -> dict[str, Any]:

@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import csv
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO
 
 import numpy as np
 
+from ...arrays import Bytes
 from ...errors import InputError
 from ...geometry.ellipse import Ellipse
 from .item import Item, Items
@@ -61,26 +63,51 @@ def write(items: Items, out: Path) -> None:
                 table.writerow([name, video.split, subject, video.frames])
             videos.clear()
 
-        for item in items:
-            if item.line["subject"] != subject:
+        for frame in items.map(_frame):
+            if frame.subject != subject:
                 finish()
-                subject = item.line["subject"]
-            record = item.line["records"][0]
-            name = f"{items.name}_{subject:06d}_{record['eye']}_{record['camera']}.mp4"
+                subject = frame.subject
+            name = f"{items.name}_{subject:06d}_{frame.eye}_{frame.camera}.mp4"
             if name not in videos:
-                videos[name] = stack.enter_context(_Video(name, item, out))
-            videos[name].add(item)
+                videos[name] = stack.enter_context(_Video(name, frame, out))
+            videos[name].add(frame)
         finish()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Frame:
+    """A frame of a video: its subject, eye, camera and split, its picture, and its annotations."""
+
+    subject: int
+    eye: str
+    camera: int
+    split: str
+    picture: Bytes
+    mask: Bytes
+    rows: dict[str, list[float]]
+
+
+def _frame(item: Item) -> _Frame:
+    record = item.line["records"][0]
+    return _Frame(
+        subject=item.line["subject"],
+        eye=record["eye"],
+        camera=record["camera"],
+        split=item.split,
+        picture=item.encoded,
+        mask=item.mask,
+        rows=rows_of(item),
+    )
 
 
 class _Video:
     """Video files of one eye, open until their last frame is added."""
 
-    def __init__(self, name: str, first: Item, out: Path) -> None:
+    def __init__(self, name: str, first: _Frame, out: Path) -> None:
         self.split, self.frames = first.split, 0
-        (h, w), notes = first.image.shape, out / "ANNOTATIONS"
+        (h, w), notes = first.picture.shape, out / "ANNOTATIONS"
         if (out / "VIDEOS" / name).exists():
-            raise ValueError(f"the samples of subject {first.line['subject']} are not consecutive")
+            raise ValueError(f"the samples of subject {first.subject} are not consecutive")
         with ExitStack() as stack:
             places = (out / "VIDEOS" / name, notes / f"{name}pupil_seg_2D.mp4", notes / f"{name}iris_seg_2D.mp4")
             self._pictures = [stack.enter_context(LosslessVideo(place, w, h)) for place in places]
@@ -91,15 +118,15 @@ class _Video:
                 self._texts[kind] = file
             self._open = stack.pop_all()
 
-    def add(self, item: Item) -> None:
+    def add(self, frame: _Frame) -> None:
         """Add a frame."""
-        if item.image.shape != self._pictures[0].size[::-1]:
+        if frame.picture.shape != self._pictures[0].size[::-1]:
             raise InputError("needs images of one size", source="--format teyed")
         self.frames += 1
-        pupil, iris = (np.where(item.mask >= least, 255, 0).astype(np.uint8) for least in (3, 2))
-        for video, picture in zip(self._pictures, (item.encoded, pupil, iris), strict=True):
+        pupil, iris = (np.where(frame.mask >= least, 255, 0).astype(np.uint8) for least in (3, 2))
+        for video, picture in zip(self._pictures, (frame.picture, pupil, iris), strict=True):
             video.add(picture)
-        for kind, values in rows_of(item).items():
+        for kind, values in frame.rows.items():
             self._texts[kind].write(";".join([str(self.frames), *(_number(value) for value in values)]) + ";\n")
 
     def __enter__(self) -> _Video:

@@ -11,7 +11,7 @@ import json
 import tarfile
 from pathlib import Path
 
-from .item import Items
+from .item import Item, Items
 
 SAMPLES = 1000
 _AS_THEY_ARE = {
@@ -30,23 +30,27 @@ def write(items: Items, out: Path) -> None:
     counts: dict[str, int] = {}
     tars: dict[str, tarfile.TarFile] = {}
     try:
-        for item in items:
-            split, k = item.split, counts.get(item.split, 0)
+        for split, files in items.map(_files):
+            k = counts.get(split, 0)
             if k % SAMPLES == 0:
                 if split in tars:
                     tars[split].close()
                 tars[split] = _open(out / f"{split}-{k // SAMPLES:06d}.tar")
             counts[split] = k + 1
-            files = {".png": item.encode()}
-            files |= {ending: item.entry.data(key) for ending, key in _AS_THEY_ARE.items()}
-            files[".noiseless.png"] = item.encode("noiseless_file_name")
-            for ending, data in files.items():
-                if data is not None:
-                    _add(tars[split], f"{item.name}{ending}", data)
-            _add(tars[split], f"{item.name}.json", json.dumps(item.exported_line()).encode())
+            for name, data in files.items():
+                _add(tars[split], name, data)
     finally:
         for tar in tars.values():
             tar.close()
+
+
+def _files(item: Item) -> tuple[str, dict[str, bytes]]:
+    """Return the split of an image and its files by name."""
+    files = {".png": item.encode()}
+    files |= {ending: item.entry.data(key) for ending, key in _AS_THEY_ARE.items()}
+    files[".noiseless.png"] = item.encode("noiseless_file_name")
+    files[".json"] = json.dumps(item.exported_line()).encode()
+    return item.split, {f"{item.name}{ending}": data for ending, data in files.items() if data is not None}
 
 
 def _open(path: Path) -> tarfile.TarFile:

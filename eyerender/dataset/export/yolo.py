@@ -9,6 +9,7 @@ of the pupil's centre, the glints and nine landmarks of each lid from the temple
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ import yaml
 from scipy import ndimage
 
 from ...arrays import Bools, Floats
-from ...folders.imagefile import write_png
+from ...folders.imagefile import png_bytes
 from ...folders.imagefolder import IRIS, PUPIL, SCLERA
+from ...storage.files import write_bytes
 from .item import Item, Items
 from .keypoints import box, keypoints, names
 
@@ -32,7 +34,7 @@ _SPLITS = {"validation": "val", "valid": "val"}
 
 def write_segments(items: Items, out: Path) -> None:
     """Write images and polygons of every split."""
-    _write(items, out, lambda item: list(_segments(item)), {})
+    _write(items, out, _segments, {})
 
 
 def write_poses(items: Items, out: Path) -> None:
@@ -40,21 +42,25 @@ def write_poses(items: Items, out: Path) -> None:
     points = names(items.lights)
     # A mirrored image shows the other eye, whose landmarks have the same names.
     more = {"kpt_shape": [len(points), 3], "flip_idx": list(range(len(points))), "kpt_names": {0: points}}
-    _write(items, out, lambda item: list(_pose(item, items.lights)), more)
+    _write(items, out, partial(_pose, lights=items.lights), more)
 
 
-def _write(items: Items, out: Path, lines: Callable[[Item], list[str]], more: dict[str, Any]) -> None:
+def _write(items: Items, out: Path, lines: Callable[[Item], Iterator[str]], more: dict[str, Any]) -> None:
     for split in items.splits:
         (out / "images" / split).mkdir(parents=True)
         (out / "labels" / split).mkdir(parents=True)
-    for item in items:
-        write_png(out / "images" / item.split / f"{item.name}.png", item.encoded)
-        text = "".join(f"{line}\n" for line in lines(item))
-        (out / "labels" / item.split / f"{item.name}.txt").write_text(text, encoding="utf-8")
+    for split, name, picture, text in items.map(partial(_files, lines=lines)):
+        write_bytes(out / "images" / split / f"{name}.png", picture, sync=False)
+        (out / "labels" / split / f"{name}.txt").write_text(text, encoding="utf-8")
     classes = ("eye",) if more else CLASSES
     data = {**{_SPLITS.get(split, split): f"images/{split}" for split in items.splits}, **more}
     data["names"] = dict(enumerate(classes))
     (out / "data.yaml").write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+
+
+def _files(item: Item, lines: Callable[[Item], Iterator[str]]) -> tuple[str, str, bytes, str]:
+    """Return the split of an image, its name, its file and the text of its labels."""
+    return item.split, item.name, png_bytes(item.encoded), "".join(f"{line}\n" for line in lines(item))
 
 
 def _segments(item: Item) -> Iterator[str]:

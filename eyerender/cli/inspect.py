@@ -1,0 +1,70 @@
+"""The command inspect."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from ..errors import InputError
+from .app import app
+from .options import AtLeastOne, Result
+from .output import emit, progress
+
+
+@app.command(name="inspect")
+def inspect(
+    folder: Annotated[Path, Parameter(name="DIR")],
+    other: Annotated[Path | None, Parameter(name="OTHER")] = None,
+    /,
+    *,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    images: int = 100_000,
+    workers: AtLeastOne = None,
+    json: Result = None,
+) -> int:
+    """Look into a dataset: its contents, what is wrong or unusual, duplicates, splits, distributions.
+
+    With a second dataset, the command also says which distributions differ.
+
+    Args:
+        folder: A folder written by generate, or by render.
+        other: A second one, to compare with.
+        output: An HTML page to write, with pictures.
+        images: The largest number of images that are read of a dataset, spread evenly over it.
+        workers: Number of processes that read them (default: all processors).
+    """
+    from ..inspection import inspect as look
+
+    if output is not None and output.suffix.lower() not in (".html", ".htm"):
+        raise InputError("must end with .html", source="--output")
+    with progress("reading") as steps:
+        data = look(folder, other, output=output, images=images, workers=workers or os.cpu_count() or 1, progress=steps)
+    page = f"\n\npage: {output}" if output is not None else ""
+    emit(data, "\n".join(_text(data)) + page, json)
+    return 0
+
+
+def _text(data: dict[str, Any]) -> list[str]:
+    lines = []
+    for found in data["datasets"]:
+        splits = ", ".join(f"{name} {own['images']}" for name, own in found["splits"].items())
+        lines.append(f"{found['path']}: {found['images_read']} of {found['images']} images read; {splits}")
+        for kind, own in found["faults"].items():
+            first = own["images"][0]
+            more = f" and {own['count'] - 1} more" if own["count"] > 1 else ""
+            lines.append(f"  {kind}: {first['image']}: {first['detail']}{more}")
+        if not found["faults"]:
+            lines.append("  no faults")
+        for outlier in found["outliers"][:5]:
+            reason = outlier["reasons"][0]
+            lines.append(f"  unusual: {outlier['image']}: {reason['column']} {reason['value']:.4g}, {reason['usual']}")
+    if data["difference"] is not None:
+        moved = [s for s in data["difference"]["columns"] if s["distance"] > s["chance"]]
+        lines.append(f"{len(moved)} of {len(data['difference']['columns'])} numbers differ by more than chance")
+        for shift in moved[:10]:
+            before, after = shift["medians"]
+            lines.append(f"  {shift['column']}: distance {shift['distance']:.3f}, median {before:.4g} and {after:.4g}")
+    return lines

@@ -1,0 +1,139 @@
+"""What is said of sound datasets: the same for all layouts and numbers of processes, and the difference of two."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import ks_2samp, spearmanr
+
+from eyerender.cli.main import run
+from eyerender.errors import InputError
+from eyerender.inspection import inspect
+from eyerender.inspection.comparing import sample_of
+from eyerender.inspection.duplicates import equal_pictures, near_duplicates
+from eyerender.inspection.outliers import outliers, scores
+from eyerender.inspection.reading import read
+from eyerender.inspection.statistics import rank_correlations
+from tests.support.drawn_dataset import FRAMES, draw, packed
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """A sound dataset of 120 images."""
+    folder = tmp_path_factory.mktemp("drawn") / "data"
+    draw(folder, 120)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(data):
+    return inspect(data)
+
+
+def test_packed_shards_give_the_same(data, found, tmp_path):
+    """Numbers of packed lines have 9 digits, and its images have another order."""
+    packed(tmp_path / "packed", data)
+    (own,), (other,) = found["datasets"], inspect(tmp_path / "packed")["datasets"]
+    for key in ("images", "images_read", "splits", "subjects_in_two_splits", "groups", "faults"):
+        assert own[key] == other[key], key
+    assert own["columns"].keys() == other["columns"].keys()
+    for name, column in own["columns"].items():
+        assert other["columns"][name]["median"] == pytest.approx(column["median"], rel=1e-6, abs=1e-6), name
+    assert {o["image"] for o in own["outliers"]} == {o["image"] for o in other["outliers"]}
+
+
+def test_some_images_are_spread_over_the_dataset(data):
+    contents = read(data, limit=30, workers=1)
+    assert contents.rows.tolist() == list(range(0, 120, 4))
+    assert contents.names[1] == "images/00000004-right.png"
+
+
+@pytest.mark.packaging
+def test_the_number_of_processes_changes_nothing(data, found):
+    assert inspect(data, workers=2) == found
+
+
+def test_splits_are_those_of_the_lines(data, found):
+    (own,) = found["datasets"]
+    splits = [json.loads(line)["split"] for line in (data / "metadata.jsonl").read_text().splitlines()]
+    assert {name: split["images"] for name, split in own["splits"].items()} == {n: splits.count(n) for n in set(splits)}
+    assert sum(split["subjects"] for split in own["splits"].values()) == 120 // FRAMES
+
+
+def test_a_shift_between_datasets_is_the_first_difference(data, tmp_path):
+    draw(tmp_path / "wider", 100, shift=0.7)
+    page = tmp_path / "page.html"
+    difference = inspect(data, tmp_path / "wider", output=page)["difference"]
+    beyond = [s["column"] for s in difference["columns"] if s["distance"] > s["chance"]]
+    pupil = {"draw eye.pupil_diameter_mm", "label pupil stop diameter (mm)", "label pupil entrance diameter (mm)",
+             "label pupil radius (px)"}  # fmt: skip
+    assert pupil <= set(beyond[:5])
+    assert "draw sensor.exposure_ms" not in beyond
+    assert "Difference of the two" in page.read_text()
+
+
+def test_distances_are_those_of_scipy(data, tmp_path):
+    draw(tmp_path / "other", 60, shift=0.2)
+    contents = [read(path, limit=1000, workers=1) for path in (data, tmp_path / "other")]
+    listed = {s["column"]: s for s in inspect(data, tmp_path / "other")["difference"]["columns"]}
+    name = "draw eye.pupil_diameter_mm"
+    assert listed[name]["distance"] == pytest.approx(ks_2samp(*(c.columns[name] for c in contents)).statistic)
+    # The albedo belongs to a subject: it is counted once for each.
+    assert len(sample_of(contents[0], "draw look.iris_albedo")) == 120 // FRAMES
+
+
+def test_correlations_are_those_of_scipy():
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(200, 4))
+    values[:, 1] += 2 * values[:, 0]
+    np.testing.assert_allclose(rank_correlations(values), spearmanr(values).statistic, atol=1e-12)
+    values[:, 3] = 1.0
+    assert np.isnan(rank_correlations(values)[3, 0])
+
+
+def test_a_number_is_unusual_alone_or_together():
+    rng = np.random.default_rng(4)
+    values = rng.normal(size=(500, 3))
+    values[:, 2] = values[:, 0] + values[:, 1]
+    values[100, 1] = 40
+    values[100, 2] = values[100, 0] + 40
+    values[200, 2] -= 2.5  # usual alone
+    assert np.abs(scores(values[:, 2])[200]) < 2.5
+    found = outliers(values, ["a", "b", "c"])
+    assert {100, 200} <= {o.at for o in found[:4]}
+    assert next(o for o in found if o.at == 100).reasons[0].column in "bc"
+    assert "suggest" in next(o for o in found if o.at == 200).reasons[0].usual
+
+
+def test_few_images_have_no_outliers():
+    assert outliers(np.random.default_rng(5).normal(size=(9, 2)), ["a", "b"]) == []
+
+
+def test_duplicates_are_equal_or_alike():
+    rng = np.random.default_rng(6)
+    thumbnails = rng.integers(0, 256, (50, 16, 16), dtype=np.uint8)
+    thumbnails[20] = np.clip(0.8 * thumbnails[10].astype(float) + 20 + rng.normal(0, 0.5, (16, 16)), 0, 255)
+    thumbnails[30:33] = 7  # flat
+    digests = [bytes([k]) for k in range(50)]
+    digests[40] = digests[5]
+    digests[45] = b""
+    assert equal_pictures(digests) == [[5, 40]]
+    (pair,) = near_duplicates(thumbnails, digests)
+    assert (pair.first, pair.second) == (10, 20)
+
+
+def test_the_command_writes_page_and_json(data, tmp_path, capsys):
+    page, file = tmp_path / "page.html", tmp_path / "found.json"
+    assert run(["inspect", str(data), "-o", str(page), "--json", str(file), "--workers", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "120 of 120 images read" in printed
+    assert "no faults" in printed
+    assert json.loads(file.read_text())["schema"] == "eyerender/inspection/1"
+    assert page.stat().st_size > 50_000
+
+
+def test_images_must_be_some(data):
+    with pytest.raises(InputError, match="--images: must be >= 1"):
+        inspect(data, images=0)
