@@ -28,10 +28,12 @@ from scipy.optimize import minimize
 
 import hard_eyes
 import make_ideal_images as ideal
-from eyerender.extraction import ExtractionSettings
-from eyerender.extraction.pipeline import pixel_fit
-from eyerender.extraction.preprocessing import prepare
+from eyerender.extraction import ExtractionSettings, pipeline
+from eyerender.extraction.glints.detection import detect_spots
+from eyerender.extraction.preprocessing import Prepared, prepare
 from eyerender.extraction.pupil import scoring, search
+from eyerender.extraction.pupil.boundary import PupilCandidate
+from eyerender.extraction.pupil.refinement import PixelFit
 from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features, goodness_of
 from eyerender.extraction.settings import Shape
 from eyerender.geometry.ellipse import Ellipse, iou
@@ -107,13 +109,20 @@ def observe(task: Task, folder: Path) -> Observed:
     # Those that may be chosen.
     order = sorted(range(len(boundaries)), key=lambda i: -boundaries[i].confidence)
     for i in order[:REFINED_OF_IMAGE]:
-        fit = pixel_fit(prepared, boundaries[i].candidate, rough)
+        fit = pixel_fit(prepared, boundaries[i].candidate)
         if fit is not None:
             out.refined.append(i)
             out.pixel.append(features(fit.ellipse, goodness_of(boundaries[i].candidate, fit)))
             out.right_refined.append(truth is not None and iou(fit.ellipse, truth) > 0.9)
             out.away_refined.append(_away(fit.ellipse, fit.covariance, truth))
     return out
+
+
+def pixel_fit(prepared: Prepared, found: PupilCandidate) -> PixelFit | None:
+    """Fit the pixel model to a boundary; None where it contradicts the edges."""
+    model = found.model
+    spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, ExtractionSettings())
+    return pipeline._refined(prepared, found, *pipeline._fit_spots(prepared, found, spots))[0]
 
 
 def _away(ellipse: Ellipse, covariance: Array, truth: Ellipse | None) -> float:

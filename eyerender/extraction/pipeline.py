@@ -137,13 +137,6 @@ def _iris_level(prepared: Prepared, found: PupilCandidate, model: EdgeModel) -> 
     return median(levels[found.sectors])
 
 
-def pixel_fit(prepared: Prepared, found: PupilCandidate, settings: ExtractionSettings) -> PixelFit | None:
-    """Fit the pixel model to a boundary; None if it contradicts the edges."""
-    model = found.model
-    spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
-    return _refined(prepared, found, *_fit_spots(prepared, found, spots))[0]
-
-
 def _refined(prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotFit) -> tuple[PixelFit | None, SpotFit]:
     """Fit the pixel model to the image without the spots.
 

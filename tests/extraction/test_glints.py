@@ -109,6 +109,29 @@ def test_a_large_oval_glint_lies_at_the_centroid_of_its_light(middle):
     assert np.hypot(*(found[0].xy_px - [x, y])) < 0.3  # a third of a pixel: the outline's pixels are whole or none
 
 
+def test_smear_along_the_rows_does_not_move_a_glint():
+    """A clipped disc of 14 px with a tail of 17 px to one side, as overloaded interlaced cameras show lamps."""
+    drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[0])
+    x, y = np.array(drawing.label["pupil"]["centre_px"]) + np.array([-8.0, 6.0])
+    v, u = np.mgrid[: drawing.image.shape[0], : drawing.image.shape[1]] - np.array([y, x])[:, None, None]
+    lit = (np.hypot(u, v) < 7.0) | ((u > 0.0) & (u < 24.0) & (np.abs(v) < 4.0))
+    found = extract(np.where(lit, 255, drawing.image).astype(np.uint8)).glints
+    assert len(found) == 1
+    assert np.hypot(*(found[0].xy_px - [x, y])) < 0.7  # the tail alone would move the centroid by 5 px
+
+
+def test_a_glint_with_a_dull_middle_is_one_glint():
+    """A rim at full scale about a middle at two thirds of it, as some overloaded cameras show lamps."""
+    drawing = ideal.draw(ideal.Condition(noise=(2, 2), glints="none"), SEEDS[0])
+    x, y = np.array(drawing.label["pupil"]["centre_px"]) + np.array([4.0, -6.0])
+    v, u = np.mgrid[: drawing.image.shape[0], : drawing.image.shape[1]] - np.array([y, x])[:, None, None]
+    radius, rim = np.hypot(u, v), np.cos(3.0 * np.arctan2(v, u)) > 0.0  # three pieces of the rim are white
+    level = np.where((radius > 5.0) & rim, 255, 180)
+    found = extract(np.where(radius < 7.0, level, drawing.image).astype(np.uint8)).glints
+    assert len(found) == 1
+    assert np.hypot(*(found[0].xy_px - [x, y])) < 0.7
+
+
 def _clip_level(image: np.ndarray) -> float:
     prepared = prepare(image, None, 1.0)
     assert isinstance(prepared, Prepared)

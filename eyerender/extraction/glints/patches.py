@@ -20,9 +20,12 @@ from ..statistics import median
 from .detection import Spots
 from .fits import SpotFit, joined
 
-NEARLY = 0.92  # share of the brightest level near the pupil that counts as saturated (compression lowers some pixels)
-LEAST_PX, MOST = 2, 24  # pixels of a saturated patch, since a single one is a Gaussian spot's peak; how many patches
-LONGEST = 1.1  # longest side of a patch in semi-axes b of the pupil; the highlight of a lid margin is longer
+# Share of the brightest level near the pupil, step between pixels, least pixels of a patch, most patches. First those
+# with a dull middle, as overloaded sensors show bright glints; then saturated ones, some pixels of which compression
+# lowers.
+BRIGHT = ((0.6, 2, 5, 8), (0.92, 1, 2, 24))
+LONGEST = 2.0  # longest side of a patch in semi-axes b of the pupil, its smear included
+HEAD = 0.8  # of the radius of the largest disc in a patch; smear along rows or columns of the sensor is narrower
 OUTLINE = (0.5, 0.75)  # shares of the height that outline a patch; the second parts patches that touch
 USUAL_PX = 2  # half the side of a spot whose fit failed
 POOR = 0.1  # residual, as a share of the visible height, with which a Gaussian does not describe a clipped spot
@@ -49,7 +52,7 @@ def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, spots
     peaks = np.clip(peaks, USUAL_PX, np.array(crop.shape[::-1]) - 1 - USUAL_PX)
     boxes = [(x - USUAL_PX, x + USUAL_PX, y - USUAL_PX, y + USUAL_PX) for x, y in peaks.tolist()]
     parts: list[SpotFit] = []
-    for left, right, top, bottom in [*_saturated(crop, prepared.clip_dn, ellipse.centre_px - corner), *boxes]:
+    for left, right, top, bottom in [*_bright_boxes(crop, prepared.clip_dn, ellipse.centre_px - corner), *boxes]:
         if max(right - left, bottom - top) < longest:
             patch = _patch(crop, (left, right, top, bottom), prepared.clip_dn, owner, len(parts) + 1)
             parts += [] if patch is None else [patch]
@@ -62,15 +65,19 @@ def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, spots
     return joined([fit.taken(np.flatnonzero(described[own])), patches])
 
 
-def _saturated(crop: Image, clip_dn: float, middle: Floats) -> list[Box]:
-    """Return boxes of the saturated patches nearest to the pupil; some cameras show a bright glint's middle dark."""
-    if crop.size == 0:
-        return []
-    bright = (crop >= min(clip_dn, NEARLY * float(crop.max()))).view(np.uint8)
-    closed = cv2.morphologyEx(bright, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    stats = cv2.connectedComponentsWithStats(closed, connectivity=8)[2][1:].tolist()
-    boxes = [(x, x + w - 1, y, y + h - 1) for x, y, w, h, area in stats if area >= LEAST_PX]
-    return sorted(boxes, key=lambda box: math.hypot(box[0] - middle[0], box[2] - middle[1]))[:MOST]
+def _bright_boxes(crop: Image, clip_dn: float, middle: Floats) -> list[Box]:
+    """Boxes of the bright patches nearest to the pupil."""
+    boxes: list[Box] = []
+    levels = [min(clip_dn, share * float(crop.max(initial=0.0))) for share, _, _, _ in BRIGHT if crop.size]
+    for level, (_, step, least, most) in zip(levels, BRIGHT, strict=False):
+        part = crop[::step, ::step]
+        closed = cv2.morphologyEx((part >= level).view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        labels, stats = cv2.connectedComponentsWithStats(closed, connectivity=8)[1:3]
+        white = np.bincount(labels[part >= levels[-1]], minlength=len(stats))
+        chosen = (stats[:, 4] >= least) & ((white < 0.5 * stats[:, 4]) | (level == levels[-1]))
+        found = [(x, x + w - step, y, y + h - step) for x, y, w, h, _ in (step * stats[1:][chosen[1:]]).tolist()]
+        boxes += sorted(found, key=lambda box: math.hypot(box[0] - middle[0], box[2] - middle[1]))[:most]
+    return boxes
 
 
 def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -> SpotFit | None:
@@ -88,8 +95,9 @@ def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -
     core = next((one for one in outlined if one is not None), None)
     if core is None or height <= 0.0 or known[seed]:
         return None
+    known[cv2.dilate(core, np.ones((3, 3), np.uint8)) > 0] = number
+    core = _head(core) if window[seed] >= clip_dn else core
     near = cv2.dilate(core, np.ones((3, 3), np.uint8)).astype(bool)
-    known[near] = number
     light = np.where(core > 0, height, np.clip(window - ground, 0.0, height))
     ys, xs = np.nonzero(near)
     weight = light[ys, xs] / light[ys, xs].sum()
@@ -120,3 +128,12 @@ def _outlined(window: Image, level: float, seed: tuple[int, int]) -> Bytes | Non
         return None
     outline, _ = cv2.findContours(core, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return np.asarray(cv2.drawContours(core, outline, -1, 1, cv2.FILLED))
+
+
+def _head(core: Bytes) -> Bytes:
+    """Mask (h, w) without what is narrower than HEAD of its widest part: an opening with a disc."""
+    depth = cv2.distanceTransform(core, cv2.DIST_L2, 5)
+    radius = HEAD * float(depth.max())
+    return np.asarray(
+        (cv2.distanceTransform((depth <= radius).view(np.uint8), cv2.DIST_L2, 5) <= radius).view(np.uint8)
+    )

@@ -69,14 +69,9 @@ def find_pupil(
     bright = _search(invert(prepared), shape, before)
     if not isinstance(bright, ScoredCandidate) or bright.confidence < SURE:
         return dark
-    return bright if _contains(dark.candidate, bright.candidate) else dark
-
-
-def _contains(outer: PupilCandidate, inner: PupilCandidate) -> bool:
-    """Return whether the second boundary lies inside the first, larger one."""
-    large, small = outer.boundary.ellipse, inner.boundary.ellipse
+    large, small = dark.candidate.boundary.ellipse, bright.candidate.boundary.ellipse
     apart = float(np.hypot(*(large.centre_px - small.centre_px)))
-    return small.area_px2 < large.area_px2 and apart < float(large.semi_axes_px[1])
+    return bright if small.area_px2 < large.area_px2 and apart < float(large.semi_axes_px[1]) else dark
 
 
 def _search(work: Prepared, shape: Shape, prior: Ellipse | None) -> ScoredCandidate | PupilResult:
@@ -137,7 +132,7 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, PupilCandid
         usual = replace(limits, least_px=max(limits.least_px, min(USUAL_PX / image.scale, 0.5 * limits.most_px)))
         for candidates in (_large, find_candidates):
             yield from ((image is not work, one) for one in _bounded(image, candidates(image, usual), limits, tried))
-    yield from ((True, one) for one in _bounded(work, list(_rounder(_best(whole), shape)), shape, whole))
+    yield from ((True, one) for one in _bounded(work, list(_rounder(whole, shape)), shape, whole))
     if shape.least_px < USUAL_PX:
         small = replace(shape, most_px=2.0 * USUAL_PX)
         yield from ((True, one) for one in _bounded(work, find_candidates(work, small), shape, whole))
@@ -212,21 +207,16 @@ def _same(first: Ellipse, second: Ellipse) -> bool:
     return near and SAME <= ratio <= 1.0 / SAME and iou(first, second) >= SAME
 
 
-def _best(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return the candidates that are not much worse than the best one."""
-    least = LIKELY * max((one.score for one in candidates), default=0.0)
-    return [one for one in candidates if one.score >= least]
-
-
 def _rounder(candidates: Sequence[Candidate], shape: Shape) -> Iterator[Candidate]:
-    """Return circles as wide as each flat blob, about its middle and to either side of it.
+    """Compute circles as wide as each likely flat blob, about its middle and to either side of it.
 
     Half a disc of radius r has the second moments of an ellipse of semi-axes r and 0.53 r, 0.42 r from the middle of
     the disc: 0.9 of the difference. If two lids cut a disc equally, its middle is that of the blob.
     """
+    least = LIKELY * max((one.score for one in candidates), default=0.0)
     for candidate in candidates:
         a, b = candidate.ellipse.semi_axes_px.tolist()
-        if b > FLAT * a or a > shape.most_px:
+        if candidate.score < least or b > FLAT * a or a > shape.most_px:
             continue
         across = np.array([-math.sin(candidate.ellipse.angle_rad), math.cos(candidate.ellipse.angle_rad)])
         for side in (0.0, 1.0, -1.0):
