@@ -328,7 +328,7 @@ def test_a_bench_scores_answers_about_an_export_as_about_the_dataset(tiny, expor
         for images in folders
     ]
     assert len(outlines[0]) == len(outlines[1]) > 10
-    scores = [[], []]
+    scores: list[list[float]] = [[], []]
     for kept, numbers in zip(scores, outlines, strict=True):
         for x, y, a, b, angle in numbers:
             # An answer that is about a pixel off; rounded, it is the same for both.
