@@ -51,7 +51,7 @@ class Job:
         )
 
     def maker(self) -> Maker:
-        """Make the worker's maker."""
+        """Create the worker's maker."""
         plan = Plan.from_mapping(self.plan, Path(self.base)).loaded()
         return Maker(plan, self.frames, backend=self.backend, threads=self.threads)  # type: ignore[arg-type]
 
