@@ -95,7 +95,9 @@ def _openeds(folder: Path) -> Iterator[Labelled]:
 
 
 def _coco(folder: Path) -> Iterator[Labelled]:
-    for file in sorted((folder / "annotations").glob("*.json")):
+    files = sorted((folder / "annotations").glob("*.json"))
+    # Files of keypoints or captions stand beside those of instances, as in the public COCO data.
+    for file in [file for file in files if file.name.startswith("instances")] or files:
         data, source = read_json(file, limit=_ANNOTATIONS_BYTES), str(file)
         try:
             categories = {str(c["name"]).lower(): c["id"] for c in data["categories"]}

@@ -42,6 +42,7 @@ COMMANDS = {
     "rig": ["scene.yaml", "--unknowns", "unknowns.yaml"],
     "status": ["folder"],
     "merge": ["folder", "other"],
+    "inspect": ["folder", "other"],
     "sweep": ["layouts.yaml"],
 }
 NO_OUTPUT = {"setup-llvm", "schema", "live"}
@@ -90,7 +91,7 @@ def test_every_command_and_every_output_is_in_the_table():
     inputs = {
         "scene", "images", "folder", "other", "spec", "records", "rig", "columns", "calibration", "eye", "eyes", "name",
         "preset", "extractor", "estimator", "reference", "function", "terms_x", "terms_y", "fixations", "side", "shard",
-        "address", "against", "recording", "population", "unknowns", "require", "folders",
+        "address", "against", "recording", "population", "unknowns", "require", "folders", "scenes",
     }  # fmt: skip
     for name in sorted(names):
         function = (gaze[name[5:]] if " " in name else app[name]).default_command

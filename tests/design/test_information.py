@@ -252,5 +252,5 @@ def test_wrong_input_is_named(scene):
         information(scene.frames(), calibration=[99])
     with pytest.raises(er.InputError, match="noise: must be > 0"):
         FeatureNoise.of(0.0, 1.0, rig=scene.rig)
-    with pytest.raises(er.InputError, match="no sphere, conic or biconic"):
+    with pytest.raises(er.InputError, match="is not a sphere, conic or biconic"):
         information(er.Scene.of(scene.spec, eye="keratoconus").frames())
