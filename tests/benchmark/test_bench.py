@@ -307,7 +307,11 @@ def test_a_mask_of_the_visible_part_gives_the_whole_pupil(hidden):
 
 @pytest.mark.parametrize(
     ("line", "message"),
-    [("a.png,1,2,3,4,0", "is not an ellipse"), ("a.png,1,2,x,3,0", "needs five numbers"), ("../a.png,1,2,3,3,0", "a.png")],
+    [
+        ("a.png,1,2,3,4,0", "is not an ellipse"),
+        ("a.png,1,2,x,3,0", "needs five numbers"),
+        ("../a.png,1,2,3,3,0", "a.png"),
+    ],
 )
 def test_a_broken_table_names_the_line(line, message, tmp_path):
     (tmp_path / "labels.csv").write_text(
