@@ -24,6 +24,7 @@ _BLACK, _WHITE = 0.03, 0.97
 # Visible pixels are counted in the mask itself, and lines have 9 digits.
 _MASK_PX = 0.01
 _LEAST_PX = 20
+_MEAN = f"{PICTURE}mean level"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,13 +64,9 @@ def measure(entry: ImageEntry) -> Picture:
     thumbnail = np.asarray(Image.fromarray(codes).resize((SIDE, SIDE), Image.Resampling.BOX))
     faults += _blank(thumbnail)
     mask = _mask(entry, image.shape, faults)
-    numbers = {
-        f"{PICTURE}mean level": float(codes.mean()) / 255,
-        f"{PICTURE}spread of levels": float(codes.std()) / 255,
-        f"{PICTURE}saturated (share)": float(np.count_nonzero(codes == 255)) / codes.size,
-    }
+    numbers = _levels(codes)
     if mask is not None:
-        numbers |= _levels(codes, mask)
+        numbers |= _levels_of_parts(codes, mask, numbers[_MEAN])
     digest = hashlib.blake2b(np.ascontiguousarray(image).tobytes(), digest_size=8).digest()
     return Picture(numbers=numbers, thumbnail=thumbnail, digest=digest, mask=mask, faults=faults)
 
@@ -111,15 +108,22 @@ def _mask(entry: ImageEntry, shape: tuple[int, ...], faults: list[Fault]) -> Byt
     return mask
 
 
-def _levels(codes: Bytes, mask: Bytes) -> dict[str, float]:
-    """Mean levels of the parts of the eye; a part of few pixels has none."""
-    counts = np.bincount(mask.ravel(), minlength=FRAME + 1)
-    sums = np.bincount(mask.ravel(), weights=codes.ravel(), minlength=FRAME + 1)
-    means = {k: sums[k] / counts[k] / 255 for k in (IRIS, PUPIL) if counts[k] >= _LEAST_PX}
+def _levels(codes: Bytes) -> dict[str, float]:
+    """Compute mean and spread of the levels, and the share of saturated pixels, from the histogram."""
+    shares, levels = np.bincount(codes.ravel(), minlength=256) / codes.size, np.arange(256) / 255
+    mean = float(shares @ levels)
+    spread = float(np.sqrt(shares @ (levels - mean) ** 2))
+    return {_MEAN: mean, f"{PICTURE}spread of levels": spread, f"{PICTURE}saturated (share)": float(shares[255])}
+
+
+def _levels_of_parts(codes: Bytes, mask: Bytes, mean: float) -> dict[str, float]:
+    """Compute mean levels of the parts of the eye; a part of few pixels has none."""
+    parts = {k: codes[mask == k] for k in (IRIS, PUPIL)}
+    means = {k: float(part.mean()) / 255 for k, part in parts.items() if part.size >= _LEAST_PX}
     found = {f"{PICTURE}level of the {name}": means[k] for name, k in (("pupil", PUPIL), ("iris", IRIS)) if k in means}
     if len(means) == 2:
         # In units of the picture's mean, so that exposure does not matter.
-        contrast = (means[IRIS] - means[PUPIL]) / max(float(codes.mean()) / 255, 1e-3)
+        contrast = (means[IRIS] - means[PUPIL]) / max(mean, 1e-3)
         found[f"{PICTURE}iris - pupil : mean"] = contrast
     return found
 
@@ -142,8 +146,8 @@ def mask_contradictions(entry: ImageEntry, mask: Bytes) -> Iterator[Fault]:
             continue
         centre = visible.get("centre_px")
         if count and centre is not None:
-            v, u = np.nonzero(inside)
-            far = float(np.hypot(u.mean() + x0 - centre[0], v.mean() + y0 - centre[1]))
+            u, v = (np.count_nonzero(inside, axis=k) @ np.arange(inside.shape[1 - k]) / count for k in (0, 1))
+            far = float(np.hypot(u + x0 - centre[0], v + y0 - centre[1]))
             if not far <= _MASK_PX:
                 yield Fault("mask and labels", f"the visible {name} is {far:.2f} px beside its label")
 
