@@ -23,7 +23,7 @@ GAMMA = 1.4
 def tile(entry: ImageEntry, height: int) -> Image.Image:
     """Show a picture at a height in px, with 8 bits."""
     full = 2.0 ** int(entry.line["bit_depth"]) - 1
-    grey = (entry.image() / full) ** (1 / (GAMMA * entry.gamma))
+    grey = (entry.image() / full) ** (entry.gamma / GAMMA)
     image = Image.fromarray(np.rint(255 * grey).astype(np.uint8))
     return image.resize((round(image.width * height / image.height), height), Image.Resampling.LANCZOS)
 
