@@ -51,7 +51,7 @@ class PartialShard:
     """A shard in the making; a context manager that resumes the finished samples of an earlier worker.
 
     Attributes:
-        made: number of finished samples, including those that were given up.
+        made: numbers of the finished samples, including those that were given up.
         images: number of their images.
     """
 
