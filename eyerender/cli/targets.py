@@ -14,6 +14,8 @@ from ..storage.files import parse_json, read_text, refuse_address, refuse_specia
 
 # Names of the parameters that say where a command writes; all other paths of a command are inputs.
 OUTPUTS = ("output", "overlay", "json")
+# Outputs with other suffixes are folders, which commands create with their parents.
+_FILES = (".csv", ".html", ".jpg", ".json", ".jsonl", ".pdf", ".png", ".svg", ".yaml", ".yml")
 _MAX_DEPTH = 4  # depth of files that name files: a dataset's spec, its scene, a head's manifest, its meshes
 _MAX_NAME = 1024
 
@@ -26,7 +28,8 @@ def check_outputs(arguments: Mapping[str, Any]) -> None:
 
     Raises:
         InputError: an output is an address; is an input, also by another name; is a file that an input names, or a file
-            of an input folder; is the JSON target but not a file; or will be emptied although it holds an input.
+            of an input folder; is the JSON target but not a file; will be emptied although it holds an input; or lies
+            where nothing can be written.
     """
     arguments = dict(_flattened(arguments))
     said = {name: arguments[name] for name in OUTPUTS if arguments.get(name) is not None}
@@ -37,6 +40,7 @@ def check_outputs(arguments: Mapping[str, Any]) -> None:
         refuse_address(place)
         if name == "json":
             refuse_special(place)
+        _check_place(place, is_file=name == "json" or place.suffix.lower() in _FILES)
     if len({os.path.realpath(place) for place in outputs.values()}) < len(outputs):
         raise InputError("is given for two outputs", source=str(place))
     existing = [(place, state) for place in outputs.values() if (state := _state(place)) is not None]
@@ -44,6 +48,19 @@ def check_outputs(arguments: Mapping[str, Any]) -> None:
         given = [path for name, value in arguments.items() if name not in OUTPUTS for path in _paths(value)]
         for place, state in existing:
             _refuse_inputs(place, state, given, emptied=bool(arguments.get("overwrite")))
+
+
+def _check_place(place: Path, *, is_file: bool) -> None:
+    """Refuse a path in which this process can create no file or folder, and files in folders that do not exist."""
+    folder = Path(os.path.realpath(place)).parent
+    if is_file and not os.path.exists(folder):
+        raise InputError(f"the folder {place.parent} does not exist", source=str(place))
+    while not os.path.exists(folder):
+        folder = folder.parent
+    if not os.path.isdir(folder):
+        raise InputError(f"cannot be written, because {folder} is not a folder", source=str(place))
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"cannot be written, because the folder {folder} is not writable", source=str(place))
 
 
 def _flattened(arguments: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
