@@ -108,17 +108,17 @@ def _arcs(visible: Visible, r: Floats) -> tuple[Floats, Floats, Floats]:
     seen = _seen(visible, r, _ANGLES)
     step = 2 * np.pi / _ANGLES
     whole = np.flatnonzero(seen.all(axis=1))
-    ends = []
-    for earlier in (False, True):
-        # An arc begins after a hidden point, and ends after a visible one.
-        circle, k = np.nonzero((seen == earlier) & (np.roll(seen, -1, axis=1) != earlier))
-        low, high = k * step, (k + 1) * step
-        for _ in range(_ANGLE_STEPS if len(k) else 0):
-            middle = 0.5 * (low + high)
-            same = visible(_polar(r[circle], middle)) == earlier
-            low, high = np.where(same, middle, low), np.where(same, high, middle)
-        ends.append((circle, 0.5 * (low + high)))
-    (which, begin), (_, end) = ends
+    # An arc begins after a hidden point, and ends after a visible one.
+    rises = np.roll(seen, -1, axis=1) & ~seen
+    falls = np.roll(~seen, -1, axis=1) & seen
+    (which, first), (falling, last) = np.nonzero(rises), np.nonzero(falls)
+    circle, k = np.append(which, falling), np.append(first, last)
+    before, low, high = np.repeat([False, True], [len(which), len(falling)]), k * step, (k + 1) * step
+    for _ in range(_ANGLE_STEPS if len(circle) else 0):
+        middle = 0.5 * (low + high)
+        same = visible(_polar(r[circle], middle)) == before
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    begin, end = np.split(0.5 * (low + high), [len(which)])
     # On each circle beginnings and ends alternate; an arc that contains angle 0 ends before it begins.
     for c in np.unique(which):
         here = which == c
