@@ -25,6 +25,7 @@ CONDITIONS = {
     "glint on the edge": "a glint is centred within 3 px of the pupil's outline",
     "window in the pupil": "the cornea mirrors a panel of light into the pupil",
     "motion": "the image moves by more than 1 px during the exposure",
+    "interlaced": "odd rows show the image moved by more than 1 px",
     "clipped skin": "more than 2 % of the skin's pixels are at full scale",
     "strong JPEG": "compressed with a quality below 50",
     "none of these": "none of the other conditions holds",
@@ -72,9 +73,12 @@ def of_scene(line: Mapping[str, Any], pupil: Ellipse | None, corner: Floats) -> 
         out.add("view > 50 deg")
     scene = json.loads(parameters.get("scene_json") or "{}")
     sensor, motion, ambient = (scene.get(key) or {} for key in ("sensor", "motion", "ambient"))
-    turned = math.hypot(*motion.get("eye_deg_s", (0.0, 0.0))) * 1e-3 * float(sensor.get("exposure_ms") or 0.0)
-    if math.radians(turned) * _ROTATION_MM * float(K[0, 0]) / distance > _MOVES_PX:
+    speed_px_ms = math.radians(math.hypot(*motion.get("eye_deg_s", (0.0, 0.0)))) * 1e-3
+    speed_px_ms *= _ROTATION_MM * float(K[0, 0]) / distance
+    if speed_px_ms * float(sensor.get("exposure_ms") or 0.0) > _MOVES_PX:
         out.add("motion")
+    if speed_px_ms * float(sensor.get("field_delay_ms") or 0.0) > _MOVES_PX:
+        out.add("interlaced")
     if sensor.get("jpeg_quality") is not None and sensor["jpeg_quality"] < _QUALITY:
         out.add("strong JPEG")
     mirror = np.asarray(world["cornea_centre_mm"]), np.asarray(world["cornea_apex_mm"]), lens

@@ -231,14 +231,18 @@ def focus_dpt(frames: Frames, row: int) -> float:
 
 
 def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:
-    """Return the job at evenly spaced moments of the exposure, with moving eye and head; empty if nothing moves."""
+    """Return the job at evenly spaced moments of the exposure, with moving eye and head; empty if nothing moves.
+
+    An interlaced camera has one exposure for its even rows, and a second one for its odd rows.
+    """
     scene, pose = frames.scene, frames.pose
-    motion = scene.spec.motion
+    motion, sensor = scene.spec.motion, scene.spec.sensor
     if motion is None:
         return ()
+    during = ((np.arange(motion.steps) + 0.5) / motion.steps - 0.5) * sensor.exposure_ms * 1e-3
+    delay = sensor.field_delay_ms * 1e-3
     out = []
-    for k in range(motion.steps):
-        time_s = ((k + 0.5) / motion.steps - 0.5) * scene.spec.sensor.exposure_ms * 1e-3
+    for k, time_s in enumerate(np.concatenate([during - delay / 2, during + delay / 2]) if delay else during):
         azimuth = pose.azimuth_rad[row] + np.radians(motion.eye_deg_s[0]) * time_s
         elevation = pose.elevation_rad[row] + np.radians(motion.eye_deg_s[1]) * time_s
         M, t = rigid_motion(Poses.listing([azimuth], [elevation]), middle.eye)

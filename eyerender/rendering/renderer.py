@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from .integrator.hostdata import HostData
 from .integrator.request import BoundFrame
 from .output.geometry import Hits, window_hits
 from .output.labels import PartLabels, highlights, part_labels
-from .output.window import RawFrame, RenderedWindow
+from .output.window import Exposed, RawFrame, RenderedWindow
 from .records.job import RenderJob
 from .records.recording import uncollected
 from .scene.background import Background, Obstacle
@@ -89,11 +90,13 @@ class Renderer:
     ) -> RawFrame:
         """Trace a job, or average its sub-frames; take labels and glints from mid-exposure."""
         shots = moments or (job,)
-        spp = max(1, (spp or self.spp) // len(shots))
+        # The sub-frames of an interlaced camera are two exposures.
+        count = len(shots) // (2 if moments and job.sensor.field_delay_ms else 1)
+        spp = max(1, (spp or self.spp) // count)
         blur: Blur | None = None
         pictures: list[Singles] = []
         failed = 0
-        glints: list[Shine] = []
+        glints: list[Sequence[Shine]] = []
         marks: tuple[Any, ...] | None = None
         around: CoarseSensor | None = None
         for shot in shots:
@@ -105,8 +108,8 @@ class Renderer:
             # The device works until something is read, so host work comes first.
             found = _marks(bound, job, surroundings) if shot.M is job.M and shot.t is job.t else None
             self._builder.prepare()
-            mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / len(shots))
-            glints += shines
+            mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / count)
+            glints.append(shines)
             mean, missed = film.means()
             pictures.append(mean)
             failed += missed
@@ -117,9 +120,15 @@ class Renderer:
             bound, surroundings = self.bind(job, lit=False)
             marks = self._mirror_images(bound.host).seen(surroundings, blur)[0], *_marks(bound, job, surroundings)()
         mirrored, labels, margins, bright, hits = marks
-        picture = np.mean(pictures, axis=0) if moments else pictures[0]
+        exposed = tuple(
+            Exposed(
+                np.mean(pictures[k : k + count], axis=0) if moments else pictures[0],
+                tuple(chain(*glints[k : k + count])),
+            )
+            for k in range(0, len(shots), count)
+        )
         return RawFrame(
-            job=job, picture=picture, glints=tuple(glints), blur=blur, mirrored=mirrored, labels=labels, failed=failed,
+            job=job, exposed=exposed, blur=blur, mirrored=mirrored, labels=labels, failed=failed,
             lid_margins_px=margins, highlights=bright, hits=hits, around=None if around is None else around.picture(),
         )  # fmt: skip
 

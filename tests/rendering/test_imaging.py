@@ -118,6 +118,26 @@ def test_a_moving_head_smears_the_glint_about_its_place(renderer):
     assert np.array_equal(still.parts, moved.parts)
 
 
+def test_rows_of_an_interlaced_camera_show_two_moments(renderer):
+    still = shot(renderer)
+    moving = {"motion": {"head_mm_s": [0, 100, 0], "steps": 2}, "sensor": {"exposure_ms": 0.5}}
+    short = shot(renderer, sensor={"exposure_ms": 0.5})
+    moving["sensor"]["field_delay_ms"] = 10.0
+    comb = shot(renderer, **moving)
+
+    def place(image, parity):
+        rows = np.arange(image.irradiance.shape[0]) % 2 == (parity + image.window[1]) % 2
+        bright = np.where(rows[:, None], image.irradiance, 0.0)
+        bright = np.where(bright > short.irradiance[:20].max() * 3, bright, 0.0)
+        return np.sum(bright * np.arange(bright.shape[1])) / np.sum(bright)
+
+    even, odd = place(comb, 0), place(comb, 1)
+    # 100 mm/s * 10 ms at 5000 / 600 px/mm; the cornea's apex moves, and with it its mirror images.
+    assert abs(odd - even) == pytest.approx(1.0 * 5000 / 600, abs=0.4)
+    assert (even + odd) / 2 == pytest.approx(place(short, 0), abs=0.2)
+    assert np.array_equal(still.parts, comb.parts)
+
+
 def test_a_panel_is_mirrored_where_a_lamp_at_its_middle_is(renderer):
     plain = shot(renderer)
     lit = shot(

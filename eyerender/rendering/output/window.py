@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,14 +54,26 @@ class RenderedWindow(ArrayValue):
     geometry: Geometry | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposed(ArrayValue):
+    """Light of one exposure.
+
+    Attributes:
+        picture: mean radiance of the pixels, with the border that the lens needs, or its parts.
+        glints: light of the lamps' mirror images.
+    """
+
+    picture: Singles
+    glints: tuple[Shine, ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RawFrame(ArrayValue):
     """A traced frame before lens and sensor are applied.
 
     Attributes:
         job: the frame's job.
-        picture: mean radiance of the pixels, with the border that the lens needs, or its parts.
-        glints: light of the lamps' mirror images.
+        exposed: the light of the frame; for an interlaced camera that of even rows, and that of odd rows.
         blur: defocus of the job.
         mirrored: positions and energies of the glints.
         labels: raster labels, if they were requested.
@@ -73,8 +86,7 @@ class RawFrame(ArrayValue):
     """
 
     job: RenderJob
-    picture: Singles
-    glints: tuple[Shine, ...]
+    exposed: tuple[Exposed, ...]
     blur: Blur
     mirrored: Mirrored
     labels: PartLabels | None
@@ -91,7 +103,11 @@ class RawFrame(ArrayValue):
             InputError: numbers so extreme that the image is not finite.
         """
         job, labels, mirrored, highlights = self.job, self.labels, self.mirrored, self.highlights
-        irradiance = sealed(self._irradiance())
+        irradiance = self._irradiance(self.exposed[0])
+        if len(self.exposed) == 2:
+            odd = 1 - job.window[1] % 2
+            irradiance[odd::2] = self._irradiance(self.exposed[1])[odd::2]
+        irradiance = sealed(irradiance)
         if not np.all(np.isfinite(irradiance)):
             raise InputError("the numbers of the scene are too extreme: its image is not finite")
         # The counts are computed from the returned irradiance, so that exposing it again gives the same counts.
@@ -118,22 +134,22 @@ class RawFrame(ArrayValue):
             geometry=geometry,
         )
 
-    def _irradiance(self) -> Singles:
-        """Compute the irradiance (height, width) of the window, W/m^2."""
+    def _irradiance(self, exposed: Exposed) -> Singles:
+        """Compute the irradiance (height, width) of the window, W/m^2, in one exposure."""
         job = self.job
         # Single precision is finer than the samples' noise, and takes half the time.
-        picture = psf.blur(self.blur.of_pictures(self.picture).astype(np.float32), job.sensor.psf_sigma_px)
-        add_shines(self.glints, picture, job)
+        picture = psf.blur(self.blur.of_pictures(exposed.picture).astype(np.float32), job.sensor.psf_sigma_px)
+        add_shines(exposed.glints, picture, job)
         picture = stray.starred(picture, job.lens.star)
         seen = (job.lens, job.camera, job.window)
         picture = _framed(picture, *seen)
         if self.around is None:
             picture = stray.scattered(picture, *seen)
         else:
-            picture = stray.scattered_around(picture, self._around(self.around), *seen)
+            picture = stray.scattered_around(picture, self._around(self.around, exposed.glints), *seen)
         return np.asarray(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)))
 
-    def _around(self, cells: Singles) -> Singles:
+    def _around(self, cells: Singles, glints: Sequence[Shine]) -> Singles:
         """Return the whole sensor in blocks, seen through the openings, with the mirror images of the lamps."""
         job, side = self.job, stray.block_px(self.job.lens)
         lens, camera = stray.in_blocks(job.lens, job.camera, side)
@@ -145,7 +161,7 @@ class RawFrame(ArrayValue):
                 spots=Spots(frozen((shine.spots.xy_px + 0.5) / side - 0.5), frozen(shine.spots.energy / side**2)),
                 blur_px=shine.blur_px / side,
             )
-            for shine in self.glints
+            for shine in glints
         ]
         add_shines(shines, picture, replace(job, camera=camera, window=whole, sensor=sensor))
         return _framed(picture, lens, camera, whole)
