@@ -45,6 +45,7 @@ class Condition:
     pupil_level: tuple[float, float] = (20.0, 20.0)
     step: tuple[float, float] = (55.0, 55.0)  # pupil to iris
     texture: tuple[float, float] = (0.0, 0.0)
+    shading: tuple[float, float] | None = None  # change of the light over a semi-axis a of the pupil, in any direction
     lid: tuple[float, float] | None = None  # covered part of the pupil, in units of its vertical semi-axis
     glints: str = "isolated"  # isolated | edge | saturated | ring | eight | scatter | none
     glint_peak: float = 225.0  # grey level at the spot's centre, background included
@@ -65,6 +66,7 @@ CONDITIONS: dict[str, Condition] = {
     "noise16": Condition(noise=(16, 16)),
     "blur4": Condition(noise=(2, 2), blur=(4, 4), glint_sigma=(4.0, 4.4)),
     "texture6": Condition(noise=(2, 2), texture=(6, 6)),
+    "shading": Condition(noise=(2, 2), shading=(0.05, 0.3)),
     "edge-glint": Condition(noise=(2, 2), glints="edge"),
     "lid": Condition(noise=(2, 2), lid=(0.2, 0.6)),
     "saturated-glint": Condition(noise=(2, 2), glints="saturated", glint_peak=1000.0),
@@ -203,6 +205,8 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
     fine = ndimage.gaussian_filter(fine, sigma_cells, mode="nearest", truncate=5.0)
     image = np.full((height, width), sclera_level)
     image[y0:y1, x0:x1] = fine.reshape(y1 - y0, CELLS, x1 - x0, CELLS).mean(axis=(1, 3))
+    if c.shading is not None:
+        image *= _shading(pupil, pick(c.shading), pick((0.0, 2.0 * math.pi)), width, height)
     for glint in glints:
         glint["seen"] = lid is None or float(lid(*glint["xy"])) > 0.0
         if glint["seen"]:
@@ -221,6 +225,13 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
         "pupil_contrast_to_noise": abs(step) / max(noise, 1e-9), "polarity": "bright" if c.bright_pupil else "dark",
     }  # fmt: skip
     return Drawing(stored, record, parameters)
+
+
+def _shading(pupil: _Conic, change: float, direction: float, width: int, height: int) -> Array:
+    """Light that changes linearly over the image, between 0.2 and 2.5 of that at the pupil's centre."""
+    x, y = np.arange(width) - pupil.centre[0], np.arange(height)[:, None] - pupil.centre[1]
+    along = (x * math.cos(direction) + y * math.sin(direction)) / pupil.semi[0]
+    return np.asarray(np.clip(1.0 + change * along, 0.2, 2.5))
 
 
 def compressed(image: NDArray[Any], quality: int) -> NDArray[Any]:

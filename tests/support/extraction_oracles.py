@@ -214,8 +214,20 @@ def level_and_slope(model: EdgeModel, place: Place) -> tuple[Floats, Floats]:
     profile = Profile.of(place.distance, place.curvature, model.sigma_px, model.kurtosis)
     inner = inner_level(model, place)
     step = model.outer @ harmonics(place.cos_u, place.sin_u, (model.outer.size - 1) // 2) - inner
-    level = inner + step * profile.edge + model.slope * profile.ramp
-    return level, step * profile.edge_by_distance + model.slope * profile.ramp_by_distance
+    within, beyond = _slopes(model, place)
+    # The inner plane ends where the blurred ramp begins.
+    level = inner + step * profile.edge + within * (place.distance - profile.ramp) + beyond * profile.ramp
+    return level, step * profile.edge_by_distance + within + (beyond - within) * profile.ramp_by_distance
+
+
+def _slopes(model: EdgeModel, place: Place) -> tuple[Floats, Floats]:
+    """Slopes (n,) of the levels inside and outside, DN per px: of the planes of first order, and the common one."""
+    radius = math.sqrt(float(model.ellipse.semi_axes_px.prod()))
+    within = (model.lean[0] * place.cos_u + model.lean[1] * place.sin_u) / radius
+    beyond = np.full(place.cos_u.size, model.slope)
+    if model.outer.size > 1:
+        beyond += (model.outer[1] * place.cos_u + model.outer[2] * place.sin_u) / radius
+    return within, beyond
 
 
 def jacobian(model: EdgeModel, place: Place) -> tuple[Floats, Floats, Floats]:
@@ -229,17 +241,20 @@ def jacobian(model: EdgeModel, place: Place) -> tuple[Floats, Floats, Floats]:
     basis = harmonics(place.cos_u, place.sin_u, (model.outer.size - 1) // 2)
     inner = inner_level(model, place)
     step = model.outer @ basis - inner
+    within, beyond = _slopes(model, place)
+    inside, radius = place.distance - profile.ramp, math.sqrt(float(model.ellipse.semi_axes_px.prod()))
     out = np.empty((FIXED - 1 + basis.shape[0], place.distance.size))
-    by_distance = step * profile.edge_by_distance + model.slope * profile.ramp_by_distance
+    by_distance = step * profile.edge_by_distance + within + (beyond - within) * profile.ramp_by_distance
     np.multiply(distance_slopes(model.ellipse, place), by_distance, out=out[:SHAPE])
-    out[5] = step * profile.edge_by_sigma + model.slope * profile.ramp_by_sigma
+    out[5] = step * profile.edge_by_sigma + (beyond - within) * profile.ramp_by_sigma
     out[6] = 1.0 - profile.edge
     out[7] = profile.ramp
     out[8] = step * profile.edge_by_kurtosis
-    np.multiply(out[6], place.cos_u, out=out[9])
-    np.multiply(out[6], place.sin_u, out=out[10])
+    np.multiply(out[6] + inside / radius, place.cos_u, out=out[9])
+    np.multiply(out[6] + inside / radius, place.sin_u, out=out[10])
     np.multiply(basis, profile.edge, out=out[11:])
-    return inner + step * profile.edge + model.slope * profile.ramp, out, by_distance
+    out[12:14] += basis[1:3] * profile.ramp / radius
+    return inner + step * profile.edge + within * inside + beyond * profile.ramp, out, by_distance
 
 
 def moved(model: EdgeModel, step: Floats) -> EdgeModel:
@@ -652,12 +667,13 @@ def _visible(
 
 
 def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
-    """Sector of each pixel (n,), and its distance, curvature, inner level and step (4, n)."""
+    """Sector of each pixel (n,), and its distance, curvature, inner level, step and slopes (6, n)."""
     model = EdgeModel.of(numbers)
     place = Place.of(model.ellipse, x, y, steps=3)
     inner = inner_level(model, place)
     step = model.outer @ harmonics(place.cos_u, place.sin_u, (model.outer.size - 1) // 2) - inner
-    return sector_of(place), np.stack([place.distance, place.curvature, inner, step])
+    within, beyond = _slopes(model, place)
+    return sector_of(place), np.stack([place.distance, place.curvature, inner, step, within, beyond - within])
 
 
 def _displacements(
@@ -668,11 +684,12 @@ def _displacements(
     Returns:
         The residual of each pixel (n,), the displacements (SECTORS,) and their weights (SECTORS,).
     """
-    model, (distance, curvature, inner, step), whole = EdgeModel.of(numbers), look, displaced
+    model, (distance, curvature, inner, step, within, bend), whole = EdgeModel.of(numbers), look, displaced
     for _ in range(2):  # the levels are not linear in a displacement as large as the blur
-        profile = Profile.of(distance + whole[bins], curvature, model.sigma_px, model.kurtosis)
-        residual = level - (inner + step * profile.edge + model.slope * profile.ramp)
-        slope = step * profile.edge_by_distance + model.slope * profile.ramp_by_distance
+        at = distance + whole[bins]
+        profile = Profile.of(at, curvature, model.sigma_px, model.kurtosis)
+        residual = level - (inner + step * profile.edge + within * at + bend * profile.ramp)
+        slope = step * profile.edge_by_distance + within + bend * profile.ramp_by_distance
         counted = slope * use
         weight = np.bincount(bins, weights=counted * slope, minlength=SECTORS).astype(np.float64)
         further = np.bincount(bins, weights=counted * residual, minlength=SECTORS) / np.maximum(weight, 1e-9)

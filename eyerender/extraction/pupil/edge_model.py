@@ -1,6 +1,7 @@
 """The pixel model of a pupil's boundary: two levels and the blurred convex edge between them.
 
-    I = inner(u) (1 - E) + outer(u) E + slope (d Phi(d / s) + s phi(d / s))
+    I = inner(u, d) (1 - E) + outer(u, d) E + slope R, in which d becomes R beside E and d - R beside 1 - E
+    R(d) = d Phi(z) + s phi(z)
     E(d) = Phi(z) + (kappa s / 2) phi(z) - (g / 24) (z^3 - 3 z) phi(z),   z = d / s
 
 d is the signed distance to the ellipse (positive outside) and kappa the curvature of the boundary at the nearest point.
@@ -9,9 +10,9 @@ distribution and its density. The second term of E is the first order in s kappa
 the blur heavier tails than a normal distribution; g is its excess kurtosis (Edgeworth series).
 
 outer is a Fourier series in u = t + angle: the ellipse's parameter t counted from the image's x axis, so it does not
-turn with the axes of a nearly round ellipse. inner is a series of first order, for iris light that is scattered into
-the pupil. The slope multiplies a blurred ramp: the iris may become brighter or darker outwards, as it does for lamps
-beside the camera.
+turn with the axes of a nearly round ellipse. inner is a series of first order. Lamps beside the camera light one side
+more, and this light continues across the boundary: the terms of first order are planes, (1 + d / sqrt(a b)) cos u. The
+slope multiplies a blurred ramp R: the iris may become brighter or darker outwards on all sides.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ from .places import BLOCK, COS_U, CURVATURE, SIN_U, places
 # Columns of a block of profiles, all by the distance d: the edge E (first), its derivatives by the distance, sigma and
 # the kurtosis, the blurred ramp max(d, 0), and its derivatives by the distance and sigma.
 BY_DISTANCE, BY_SIGMA, BY_KURTOSIS, RAMP, RAMP_BY_DISTANCE, RAMP_BY_SIGMA = (k * BLOCK for k in range(1, 7))
+
+# Columns of a block of local levels; the inner level comes first.
+STEP, WITHIN, BEND = (k * BLOCK for k in range(1, 4))
 
 # Phi and phi at z = -LAST to LAST in steps of 1 / FINE; a Taylor series of fourth order leads to 1e-11 between them.
 FINE, LAST = 32, 8
@@ -138,23 +142,39 @@ def turn_harmonics(place: Floats, count: int, basis: Floats) -> None:
 
 
 @inlined
-def outer_levels(place: Floats, count: int, outer: Floats, basis: Floats, out: Floats) -> None:
-    """Write the outer levels of `count` pixels: the Fourier series `outer` at their positions."""
+def local_levels(place: Floats, count: int, numbers: Floats, basis: Floats, out: Floats) -> None:
+    """Write what light does about `count` positions, as columns of out (4 BLOCK,).
+
+    These are inner level, step, slope inside and change of slope: the level is inner + step E + within d + bend R.
+
+    Args:
+        place: (8 BLOCK,) of `places`.
+        count: number of points.
+        numbers: (p,) the model (see `EdgeModel.numbers`).
+        basis: (2 BLOCK,) scratch memory.
+        out: (4 BLOCK,) the result.
+    """
+    outer, plane = numbers[11:], 1.0 / math.sqrt(numbers[2] * numbers[3])
     for i in range(count):
-        out[i], basis[i], basis[BLOCK + i] = outer[0], 1.0, 0.0
+        lean = numbers[9] * place[COS_U + i] + numbers[10] * place[SIN_U + i]
+        out[i], out[STEP + i] = numbers[6] + lean, outer[0] - numbers[6] - lean
+        out[WITHIN + i], out[BEND + i] = lean * plane, numbers[7] - lean * plane
+        basis[i], basis[BLOCK + i] = 1.0, 0.0
     for j in range(1, outer.size, 2):
         turn_harmonics(place, count, basis)
         for i in range(count):
-            out[i] += outer[j] * basis[i] + outer[j + 1] * basis[BLOCK + i]
+            part = outer[j] * basis[i] + outer[j + 1] * basis[BLOCK + i]
+            out[STEP + i] += part
+            if j == 1:
+                out[BEND + i] += part * plane
 
 
 @compiled("f8[::1], f8[::1], f8[::1], f8[::1]")
 def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
     """Compute levels (n,) of the model with these parameters; `displaced` is empty for an exact ellipse."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
-    inner_dn, slope, lean_x, lean_y = numbers[6], numbers[7], numbers[9], numbers[10]
     place, edge, basis = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(2 * BLOCK)
-    out, outer, n = np.empty(x.size), np.empty(BLOCK), displaced.size
+    out, local, n = np.empty(x.size), np.empty(4 * BLOCK), displaced.size
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
         places(ellipse, x, y, start, count, place)
@@ -165,10 +185,10 @@ def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
                 first = displaced[int(low) % n]
                 place[i] += first + (at - low) * (displaced[int(low + 1.0) % n] - first)
         profiles(place, count, numbers[5], numbers[8], edge)
-        outer_levels(place, count, numbers[11:], basis, outer)
+        local_levels(place, count, numbers, basis, local)
         for i in range(count):
-            inner = inner_dn + lean_x * place[COS_U + i] + lean_y * place[SIN_U + i]
-            out[start + i] = inner + (outer[i] - inner) * edge[i] + slope * edge[RAMP + i]
+            flat = local[i] + local[WITHIN + i] * place[i]
+            out[start + i] = flat + local[STEP + i] * edge[i] + local[BEND + i] * edge[RAMP + i]
     return out
 
 

@@ -17,13 +17,17 @@ from ...jit import compiled, inlined, summing
 from ..products import add_products, largest_size, solve
 from .covariance import SHAPE
 from .edge_model import (
+    BEND,
     BY_DISTANCE,
     BY_KURTOSIS,
     BY_SIGMA,
     RAMP,
     RAMP_BY_DISTANCE,
     RAMP_BY_SIGMA,
+    STEP,
+    WITHIN,
     EdgeModel,
+    local_levels,
     profiles,
     turn_harmonics,
 )
@@ -33,9 +37,9 @@ from .places import BLOCK, COS_T, COS_U, NX, NY, SECTORS, SIN_T, SIN_U, places
 FIXED = SHAPE + 7
 # Standard deviations of parameters that are expected to be near 0: the harmonics of the outer level, in steps (under a
 # lid nothing else constrains them); its change over a semi-axis b, in steps (caused by lamps beside the camera); the
-# kurtosis of the blur; the lean of the inner level, in steps (scattered light only, so that noise does not produce a
-# lean).
-HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.003
+# kurtosis of the blur; the lean of the inner level, in steps (scattered light, and shading of a pupil that is not
+# black: with 0.003 the centre of a shaded pupil was off by 0.02 px).
+HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.05
 KURTOSIS_LIMITS = (-1.5, 3.0)  # outside these limits the edge would not be monotonic
 STILL_PX = 1.5e-2  # a fit ends with a step smaller than this
 
@@ -175,30 +179,27 @@ def _rows(
         count: number of pixels in it.
         numbers: (p,) the model (see `EdgeModel.numbers`).
         out: receives the derivatives (p BLOCK,), parameter after parameter in the order of `numbers`, the residuals
-            (BLOCK,) and the derivatives by the distance (BLOCK,). It ends with scratch memory (2 BLOCK,).
+            (BLOCK,) and the derivatives by the distance (BLOCK,). It ends with scratch memory (2 and 4 BLOCK,).
     """
-    rows, residual, steep, basis = out
-    cos, sin = math.cos(numbers[4]), math.sin(numbers[4])
-    inner_dn, slope, lean_x, lean_y, outer = numbers[6], numbers[7], numbers[9], numbers[10], numbers[11:]
+    rows, residual, steep, basis, local = out
+    cos, sin, plane = math.cos(numbers[4]), math.sin(numbers[4]), 1.0 / math.sqrt(numbers[2] * numbers[3])
+    local_levels(place, count, numbers, basis, local)
     for i in range(count):
-        residual[i], basis[i], basis[BLOCK + i] = outer[0], 1.0, 0.0
-        rows[11 * BLOCK + i] = edge[i]
-    for j in range(1, outer.size, 2):
-        turn_harmonics(place, count, basis)
-        first = (11 + j) * BLOCK
-        for i in range(count):
-            rows[first + i], rows[first + BLOCK + i] = basis[i] * edge[i], basis[BLOCK + i] * edge[i]
-            residual[i] += outer[j] * basis[i] + outer[j + 1] * basis[BLOCK + i]
-    for i in range(count):
-        cu, su = place[COS_U + i], place[SIN_U + i]
-        inner = inner_dn + lean_x * cu + lean_y * su
-        step, within = residual[i] - inner, 1.0 - edge[i]
-        steep[i] = step * edge[BY_DISTANCE + i] + slope * edge[RAMP_BY_DISTANCE + i]
-        residual[i] = level[start + i] - (inner + step * edge[i] + slope * edge[RAMP + i])
-        rows[5 * BLOCK + i] = step * edge[BY_SIGMA + i] + slope * edge[RAMP_BY_SIGMA + i]
-        rows[6 * BLOCK + i], rows[7 * BLOCK + i] = within, edge[RAMP + i]
+        inner, step, within, bend = local[i], local[STEP + i], local[WITHIN + i], local[BEND + i]
+        steep[i] = step * edge[BY_DISTANCE + i] + within + bend * edge[RAMP_BY_DISTANCE + i]
+        residual[i] = level[start + i] - (inner + step * edge[i] + within * place[i] + bend * edge[RAMP + i])
+        rows[5 * BLOCK + i] = step * edge[BY_SIGMA + i] + bend * edge[RAMP_BY_SIGMA + i]
+        rows[6 * BLOCK + i], rows[7 * BLOCK + i] = 1.0 - edge[i], edge[RAMP + i]
         rows[8 * BLOCK + i] = step * edge[BY_KURTOSIS + i]
-        rows[9 * BLOCK + i], rows[10 * BLOCK + i] = within * cu, within * su
+        sloping = 1.0 - edge[i] + (place[i] - edge[RAMP + i]) * plane
+        rows[9 * BLOCK + i], rows[10 * BLOCK + i] = sloping * place[COS_U + i], sloping * place[SIN_U + i]
+        rows[11 * BLOCK + i], basis[i], basis[BLOCK + i] = edge[i], 1.0, 0.0
+    for j in range(1, numbers.size - 11, 2):
+        turn_harmonics(place, count, basis)
+        first, sloping = (11 + j) * BLOCK, plane if j == 1 else 0.0
+        for i in range(count):
+            value = edge[i] + sloping * edge[RAMP + i]
+            rows[first + i], rows[first + BLOCK + i] = basis[i] * value, basis[BLOCK + i] * value
     for i in range(count):
         c, s, nx, ny = place[COS_T + i], place[SIN_T + i], place[NX + i], place[NY + i]
         rows[i], rows[BLOCK + i] = (ny * sin - nx * cos) * steep[i], (-nx * sin - ny * cos) * steep[i]
@@ -228,7 +229,7 @@ def _pixel_sums(
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
     sectors, size = displaced.size, numbers.size
     matrix, basis, place, edge = np.zeros((size, size)), np.empty(2 * BLOCK), np.empty(8 * BLOCK), np.empty(7 * BLOCK)
-    flat, residual, steep = np.empty(size * BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    flat, residual, steep, local = np.empty(size * BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(4 * BLOCK)
     rows, pull, across = flat.reshape(size, BLOCK), np.zeros((size, sectors)), np.zeros((size, sectors))
     along, square, cost = np.zeros(sectors), np.zeros(sectors), 0.0
     for start in range(0, x.size, BLOCK):
@@ -237,7 +238,7 @@ def _pixel_sums(
         for i in range(count):
             place[i] += displaced[index[start + i]]
         profiles(place, count, numbers[5], numbers[8], edge)
-        _rows(place, edge, level, start, count, numbers, (flat, residual, steep, basis))
+        _rows(place, edge, level, start, count, numbers, (flat, residual, steep, basis, local))
         add_products(rows, 0, count, matrix)
         begin = 0
         while begin < count:  # the pixels of a sector are contiguous

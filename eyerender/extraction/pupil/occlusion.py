@@ -12,7 +12,7 @@ from ...jit import compiled, inlined
 from ..products import largest_size, selected
 from ..statistics import quantile_of
 from .consensus import UNEVEN
-from .edge_model import BY_DISTANCE, RAMP, RAMP_BY_DISTANCE, EdgeModel, outer_levels, profiles
+from .edge_model import BY_DISTANCE, RAMP, RAMP_BY_DISTANCE, EdgeModel, local_levels, profiles
 from .least_squares import Band
 from .places import BLOCK, COS_U, CURVATURE, SECTORS, SIN_U, places, sector_at
 
@@ -68,20 +68,19 @@ def visible_part(
 
 @compiled("f8[::1], f8[::1], f8[::1]")
 def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
-    """Compute the sector (n,) of each pixel, and its distance, curvature, inner level and step (4, n)."""
+    """Compute the sector (n,) of each pixel, and its distance, curvature and `local_levels` (6, n)."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
-    bins, out = np.empty(x.size, dtype=np.int64), np.empty((4, x.size))
-    place, basis, outer = np.empty(8 * BLOCK), np.empty(2 * BLOCK), np.empty(BLOCK)
+    bins, out = np.empty(x.size, dtype=np.int64), np.empty((6, x.size))
+    place, basis, local = np.empty(8 * BLOCK), np.empty(2 * BLOCK), np.empty(4 * BLOCK)
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
         places(ellipse, x, y, start, count, place)
-        outer_levels(place, count, numbers[11:], basis, outer)
+        local_levels(place, count, numbers, basis, local)
         for i in range(count):
-            cu, su = place[COS_U + i], place[SIN_U + i]
-            inner = numbers[6] + numbers[9] * cu + numbers[10] * su
-            bins[start + i] = sector_at(cu, su)
+            bins[start + i] = sector_at(place[COS_U + i], place[SIN_U + i])
             out[0, start + i], out[1, start + i] = place[i], place[CURVATURE + i]
-            out[2, start + i], out[3, start + i] = inner, outer[i] - inner
+            for k in range(4):
+                out[2 + k, start + i] = local[k * BLOCK + i]
     return bins, out
 
 
@@ -101,7 +100,7 @@ def _displacements(
     Returns:
         The residual of each pixel (n,), the displacements (SECTORS,) and their weights (SECTORS,).
     """
-    sigma, slope, n = numbers[5], numbers[7], bins.size
+    sigma, n = numbers[5], bins.size
     place, edge, residual, steep = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(n), np.empty(n)
     whole, weight, further = displaced.copy(), np.empty(SECTORS), np.empty(SECTORS)
     for _ in range(2):  # the levels are not linear in a displacement as large as the blur
@@ -113,9 +112,9 @@ def _displacements(
                 place[i], place[CURVATURE + i] = look[0, start + i] + whole[bins[start + i]], look[1, start + i]
             profiles(place, count, sigma, numbers[8], edge)
             for i in range(count):
-                step = look[3, start + i]
-                steep[start + i] = step * edge[BY_DISTANCE + i] + slope * edge[RAMP_BY_DISTANCE + i]
-                expected = look[2, start + i] + step * edge[i] + slope * edge[RAMP + i]
+                inner, step, within, bend = look[2:, start + i]
+                steep[start + i] = step * edge[BY_DISTANCE + i] + within + bend * edge[RAMP_BY_DISTANCE + i]
+                expected = inner + step * edge[i] + within * place[i] + bend * edge[RAMP + i]
                 residual[start + i] = level[start + i] - expected
         for i in range(n):
             if use[i]:
