@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -26,11 +27,26 @@ from tests.support import stages
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch):
+def place(tmp_path, monkeypatch, bad_things):
     """A folder with one of each bad thing, as the current folder."""
+    shutil.copytree(bad_things, tmp_path, dirs_exist_ok=True)
+    os.mkfifo(tmp_path / "pipe.yaml")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def bad_things(tmp_path_factory):
+    """One of each bad thing; they are written once, and copied for each test."""
+    folder = tmp_path_factory.mktemp("bad")
+    with contextlib.chdir(folder):
+        _write_bad_things()
+    return folder
+
+
+def _write_bad_things():
     data = yaml.safe_load(shipped_scenes()["quickstart"].read_text(encoding="utf-8"))
 
     def scene(name, path, value):
@@ -57,7 +73,6 @@ def place(tmp_path, monkeypatch):
     scene("nolens.yaml", "rig.cameras.0", {"resolution_px": [640, 480], "calibration": {"file": "none.yml"}})
     scene("focal.yaml", "rig.cameras.0.focal_length_mm", 1e300)
     scene("grid.yaml", "targets", {"grid": [10**9, 1]})
-    os.mkfifo("pipe.yaml")
     Path("broken.py").write_text("def", encoding="utf-8")
     Path("exits.py").write_text("raise SystemExit(3)", encoding="utf-8")
     records: dict[str, Any] = {"records": [], "rig": None}
@@ -91,7 +106,6 @@ def place(tmp_path, monkeypatch):
     Path("taken").mkdir()
     (Path("taken") / "thesis.txt").write_text("years of work")
     (Path("file")).write_text("x")
-    return tmp_path
 
 
 FIT = ["gaze", "fit", "--estimator", "regression", "-o", "c.json"]
