@@ -196,7 +196,7 @@ def _thumbnails(run: Run, images: Sequence[LabelledImage]) -> list[Thumbnail]:
 
 
 def _factors(image: LabelledImage, edge: Edge | None) -> dict[str, float]:
-    """Return possible causes of an error; noise and blur as stated by the folder, else as measured, with their errors."""
+    """Return possible causes of an error; noise and blur are those that the folder states, else measured."""
     out = dict(image.factors)
     if image.known:
         out |= {"noise_dn": image.known["noise_dn"], "blur_px": image.known["blur_px"]}

@@ -149,7 +149,7 @@ def test_under_a_lid_the_edge_is_measured_where_it_is_visible():
 
 
 def arc_of_a_pupil(seed, rows):
-    """A drawn pupil of which only some rows are visible, between two bright lids: levels, outline and visible pixels."""
+    """Grey levels, outline and visible pixels of a drawn pupil that shows some rows between two bright lids."""
     condition = ideal.Condition(size=(160, 140), blur=(1.0, 1.0), noise=(2.0, 2.0), semi_axis=(30, 30), glints="none")
     drawing = ideal.draw(condition, seed)
     label = drawing.label["pupil"]
