@@ -33,7 +33,7 @@ _ROBUST = 0.1  # residuals above this share of the step count less; the priors w
 _PRIOR_SLOPE, _PRIOR_SHIFT_PX, _PRIOR_LOG_SIGMA = 0.3, 0.5, 1.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Edge:
     """The pupil's edge in an image.
 
@@ -90,7 +90,8 @@ def edge_of(
     quantum = 255.0 / (2**bit_depth - 1)
     if known:
         noise = math.hypot(known["noise_dn"], quantum / math.sqrt(12.0))
-        return Edge(noise, known["step_dn"], math.sqrt(known["blur_px"] ** 2 + 1.0 / 12.0))
+        sigma = math.sqrt(known["blur_px"] ** 2 + 1.0 / 12.0)
+        return Edge(noise_dn=noise, step_dn=known["step_dn"], sigma_px=sigma)
     grey = np.asarray(image, dtype=np.float64) * quantum
     if shows is None:
         return measure_edge(grey, pupil, glints_px, quantum)
@@ -202,7 +203,13 @@ def _fit_step(d: Floats, value: Floats, reach: float) -> tuple[Edge, float]:
     scatter = 1.4826 * float(np.median(np.abs(rest))) * math.sqrt(len(d) / (len(d) - len(start)))
     errors = scatter * np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)))
     sigma = math.exp(min(float(fit.x[4]), 5.0))
-    edge = Edge(scatter * scale, float(fit.x[1]), sigma, 360.0, float(errors[1]), sigma * float(errors[4]))
+    edge = Edge(
+        noise_dn=scatter * scale,
+        step_dn=float(fit.x[1]),
+        sigma_px=sigma,
+        step_sd_dn=float(errors[1]),
+        sigma_sd_px=sigma * float(errors[4]),
+    )
     return edge, float(fit.x[5])
 
 

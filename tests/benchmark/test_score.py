@@ -191,7 +191,9 @@ def test_the_bound_is_the_inverse_of_the_fisher_information(radius, blur, noise)
 
     slope = (disc(x0 + 0.01) - disc(x0 - 0.01)) / 0.02
     exact = noise / math.sqrt(float(np.sum(slope**2)))
-    got = Edge(noise, step, sigma).centre_sigma_px(Ellipse(np.array([x0, y0]), np.array([radius, radius]), 0.0))
+    got = Edge(noise_dn=noise, step_dn=step, sigma_px=sigma).centre_sigma_px(
+        Ellipse(np.array([x0, y0]), np.array([radius, radius]), 0.0)
+    )
     assert got == pytest.approx(exact, rel=0.01)  # the formula neglects (sigma / R)^2
 
 
