@@ -29,7 +29,7 @@ from ..geometry.ellipse import Ellipse
 from ..storage.files import inside, read_json, read_text
 from .centrelabels import is_excuse, is_lpw, read_excuse, read_lpw
 from .glintlabels import TrueGlint
-from .own import MAX_IMAGES, SUFFIXES, Labelled, ellipse_of_mask
+from .own import FEWEST_PIXELS, MAX_IMAGES, SUFFIXES, Labelled, ellipse_of_mask
 
 PUPIL = 3
 _ANNOTATIONS_BYTES = 2**30
@@ -90,7 +90,9 @@ def _openeds(folder: Path) -> Iterator[Labelled]:
         if classes.ndim != 2 or classes.size > _MOST_PIXELS or classes.dtype.kind not in "ui":
             raise InputError("must be an image of whole numbers", source=str(label))
         relative = path.relative_to(folder).as_posix()
-        pupil = ellipse_of_mask(np.asarray(classes) == PUPIL, str(label))
+        mask = np.asarray(classes) == PUPIL
+        # Between closed lids, a few pixels of the pupil may be visible: too few for an outline, and to be found.
+        pupil = ellipse_of_mask(mask, str(label)) if np.count_nonzero(mask) >= FEWEST_PIXELS else None
         yield Labelled(name=relative, path=path, pupil=pupil, subject=subjects.get(relative, ""))
 
 

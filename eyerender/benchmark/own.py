@@ -36,6 +36,7 @@ COLUMNS = ("centre_x_px", "centre_y_px", "semi_axis_a_px", "semi_axis_b_px", "an
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
 MAX_IMAGES = 100_000
+FEWEST_PIXELS = 20  # of a pupil in a mask
 GLINTS = "glints.csv"
 _TRIALS, _NEAR_PX, _OUTSIDE_PX = 200, 0.7, 1.2
 
@@ -197,7 +198,7 @@ def ellipse_of_mask(mask: Bools, source: str = "") -> Ellipse | None:
     y, x = np.nonzero(mask)
     if x.size == 0:
         return None
-    if x.size < 20:
+    if x.size < FEWEST_PIXELS:
         raise InputError(f"marks only {x.size} pixels", source=source)
     whole = _of_moments(x, y)
     points = _contour(mask)

@@ -30,6 +30,8 @@ _ORIGIN = (
     "(pixel_origin of the conventions)"
 )
 _LEAST_FOR_ORIGIN = 8
+# How well an edge is measured: its visible arc, and the relative standard errors of step and width.
+_EDGE_COLUMNS = ("edge_arc_deg", "edge_step_error", "edge_width_error")
 
 
 def entry_of(
@@ -104,7 +106,7 @@ def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors:
         "glints_swapped": g.swapped if g else None,
         "glint_px": float(np.mean([np.hypot(*e) for e in g.errors_px])) if g and g.errors_px else None,
         "conditions": "; ".join(image.conditions),
-        **{name: factors.get(name) for name in FACTORS},
+        **{name: factors.get(name) for name in (*FACTORS, *_EDGE_COLUMNS)},
     }
 
 

@@ -196,7 +196,7 @@ def _thumbnails(run: Run, images: Sequence[LabelledImage]) -> list[Thumbnail]:
 
 
 def _factors(image: LabelledImage, edge: Edge | None) -> dict[str, float]:
-    """Return possible causes of an error; noise and blur as stated by the folder, else as measured."""
+    """Return possible causes of an error; noise and blur are those that the folder states, else measured."""
     out = dict(image.factors)
     if image.known:
         out |= {"noise_dn": image.known["noise_dn"], "blur_px": image.known["blur_px"]}
@@ -204,6 +204,9 @@ def _factors(image: LabelledImage, edge: Edge | None) -> dict[str, float]:
         out |= {"noise_dn": edge.noise_dn, "blur_px": math.sqrt(max(edge.sigma_px**2 - 1.0 / 12.0, 0.0))}
     if edge is not None:
         out["contrast_to_noise"] = abs(edge.step_dn) / edge.noise_dn
+    if edge is not None and not image.known:
+        out |= {"edge_arc_deg": edge.arc_deg, "edge_step_error": edge.step_sd_dn / abs(edge.step_dn)}
+        out["edge_width_error"] = edge.sigma_sd_px / edge.sigma_px
     return out
 
 

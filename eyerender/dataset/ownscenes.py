@@ -29,7 +29,7 @@ MORE = ("subject", "sequence", "attempt")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GivenScene:
-    """A scene of a user's code as the parts of a sample.
+    """The parts of a sample that a user's function gives.
 
     Attributes:
         tree: plain mapping that `SceneSpec` validates.

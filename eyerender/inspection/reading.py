@@ -55,11 +55,11 @@ class Contents:
         rows: (n,) rows of the folder's entries.
         names: (n,) files of the images, empty where the line cannot be read.
         frames: (n,) numbers of the frames, -1 where there are none.
-        subjects: (n,) the same of the subjects.
+        subjects: (n,) numbers of the subjects, -1 where there are none.
         groups: (n,) name of a group -> value, by kind of group.
         columns: name -> (n,), nan where an image has no such number.
         thumbnails: (n, SIDE, SIDE) mean levels.
-        digests: (n,) of the pixels; empty where there is no picture.
+        digests: (n,) digests of the pixels, empty where there is no picture.
         faults: place among the rows -> what is wrong.
     """
 

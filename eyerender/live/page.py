@@ -261,7 +261,7 @@ class Tab:
             self._lamp_place = [Knob(axis, "mm", 0.5, lambda _: self._move_light()) for axis in AXES]
             self._power = Knob("Intensity", "mW/sr", None, lambda _: self._move_light(), digits=3)
             with ui.element("div").classes("line"):
-                _button("Add an LED", lambda: self._apply(lambda s: s.with_light_added(self._light), refresh=True))
+                _button("Add an LED", self._add_light)
                 _button("Remove it", lambda: self._apply(lambda s: s.without_light(self._light), refresh=True))
         with _group("Camera"):
             self._chosen = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), self._choose_camera)
@@ -273,7 +273,7 @@ class Tab:
                 self._aim = _button(
                     "Aim at the eye", lambda: self._apply(lambda s: s.with_camera_aimed(self._lens), refresh=True)
                 )
-                _button("Add a camera", lambda: self._apply(lambda s: s.with_camera_added(self._lens), refresh=True))
+                _button("Add a camera", self._add_camera)
                 _button("Remove it", lambda: self._apply(lambda s: s.without_camera(self._lens), refresh=True))
         with _group("Exposure, all cameras"):
             self._exposure = Knob(
@@ -349,6 +349,20 @@ class Tab:
     def _choose_camera(self, camera: int) -> None:
         self._lens = camera
         self._refresh()
+
+    def _add_light(self) -> None:
+        """Copy the chosen LED and choose the copy."""
+        count = len(self._setup.scene.rig.lights)
+        self._apply(lambda setup: setup.with_light_added(self._light))
+        if len(self._setup.scene.rig.lights) > count:
+            self._choose_light(count)
+
+    def _add_camera(self) -> None:
+        """Copy the chosen camera and choose the copy."""
+        count = len(self._setup.scene.rig.cameras)
+        self._apply(lambda setup: setup.with_camera_added(self._lens))
+        if len(self._setup.scene.rig.cameras) > count:
+            self._choose_camera(count)
 
     def _move_light(self) -> None:
         place, power = [knob.value for knob in self._lamp_place], self._power.value

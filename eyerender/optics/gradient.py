@@ -255,7 +255,7 @@ class _Rays(NamedTuple):
 
 
 def _to_ridge(rays: _Rays, first: _Half, last: _Half, steps: int) -> _Rays:
-    """Trace rays to the ridge, where both halves have the same p."""
+    """Trace rays through the first half of the lens to the ridge, where the parameters p of both halves are equal."""
     # The straight line gives the time to its point closest to the centre.
     time = -_dot(rays.place, rays.speed) / _dot(rays.speed, rays.speed)
     for _ in range(_AIMS):

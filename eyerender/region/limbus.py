@@ -22,8 +22,8 @@ def upwards(front: Surface) -> Floats:
 def lower(front: Surface, y: Floats, z: Floats, aspect: float) -> tuple[Floats, Floats]:
     """Move points of the front cornea (its own frame, mm) towards the horizontal plane through its axis.
 
-    Their height above that plane becomes `aspect` times as large, so a circle about the axis becomes the ellipse of
-    that height over width.
+    Their height above that plane is multiplied by `aspect`, so a circle about the axis becomes an ellipse whose height
+    is `aspect` times its width.
     """
     up = upwards(front)
     less = (aspect - 1.0) * (up[0] * y + up[1] * z)

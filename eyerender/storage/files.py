@@ -98,7 +98,7 @@ def refuse_special(path: str | Path) -> None:
 
 
 def refuse_address(path: str | Path) -> None:
-    """Check that an output path is not an address such as `s3://bucket/x`, of which a path keeps one slash.
+    """Refuse an output path that is an address such as `s3://bucket/x`: it would become the folder `s3:/bucket/x`.
 
     Raises:
         InputError: the path is an address.

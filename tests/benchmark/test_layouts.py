@@ -29,7 +29,7 @@ def picture():
 
 def openeds(folder, classes):
     for name in ("images", "labels"):
-        (folder / "train" / name).mkdir(parents=True)
+        (folder / "train" / name).mkdir(parents=True, exist_ok=True)
     write_png(folder / "train" / "images" / "000000.png", picture())
     np.save(folder / "train" / "labels" / "000000.npy", classes)
     (folder / "files.csv").write_text("file,from,subject\ntrain/images/000000.png,a.png,7\n")
@@ -58,6 +58,10 @@ def test_openeds(tmp_path):
     (image,) = load_labelled(openeds(tmp_path, np.where(mask(), 3, 2).astype(np.uint8)))
     assert (image.name, image.subject, image.gamma_from) == ("train/images/000000.png", "7", "assumed")
     assert iou(image.pupil, PUPIL) > 0.98  # whole pixels
+    speck = np.where(mask(), 2, 0).astype(np.uint8)
+    speck[:1, :19] = 3
+    (image,) = load_labelled(openeds(tmp_path, speck))
+    assert not image.shows_pupil
     (tmp_path / "train" / "images" / "000000.png").unlink()
     with pytest.raises(InputError, match="no image of this name"):
         load_labelled(tmp_path)

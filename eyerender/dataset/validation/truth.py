@@ -112,7 +112,7 @@ class DatasetTruth:
 
     @classmethod
     def _of_stored(cls, plan: Plan, first: dict[str, Any], stale: str | None) -> DatasetTruth:
-        """Use the scenes of the lines; raises one of `WRONG`, `InputError`."""
+        """Compute the truth from the scenes that the lines hold; raises one of `WRONG`, `InputError`."""
         assert plan.scenes is not None
         stored = StoredScenes({int(first["sample"]): first}, is_told=not plan.scenes.reference)
         # The exposure that a subject got is in its scenes.

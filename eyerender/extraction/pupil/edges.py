@@ -203,11 +203,19 @@ def nearest(image: Image, x: float, y: float) -> float:
 def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, limits: tuple[float, ...]) -> Bools:
     """Return which points have pupil behind them and iris ahead of them.
 
-    `limits` holds the pupil's level and, relative to it, the dark level, the iris' level, the rise at an edge inside a
-    window's reflection, the bright level, and the rise farther ahead. A point passes if the level `depth` px behind is
-    dark (or darker than an iris, if the level `depth` px ahead exceeds it by the rise inside a reflection, whose light
-    then counts as the pupil's), if the level half as far ahead is not bright, and if the level rises by less than the
-    last limit from `depth` px ahead to half as far again.
+    A point passes if all of this holds:
+
+    - The level `depth` px behind it is dark. Inside a window's reflection it need only be darker than an iris, if the
+      level `depth` px ahead exceeds it by `clear`.
+    - The level half of `depth` ahead is not bright, relative to the pupil or to the reflection.
+    - From `depth` to 1.5 `depth` ahead, the level rises by less than `rise`.
+
+    Args:
+        smooth: smoothed image (h, w).
+        points: (n, 2) points on the outline, px.
+        normals: (n, 2) unit normals, outwards.
+        depth: distance, px.
+        limits: level of the pupil, and relative to it the limits dark, iris, `clear`, bright and `rise`.
     """
     pupil, dark, iris, clear, bright, rise = limits
     out = np.empty(points.shape[0], dtype=np.bool_)

@@ -34,7 +34,7 @@ class View:
 
 
 def water_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> TriangleHit:
-    """Intersect camera rays (scene's frame) with menisci in front of what they meet."""
+    """Intersect camera rays (scene's frame) with the menisci that lie before their first hit."""
     hit = frame.region.water.ray_intersect_preliminary(segment(o, d, nearest), coherent=True, active=True)
     return replace(TriangleHit.of(hit), prim_index=frame.region.on_water(hit))
 

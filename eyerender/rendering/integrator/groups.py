@@ -24,7 +24,7 @@ from .visibility import HitTable
 
 @dataclass(kw_only=True)
 class LampShare:
-    """A lamp, and the number of users that one user's ray to it represents."""
+    """A lamp, and its weight: the number of users for which the ray of one user stands."""
 
     lamp: Lamp
     weight: mi.Float

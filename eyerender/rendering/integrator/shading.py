@@ -39,7 +39,7 @@ def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float
 
 
 def direct(si: SurfaceInteraction, albedo: mi.Float, outer: mi.Float, shine: mi.Float) -> mi.Float:
-    """Compute the radiance of lamp-lit matte surfaces: from their irradiance and their sheen."""
+    """Compute the radiance of matte surfaces lit by lamps, the sum of diffuse reflection and gloss."""
     return dr.select(si.met, si.cover * (albedo * outer * dr.inv_pi + shine), 0)
 
 

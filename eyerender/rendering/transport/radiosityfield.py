@@ -146,7 +146,7 @@ def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, r
 
 
 def _around(buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any) -> Any:
-    """Interpolate between rings and turns; the turns form a closed ring."""
+    """Interpolate between rings, and between the nodes around a ring, whose last node neighbours the first."""
     ring, turn = dr.clip(ring, 0, rings - 1.001), dr.clip(turn, 0, turns - 0.001)
     i, j = mi.UInt32(ring), mi.UInt32(turn)
     s, t = ring - mi.Float(i), turn - mi.Float(j)
