@@ -20,6 +20,7 @@ import json
 import os
 import random
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -28,7 +29,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from _bench import Report, Row, options_of, resident_mib, row, single_threaded
 from _people import recipe
@@ -39,6 +40,7 @@ import numpy as np  # noqa: E402
 import yaml  # noqa: E402
 
 from eyerender.dataset import shard  # noqa: E402
+from eyerender.dataset.done import sum_of  # noqa: E402
 from eyerender.dataset.estimate import estimate  # noqa: E402
 from eyerender.dataset.maker import Maker  # noqa: E402
 from eyerender.dataset.plan import Plan  # noqa: E402
@@ -46,8 +48,9 @@ from eyerender.dataset.pool import LocalPool  # noqa: E402
 from eyerender.dataset.realise import frames_of  # noqa: E402
 from eyerender.dataset.run import generate  # noqa: E402
 from eyerender.dataset.shard import Staged, commit, write_shard  # noqa: E402
-from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
+from eyerender.dataset.spec import DatasetSpec, GeometryKind, find_dataset  # noqa: E402
 from eyerender.dataset.worker import Job  # noqa: E402
+from eyerender.folders.imagefile import write_picture  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "scripts" / "recipes"
@@ -115,6 +118,7 @@ class Bench:
         yield from self.scaling()
         yield from self.prediction()
         yield from self.apart()
+        yield from self.geometry()
         yield from self.memory()
         yield from self.kills()
 
@@ -220,6 +224,30 @@ class Bench:
         yield row("the same without syncing", whole - syncing[0], "s")
         yield row("what syncing adds", 100 * syncing[0] / (whole - syncing[0]), "%", must=3.0)
         yield row("on disk, masks and labels included", size / n, "bytes")
+
+    def geometry(self) -> Iterable[Row]:
+        """CPU of each kind of geometry, written and hashed, against the same image without any: median of pairs."""
+        count = 4 if self.small else 8
+        data = recipe(FOLDER / f"{RECIPES[0]}.yaml", 1, None, count)
+        plans = {}
+        for kind in ("", *get_args(GeometryKind)):
+            labels = {**data.get("labels", {}), "geometry": [kind] if kind else None}
+            plans[kind] = Plan.of(DatasetSpec.from_mapping({**data, "labels": labels}))
+        maker = Maker(plans[""], 1, backend=self.backend, threads=1)  # type: ignore[arg-type]
+        found: dict[str, list[float]] = {kind: [] for kind in plans}
+        with tempfile.TemporaryDirectory() as folder:
+            for sample in (0, *range(count)):
+                for kind, maker.plan in plans.items():
+                    start = time.process_time()
+                    for name, picture in maker.make(sample).images[0].pictures.items():
+                        write_picture(Path(folder) / name, picture)
+                        sum_of(Path(folder) / name)
+                    found[kind].append(time.process_time() - start)
+        plain = found.pop("")[1:]  # the first images record kernels
+        yield row("people_openeds, as shipped, in turns: CPU", 1e3 * statistics.median(plain), "ms/image")
+        for kind, spent in found.items():
+            share = statistics.median(own / bare - 1.0 for own, bare in zip(spent[1:], plain, strict=True))
+            yield row(f"{kind}, written and hashed: CPU", 100.0 * share, "%", must=5.0)
 
     def memory(self) -> Iterable[Row]:
         """Growth of a worker's resident memory."""
