@@ -44,8 +44,8 @@ er.generate(scenes="reading:scene", path=folder / "reading", count=COUNT, seed=7
 print("valid:", er.validate(folder / "reading")["ok"])
 
 # %%
-# In a loop, a scene may depend on those before it. Here, the headset slips down in a random walk. After an interruption,
-# a writer with the same arguments goes on with the samples that are missing.
+# In a loop, a scene may depend on those before it. Here, the headset slips down in a random walk. After an
+# interruption, a writer with the same arguments goes on with the samples that are missing.
 slip_mm = np.cumsum(np.abs(np.random.default_rng(3).normal(0, 0.15, COUNT)))
 base = er.load_scene("head_mounted").with_({"image.window_px": [200, 160], "image.spp": 4}, gaze_deg=(0, 0))
 with er.DatasetWriter(folder / "slipping", COUNT, name="slipping") as writer:

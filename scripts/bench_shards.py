@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +64,17 @@ def fabricate(folder: Path, plan: Plan) -> None:
     begin(folder, plan, print)
     selection, text = plan.spec.selection, b""
     blocks: list[int] = []
+    splits, split_of = sorted(plan.spec.splits), cache(plan.split_of)
+    made_by = {
+        "digest": plan.digest,
+        "versions": run_versions(),
+        "backend": {"name": "llvm", "device": "fabricated"},
+        "cpu": cpu_family(),
+    }
     for shard in plan.spec.shards:
         samples = plan.spec.shard_samples(shard)
         subjects = [selection.subject_of(sample) for sample in samples]
-        splits = sorted(plan.spec.splits)
-        names = [plan.split_of(subject) for subject in subjects]
+        names = [split_of(subject) for subject in subjects]
         if not text:
             lines = [line_of(*who) for who in zip(samples, subjects, names, strict=True)]
             text, blocks = pack_lines(lines)
@@ -84,10 +91,7 @@ def fabricate(folder: Path, plan: Plan) -> None:
             "chosen": chosen,
             "images": len(samples),
             "images_saturated": 0,
-            "digest": plan.digest,
-            "versions": run_versions(),
-            "backend": {"name": "llvm", "device": "fabricated"},
-            "cpu": cpu_family(),
+            **made_by,
             "rejections": [],
             "given_up": [],
             "saturated": [],
