@@ -32,7 +32,7 @@ from eyerender.dataset.runfile import begin  # noqa: E402
 from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
 from eyerender.dataset.status import status  # noqa: E402
 from eyerender.folders.imagefolder import ImageFolder  # noqa: E402
-from eyerender.folders.packed import LINES_GZ, TAR, pack_lines  # noqa: E402
+from eyerender.folders.packed import LINES_GZ, MEMBERS, TAR, pack_lines  # noqa: E402
 
 IMAGES = 250
 LINED = 100  # shards that have lines, which are those of the first
@@ -56,7 +56,14 @@ def line_of(sample: int, subject: int, split: str) -> dict[str, Any]:
     name = f"images/00000/{sample:08d}-right.png"
     own = {"sample": sample, "subject": subject, "split": split, "records": [{"eye": "right"}]}
     window = {"x0": 0, "y0": 0, "width": 16, "height": 16}
-    return {"schema": "eyerender/image/4", "file_name": name, "window_px": window, **own, "parameters": parameters}
+    return {
+        "schema": "eyerender/image/4",
+        "file_name": name,
+        "window_px": window,
+        **own,
+        MEMBERS: {},
+        "parameters": parameters,
+    }
 
 
 def fabricate(folder: Path, plan: Plan) -> None:
