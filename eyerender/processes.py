@@ -57,8 +57,8 @@ class Endings:
         try:
             yield
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+            for changed, handler in before.items():
+                signal.signal(changed, handler)
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
