@@ -301,7 +301,8 @@ class Bench:
 @contextmanager
 def geometry_timed() -> Iterator[list[float]]:
     """A list that gets the seconds that geometry of pixels takes for each image that is made while the block runs."""
-    spent, real = [], renderer.window_hits
+    spent: list[float] = []
+    real = renderer.window_hits
 
     def timed(bound: Any, job: Any, scene: object) -> Any:
         real(bound, job, scene)()  # whatever was launched before it is done now
