@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.connection import wait
+from types import FrameType
 from typing import Any, TypeVar
 
 Task = TypeVar("Task")
@@ -33,6 +34,49 @@ def signals_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class Endings:
+    """Ctrl-C and SIGTERM during a block: they raise at once, or only after work that must not be cut off."""
+
+    def __init__(self) -> None:
+        self._is_deferred = False
+        self._waiting: BaseException | None = None
+
+    @contextmanager
+    def raised(self) -> Iterator[None]:
+        """Let SIGTERM raise SystemExit in the block, and Ctrl-C KeyboardInterrupt.
+
+        A signal that the program handles itself or ignores stays as it is, and so do all outside of the main thread.
+        """
+        before: dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            for number, default in ((signal.SIGTERM, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler)):
+                if signal.getsignal(number) == default:
+                    before[number] = signal.signal(number, self._handle)
+        try:
+            yield
+        finally:
+            for changed, handler in before.items():
+                signal.signal(changed, handler)
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Within `raised`, let a signal raise only after this block."""
+        self._is_deferred = True
+        try:
+            yield
+        finally:
+            self._is_deferred = False
+            waiting, self._waiting = self._waiting, None
+            if waiting is not None:
+                raise waiting
+
+    def _handle(self, number: int, _frame: FrameType | None) -> None:
+        ending = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+        if not self._is_deferred:
+            raise ending
+        self._waiting = ending
 
 
 @contextmanager

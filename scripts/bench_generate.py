@@ -20,6 +20,7 @@ import json
 import os
 import random
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -28,7 +29,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from _bench import Report, Row, options_of, resident_mib, row, single_threaded
 from _people import recipe
@@ -39,6 +40,7 @@ import numpy as np  # noqa: E402
 import yaml  # noqa: E402
 
 from eyerender.dataset import shard  # noqa: E402
+from eyerender.dataset.done import sum_of  # noqa: E402
 from eyerender.dataset.estimate import estimate  # noqa: E402
 from eyerender.dataset.maker import Maker  # noqa: E402
 from eyerender.dataset.plan import Plan  # noqa: E402
@@ -46,8 +48,11 @@ from eyerender.dataset.pool import LocalPool  # noqa: E402
 from eyerender.dataset.realise import frames_of  # noqa: E402
 from eyerender.dataset.run import generate  # noqa: E402
 from eyerender.dataset.shard import Staged, commit, write_shard  # noqa: E402
-from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
+from eyerender.dataset.spec import DatasetSpec, GeometryKind, find_dataset  # noqa: E402
 from eyerender.dataset.worker import Job  # noqa: E402
+from eyerender.folders.imagefile import write_picture  # noqa: E402
+from eyerender.rendering import renderer  # noqa: E402
+from eyerender.rendering.output.geometry import geometry_of  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "scripts" / "recipes"
@@ -115,6 +120,7 @@ class Bench:
         yield from self.scaling()
         yield from self.prediction()
         yield from self.apart()
+        yield from self.geometry()
         yield from self.memory()
         yield from self.kills()
 
@@ -221,6 +227,35 @@ class Bench:
         yield row("what syncing adds", 100 * syncing[0] / (whole - syncing[0]), "%", must=3.0)
         yield row("on disk, masks and labels included", size / n, "bytes")
 
+    def geometry(self) -> Iterable[Row]:
+        """CPU of the additional work for each kind of geometry, repeated and timed alone, over that of an image."""
+        count = 3 if self.small else 8
+        data = recipe(FOLDER / f"{RECIPES[0]}.yaml", 1, None, 1)
+        plain, maker = 0.0, None
+        for kind in ("", *get_args(GeometryKind)):
+            labels = {**data.get("labels", {}), "geometry": [kind] if kind else None}
+            made = Plan.of(DatasetSpec.from_mapping({**data, "labels": labels}))
+            maker = maker or Maker(made, 1, backend=self.backend, threads=1)  # type: ignore[arg-type]
+            maker.plan = made
+            maker.make(0)
+            with tempfile.TemporaryDirectory() as folder, geometry_timed() as spent:
+                for _ in range(count):
+                    start = time.process_time()
+                    pictures = maker.make(0).images[0].pictures
+                    if kind:
+                        start = time.process_time()
+                        write_picture(Path(folder) / kind, pictures[kind])
+                        sum_of(Path(folder) / kind)
+                        spent[-1] += time.process_time() - start
+                    else:
+                        spent.append(time.process_time() - start)
+            if kind:
+                share = statistics.median(spent) / plain
+                yield row(f"{kind}, written and hashed: CPU", 100.0 * share, "%", must=5.0)
+            else:
+                plain = statistics.median(spent)
+                yield row("people_openeds, as shipped, the same image again: CPU", 1e3 * plain, "ms/image")
+
     def memory(self) -> Iterable[Row]:
         """Growth of a worker's resident memory."""
         count = 600 if self.small else 5000
@@ -261,6 +296,26 @@ class Bench:
                 other = _tree(Path(place) / f"killed{k}")
                 differ += sum(whole.get(name) != other.get(name) for name in {*whole, *other})
         yield row(f"files that differ after {kills} kills", differ, "files", must=0)
+
+
+@contextmanager
+def geometry_timed() -> Iterator[list[float]]:
+    """A list that gets the seconds that geometry of pixels takes for each image that is made while the block runs."""
+    spent: list[float] = []
+    real = renderer.window_hits
+
+    def timed(bound: Any, job: Any, scene: object) -> Any:
+        real(bound, job, scene)()  # whatever was launched before it is done now
+        start = time.process_time()
+        geometry_of(job, real(bound, job, scene)())
+        spent.append(time.process_time() - start)
+        return real(bound, job, scene)
+
+    renderer.window_hits = timed
+    try:
+        yield spent
+    finally:
+        renderer.window_hits = real
 
 
 @contextmanager

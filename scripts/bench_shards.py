@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from eyerender.dataset.runfile import begin  # noqa: E402
 from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
 from eyerender.dataset.status import status  # noqa: E402
 from eyerender.folders.imagefolder import ImageFolder  # noqa: E402
-from eyerender.folders.packed import LINES_GZ, TAR, pack_lines  # noqa: E402
+from eyerender.folders.packed import LINES_GZ, MEMBERS, TAR, pack_lines  # noqa: E402
 
 IMAGES = 250
 LINED = 100  # shards that have lines, which are those of the first
@@ -55,7 +56,14 @@ def line_of(sample: int, subject: int, split: str) -> dict[str, Any]:
     name = f"images/00000/{sample:08d}-right.png"
     own = {"sample": sample, "subject": subject, "split": split, "records": [{"eye": "right"}]}
     window = {"x0": 0, "y0": 0, "width": 16, "height": 16}
-    return {"schema": "eyerender/image/4", "file_name": name, "window_px": window, **own, "parameters": parameters}
+    return {
+        "schema": "eyerender/image/4",
+        "file_name": name,
+        "window_px": window,
+        **own,
+        MEMBERS: {},
+        "parameters": parameters,
+    }
 
 
 def fabricate(folder: Path, plan: Plan) -> None:
@@ -63,11 +71,17 @@ def fabricate(folder: Path, plan: Plan) -> None:
     begin(folder, plan, print)
     selection, text = plan.spec.selection, b""
     blocks: list[int] = []
+    splits, split_of = sorted(plan.spec.splits), cache(plan.split_of)
+    made_by = {
+        "digest": plan.digest,
+        "versions": run_versions(),
+        "backend": {"name": "llvm", "device": "fabricated"},
+        "cpu": cpu_family(),
+    }
     for shard in plan.spec.shards:
         samples = plan.spec.shard_samples(shard)
         subjects = [selection.subject_of(sample) for sample in samples]
-        splits = sorted(plan.spec.splits)
-        names = [plan.split_of(subject) for subject in subjects]
+        names = [split_of(subject) for subject in subjects]
         if not text:
             lines = [line_of(*who) for who in zip(samples, subjects, names, strict=True)]
             text, blocks = pack_lines(lines)
@@ -84,10 +98,7 @@ def fabricate(folder: Path, plan: Plan) -> None:
             "chosen": chosen,
             "images": len(samples),
             "images_saturated": 0,
-            "digest": plan.digest,
-            "versions": run_versions(),
-            "backend": {"name": "llvm", "device": "fabricated"},
-            "cpu": cpu_family(),
+            **made_by,
             "rejections": [],
             "given_up": [],
             "saturated": [],

@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""Bench of eyerender.torch: images a second that a stream gives with two workers, against those that `generate` makes.
+"""Bench of eyerender.torch: images a second that streams give with two workers, against those that `generate` makes.
 
     bench_torch.py [--quick] [--json F] [--backend llvm|cuda]
 
 It needs PyTorch: .venv-torch/bin/python scripts/bench_torch.py, after scripts/test-torch has made that environment.
-Images are 640 x 480 px at 4 samples per pixel, without lids. Both sides have two workers of one thread each and are
+Images are 640 x 480 px at 4 samples per pixel, without lids. All sides have two workers of one thread each and are
 measured in turn, three times each; the medians count. Rates are measured after every worker has made its first samples,
-so they exclude starting and compiling. --quick makes fewer images, once. The exit code is 1 if a `must` is missed.
+or its first window of mixed images, so they exclude starting and compiling. --quick makes fewer images, once. The exit
+code is 1 if a `must` is missed.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from eyerender.dataset.pool import LocalPool  # noqa: E402
 from eyerender.dataset.realise import frames_of  # noqa: E402
 from eyerender.dataset.worker import Job  # noqa: E402
 
-WORKERS, BATCH, SHARD = 2, 8, 48
+WORKERS, BATCH, SHARD, MIXED = 2, 8, 48, 4
 
 
 def generated(count: int, backend: str) -> float:
@@ -42,28 +43,33 @@ def generated(count: int, backend: str) -> float:
     return clock.rate
 
 
-def streamed(count: int, backend: str) -> float:
-    """Images a second of a stream, from the first batch of the last worker on."""
+def streamed(count: int, backend: str, shuffle: int) -> float:
+    """Images a second of a stream, after the first batches that each worker renders together."""
     from eyerender.torch import StreamDataset
 
-    stream = StreamDataset(plan(count, SHARD), batch_size=BATCH, backend=backend, threads=1)  # type: ignore[arg-type]
-    start, images = 0.0, 0
+    stream = StreamDataset(plan(count, SHARD), batch_size=BATCH, shuffle=shuffle, backend=backend, threads=1)  # type: ignore[arg-type]
+    start, images, first = 0.0, 0, WORKERS * max(shuffle, 1)
     for number, batch in enumerate(stream.loader(WORKERS)):
-        if number >= WORKERS:
+        if number >= first:
             images += len(batch["image"])
-        elif number == WORKERS - 1:
+        elif number == first - 1:
             start = time.perf_counter()
     return images / (time.perf_counter() - start)
 
 
 def rows(backend: str, quick: bool) -> Iterable[Row]:
     """All rows, as they are measured."""
-    count = 96 if quick else 192
-    found = [(generated(count, backend), streamed(count, backend)) for _ in range(1 if quick else 3)]
-    runs, streams = (statistics.median(side) for side in zip(*found, strict=True))
+    count = 128 if quick else 256
+    found = [
+        (generated(count, backend), streamed(count, backend, 0), streamed(count, backend, MIXED))
+        for _ in range(1 if quick else 3)
+    ]
+    runs, streams, mixed = (statistics.median(side) for side in zip(*found, strict=True))
     yield row("generate, two workers of one thread each", runs, "images/s")
     yield row("stream, two workers of one thread each", streams, "images/s")
+    yield row(f"the same, mixing {MIXED} batches of each worker", mixed, "images/s")
     yield row("stream against generate", streams / runs, "ratio", must=0.9, at_least=True)
+    yield row("mixed stream against stream", mixed / streams, "ratio", must=0.9, at_least=True)
 
 
 def main() -> int:

@@ -225,7 +225,17 @@ def export_dataset(
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     *,
     format: Literal[
-        "webdataset", "imagefolder", "coco", "yolo-seg", "yolo-pose", "csv", "parquet", "openeds", "ellseg", "teyed"
+        "webdataset",
+        "imagefolder",
+        "coco",
+        "yolo-seg",
+        "yolo-pose",
+        "csv",
+        "parquet",
+        "labels",
+        "openeds",
+        "ellseg",
+        "teyed",
     ],
     bits: Literal[8, 16] = 8,
     encoding: Literal["linear", "gamma"] | None = None,
@@ -245,7 +255,7 @@ def export_dataset(
         encoding: Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16 bits).
         gain: Exposure gain of all images (default: measured on a sample of the images; 1 for 16-bit linear images).
         workers: Number of processes that read and encode images. The bytes do not depend on it.
-        shuffle: Write the images in a random order with this seed, instead of the order of the samples (not teyed).
+        shuffle: Write the images in a random order with this seed, instead of that of the samples (not teyed, labels).
     """
     from ..dataset.export import export
 

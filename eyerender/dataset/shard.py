@@ -174,10 +174,11 @@ def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[i
 
 def remove_leftovers(folder: Path, mine: set[int], done: set[int]) -> None:
     """Remove remains of earlier runs in shards that this run makes, except checkpoints of unfinished shards."""
-    take_back(folder, mine - done)
+    missing = mine - done
+    take_back(folder, missing)
     remove_stages(folder, mine, done)
     for kind in (*KINDS, SHARDS):
         if (folder / kind).is_dir():
             for place in (folder / kind).iterdir():
-                if place.name.isdigit() and int(place.name) in mine - done:
+                if place.name.isdigit() and int(place.name) in missing:
                     shutil.rmtree(place, ignore_errors=True)

@@ -14,6 +14,7 @@ import numpy as np
 from ..backends.choose import BackendChoice
 from ..errors import InputError
 from ..imaging.capture import EyeImage
+from ..processes import Endings
 from ..progress import Say
 from .maker import MadeSample, Maker
 from .options import RunOptions
@@ -33,7 +34,8 @@ class DatasetWriter:
 
     The folder is that of `generate`, with a file for each picture: shards that are whole or absent, checkpoints every
     ten seconds, checksums, masks and all labels. A loop that was killed resumes with a new writer of the same
-    arguments: `in` says which samples are stored. The folder is assembled when all samples are there.
+    arguments: `in` says which samples are stored. The folder is assembled when all samples are there. In the main
+    thread, SIGTERM ends the block with SystemExit (unless the program handles it), so that no stored sample is lost.
 
         with er.DatasetWriter("out", 1000) as writer:
             for i in writer.missing():
@@ -91,6 +93,7 @@ class DatasetWriter:
         self._run: Run | None = None
         self._maker: Maker | None = None
         self._partial: PartialShard | None = None
+        self._endings = Endings()
         self._is_checked = False
         self.summary = None
 
@@ -125,10 +128,12 @@ class DatasetWriter:
                 backend, threads = self._options.backend, self._options.threads
                 self._maker = Maker(self._plan, run.frames, backend=backend, threads=threads)
                 run.ready(self._maker.backend, _NAME)
-            try:
-                yield
-            finally:
-                self._leave()
+            with self._endings.raised():
+                try:
+                    yield
+                finally:
+                    with self._endings.deferred():
+                        self._leave()
             self.summary = run.finish()
 
     def __contains__(self, sample: object) -> bool:
@@ -192,10 +197,11 @@ class DatasetWriter:
         made = self._made(sample, images)
         shard = self._shard_of(sample)
         partial = self._entered(shard)
-        partial.add(made)
-        self._opened_run.sample(shard, len(partial.made), len(made.images))
-        if self._is_complete(partial):
-            self._leave()
+        with self._endings.deferred():
+            partial.add(made)
+            self._opened_run.sample(shard, len(partial.made), len(made.images))
+            if self._is_complete(partial):
+                self._leave()
         return len(made.images)
 
     def _made(self, sample: int, images: Sequence[EyeImage] | None) -> MadeSample:

@@ -73,9 +73,9 @@ def picture_bytes(picture: NDArray[Any]) -> bytes:
     """Encode integers as PNG (`png_bytes`), and real numbers as NumPy's .npy, float32."""
     if picture.dtype.kind == "u":
         return png_bytes(picture)
-    file = io.BytesIO()
-    np.save(file, np.ascontiguousarray(picture, dtype=np.float32), allow_pickle=False)
-    return file.getvalue()
+    values, head = np.ascontiguousarray(picture, dtype=np.float32), io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(values))
+    return head.getvalue() + values.tobytes()
 
 
 def array_of(data: bytes, shape: tuple[int, ...], source: str) -> Singles:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import signal
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -21,6 +24,7 @@ from eyerender.dataset.validate import validate
 from eyerender.errors import InputError
 from tests.support import own_scenes
 from tests.support.dataset_specs import command, mapping, plan, tree
+from tests.support.paths import ROOT
 
 OWN = "tests.support.own_scenes"
 SMALL: Any = {"workers": 1, "threads": 1}
@@ -195,6 +199,45 @@ def test_a_writer_stores_a_stream_and_resumes_it(tmp_path):
     report = validate(tmp_path / "a", render=2, threads=1)
     assert report["problems"] == []
     assert report["recomputed"] == 10
+
+
+LOOP = """
+import sys, time
+import eyerender as er
+from tests.support.own_scenes import objects
+with er.DatasetWriter(sys.argv[1], 30, threads=1) as writer:
+    for i in writer.missing():
+        writer.add(i, objects(1, i), subject=i)
+        print(i, flush=True)
+        time.sleep(float(sys.argv[2]))
+"""
+
+
+def loop(folder, pause):
+    """Start a loop of a writer of 30 samples."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    run = [sys.executable, "-c", LOOP, str(folder), str(pause)]
+    return subprocess.Popen(run, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.render
+@pytest.mark.packaging
+@pytest.mark.parametrize("pause", [0.0, 1.0])
+def test_a_writer_loses_no_stored_sample_by_sigterm(tmp_path, pause):
+    """Neither while it renders and writes, nor while the user's code is at work."""
+    stored = 0
+    for wanted in (3, 5):
+        process = loop(tmp_path / "a", pause)
+        with process:
+            numbers = [int(process.stdout.readline()) for _ in range(wanted)]
+            process.send_signal(signal.SIGTERM)
+            numbers += [int(line) for line in process.stdout]
+        assert process.returncode == 128 + signal.SIGTERM
+        assert numbers[0] in (stored, stored + 1)  # one may be stored but not printed
+        stored = numbers[-1] + 1
+    assert loop(tmp_path / "a", 0.0).wait(120) == 0
+    assert loop(tmp_path / "b", 0.0).wait(120) == 0
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
 @pytest.mark.render

@@ -6,6 +6,7 @@ import json
 import pickle
 import shutil
 import tarfile
+from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
@@ -86,6 +87,33 @@ def test_it_is_validated_and_exported(tiny, packed, tmp_path):
         {p.name: p.read_bytes() for p in (tmp_path / name / "images").iterdir()} for name in ("files", "packed")
     ]
     assert pictures[0] == pictures[1]
+
+
+def test_labels_of_each_shard_are_exported_in_the_order_of_its_tar(tiny, packed, tmp_path, monkeypatch):
+    """`datasets` reads pictures and labels side by side, without a copy of the pictures."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    import datasets
+
+    done = export(packed, "labels", tmp_path / "out", workers=2)
+    assert done["image"] is None
+    files = sorted((tmp_path / "out" / "labels").iterdir())
+    assert [path.name for path in files] == ["00000.parquet", "00001.parquet", "00002.parquet"]
+    cache = str(tmp_path / "cache")
+    rows = datasets.load_dataset("parquet", data_files=[str(path) for path in files], split="train", cache_dir=cache)
+    tars = [str(packed / "shards" / path.stem / "images.tar") for path in files]
+    pictures = datasets.load_dataset("webdataset", data_files=tars, split="train", cache_dir=cache, streaming=True)
+    entries = list(ImageFolder.load(packed))
+    for row, picture, entry in zip(rows, pictures, entries, strict=True):
+        assert row["__key__"] == picture["__key__"] == PurePosixPath(entry.name).stem
+        assert np.array_equal(np.asarray(picture["png"]), entry.image())
+        centre = np.subtract(entry.labels["pupil"]["amodal"]["centre_px"], entry.window[:2])
+        assert np.allclose([row["pupil_amodal_x_px"], row["pupil_amodal_y_px"]], centre, rtol=0, atol=1e-9)
+        assert (row["bit_depth"], row["subject"]) == (entry.line["bit_depth"], entry.line["subject"])
+    assert "Values of the images" not in (tmp_path / "out" / "README.md").read_text()
+    with pytest.raises(InputError, match="is not of the layout webdataset"):
+        export(tiny, "labels", tmp_path / "other")
+    with pytest.raises(InputError, match="--gain: the layout labels has no images"):
+        export(packed, "labels", tmp_path / "other", gain=2.0)
 
 
 def test_loaders_of_image_folders_read_its_export(tiny, packed, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import pickle
 from collections import Counter, defaultdict
 from itertools import pairwise
@@ -20,6 +21,7 @@ from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import mapping, plan, write
+from tests.support.paths import load
 
 PEOPLE = ("people_eyelink", "people_nvgaze", "people_openeds", "people_pupil_core")
 
@@ -33,6 +35,15 @@ def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
         made = Plan.load(name)
         assert len(spec.shards) >= 8
         assert realise(made, spec.selection.samples[-1], frames_of(made)).sample is not None
+
+
+@pytest.mark.parametrize("name", ["dataset_quick", "dataset_region", *PEOPLE])
+def test_older_specs_still_give_their_samples(name):
+    """The same numbers to the last digit as an older version gave."""
+    golden = load("samples_1.json")[name]
+    made = Plan.of(DatasetSpec.from_mapping(golden["spec"]))
+    for sample in golden["samples"]:
+        assert json.loads(json.dumps(made.draw(sample["sample"]).to_mapping())) == sample
 
 
 def test_lights_of_samples_follow_the_rule_of_the_specs_format(tmp_path):

@@ -21,7 +21,7 @@ from ...progress import Progress
 from ...storage.files import write_json, write_text
 from ..assemble import verify_dataset, verify_finished
 from ..validation.problems import WRONG
-from . import coco, ellseg, imagefolder, openeds, parquet, table, teyed, webdataset, yolo
+from . import coco, ellseg, imagefolder, labels, openeds, parquet, table, teyed, webdataset, yolo
 from .card import export_card
 from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
 from .item import Item, Items, wrong_labels
@@ -39,13 +39,15 @@ FORMATS: dict[str, Writer] = {
     "yolo-pose": yolo.write_poses,
     "csv": table.write,
     "parquet": parquet.write,
+    "labels": labels.write,
     "openeds": openeds.write,
     "ellseg": ellseg.write,
     "teyed": teyed.write,
 }
 # The other layouts have 8 bits by definition.
 _SIXTEEN_BITS = ("webdataset", "imagefolder", "coco", "csv", "parquet")
-_ORDERED = ("teyed",)
+_ORDERED = {"teyed": "the frames of teyed have an order", "labels": "the rows of labels have the order of the shards"}
+_PICTURELESS = ("labels",)
 
 
 def export(
@@ -72,7 +74,7 @@ def export(
         gain: factor for all values; by default 1 for 16 bits linear, otherwise measured on a sample of the images.
         workers: number of processes that read and encode the images; the bytes do not depend on it.
         shuffle: seed of a random order of the images; by default they are in the order of the samples. It is refused
-            for `teyed`, whose videos have an order.
+            for `teyed` and `labels`, which have an order of their own.
         overwrite: replace the contents of `out`.
         progress: called with images done, images in all and "".
 
@@ -81,15 +83,9 @@ def export(
             labels differ from what this version writes, or `out` is not empty.
         EyerenderError: `out` cannot be written.
     """
-    if format not in FORMATS:
-        raise InputError(f"must be one of {', '.join(FORMATS)}, not {format!r}", source="--format")
-    check(bits, encoding, gain)
-    if bits == 16 and format not in _SIXTEEN_BITS:
-        raise InputError(f"the layout {format} holds 8 bits; {', '.join(_SIXTEEN_BITS)} can hold 16", source="--bits")
+    _check_options(format, bits, encoding, gain, shuffle)
     if workers < 1:
         raise InputError("must be >= 1", source="--workers")
-    if shuffle is not None and format in _ORDERED:
-        raise InputError(f"the frames of {format} have an order", source="--shuffle")
     folder = ImageFolder.load(path)
     if folder.dataset.get("kind") != "dataset":
         raise InputError("is not a generated dataset (its kind is not 'dataset')", source=str(Path(path) / DATASET))
@@ -106,7 +102,8 @@ def export(
     items = Items(folder, step, workers=workers, shuffle=shuffle)
     with staged(out, overwrite=overwrite) as stage, _labels_as_made(items):
         items.survey()
-        items.encoding = _encoding(items, bits, encoding or ("gamma" if bits == 8 else "linear"), gain)
+        if format not in _PICTURELESS:
+            items.encoding = _encoding(items, bits, encoding or ("gamma" if bits == 8 else "linear"), gain)
         head = FORMATS[format](items, stage) or ""
         done = {
             "schema": SCHEMA,
@@ -116,12 +113,29 @@ def export(
             "unfinished": bool(folder.unfinished),
             "images_by_split": items.images_by_split,
             "source_bit_depths": sorted(items.bit_depths),
-            "image": items.encoding.to_mapping(),
+            "image": None if format in _PICTURELESS else items.encoding.to_mapping(),
         }
         layout = sys.modules[FORMATS[format].__module__].__doc__ or ""
         write_text(stage / CARD, head + export_card(items.name, done, layout, items.encoding), sync=False)
         write_json(stage / EXPORT, done, sync=False)
     return {**done, "path": str(out)}
+
+
+def _check_options(format: str, bits: int, encoding: Curve | None, gain: float | None, shuffle: int | None) -> None:
+    """Check that a layout exists and can be written so.
+
+    Raises:
+        InputError: it cannot.
+    """
+    if format not in FORMATS:
+        raise InputError(f"must be one of {', '.join(FORMATS)}, not {format!r}", source="--format")
+    check(bits, encoding, gain)
+    if bits == 16 and format not in _SIXTEEN_BITS:
+        raise InputError(f"the layout {format} holds 8 bits; {', '.join(_SIXTEEN_BITS)} can hold 16", source="--bits")
+    if shuffle is not None and format in _ORDERED:
+        raise InputError(_ORDERED[format], source="--shuffle")
+    if format in _PICTURELESS and (encoding is not None or gain is not None):
+        raise InputError(f"the layout {format} has no images", source="--encoding" if gain is None else "--gain")
 
 
 def _encoding(items: Items, bits: int, curve: Curve, gain: float | None) -> Encoding:

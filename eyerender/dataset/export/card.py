@@ -21,18 +21,15 @@ _COLUMNS = " Their columns are `camera_line_of_sight_x`, `_y`, `_z` and `camera_
 _GAZE = {
     "csv": gaze.CARD.format(columns=_COLUMNS),
     "parquet": gaze.CARD.format(columns=_COLUMNS),
+    "labels": gaze.CARD.format(columns=_COLUMNS),
     "coco": gaze.CARD.format(columns=" They are keys of each image."),
 }
 
 
 def export_card(name: str, done: dict[str, Any], layout: str, encoding: Encoding) -> str:
     """Return the text of README.md; `layout` describes the files."""
-    image = encoding.to_mapping()
     splits = "\n".join(f"| {split} | {count} |" for split, count in done["images_by_split"].items())
-    depths = " or ".join(str(depth) for depth in done["source_bit_depths"])
-    read = ""
-    if encoding.bits == 16:
-        read = f"\n## Reading 16 bits\n{WHOLE}{WEBDATASET if done['format'] == 'webdataset' else ''}"
+    values = "" if done["image"] is None else _values(done, encoding)
     return f"""# {name}: {done["format"]}
 
 {done["images"]} synthetic near-infrared images of eyes with exact labels, exported from the dataset "{name}".
@@ -45,7 +42,17 @@ README.md of the dataset explains how they were made and what the labels mean.
 ## Files
 {layout.strip()}
 {_GAZE.get(done["format"], "")}
-## Values of the images
+{values}"""
+
+
+def _values(done: dict[str, Any], encoding: Encoding) -> str:
+    """Describe the values of the images, and how to decode them."""
+    image = encoding.to_mapping()
+    depths = " or ".join(str(depth) for depth in done["source_bit_depths"])
+    read = ""
+    if encoding.bits == 16:
+        read = f"\n## Reading 16 bits\n{WHOLE}{WEBDATASET if done['format'] == 'webdataset' else ''}"
+    return f"""## Values of the images
 The images have {encoding.bits} bits, encoding `{encoding.curve}`, and one exposure gain of {encoding.gain:g}.
 {_GAINS[encoding.gain_from]}
 Images of two exports have the same scale only if their gains are the same (`--gain`).

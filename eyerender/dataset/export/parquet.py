@@ -31,7 +31,7 @@ _PICTURES = {
     "noiseless": "noiseless_file_name",
     "highlight_mask": "highlight_mask_file_name",
 }
-_TEXTS = ("split", "encoding", "eye", "eye_model", "camera_name", "line_json")
+_TEXTS = ("__key__", "split", "encoding", "eye", "eye_model", "camera_name", "line_json")
 _WHOLE = (
     "sample",
     "subject",
@@ -54,18 +54,12 @@ _SIZES = (
 
 def write(items: Items, out: Path) -> str:
     """Write data/, and return the head of README.md: YAML that names columns and splits."""
-    try:
-        pa: Any = import_module("pyarrow")
-        parquet: Any = import_module("pyarrow.parquet")
-    except ImportError:
-        raise InputError(
-            "needs pyarrow (the extra 'parquet'); run: pip install pyarrow", source="--format parquet"
-        ) from None
+    pa, parquet = libraries("parquet")
     (out / "data").mkdir()
     first = next(iter(items.sample(1)))
     pictures = [name for name, key in _PICTURES.items() if first.line.get(key) is not None]
-    types = dict.fromkeys(pictures, "image") | {name: _type(name) for name in _row(first, items.lights)}
-    schema = _schema(pa, types)
+    types = dict.fromkeys(pictures, "image") | {name: type_of(name) for name in _row(first, items.lights)}
+    schema = schema_of(pa, types)
     files: dict[str, _File] = {}
     with ExitStack() as stack:
         for row in items.map(partial(_whole_row, pictures=pictures, lights=items.lights)):
@@ -77,16 +71,34 @@ def write(items: Items, out: Path) -> str:
     return _head(items, types, out)
 
 
+def libraries(layout: str) -> tuple[Any, Any]:
+    """Import pyarrow and pyarrow.parquet.
+
+    Raises:
+        InputError: pyarrow is not installed.
+    """
+    try:
+        return import_module("pyarrow"), import_module("pyarrow.parquet")
+    except ImportError:
+        reason = "needs pyarrow (the extra 'parquet'); run: pip install pyarrow"
+        raise InputError(reason, source=f"--format {layout}") from None
+
+
 def _whole_row(item: Item, pictures: list[str], lights: int) -> dict[str, Any]:
     return {**{name: _picture(item, name) for name in pictures}, **_row(item, lights)}
 
 
-def _row(item: Item, lights: int) -> dict[str, Any]:
+def labels_of(item: Item, lights: int) -> dict[str, Any]:
+    """Return the labels of an image as one flat row, without names of files."""
     row = row_of(item, lights)
     del row["file_name"], row["mask_file_name"]
     for k in range(lights):
         row[f"glint{k}_visible"] = bool(row[f"glint{k}_visible"])
-    return {**row, "line_json": json.dumps(item.exported_line(), sort_keys=True)}
+    return row
+
+
+def _row(item: Item, lights: int) -> dict[str, Any]:
+    return {**labels_of(item, lights), "line_json": json.dumps(item.exported_line(), sort_keys=True)}
 
 
 def _picture(item: Item, name: str) -> dict[str, Any] | None:
@@ -95,7 +107,7 @@ def _picture(item: Item, name: str) -> dict[str, Any] | None:
     return None if data is None else {"bytes": data, "path": f"{item.name}.png"}
 
 
-def _type(name: str) -> str:
+def type_of(name: str) -> str:
     """Return the type of a label column in the notation of `datasets`."""
     if name in _TEXTS:
         return "string"
@@ -104,7 +116,8 @@ def _type(name: str) -> str:
     return "bool" if name.startswith("glint") and name.endswith("_visible") else "float64"
 
 
-def _schema(pa: Any, types: dict[str, str]) -> Any:
+def schema_of(pa: Any, types: dict[str, str]) -> Any:
+    """Return the schema of columns whose types are in the notation of `datasets`."""
     kinds = {
         "image": pa.struct([("bytes", pa.binary()), ("path", pa.string())]),
         "string": pa.string(),

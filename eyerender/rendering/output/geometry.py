@@ -20,7 +20,6 @@ from ...folders.imagefolder import FRAME, IRIS, PUPIL, SCLERA
 from ...geometry.surfaces import Surface, Xyz
 from ...optics.interface import dot
 from ...region.mesh import sheet_codes
-from ...rig.camera import PinholeCamera, Window
 from ..hits.primary import facing, intersect
 from ..integrator.request import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
@@ -32,6 +31,7 @@ from ..scene.region import RegionScene
 NOTHING, SKIN, UPPER_LID, LOWER_LID, LASHES, BROW, CARUNCLE, TEARS = 0, 5, 6, 7, 8, 9, 10, 11
 """Instances in addition to the parts of a mask."""
 _PARTS = {"skin": SKIN, "head": SKIN, "lashes": LASHES, "brow": BROW, "tears": TEARS}
+_STRIP = 4096  # rays whose numbers fit into a processor's cache
 _STEPS = 2  # of Newton's method, which rays at a grazing angle need
 _SHEET = np.array([CARUNCLE, UPPER_LID, LOWER_LID, SKIN], dtype=np.uint8)
 
@@ -70,7 +70,7 @@ class Hits(ArrayValue):
 
     Attributes:
         point: (3, n) mm.
-        normal: (3, n) normals of the surface without its relief.
+        normal: (3, n) unit normals of the surface without its relief, toward the camera.
         inner: (3, n) mm in the plane of the iris.
         part: (n,) part of the eye, `SKIN` for the surroundings.
         cornea: (n,) whether the cornea is met, also where its rim is opaque.
@@ -122,7 +122,8 @@ def _hits(
     clear = si.cornea & (si.opacity < 0.5)
     inside = dr.select(si.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
     part = dr.select(clear, inside, dr.select(si.cornea | si.sclera, mi.UInt8(SCLERA), mi.UInt8(NOTHING)))
-    point, normal, face = si.point, si.normal, mi.UInt32(0)
+    away = dr.dot(si.normal, frame.vector_to_eye(d)) > 0
+    point, normal, face = si.point, dr.select(away, -si.normal, si.normal), mi.UInt32(0)
     if frame.region is not None:
         face = frame.region.face(hit)
         part = dr.select(si.other, mi.UInt8(SKIN), part)
@@ -153,41 +154,78 @@ def geometry_of(job: RenderJob, hits: Hits) -> Geometry:
     shape = job.window[3], job.window[2]
     depth, normals = (None, None) if hits.point is None else _surface(job, hits)
     return Geometry(
-        depth=depth if "depth" in job.geometry else None,
-        normals=normals if "normals" in job.geometry else None,
+        depth=depth,
+        normals=normals,
         iris_coordinates=None if hits.inner is None else _on_iris(job, hits),
         instances=frozen(hits.instance.reshape(shape), np.uint8),
     )
 
 
-def _surface(job: RenderJob, hits: Hits) -> tuple[Singles, Singles | None]:
-    """Compute depth, and normals if they are wanted."""
+def _surface(job: RenderJob, hits: Hits) -> tuple[Singles | None, Singles | None]:
+    """Compute depth and normals, those of them that are wanted."""
     assert hits.point is not None
     assert hits.normal is not None
     shape = job.window[3], job.window[2]
     axes = job.camera.sensor_axes @ job.M  # eye's frame to that of the picture
-    origin = job.M.T @ (job.camera.nodal_point_mm - job.t)
-    ways = _ways(job.camera, job.window, axes)
-    x, y, z = (c.astype(float) for c in hits.normal)
-    normal = x, y, z
-    a, b, c = (p - o for p, o in zip(hits.point, origin, strict=True))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = dot(ways, normal)
-        reach = dot((a, b, c), normal) / along
-    if job.mesh_edge_mm is None:
-        sclera = (hits.part == SCLERA) & ~hits.cornea
-        for met, surface in ((hits.cornea, job.eye.front[0]), (sclera, _Sphere.of(job.eye))):
-            _refine(origin, ways, np.flatnonzero(met), surface, (reach, normal))
-        along = dot(ways, normal)
-    nothing = hits.instance == NOTHING
-    reach[nothing] = np.nan
-    depth = sealed(reach.astype(np.float32).reshape(shape))
-    if "normals" not in job.geometry:
-        return depth, None
-    turned = -np.sign(along)
-    turned[nothing] = np.nan
-    both = (axes @ np.stack(normal)) * turned
-    return depth, sealed(np.ascontiguousarray(both.T, dtype=np.float32).reshape(*shape, 3))
+    exact = [] if job.mesh_edge_mm is not None else _on_eye(job, hits, axes)
+    nothing = np.flatnonzero(hits.instance == NOTHING)
+    depth, normals = None, None
+    if "depth" in job.geometry:
+        reach = _rays(job, axes).to_planes(hits.point, hits.normal)
+        for rows, distance, _ in exact:
+            reach[rows] = distance
+        reach[nothing] = np.nan
+        depth = sealed(reach.astype(np.float32).reshape(shape))
+    if "normals" in job.geometry:
+        turned = hits.normal.T @ axes.T.astype(np.float32)
+        for rows, _, normal in exact:
+            turned[rows] = (axes @ normal).T
+        turned[nothing] = np.nan
+        normals = sealed(turned.reshape(*shape, 3))
+    return depth, normals
+
+
+def _on_eye(job: RenderJob, hits: Hits, axes: Floats) -> list[tuple[Indices, Floats, Floats]]:
+    """Intersect the rays that meet cornea and sclera with the exact surfaces.
+
+    Returns:
+        For each surface the rows (k,), the distances along the camera's axis (k,) and the unit normals toward the
+        camera (3, k).
+    """
+    assert hits.point is not None
+    assert hits.normal is not None
+    sclera = (hits.part == SCLERA) & ~hits.cornea
+    found = []
+    for met, surface in ((hits.cornea, job.eye.front[0]), (sclera, _Sphere.of(job.eye))):
+        rows = np.flatnonzero(met)
+        rays = _rays(job, axes, rows)
+        start = rays.to_planes(hits.point[:, rows], hits.normal[:, rows])
+        found.append((rows, *_refined(rays, start, surface)))
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Rays:
+    """Rays from a point (3,) in n directions (three arrays), of length 1 along the camera's axis."""
+
+    origin: Floats
+    ways: Xyz
+
+    def at(self, t: Floats) -> Xyz:
+        """Return the points at distances along the camera's axis."""
+        x, y, z = (o + t * way for o, way in zip(self.origin, self.ways, strict=True))
+        return x, y, z
+
+    def to_planes(self, points: Singles, normals: Singles) -> Floats:
+        """Compute the distances (n,) to planes through points (3, n) with normals (3, n), in double precision."""
+        reach = np.empty(points.shape[1])
+        for k in range(0, reach.size, _STRIP):
+            part = slice(k, k + _STRIP)
+            (a, b, c), (x, y, z) = points[:, part].astype(float), normals[:, part].astype(float)
+            (ox, oy, oz), (wx, wy, wz) = self.origin, (way[part] for way in self.ways)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                reach[part] = dot((a - ox, b - oy, c - oz), (x, y, z)) / dot((wx, wy, wz), (x, y, z))
+        return reach
 
 
 class _Sphere:
@@ -212,23 +250,15 @@ class _Sphere:
         return x, y, z
 
 
-def _refine(origin: Floats, ways: Xyz, rows: Indices, surface: Surface | _Sphere, found: tuple[Floats, Xyz]) -> None:
-    """Improve some distances along rays to a surface by Newton's method, and set the unit normals there."""
-    reach, normal = found
-    way = (ways[0][rows], ways[1][rows], ways[2][rows])
-    t = reach[rows]
+def _refined(rays: _Rays, reach: Floats, surface: Surface | _Sphere) -> tuple[Floats, Floats]:
+    """Improve distances to a surface by Newton's method; return them and the unit normals (3, k) toward the camera."""
     for _ in range(_STEPS):
-        point = _along(origin, way, t)
-        t = t - surface.value_at(point) / (2 * dot(way, surface.gradient_at(point)))
-    gradient = surface.gradient_at(_along(origin, way, t))
+        point = rays.at(reach)
+        reach = reach - surface.value_at(point) / (2 * dot(rays.ways, surface.gradient_at(point)))
+    gradient = surface.gradient_at(rays.at(reach))
     length = np.sqrt(dot(gradient, gradient))
-    reach[rows] = t
-    for own, g in zip(normal, gradient, strict=True):
-        own[rows] = g / length
-
-
-def _along(origin: Floats, way: Xyz, t: Floats) -> Xyz:
-    return origin[0] + t * way[0], origin[1] + t * way[1], origin[2] + t * way[2]
+    away = np.where(dot(rays.ways, gradient) > 0, -length, length)
+    return reach, np.stack(gradient) / away
 
 
 def _on_iris(job: RenderJob, hits: Hits) -> Singles:
@@ -248,19 +278,20 @@ def _on_iris(job: RenderJob, hits: Hits) -> Singles:
     return sealed(out.reshape(job.window[3], job.window[2], 2))
 
 
-def _ways(camera: PinholeCamera, window: Window, axes: Floats) -> Xyz:
-    """Directions through the centres of pixels, three arrays (n,), of length 1 along the camera's axis.
+def _rays(job: RenderJob, axes: Floats, rows: Indices | None = None) -> _Rays:
+    """Compute the rays through the centres of all pixels, or of some rows of the flattened window.
 
     axes: rows are right, down and forward of the picture.
     """
-    x0, y0, width, height = window
-    u, v = np.arange(x0, x0 + width, dtype=float), np.arange(y0, y0 + height, dtype=float)
-    if np.any(camera.distortion):
-        pixels = camera.ideal(np.stack(np.meshgrid(u, v), axis=-1))
-        u, v = pixels[..., 0], pixels[..., 1]
+    camera, (x0, y0, width, height) = job.camera, job.window
+    if rows is None:
+        u, v = x0 + np.arange(width, dtype=float), y0 + np.arange(height, dtype=float)[:, None]
     else:
-        v = v[:, None]
+        u, v = (x0 + rows % width).astype(float), (y0 + rows // width).astype(float)
+    if np.any(camera.distortion):
+        pixels = camera.ideal(np.stack(np.broadcast_arrays(u, v), axis=-1))
+        u, v = pixels[..., 0], pixels[..., 1]
     x = (u - camera.K[0, 2]) / camera.K[0, 0]
     y = (v - camera.K[1, 2]) / camera.K[1, 1]
     one, two, three = ((x * axes[0, k] + (y * axes[1, k] + axes[2, k])).ravel() for k in range(3))
-    return one, two, three
+    return _Rays(job.M.T @ (camera.nodal_point_mm - job.t), (one, two, three))
