@@ -20,6 +20,10 @@ from .unknowns import COUNT
 from .varied import Images, Slopes
 
 ELLIPSE_POINTS, MOST_POINTS = 24, 40
+MODEL_PX = 0.02
+"""Deviation that is added to the covariances of an extractor (chosen): they hold the sensor's noise alone, often less
+than .01 px, but features are displaced by more than that. A good outline would count as wrong without it."""
+_OF_ELLIPSE, _OF_POINT = MODEL_PX**2 * np.diag([1.0, 1.0, 1.0, 1.0, 0.0]), MODEL_PX**2 * np.eye(2)
 _NEWTON = 4
 _LEAST_RATIO = 1e-6
 
@@ -58,7 +62,10 @@ class Measured(ArrayValue):
 
 
 def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Measured:
-    """Convert observations to whitened features, with their covariances or, where these are missing, `noise`."""
+    """Convert observations to whitened features.
+
+    Covariances are those of the observations plus that of `MODEL_PX`, or, where these are missing, those of `noise`.
+    """
     camera = np.maximum(observations.index.camera, 0)
     points, white, size = _outlines(observations, noise.outline_px[camera])
     glints, weights = np.zeros((len(camera), lights, 2)), np.zeros((len(camera), lights, 2, 2))
@@ -66,7 +73,7 @@ def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Me
         place, found = observations.glints.of_light(light)
         deviation = noise.glint_px[camera, light]
         covariance = np.where(found, deviation, 1.0)[:, None, None] ** 2 * np.eye(2)
-        given = _covariance_of(observations, light)
+        given = _covariance_of(observations, light) + _OF_POINT
         own = found & np.isfinite(given).all(axis=(1, 2))
         covariance[own] = given[own]
         usable = found & np.isfinite(covariance).all(axis=(1, 2))
@@ -115,7 +122,7 @@ def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Fl
         at, basis, speed = _of_ellipse(pupil.centre_px[row], pupil.semi_axes_px[row], float(pupil.angle_rad[row]))
         points[row, :ELLIPSE_POINTS] = at
         if covered[row]:
-            part = _whitening(pupil.covariance[row]) @ np.linalg.pinv(basis, rcond=_LEAST_RATIO)
+            part = _whitening(pupil.covariance[row] + _OF_ELLIPSE) @ np.linalg.pinv(basis, rcond=_LEAST_RATIO)
         else:
             part = np.diag(np.sqrt(speed * 2.0 * np.pi / ELLIPSE_POINTS) / deviation[row])
         white[row, : len(part), :ELLIPSE_POINTS] = part

@@ -12,7 +12,7 @@ from scipy import stats
 import eyerender as er
 from eyerender.cli.main import run
 from eyerender.design.eyefile import changed_file
-from eyerender.design.features import measured, outline_distances, residuals
+from eyerender.design.features import MODEL_PX, measured, outline_distances, residuals
 from eyerender.design.fit import Options, equations_of, fit_eye, instants_of, problem_of, solve, weights_of
 from eyerender.design.information import case_of, inverse, joint_matrix, outline_normals
 from eyerender.design.noise import FeatureNoise
@@ -209,7 +209,7 @@ def test_distances_from_an_outline():
 
 
 def test_an_ellipse_with_a_covariance_weighs_as_it_says():
-    """Whitened distances of a slightly other ellipse are those of its parameters: de^T C^-1 de."""
+    """Whitened distances of a slightly other ellipse are those of its parameters, d^T C^-1 d with `MODEL_PX` in C."""
     frames = frames_of("head_mounted", most=1)
     seen = er.trace(frames)
     rng = np.random.default_rng(2)
@@ -225,7 +225,31 @@ def test_an_ellipse_with_a_covariance_weighs_as_it_says():
     second = measured(replace(bare, pupil=other), noise, len(frames.scene.rig.lights))
     distance, _ = outline_distances(first.outline_px, None, second.outline_px)
     whitened = np.einsum("nij,nj->ni", second.outline_white, distance)
-    assert np.sum(whitened**2) == pytest.approx(change @ np.linalg.inv(covariance[0]) @ change, rel=1e-3)
+    whole = covariance[0] + MODEL_PX**2 * np.diag([1, 1, 1, 1, 0])
+    assert np.sum(whitened**2) == pytest.approx(change @ np.linalg.inv(whole) @ change, rel=1e-3)
+
+
+@pytest.mark.parametrize("off", [0.08, 5.0])
+def test_outlines_that_are_off_by_more_than_their_noise_count_and_wrong_ones_do_not(off):
+    """As an extractor gives them: a noise of .008 px is stated, and every fourth outline is longer and narrower."""
+    frames = frames_of("head_mounted")
+    seen = er.trace(frames)
+    longer = np.arange(len(seen)) % 4 == 1
+    bent = replace(
+        seen,
+        pupil=replace(
+            seen.pupil,
+            semi_axes_px=seen.pupil.semi_axes_px + off * longer[:, None] * [1, -1],
+            covariance=np.tile(0.008**2 * np.eye(5), (len(seen), 1, 1)),
+            points_px=seen.pupil.points_px[:, :0],
+        ),
+        glints=replace(seen.glints, covariance=np.tile(0.008**2 * np.eye(2), (*seen.glints.light.shape, 1, 1))),
+    )
+    (fit,) = fit_eye(bent, frames.scene.rig, Unknowns(slippage_mm=3.0), targets=False)
+    truth = np.stack([seen.pose.azimuth_rad, seen.pose.elevation_rad], axis=1)
+    assert (fit.outline_weight[~longer] > 0.99).all()
+    assert ((fit.outline_weight[longer] > 0.9) == (off < 1.0)).all()
+    assert np.degrees(np.abs(fit.theta[fit.instant, :2] - truth)).max() < 0.1
 
 
 def test_the_eye_file_is_the_eye_that_was_fitted():
