@@ -24,6 +24,8 @@ MODEL_PX = 0.02
 """Deviation that is added to the covariances of an extractor (chosen): they hold the sensor's noise alone, often less
 than .01 px, but features are displaced by more than that. A good outline would count as wrong without it."""
 _OF_ELLIPSE, _OF_POINT = MODEL_PX**2 * np.diag([1.0, 1.0, 1.0, 1.0, 0.0]), MODEL_PX**2 * np.eye(2)
+_ANY_AXES_PX = np.array([20.0, 20.0])
+"""Semi-axes of the circle about a pupil that is given by its centre alone."""
 _NEWTON = 4
 _LEAST_RATIO = 1e-6
 
@@ -101,6 +103,13 @@ def _whitening(covariance: Floats) -> Floats:
     return np.asarray(root[..., None] * np.swapaxes(vectors, -1, -2))
 
 
+def sized(observations: Observations) -> Bools:
+    """Return which pupils (n,) have an outline: six points, or an ellipse; others have a centre at most."""
+    pupil = observations.pupil
+    ellipse = np.isfinite(pupil.semi_axes_px).all(axis=1) & np.isfinite(pupil.angle_rad)
+    return np.asarray(ellipse | (np.isfinite(pupil.points_px).all(axis=2).sum(axis=1) >= 6))
+
+
 def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Floats, Ints]:
     """Compute points of the outlines, the whitening of their distances, and the number of independent distances."""
     pupil = observations.pupil
@@ -118,10 +127,15 @@ def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Fl
         white[row, good, good] = np.sqrt(length) / deviation[row]
         size[row] = len(good)
     covered: Bools = np.asarray(np.isfinite(pupil.covariance).all(axis=(1, 2)))
+    whole = sized(observations)
     for row in np.flatnonzero(of_ellipse):
-        at, basis, speed = _of_ellipse(pupil.centre_px[row], pupil.semi_axes_px[row], float(pupil.angle_rad[row]))
+        axes, angle = (pupil.semi_axes_px[row], float(pupil.angle_rad[row])) if whole[row] else (_ANY_AXES_PX, 0.0)
+        at, basis, speed = _of_ellipse(pupil.centre_px[row], axes, angle)
         points[row, :ELLIPSE_POINTS] = at
-        if covered[row]:
+        if not whole[row]:
+            # Only the centre counts: it is in the odd harmonics of the distances, size and shape are in the even ones.
+            part = np.linalg.pinv(basis, rcond=_LEAST_RATIO)[:2] / deviation[row]
+        elif covered[row]:
             part = _whitening(pupil.covariance[row] + _OF_ELLIPSE) @ np.linalg.pinv(basis, rcond=_LEAST_RATIO)
         else:
             part = np.diag(np.sqrt(speed * 2.0 * np.pi / ELLIPSE_POINTS) / deviation[row])

@@ -63,11 +63,11 @@ def test_exact_features_give_the_gaze_back(rig, eye):
     wanted[:, :2], wanted[:, PUPIL] = truth, 2 * np.sqrt(np.prod(frames.scene.eye("right").stop.semi_axes_mm))
     wanted[:, 6:9] = -theta[6:9]
     wanted[:, 12:15] = [-0.4, 0.6, -0.5]
-    assert_seen_combinations(fit, wanted)
+    assert deviation_of_seen(fit, wanted) < 1e-6
 
 
-def assert_seen_combinations(fit, wanted):
-    """Combinations by singular vectors of the scaled information agree to 1e-6 of their size."""
+def deviation_of_seen(fit, wanted):
+    """The largest deviation of what is seen, combinations by singular vectors of the scaled information, over all."""
     gap = []
     for name in fit.known.names:
         kind, _, at = name.partition(" of instant ")
@@ -77,7 +77,7 @@ def assert_seen_combinations(fit, wanted):
     scale = np.sqrt(np.diag(fit.known.matrix))
     values, vectors = np.linalg.eigh(fit.known.matrix / scale / scale[:, None])
     seen = values > 1e-11
-    assert np.abs(vectors[:, seen].T @ (difference * scale)).max() < 1e-6 * np.linalg.norm(size * scale)
+    return np.abs(vectors[:, seen].T @ (difference * scale)).max() / np.linalg.norm(size * scale)
 
 
 def noisy(frames, noise, draws, seed, slippage_mm=0.0):
@@ -154,13 +154,12 @@ def test_chi_square_and_intervals_over_noisy_draws(rig):
     chi2 = float(np.sum(found.outline**2) + np.sum(found.glints**2))
     chi2 += float(np.sum((theta - problem.centre) ** 2 * problem.precision))
     dof = draws * (30 + 2 * len(scene.rig.lights) - 3)  # three unknowns of each frame have no prior
-    low, high = stats.chi2.ppf([0.005, 0.995], dof)
-    assert low < chi2 < high
+    assert abs(stats.norm.ppf(stats.chi2.cdf(chi2, dof))) < 2.576  # the band of 99 %, in standard deviations
     deviation = np.sqrt(
         np.array([np.diag(np.linalg.inv(m[np.ix_(free, free)] + np.diag(problem.precision[free]))) for m in matrix])
     )
     inside = np.abs(theta - truth)[:, free] < 1.96 * deviation
-    assert ((inside[:, :2].mean(axis=0) > 0.93) & (inside[:, :2].mean(axis=0) < 0.97)).all()
+    assert np.abs(inside[:, :2].mean(axis=0) - 0.95).max() < 0.02
 
 
 @pytest.mark.parametrize("what", ["glints", "outlines"])
@@ -191,7 +190,8 @@ def test_wrong_features_hardly_matter(what):
         wrong = rng.random(len(points)) < 0.1
         points = np.where(wrong[:, None, None], points + rng.uniform(8, 30, (len(points), 1, 2)), points)
     assert wrong.any()
-    assert error(glints, points) <= 1.5 * clean
+    ratio = error(glints, points) / clean
+    assert ratio <= 1.5
 
 
 def test_distances_from_an_outline():
@@ -250,6 +250,22 @@ def test_outlines_that_are_off_by_more_than_their_noise_count_and_wrong_ones_do_
     assert (fit.outline_weight[~longer] > 0.99).all()
     assert ((fit.outline_weight[longer] > 0.9) == (off < 1.0)).all()
     assert np.degrees(np.abs(fit.theta[fit.instant, :2] - truth)).max() < 0.1
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_centres_of_pupils_alone_give_the_gaze_too(rig):
+    """As tables of many trackers hold them; the size of the pupil stays that of the prior."""
+    frames = frames_of(rig)
+    seen = er.trace(frames)
+    count = len(seen)
+    none = {"points_px": seen.pupil.points_px[:, :0], "semi_axes_px": np.full((count, 2), np.nan)}
+    bare = replace(seen, pupil=replace(seen.pupil, **none, angle_rad=np.full(count, np.nan)))
+    (fit,) = fit_eye(bare, frames.scene.rig, Unknowns(slippage_mm=3.0), targets=False)
+    truth = np.stack([seen.pose.azimuth_rad, seen.pose.elevation_rad], axis=1)
+    # Perspective makes an outline that is not centred on its ellipse's centre, seen from near.
+    assert np.degrees(np.abs(fit.theta[fit.instant, :2] - truth)).max() < 0.03
+    assert fit.converged.all()
+    assert (fit.theta[:, PUPIL] == fit.theta[0, PUPIL]).all()
 
 
 def test_the_eye_file_is_the_eye_that_was_fitted():
