@@ -15,6 +15,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +63,7 @@ def observe(person: Person, targets_mm: list[list[float]], head_mm: np.ndarray) 
 
 def errors_of(name: str, calibration: Observations, tests: Observations, rig: er.Rig) -> np.ndarray:
     """Angles between the estimates and the targets, in degrees; NaN without an estimate."""
-    options = {"normalised": False} if name == "regression" else {}  # of one eye
+    options: dict[str, Any] = {"normalised": False} if name == "regression" else {}  # of one eye
     fitted = choose_estimator(name, **options).fit(calibration, rig)
     if isinstance(fitted, RayEstimator):
         return er.gaze.ray_errors_deg(tests, fitted.predict_rays(tests, rig))

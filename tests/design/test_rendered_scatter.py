@@ -55,7 +55,7 @@ def test_the_scatter_of_the_extractor_is_that_of_the_bound_over_its_efficiency()
     points = exact.pupil.points_px
     assert np.linalg.norm(points[0][:, None] - exact.glints.xy_px[0], axis=2).min() > 10
     normal, length = outline_normals(points, np.ones(points.shape[:2], dtype=bool))
-    mean = electrons(sensor, image.irradiance, nm)
+    mean = electrons(sensor, image.irradiance.astype(np.float64), nm)
     edge = edge_information(mean, points[0] - image.window[:2], normal[0], read_noise_e(sensor))
     # The noise of a scene follows from the iris' mean albedo and a chosen level of the pupil. This iris is darker
     # beside its pupil, so that the step is two thirds as high.
