@@ -26,7 +26,7 @@ from ..design.crowd import (
     finite_or_none,
     users_of,
 )
-from ..design.noise import FeatureNoise, sensor_noise
+from ..design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
 from ..design.people import CALIBRATION_CELLS, GRID, LOST, Figures, Survey, place_of
 from ..design.safety import NOTE, eye_exposure
 from ..design.unknowns import Unknowns
@@ -35,6 +35,7 @@ from ..folders.outfolder import staged
 from ..gaze.estimate import ray_errors_deg
 from ..gaze.store import choose_estimator
 from ..imaging.imageobserver import ImageObserver
+from ..population.people import Person
 from ..progress import Progress
 from ..report.page import Card, Figure, Page, Section, Table, write_page
 from ..report.style import figure, svg
@@ -48,6 +49,7 @@ SCHEMA = "eyerender/rig/1"
 REPORT, PEOPLE, GAZE, SUMMARY = "report.html", "people.csv", "gaze.csv", "summary.json"
 ESTIMATORS = ("direction-regression", "hennessey", "guestrin-eizenman", "maximum-likelihood")
 NOISE_ONLY = "noise only"
+TRAITS = ("age", "lids open (mm)", "fissure wide (mm)", "pupils apart (mm)")
 _TARGET_MM = 1000.0
 _SLIPPING = 4
 
@@ -315,22 +317,46 @@ def page_of(scene: Scene, survey: Survey, found: Figures, data: dict[str, Any]) 
     """Compose the report's page."""
     share = data["coverage"]["outline_and_2_glints"]
     cards = [
-        Card(_degrees(data["frame_to_frame_deg"]["U50E95"]), "noise of gaze, median person (U50E95, noise only)"),
-        Card(_degrees(data["bound_deg"]["U95E95"]), "after a calibration, worst 5 % of people (U95E95, noise only)"),
         Card(f"{100 * share:.1f} %", "of people and directions with two glints and 60 % of the outline"),
+        Card(_degrees(data["frame_to_frame_deg"]["U50E95"]), "noise of gaze, median person (U50E95, noise only)"),
+        Card(_degrees(data["bound_deg"]["U95E95"]),
+             "after a calibration, 95th-percentile person (U95E95, noise only)"),
         Card(_cornea_share(data["safety"]), f"of the corneal limit ({NOTE})"),
     ]  # fmt: skip
     sections = (
-        _gaze_section(survey, found), _who_section(found, data), _slippage_section(data), _bias_section(data),
+        _gaze_section(survey, found), _who_section(survey, found, data), _slippage_section(data), _bias_section(data),
         _safety_section(data),
     )  # fmt: skip
     lead = [
+        _answer(data),
         f"{data['people']} people look in {GRID * GRID} directions in front of the rig of '{scene.name}'. "
         "Everything but errors on images follows from ray optics.",
         "The bound is the smallest error that any unbiased estimator can have with these features. It counts noise "
-        "alone. What an estimator assumes wrongly about the eye comes on top.",
+        "alone. What an estimator assumes wrongly about the eye comes on top. U50E95 and U95E95 are the median and the "
+        "95th-percentile person's 95th-percentile error over the directions.",
     ]
     return Page(f"Rig report: {scene.name}", lead, cards, sections)
+
+
+def _answer(data: dict[str, Any]) -> str:
+    """Say in a few sentences how good the rig is."""
+    share, bound, noise = data["coverage"]["outline_and_2_glints"], data["bound_deg"], data["frame_to_frame_deg"]
+    fixation = np.sqrt(2.0 / len(CALIBRATION_CELLS)) * FIXATION_DEG
+    parts = [f"In short: the rig sees two glints and 60 % of the pupil's outline in {100 * share:.1f} % of all cases."]
+    if noise["U50E95"] is None:
+        parts.append("For the median person, the features do not determine gaze in every direction.")
+    else:
+        parts.append(f"The sensor's noise moves the gaze of the median person by {_degrees(noise['U50E95'])}.")
+    if bound["U50E95"] is not None:
+        parts.append(
+            f"After a calibration on nine targets the bound is {_degrees(bound['U50E95'])}, of which the noise of "
+            f"fixation alone is {_degrees(float(fixation))}."
+        )
+    known = {name: one["U50E95"] for name, one in data["estimators"].items() if one["U50E95"] is not None}
+    if known:
+        best = min(known, key=lambda name: known[name])
+        parts.append(f"The best estimator, {best}, has model errors of {_degrees(known[best])}.")
+    return " ".join(parts)
 
 
 def _degrees(value: float | None) -> str:
@@ -366,13 +392,15 @@ def _gaze_section(survey: Survey, found: Figures) -> Section:
     return Section("Where does the rig see well?", [], drawn)
 
 
-def _who_section(found: Figures, data: dict[str, Any]) -> Section:
+def _who_section(survey: Survey, found: Figures, data: dict[str, Any]) -> Section:
     covered = ((found.outline >= OUTLINE) & (found.glints >= 2)).mean(axis=1)
-    worst = np.argsort(covered, kind="stable")[:10]
     noise = np.quantile(found.noise_deg, 0.95, axis=1, method="higher")
+    worst = np.lexsort((-noise, covered))[:10]
+    population = Population.from_mapping(survey.population)
     rows = [
         [str(found.subject[k]), f"{100 * covered[k]:.0f} %", f"{found.glints[k].mean():.1f}",
-         f"{100 * found.outline[k].mean():.0f} %", _degrees(finite_or_none(noise[k]))]
+         f"{100 * found.outline[k].mean():.0f} %", _degrees(finite_or_none(noise[k])),
+         *_traits_of(population.person(int(found.subject[k]), survey.seed))]
         for k in worst
     ]  # fmt: skip
     shares = data["coverage"]
@@ -385,20 +413,30 @@ def _who_section(found: Figures, data: dict[str, Any]) -> Section:
     tables = [
         Table(header=["visible", "people x directions"], rows=coverage, caption="Coverage."),
         Table(header=["reason", "glints"], rows=missing, caption="Why glints are missing. Lashes are not considered."),
-        Table(header=["person", "covered directions", "glints", "outline", "noise, 95th percentile"], rows=rows,
-              caption="The ten people for whom the rig covers least."),
+        Table(header=["person", "covered", "glints", "outline", "noise, 95th percentile", *TRAITS], rows=rows,
+              caption="The ten people for whom the rig covers least; those with the same coverage by their noise."),
     ]  # fmt: skip
     return Section("For whom does it fail?", [], [], tables)
+
+
+def _traits_of(person: Person) -> list[str]:
+    """Return a person's `TRAITS` as text."""
+    fissure = person.region().fissure
+    opening = f"{fissure.upper_mm + fissure.lower_mm:.1f}"
+    return [f"{person.number('age_years'):.0f}", opening, f"{fissure.width_mm:.1f}", f"{person.ipd_mm:.1f}"]
 
 
 def _slippage_section(data: dict[str, Any]) -> Section:
     rows = data["slippage"]
     plane, away = rows[: len(SHIFTS_MM) ** 2], rows[len(SHIFTS_MM) ** 2 :]
     drawn = []
-    for key, title in (("noise_deg", "noise of gaze (median, deg)"), ("covered_2_glints", "covered with two glints")):
+    for key, title, (low, high) in (
+        ("noise_deg", "noise of gaze (median, deg)", (None, None)),
+        ("covered_2_glints", "share of directions with two glints and 60 % of the outline", (0, 1)),
+    ):
         values = np.array([np.nan if row[key] is None else row[key] for row in plane]).reshape(2 * (len(SHIFTS_MM),))
         with figure(3.3, 2.7) as (fig, ax):
-            image = ax.imshow(values, extent=(-3.75, 3.75, -3.75, 3.75), aspect="auto")
+            image = ax.imshow(values, extent=(-3.75, 3.75, -3.75, 3.75), aspect="auto", vmin=low, vmax=high)
             fig.colorbar(image)
             ax.grid(False)
             ax.set_xlabel("eye to the left (mm)")
@@ -423,13 +461,14 @@ def _bias_section(data: dict[str, Any]) -> Section:
         ]  # fmt: skip
         count = max((v["people"] for v in data[key].values()), default=0)
         if count:
-            caption = f"Errors on {what}, {count} people."
-            head = ["estimator", "U50E95", "U95E95", "reason"]
-            tables.append(Table(header=head, rows=rows, caption=caption, wide=(3,)))
+            columns = 4 if any(row[3] for row in rows) else 3
+            caption = f"Errors on {what}, {count} {'person' if count == 1 else 'people'}."
+            head = ["estimator", "U50E95", "U95E95", "note"][:columns]
+            tables.append(Table(header=head, rows=[row[:columns] for row in rows], caption=caption, wide=(3,)))
     text = (
-        "Each estimator is calibrated on nine targets. Errors on exact features have no noise in them: this is what "
-        "each estimator assumes wrongly about the eye. Errors on rendered images add noise, lids, lashes and the "
-        "extractor."
+        "Estimators that need no screen, each calibrated on nine targets. Errors on exact features have no noise: this "
+        "is what each estimator assumes wrongly about the eye. Errors on rendered images add noise, lids, lashes and "
+        "the extractor. With few people, U50E95 and U95E95 are almost the same."
     )
     return Section("What do estimators add?", [text], [], tables)
 

@@ -12,6 +12,7 @@ from ..report.page import Card, Figure, Page, Section, Table, write_page
 from ..report.style import ANALYTIC, IMAGE, figure, svg
 
 _MOST_ROWS = 60
+_LITTLE = 0.05
 
 
 def write_report(path: Path, data: Mapping[str, Any]) -> None:
@@ -29,6 +30,7 @@ def write_report(path: Path, data: Mapping[str, Any]) -> None:
              "of the corneal limit at least, on the front (not a conformity test)"),
     ]  # fmt: skip
     lead = [
+        _answer(front),
         f"{len(rows)} layouts of the rig of '{data['scene']}', each before the same {data['people']} people in 81 "
         "directions of gaze. Everything follows from ray optics; nothing is rendered.",
         "A layout is on the Pareto front if no other one is at least as good in noise, dropout, number of LEDs and "
@@ -43,9 +45,38 @@ def write_report(path: Path, data: Mapping[str, Any]) -> None:
     ]  # fmt: skip
     sections = (
         Section("Which layouts are worth a look?", [], plots, [_table(front)]),
-        Section("How were LEDs chosen?", [_CHOICE]),
+        Section("How were LEDs chosen?", [_CHOICE], [], [_places(front)]),
     )
     write_page(path, Page(f"Sweep of rigs: {data['scene']}", lead, cards, sections))
+
+
+def _answer(front: Sequence[Mapping[str, Any]]) -> str:
+    """Name the layouts with the least noise and with the fewest LEDs among those with little dropout."""
+    good = [row for row in front if row["dropout"] < _LITTLE and row["noise_deg"] is not None]
+    if not good:
+        return "In short: no layout sees two glints and 60 % of the pupil's outline in 95 % of all cases."
+    best = min(good, key=lambda row: row["noise_deg"])
+    few = min(good, key=lambda row: (row["leds"], row["noise_deg"]))
+    text = (
+        f"In short: among the layouts that see two glints and 60 % of the pupil's outline in 95 % of all cases, layout "
+        f"{best['number']} has the least noise, {_degrees(best['noise_deg'])} with {_leds(best)}."
+    )
+    if few["leds"] == best["leds"]:
+        return f"{text} No such layout needs fewer LEDs."
+    return (
+        f"{text} Layout {few['number']} needs the fewest LEDs and has {_degrees(few['noise_deg'])} with {_leds(few)}."
+    )
+
+
+def _leds(row: Mapping[str, Any]) -> str:
+    return f"{row['leds']} LED{'' if row['leds'] == 1 else 's'}"
+
+
+def _places(front: Sequence[Mapping[str, Any]]) -> Table:
+    """Return the table of the places of LEDs that layouts on the front use."""
+    places = {k: mm for row in front for k, mm in zip(row["chosen"], row["lights_mm"], strict=True)}
+    rows = [[str(k), ", ".join(f"{v:.4g}" for v in places[k])] for k in sorted(places)]
+    return Table(header=["place", "position (mm)"], rows=rows, caption="Places of LEDs on the Pareto front.")
 
 
 _CHOICE = (
@@ -92,7 +123,8 @@ def _values(values: Mapping[str, Any]) -> str:
     def text(value: Any) -> str:
         return "(" + ", ".join(f"{v:.4g}" for v in value) + ")" if isinstance(value, list) else f"{value:.4g}"
 
-    return "; ".join(f"{name} {text(value)}" for name, value in values.items()) or "the scene's own"
+    shown = {name: value for name, value in values.items() if name != "number"}  # it has a column of its own
+    return "; ".join(f"{name} {text(value)}" for name, value in shown.items()) or "the scene's own"
 
 
 def _degrees(value: float | None) -> str:

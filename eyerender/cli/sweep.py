@@ -68,5 +68,6 @@ def _text(found: dict[str, Any], report: Path) -> str:
     lines = [f"{found['layouts']} layouts, {len(best)} of them on the Pareto front"]
     for row in sorted(best, key=lambda row: row["noise_deg"] or float("inf"))[:8]:
         noise = "not seen" if row["noise_deg"] is None else f"{row['noise_deg']:.4f} deg"
-        lines.append(f"layout {row['number']}: noise {noise}, dropout {100 * row['dropout']:.1f} %, {row['leds']} LEDs")
+        leds = f"{row['leds']} LED{'' if row['leds'] == 1 else 's'}"
+        lines.append(f"layout {row['number']}: noise {noise}, dropout {100 * row['dropout']:.1f} %, {leds}")
     return "\n".join([*lines, "", f"report: {report}"])

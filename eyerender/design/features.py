@@ -20,6 +20,12 @@ from .unknowns import COUNT
 from .varied import Images, Slopes
 
 ELLIPSE_POINTS, MOST_POINTS = 24, 40
+MODEL_PX = 0.02
+"""Deviation that is added to the covariances of an extractor (chosen): they hold the sensor's noise alone, often less
+than .01 px, but features are displaced by more than that. A good outline would count as wrong without it."""
+_OF_ELLIPSE, _OF_POINT = MODEL_PX**2 * np.diag([1.0, 1.0, 1.0, 1.0, 0.0]), MODEL_PX**2 * np.eye(2)
+_ANY_AXES_PX = np.array([20.0, 20.0])
+"""Semi-axes of the circle about a pupil that is given by its centre alone."""
 _NEWTON = 4
 _LEAST_RATIO = 1e-6
 
@@ -58,7 +64,10 @@ class Measured(ArrayValue):
 
 
 def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Measured:
-    """Convert observations to whitened features, with their covariances or, where these are missing, `noise`."""
+    """Convert observations to whitened features.
+
+    Covariances are those of the observations plus that of `MODEL_PX`, or, where these are missing, those of `noise`.
+    """
     camera = np.maximum(observations.index.camera, 0)
     points, white, size = _outlines(observations, noise.outline_px[camera])
     glints, weights = np.zeros((len(camera), lights, 2)), np.zeros((len(camera), lights, 2, 2))
@@ -66,7 +75,7 @@ def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Me
         place, found = observations.glints.of_light(light)
         deviation = noise.glint_px[camera, light]
         covariance = np.where(found, deviation, 1.0)[:, None, None] ** 2 * np.eye(2)
-        given = _covariance_of(observations, light)
+        given = _covariance_of(observations, light) + _OF_POINT
         own = found & np.isfinite(given).all(axis=(1, 2))
         covariance[own] = given[own]
         usable = found & np.isfinite(covariance).all(axis=(1, 2))
@@ -94,6 +103,13 @@ def _whitening(covariance: Floats) -> Floats:
     return np.asarray(root[..., None] * np.swapaxes(vectors, -1, -2))
 
 
+def sized(observations: Observations) -> Bools:
+    """Return which pupils (n,) have an outline: six points, or an ellipse; others have a centre at most."""
+    pupil = observations.pupil
+    ellipse = np.isfinite(pupil.semi_axes_px).all(axis=1) & np.isfinite(pupil.angle_rad)
+    return np.asarray(ellipse | (np.isfinite(pupil.points_px).all(axis=2).sum(axis=1) >= 6))
+
+
 def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Floats, Ints]:
     """Compute points of the outlines, the whitening of their distances, and the number of independent distances."""
     pupil = observations.pupil
@@ -111,11 +127,16 @@ def _outlines(observations: Observations, deviation: Floats) -> tuple[Floats, Fl
         white[row, good, good] = np.sqrt(length) / deviation[row]
         size[row] = len(good)
     covered: Bools = np.asarray(np.isfinite(pupil.covariance).all(axis=(1, 2)))
+    whole = sized(observations)
     for row in np.flatnonzero(of_ellipse):
-        at, basis, speed = _of_ellipse(pupil.centre_px[row], pupil.semi_axes_px[row], float(pupil.angle_rad[row]))
+        axes, angle = (pupil.semi_axes_px[row], float(pupil.angle_rad[row])) if whole[row] else (_ANY_AXES_PX, 0.0)
+        at, basis, speed = _of_ellipse(pupil.centre_px[row], axes, angle)
         points[row, :ELLIPSE_POINTS] = at
-        if covered[row]:
-            part = _whitening(pupil.covariance[row]) @ np.linalg.pinv(basis, rcond=_LEAST_RATIO)
+        if not whole[row]:
+            # Only the centre counts: it is in the odd harmonics of the distances, size and shape are in the even ones.
+            part = np.linalg.pinv(basis, rcond=_LEAST_RATIO)[:2] / deviation[row]
+        elif covered[row]:
+            part = _whitening(pupil.covariance[row] + _OF_ELLIPSE) @ np.linalg.pinv(basis, rcond=_LEAST_RATIO)
         else:
             part = np.diag(np.sqrt(speed * 2.0 * np.pi / ELLIPSE_POINTS) / deviation[row])
         white[row, : len(part), :ELLIPSE_POINTS] = part

@@ -24,7 +24,7 @@ from ..eye.spec import EyeSpec
 from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry, RigLike
 from .eyefile import changed_file
-from .features import Measured, Residuals, measured, residuals
+from .features import Measured, Residuals, measured, residuals, sized
 from .information import EyeInformation, eye_information
 from .noise import FeatureNoise
 from .unknowns import (
@@ -249,6 +249,8 @@ def fit_one(
 ) -> EyeFit:
     """Fit one eye."""
     mine = observations.take(rows)
+    if not sized(mine).any():
+        unknowns = unknowns.model_copy(update={"pupil_mm": "known"})  # centres alone do not show it
     problem = problem_of(mine, rig, spec, unknowns, noise, options)
     theta = start_of(problem) if options.start is None else np.array(options.start)
     theta, converged = solve(problem, theta)

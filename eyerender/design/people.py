@@ -25,7 +25,7 @@ from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
 from ..population.people import Person
 from ..region.anatomy import Region
-from ..region.contour import contour
+from ..region.contour import inner_margins
 from ..region.globe import Globe
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigGeometry
@@ -268,33 +268,23 @@ def _openings(survey: Survey, people: list[Someone]) -> Floats:
     """
     grid = survey.directions_deg.reshape(GRID, GRID, 2)
     poses = Poses.from_degrees(*grid[:, list(CALIBRATION)].reshape(-1, 2).T)
+    columns = np.arange(GRID)
+    shares = np.maximum(1.0 - np.abs(columns[:, None] - np.array(CALIBRATION)) / CALIBRATION[1], 0.0)
     out = []
     for one in people:
-        turn, shift = rigid_motion(poses, one.eye)
-        mirror = np.array([1.0, -1.0 if one.eye.side == "left" else 1.0, 1.0])
-        edges = [
-            contour(one.region, _globe(one.eye, turn[k], shift[k]), _MARGIN_COLUMNS).point for k in range(len(poses))
-        ]
-        known = np.array(edges).reshape(GRID, len(CALIBRATION), _MARGIN_COLUMNS, 3) * mirror + one.place_mm
-        for row in known:
-            for column in range(GRID):
-                left = min(column // 4, 1)
-                share = (column - 4 * left) / 4.0
-                out.append((1.0 - share) * row[left] + share * row[left + 1])
-    return np.array(out)
-
-
-def _globe(eye: EyeModel, turn: Floats, shift: Floats) -> Globe:
-    """Compute the globe of an eye in a pose."""
-    return Globe(
-        cornea=eye.front[0],
-        limbus_radius_mm=float(eye.limbus_radius_mm),
-        centre_mm=eye.sclera.centre_mm,
-        radius_mm=float(eye.sclera.radius_mm),
-        M=turn,
-        t=shift,
-        mirrored=eye.side == "left",
-    )
+        globe = Globe(
+            cornea=one.eye.front[0],
+            limbus_radius_mm=float(one.eye.limbus_radius_mm),
+            centre_mm=one.eye.sclera.centre_mm,
+            radius_mm=float(one.eye.sclera.radius_mm),
+            M=np.eye(3),
+            t=np.zeros(3),
+            mirrored=one.eye.side == "left",
+        )
+        margins = inner_margins(one.region, globe, rigid_motion(poses, one.eye), _MARGIN_COLUMNS) + one.place_mm
+        known = margins.reshape(GRID, len(CALIBRATION), -1)
+        out.append((shares @ known).reshape(GRID * GRID, _MARGIN_COLUMNS, 3))
+    return np.concatenate(out)
 
 
 def visible(slopes: Slopes, camera: PinholeCamera, openings: Floats | None) -> tuple[Slopes, Ints]:

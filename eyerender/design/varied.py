@@ -16,7 +16,7 @@ from ..analytic.features import View
 from ..analytic.rays import glint_exits, pupil_exits
 from ..arrays import Bools, Floats, Ints, Statuses
 from ..errors import InputError
-from ..eye.batch import CHUNK_POINTS, slices, stack_eyes, structure_of, take_eyes
+from ..eye.batch import slices, stack_eyes, structure_of, take_eyes
 from ..eye.model import EyeModel, RotationCentres, Stop
 from ..eye.pose import Poses, rigid_motion
 from ..geometry.surfaces import Surface
@@ -47,6 +47,8 @@ TRACED = np.array([AZIMUTH, ELEVATION, PUPIL, 3, 4, 5, RADIUS, ASPHERICITY, DEPT
 STEPS = np.where(TRACED < PUPIL, 1e-4, 1e-3)
 """Steps of the central differences by the traced unknowns: angles in rad, lengths in mm, Q, ellipticity."""
 _RAY_STEP = 1e-5
+_TOGETHER = 240_000
+"""Points refracted at once: the search for the few rays that the compiled solver misses has a high cost per call."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -239,7 +241,7 @@ def images_of(views: Views, theta: Floats, boundary_points: int) -> Images:
     outline_ok, glint_ok = np.zeros((n, k), dtype=bool), np.zeros((n, m), dtype=bool)
     for number in np.unique(views.camera):
         rows = np.flatnonzero(views.camera == number)
-        for part in slices(len(rows), max(1, CHUNK_POINTS // (k + 1))):
+        for part in slices(len(rows), max(1, _TOGETHER // (k + 1))):
             block = rows[part]
             seen = _images_of_camera(views.take(block), theta[block], int(number), k)
             outline[block], outline_ok[block], glints[block], glint_ok[block] = seen
@@ -327,7 +329,11 @@ def turned(theta: Floats) -> Floats:
 
 def lines_of_sight(views: Views, theta: Floats) -> tuple[Floats, Floats]:
     """Compute lines of sight in the world: points (n, 3) mm where they leave the cornea, and unit directions (n, 3)."""
-    eye = take_eyes(views.eyes, views.person)
+    return _lines_of(take_eyes(views.eyes, views.person), views, theta)
+
+
+def _lines_of(eye: EyeModel, views: Views, theta: Floats) -> tuple[Floats, Floats]:
+    """Compute `lines_of_sight` with the eye of each view, which is slow to select."""
     handed = eye.stop.handed
     way = eye.chief_ray.direction
     nasal = np.arctan2(handed * way[:, 1], way[:, 0]) + theta[:, KAPPA][:, 0]
@@ -347,22 +353,28 @@ def tangents(direction: Floats) -> Floats:
 
 def gaze_slopes(views: Views, theta: Floats) -> Floats:
     """Compute derivatives (n, 2, 23) of the line of sight's direction, left and up (rad), by the unknowns."""
-    across = tangents(lines_of_sight(views, theta)[1])
+    eye = take_eyes(views.eyes, views.person)
+    across = tangents(_lines_of(eye, views, theta)[1])
     columns = [AZIMUTH, ELEVATION, KAPPA.start, KAPPA.start + 1]
-    return _differences(theta, columns, lambda t: np.einsum("nci,ni->nc", across, lines_of_sight(views, t)[1]))
+    return _differences(theta, columns, lambda t: np.einsum("nci,ni->nc", across, _lines_of(eye, views, t)[1]))
 
 
 def target_misses(views: Views, theta: Floats, target_mm: Floats) -> Floats:
     """Compute angles (n, 2) in rad, left and up, from the direction of targets (n, 3) to the line of sight."""
-    point, way = lines_of_sight(views, theta)
-    wanted = normalize(target_mm - point)
-    return np.asarray(np.einsum("nci,ni->nc", tangents(wanted), way))
+    return _misses(lines_of_sight(views, theta), target_mm)
+
+
+def _misses(lines: tuple[Floats, Floats], target_mm: Floats) -> Floats:
+    """Compute the angles (n, 2) of `target_misses` from lines of sight."""
+    point, way = lines
+    return np.asarray(np.einsum("nci,ni->nc", tangents(normalize(target_mm - point)), way))
 
 
 def target_slopes(views: Views, theta: Floats, target_mm: Floats) -> Floats:
     """Compute derivatives (n, 2, 23) of `target_misses` by the unknowns."""
     columns = [c for c in range(TORICITY.start) if c not in (PUPIL, RADIUS, ASPHERICITY, DEPTH)]
-    return _differences(theta, columns, lambda t: target_misses(views, t, target_mm))
+    eye = take_eyes(views.eyes, views.person)
+    return _differences(theta, columns, lambda t: _misses(_lines_of(eye, views, t), target_mm))
 
 
 def _differences(theta: Floats, columns: Sequence[int], function: object) -> Floats:

@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import root
 
 from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.transforms import normalize
-from ..optics.trace import inward_path, trace
+from ..optics.trace import outward_path, trace
 from ..status import Status
 from .landmarks import field_direction, fovea_by_nodal_ray, incident_node, path_to_retina
 from .model import EyeModel
@@ -26,7 +25,8 @@ from .spec import EyeSpec
 _START_MM = 20.0
 _STEP_RAD = 1e-4
 _STEPS = 8
-_SETTLED_MM = 1e-9
+_SETTLED_MM, _SETTLED_RAD = 1e-9, 1e-13
+_ASIDE = np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
@@ -116,36 +116,32 @@ def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: flo
 
 
 def _through_stop(eye: EyeModel, way: Callable[[Floats], Floats], reason: str) -> tuple[Floats, Floats]:
-    """Trace the ray that passes, refracted, through the centre of the stop: its corneal point and outward direction.
+    """Find the ray from the centre of the stop that leaves the cornea in a wanted direction, by Newton's method.
 
     Args:
         eye: the eye.
-        way: returns the outward unit direction (3,) of the ray at a corneal point (3,).
+        way: returns the wanted unit directions (3,) or (k, 3) of rays that leave the cornea at points (k, 3).
         reason: message of the error.
+
+    Returns:
+        The point (3,) where the ray leaves the cornea, and its direction (3,) there.
 
     Raises:
         InputError: there is no such ray.
     """
-    front, stop = eye.front[0], eye.stop
-    path = inward_path(eye.front, eye.front_indices)
-
-    def ray(place: Floats) -> tuple[Floats, Floats]:
-        point = front.to_eye(np.array([float(front.sag(*place)), *place]))
-        return point, way(point)
-
-    def miss(place: Floats) -> Floats:
-        point, direction = ray(place)
-        traced = trace(path, 1.0, point + _START_MM * direction, -direction)
-        if traced.status != Status.OK:
-            return np.full(2, 1e3)
-        end, inside = traced.points_mm[-1], traced.directions[-1]
-        gap = end + inside * (((stop.centre_mm - end) @ stop.normal) / (inside @ stop.normal)) - stop.centre_mm
-        return np.asarray(stop.rotation[:, 1:].T @ gap)
-
-    found = root(miss, np.array(stop.centre_mm[1:]), tol=1e-14)
-    if not np.linalg.norm(miss(found.x)) < _SETTLED_MM:
-        raise InputError(reason, path="stop.position_mm")
-    return ray(found.x)
+    path = outward_path(eye.front, eye.front_indices)
+    start = np.broadcast_to(eye.stop.centre_mm, (3, 3))
+    inside = np.array([1.0, 0.0, 0.0])
+    for _ in range(_STEPS):
+        traced = trace(path, float(eye.front_indices[-1]), start, normalize(inside + _STEP_RAD * _ASIDE))
+        if not (traced.status == Status.OK).all():
+            break
+        error = (traced.directions[-1] - way(traced.points_mm[-1]))[:, 1:]
+        if np.abs(error[0]).max() < _SETTLED_RAD:
+            return traced.points_mm[-1, 0], traced.directions[-1, 0]
+        slope = (error[1:] - error[0]).T / _STEP_RAD
+        inside = normalize(inside - [0.0, *np.linalg.solve(slope, error[0])])
+    raise InputError(reason, path="stop.position_mm")
 
 
 def angles_of(eye: EyeModel, way: Floats) -> Floats:

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 PERSON_NUMBERS = 17
 OUTLINE_PX, GLINT_PX = 0.2, 0.1
 """Deviations of features without a covariance (chosen): a sensor's noise, and what eyes still differ from the model."""
-MODEL_PX = 0.02
-"""Deviation that is added to the covariances of an extractor (chosen): they hold the sensor's noise alone, often less
-than .01 px, but features are displaced by more than that. A good outline would count as wrong without it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +94,7 @@ class MaximumLikelihood:
         from ..eye.catalogue import load_eye
 
         assert isinstance(unknowns, Unknowns)
-        built, observations = rig.build(), _widened(observations)
+        built = rig.build()
         noise = FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=built)
         out = {}
         for eye in np.unique(observations.index.eye):
@@ -108,13 +105,3 @@ class MaximumLikelihood:
             except InputError as error:
                 raise error.placed(under=f"{EYES[max(int(eye), 0)]} eye") from None
         return out
-
-
-def _widened(observations: Observations) -> Observations:
-    """Add the variance of `MODEL_PX` to the covariances of pupils (centre and semi-axes) and glints."""
-    pupil, glints = observations.pupil, observations.glints
-    of_pupil = pupil.covariance + MODEL_PX**2 * np.diag([1.0, 1.0, 1.0, 1.0, 0.0])
-    of_glints = glints.covariance + MODEL_PX**2 * np.eye(2)
-    return replace(
-        observations, pupil=replace(pupil, covariance=of_pupil), glints=replace(glints, covariance=of_glints)
-    )

@@ -86,16 +86,47 @@ def canthi(spec: Region) -> tuple[Floats, Floats]:
 def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
     """Compute the contour of the fissure for a posed globe."""
     angle, a, upper, on_globe, flat = _columns(columns)
-    yz, openness = _outline(spec, globe, a, upper)
+    yz, openness = _outline(spec, globe.radius_mm, np.asarray(globe.elevation_rad), a, upper)
     centre = globe.rest + on_globe * (globe.centre - globe.rest)
-    point, normal = _support(globe, centre, yz)
+    point, normal = _support(globe.radius_mm, centre, yz)
     point = globe.pushed_out(point, spec.lids.film_mm)
     away = unit(flat - normal * dots(flat, normal)[..., None])
     along_lid = unit(crosses(away, normal) * upper[:, None])
     along_lid = along_lid * np.where(along_lid[:, 1:2] < 0, -1.0, 1.0)
     return Contour(
-        angle=angle, along=a, upper=upper, point=point, normal=normal, away=away, along_lid=along_lid, openness=openness
+        angle=angle,
+        along=a,
+        upper=upper,
+        point=point,
+        normal=normal,
+        away=away,
+        along_lid=along_lid,
+        openness=float(openness),
     )
+
+
+def inner_margins(spec: Region, globe: Globe, motions: tuple[Floats, Floats], columns: int = COLUMNS) -> Floats:
+    """Compute the points of `contour` for many poses of a globe at once, in the frame of the unrotated eye.
+
+    Args:
+        spec: the region.
+        globe: the globe at rest.
+        motions: rotations M (k, 3, 3) and translations t (k, 3) of the motions p = M x + t.
+        columns: number of points.
+
+    Returns:
+        Points (k, columns, 3) mm, mirrored back for a left eye.
+    """
+    turn, shift = motions
+    mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    _, a, upper, on_globe, _ = _columns(columns)
+    yz, _ = _outline(spec, globe.radius_mm, np.arcsin(np.clip(turn[:, 2, 0], -1, 1)), a, upper)
+    moved = mirror * (turn @ globe.centre_mm + shift)
+    point, _ = _support(globe.radius_mm, globe.rest + on_globe * (moved - globe.rest)[:, None], yz)
+    # The globe at rest pushes them out in its own frame.
+    resting = mirror * ((mirror * point - shift[:, None]) @ turn)
+    pushed = mirror * globe.pushed_out(resting, spec.lids.film_mm)
+    return np.asarray(pushed @ np.swapaxes(turn, 1, 2) + shift[:, None])
 
 
 @lru_cache(maxsize=4)
@@ -110,36 +141,34 @@ def _columns(count: int) -> tuple[Floats, ...]:
     return tuple(sealed(v) for v in (angle, a, upper, on_globe, flat))
 
 
-def _outline(spec: Region, globe: Globe, a: Floats, upper: Floats) -> tuple[Floats, float]:
-    """Compute the inner edge (y, z) in frontal view (n, 2), and the openness."""
+def _outline(spec: Region, radius_mm: float, elevation_rad: Floats, a: Floats, upper: Floats) -> tuple[Floats, Floats]:
+    """Compute the inner edge (y, z) in frontal view (..., n, 2), and the openness (...), for elevations (...)."""
     f, lids = spec.fissure, spec.lids
     middle, half = canthi(spec)
     chord = middle + a[:, None] * half
     middle_z = middle[1] + f.peak * half[1]
-    reach = globe.radius_mm + 0.5
+    reach = radius_mm + 0.5
+
     # The middles of the margins are angles about the globe's centre. Lids touch only in a blink.
-    turn = globe.elevation_rad
-
-    def height(rest_mm: float, follows: float) -> float:
+    def height(rest_mm: float, follows: float) -> Floats:
         at_rest = np.arcsin(np.clip(rest_mm / reach, -0.95, 0.95))
-        return float(reach * np.sin(np.clip(at_rest + follows * turn, -0.8, 0.8)))
+        return np.asarray(reach * np.sin(np.clip(at_rest + follows * elevation_rad, -0.8, 0.8)))
 
-    low = -height(f.lower_mm, -lids.lower_follows) - middle_z
-    low = min(low, -0.6)
-    high = max(height(f.upper_mm, lids.upper_follows) - middle_z, low + 1.0)
+    low = np.minimum(-height(f.lower_mm, -lids.lower_follows) - middle_z, -0.6)
+    high = np.maximum(height(f.upper_mm, lids.upper_follows) - middle_z, low + 1.0)
     rest = f.upper_mm - middle_z
     # Closed lids meet near the place of the lower lid. A lower lid that is very low moves up to meet the other.
-    shut = 0.92 * low + 0.08 * min(high, 0.0)
-    shut = max(shut, -3.2 + 0.5 * (shut + 3.2))
+    shut = 0.92 * low + 0.08 * np.minimum(high, 0.0)
+    shut = np.maximum(shut, -3.2 + 0.5 * (shut + 3.2))
     shape_up, shape_low, bay = _shapes(len(a), f.peak)
-    closed = shut * shape_low
+    closed = shut[..., None] * shape_low
     b = spec.blink
-    up = (1 - b) * high * shape_up * bay + b * (closed + _GAP_MM * shape_up)
-    down = (1 - b) * low * shape_low * bay + b * (closed - _GAP_MM * shape_low)
+    up = (1 - b) * high[..., None] * shape_up * bay + b * (closed + _GAP_MM * shape_up)
+    down = (1 - b) * low[..., None] * shape_low * bay + b * (closed - _GAP_MM * shape_low)
     up = np.maximum(up, down + _GAP_MM * shape_up)
     z = chord[:, 1] + np.where(upper > 0, up, down)
-    openness = (1 - b) * float(np.clip((high - low) / (rest - low), 0, 1.3))
-    return np.stack([chord[:, 0], z], axis=-1), openness
+    openness = (1 - b) * np.clip((high - low) / (rest - low), 0, 1.3)
+    return np.stack([np.broadcast_to(chord[:, 0], z.shape), z], axis=-1), np.asarray(openness)
 
 
 @lru_cache(maxsize=16)
@@ -156,12 +185,12 @@ def _shape(a: Floats, peak: float, power: float) -> Floats:
     return np.asarray(np.maximum(1 + a, 0) ** p * np.maximum(1 - a, 0) ** q / most)
 
 
-def _support(globe: Globe, centre: Floats, yz: Floats) -> tuple[Floats, Floats]:
+def _support(radius_mm: float, centre: Floats, yz: Floats) -> tuple[Floats, Floats]:
     """Compute points over (y, z) of the sphere or its flattened tangent continuation, and their normals."""
     d = yz - centre[..., 1:]
     rho = np.maximum(np.hypot(d[..., 0], d[..., 1]), 1e-9)
     e = d / rho[..., None]
-    R = globe.radius_mm
+    R = radius_mm
     nasal, temporal = step(e[..., 0], 0.2, 0.85), step(-e[..., 0], 0.2, 0.85)
     limit = _VERTICAL + nasal * (_MEDIAL - _VERTICAL) + temporal * (LATERAL - _VERTICAL)
     soft = 14.0 - 9.5 * nasal

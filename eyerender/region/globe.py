@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import ArrayValue, Floats, frozen, remembered, sealed
-from ..geometry.surfaces import Surface
+from ..geometry.surfaces import Surface, components
 from ..geometry.vectors import lengths
 
 _POLAR, _TURNS = 241, 96
@@ -160,8 +160,9 @@ def _table(cornea: Surface, limbus_mm: float, centre: tuple[float, ...], radius_
     c = np.array(centre)
     # Rays run from outside inwards, so that they meet the front of the cornea first.
     start = radius_mm + 8.0
-    distance, met = cornea.intersect(c + start * n, -n)
-    r = np.where(met, start - distance, radius_mm)
+    hit = cornea.hit(components(c + start * n), components(-n), True)
+    met = hit.ok & (hit.distance > 0.0)
+    r = np.where(met, start - hit.distance, radius_mm)
     local = cornea.to_local(c + r[..., None] * n)
     inside = met & (np.hypot(local[..., 1], local[..., 2]) <= limbus_mm) & (r > 0.5 * radius_mm)
     return frozen(np.where(inside, np.maximum(r - radius_mm, 0.0), 0.0))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..design.people import GRID
+from ..design.people import GRID, LOST
 from ..report.page import Card, Figure, Page, Section, Table, write_page
 from ..report.style import figure, svg
 
@@ -32,7 +32,7 @@ def write_rigs_page(path: Path, data: Mapping[str, Any], maps: Mapping[str, Floa
         "Lashes and frames are not considered.",
     ]
     sections = (
-        Section("Which layout loses whom?", [], [], [_overview(rows), _regions(rows)]),
+        Section("Which layout loses whom?", [], [], [_overview(rows), _regions(rows), _why(rows)]),
         Section("Where?", [], [Figure(_map(maps[row["layout"]]), f"{row['layout']}: share of people who are lost, over "
                 "azimuth (to the left) and elevation of the optic axis.", True) for row in rows]),
         Section("Who?", [_WHO], [], [_who(rows)]),
@@ -79,6 +79,14 @@ def _regions(rows: Any) -> Table:
     return Table(header=["looking", *names], rows=body, caption="Lost, by where people look.")
 
 
+def _why(rows: Any) -> Table:
+    body = [
+        [row["layout"], str(len(row["leds"])), *(f"{row['glints_missing'][name]:.2f}" for name in LOST)] for row in rows
+    ]
+    head = ["layout", "LEDs", "off the cornea", "off the sensor", "behind a lid"]
+    return Table(header=head, rows=body, caption="Mean number of glints that are missing, by reason.")
+
+
 def _who(rows: Any) -> Table:
     names = list(rows[0]["lost_by_third"])
     body = [
@@ -115,6 +123,7 @@ def _buys(rows: Any) -> str:
             count, noise = (np.array([one[k] for one in row["leds"]], float) for k in ("leds", "axis_deg_median"))
             ax.plot(count, noise, marker="o", label=row["layout"])
         ax.set_yscale("log")
+        ax.xaxis.get_major_locator().set_params(integer=True)
         ax.set_xlabel("number of LEDs")
         ax.set_ylabel("noise of the optic axis (deg)")
         fig.legend(loc="outside right center", frameon=False)

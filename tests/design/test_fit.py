@@ -12,7 +12,7 @@ from scipy import stats
 import eyerender as er
 from eyerender.cli.main import run
 from eyerender.design.eyefile import changed_file
-from eyerender.design.features import measured, outline_distances, residuals
+from eyerender.design.features import MODEL_PX, measured, outline_distances, residuals
 from eyerender.design.fit import Options, equations_of, fit_eye, instants_of, problem_of, solve, weights_of
 from eyerender.design.information import case_of, inverse, joint_matrix, outline_normals
 from eyerender.design.noise import FeatureNoise
@@ -63,11 +63,11 @@ def test_exact_features_give_the_gaze_back(rig, eye):
     wanted[:, :2], wanted[:, PUPIL] = truth, 2 * np.sqrt(np.prod(frames.scene.eye("right").stop.semi_axes_mm))
     wanted[:, 6:9] = -theta[6:9]
     wanted[:, 12:15] = [-0.4, 0.6, -0.5]
-    assert_seen_combinations(fit, wanted)
+    assert deviation_of_seen(fit, wanted) < 1e-6
 
 
-def assert_seen_combinations(fit, wanted):
-    """Combinations by singular vectors of the scaled information agree to 1e-6 of their size."""
+def deviation_of_seen(fit, wanted):
+    """The largest deviation of what is seen, combinations by singular vectors of the scaled information, over all."""
     gap = []
     for name in fit.known.names:
         kind, _, at = name.partition(" of instant ")
@@ -77,7 +77,7 @@ def assert_seen_combinations(fit, wanted):
     scale = np.sqrt(np.diag(fit.known.matrix))
     values, vectors = np.linalg.eigh(fit.known.matrix / scale / scale[:, None])
     seen = values > 1e-11
-    assert np.abs(vectors[:, seen].T @ (difference * scale)).max() < 1e-6 * np.linalg.norm(size * scale)
+    return np.abs(vectors[:, seen].T @ (difference * scale)).max() / np.linalg.norm(size * scale)
 
 
 def noisy(frames, noise, draws, seed, slippage_mm=0.0):
@@ -154,13 +154,12 @@ def test_chi_square_and_intervals_over_noisy_draws(rig):
     chi2 = float(np.sum(found.outline**2) + np.sum(found.glints**2))
     chi2 += float(np.sum((theta - problem.centre) ** 2 * problem.precision))
     dof = draws * (30 + 2 * len(scene.rig.lights) - 3)  # three unknowns of each frame have no prior
-    low, high = stats.chi2.ppf([0.005, 0.995], dof)
-    assert low < chi2 < high
+    assert abs(stats.norm.ppf(stats.chi2.cdf(chi2, dof))) < 2.576  # the band of 99 %, in standard deviations
     deviation = np.sqrt(
         np.array([np.diag(np.linalg.inv(m[np.ix_(free, free)] + np.diag(problem.precision[free]))) for m in matrix])
     )
     inside = np.abs(theta - truth)[:, free] < 1.96 * deviation
-    assert ((inside[:, :2].mean(axis=0) > 0.93) & (inside[:, :2].mean(axis=0) < 0.97)).all()
+    assert np.abs(inside[:, :2].mean(axis=0) - 0.95).max() < 0.02
 
 
 @pytest.mark.parametrize("what", ["glints", "outlines"])
@@ -191,7 +190,8 @@ def test_wrong_features_hardly_matter(what):
         wrong = rng.random(len(points)) < 0.1
         points = np.where(wrong[:, None, None], points + rng.uniform(8, 30, (len(points), 1, 2)), points)
     assert wrong.any()
-    assert error(glints, points) <= 1.5 * clean
+    ratio = error(glints, points) / clean
+    assert ratio <= 1.5
 
 
 def test_distances_from_an_outline():
@@ -209,7 +209,7 @@ def test_distances_from_an_outline():
 
 
 def test_an_ellipse_with_a_covariance_weighs_as_it_says():
-    """Whitened distances of a slightly other ellipse are those of its parameters: de^T C^-1 de."""
+    """Whitened distances of a slightly other ellipse are those of its parameters, d^T C^-1 d with `MODEL_PX` in C."""
     frames = frames_of("head_mounted", most=1)
     seen = er.trace(frames)
     rng = np.random.default_rng(2)
@@ -225,7 +225,47 @@ def test_an_ellipse_with_a_covariance_weighs_as_it_says():
     second = measured(replace(bare, pupil=other), noise, len(frames.scene.rig.lights))
     distance, _ = outline_distances(first.outline_px, None, second.outline_px)
     whitened = np.einsum("nij,nj->ni", second.outline_white, distance)
-    assert np.sum(whitened**2) == pytest.approx(change @ np.linalg.inv(covariance[0]) @ change, rel=1e-3)
+    whole = covariance[0] + MODEL_PX**2 * np.diag([1, 1, 1, 1, 0])
+    assert np.sum(whitened**2) == pytest.approx(change @ np.linalg.inv(whole) @ change, rel=1e-3)
+
+
+@pytest.mark.parametrize("off", [0.08, 5.0])
+def test_outlines_that_are_off_by_more_than_their_noise_count_and_wrong_ones_do_not(off):
+    """As an extractor gives them: a noise of .008 px is stated, and every fourth outline is longer and narrower."""
+    frames = frames_of("head_mounted")
+    seen = er.trace(frames)
+    longer = np.arange(len(seen)) % 4 == 1
+    bent = replace(
+        seen,
+        pupil=replace(
+            seen.pupil,
+            semi_axes_px=seen.pupil.semi_axes_px + off * longer[:, None] * [1, -1],
+            covariance=np.tile(0.008**2 * np.eye(5), (len(seen), 1, 1)),
+            points_px=seen.pupil.points_px[:, :0],
+        ),
+        glints=replace(seen.glints, covariance=np.tile(0.008**2 * np.eye(2), (*seen.glints.light.shape, 1, 1))),
+    )
+    (fit,) = fit_eye(bent, frames.scene.rig, Unknowns(slippage_mm=3.0), targets=False)
+    truth = np.stack([seen.pose.azimuth_rad, seen.pose.elevation_rad], axis=1)
+    assert (fit.outline_weight[~longer] > 0.99).all()
+    assert ((fit.outline_weight[longer] > 0.9) == (off < 1.0)).all()
+    assert np.degrees(np.abs(fit.theta[fit.instant, :2] - truth)).max() < 0.1
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_centres_of_pupils_alone_give_the_gaze_too(rig):
+    """As tables of many trackers hold them; the size of the pupil stays that of the prior."""
+    frames = frames_of(rig)
+    seen = er.trace(frames)
+    count = len(seen)
+    none = {"points_px": seen.pupil.points_px[:, :0], "semi_axes_px": np.full((count, 2), np.nan)}
+    bare = replace(seen, pupil=replace(seen.pupil, **none, angle_rad=np.full(count, np.nan)))
+    (fit,) = fit_eye(bare, frames.scene.rig, Unknowns(slippage_mm=3.0), targets=False)
+    truth = np.stack([seen.pose.azimuth_rad, seen.pose.elevation_rad], axis=1)
+    # Perspective makes an outline that is not centred on its ellipse's centre, seen from near.
+    assert np.degrees(np.abs(fit.theta[fit.instant, :2] - truth)).max() < 0.03
+    assert fit.converged.all()
+    assert (fit.theta[:, PUPIL] == fit.theta[0, PUPIL]).all()
 
 
 def test_the_eye_file_is_the_eye_that_was_fitted():

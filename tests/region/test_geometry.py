@@ -5,6 +5,8 @@ The globe's distance is taken from its exact surfaces here, while the region its
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -15,7 +17,7 @@ from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.geometry.vectors import dots
 from eyerender.region.anatomy import Lashes, Region
 from eyerender.region.brow import brow
-from eyerender.region.contour import COLUMNS, contour
+from eyerender.region.contour import COLUMNS, contour, inner_margins
 from eyerender.region.globe import Globe
 from eyerender.region.hairs import SEGMENTS, Hairs, tube_faces
 from eyerender.region.lashes import lashes, plan
@@ -166,6 +168,22 @@ def test_every_second_column_beyond_the_inner_edge_is_enough():
     assert np.sqrt(np.mean(np.square(off))) < 0.015  # mm
     assert np.percentile(off, 99) < 0.05
     assert np.max(off) < 0.2
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("blink", [0.0, 0.6])
+def test_inner_margins_of_many_poses_are_those_of_each(side, blink):
+    eye, spec = load_eye("E2").build(eye=side), Region(blink=blink)
+    turn, shift = rigid_motion(Poses.from_degrees([-20.0, 0.0, 15.0], [-15.0, 5.0, 10.0]), eye)
+    globe = Globe(
+        cornea=eye.front[0], limbus_radius_mm=float(eye.limbus_radius_mm), centre_mm=eye.sclera.centre_mm,
+        radius_mm=float(eye.sclera.radius_mm), M=np.eye(3), t=np.zeros(3), mirrored=side == "left",
+    )  # fmt: skip
+    points = inner_margins(spec, globe, (turn, shift), 44)
+    mirror = np.array([1.0, -1.0 if side == "left" else 1.0, 1.0])
+    for k in range(3):
+        posed = replace(globe, M=turn[k], t=shift[k])
+        assert points[k] * mirror == pytest.approx(contour(spec, posed, 44).point, abs=1e-10)
 
 
 def test_the_sheet_is_one_surface():

@@ -120,5 +120,6 @@ def test_a_mirrored_picture_is_that_of_stock_mitsuba_with_a_real_mirror(renderer
         each, other = through[:, inner].mean(axis=1), direct[:, inner].mean(axis=1)
         error = each.std(ddof=1) / np.sqrt(len(each)) / each.mean()
         exported_error = np.hypot(error, other.std(ddof=1) / np.sqrt(len(other)) / other.mean())
-        assert abs(mine[inner].mean() / each.mean() - 1.0) < 0.005 + 2 * error
-        assert abs(other.mean() / each.mean() - 1.0) < 0.005 + 2 * exported_error
+        limit, exported_limit = 0.005 + 2 * error, 0.005 + 2 * exported_error
+        assert abs(mine[inner].mean() / each.mean() - 1.0) < limit
+        assert abs(other.mean() / each.mean() - 1.0) < exported_limit
