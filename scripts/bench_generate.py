@@ -30,6 +30,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, get_args
+from unittest.mock import patch
 
 from _bench import Report, Row, options_of, resident_mib, row, single_threaded
 from _people import recipe
@@ -52,7 +53,7 @@ from eyerender.dataset.spec import DatasetSpec, GeometryKind, find_dataset  # no
 from eyerender.dataset.worker import Job  # noqa: E402
 from eyerender.folders.imagefile import write_picture  # noqa: E402
 from eyerender.rendering import renderer  # noqa: E402
-from eyerender.rendering.output.geometry import geometry_of  # noqa: E402
+from eyerender.rendering.output.geometry import geometry_of, window_hits  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "scripts" / "recipes"
@@ -302,20 +303,16 @@ class Bench:
 def geometry_timed() -> Iterator[list[float]]:
     """A list that gets the seconds that geometry of pixels takes for each image that is made while the block runs."""
     spent: list[float] = []
-    real = renderer.window_hits
 
-    def timed(bound: Any, job: Any, scene: object) -> Any:
-        real(bound, job, scene)()  # whatever was launched before it is done now
+    def timed(bound: Any, job: Any, scene: Any) -> Any:
+        window_hits(bound, job, scene)()  # whatever was launched before it is done now
         start = time.process_time()
-        geometry_of(job, real(bound, job, scene)())
+        geometry_of(job, window_hits(bound, job, scene)())
         spent.append(time.process_time() - start)
-        return real(bound, job, scene)
+        return window_hits(bound, job, scene)
 
-    renderer.window_hits = timed
-    try:
+    with patch.object(renderer, "window_hits", timed):
         yield spent
-    finally:
-        renderer.window_hits = real
 
 
 @contextmanager

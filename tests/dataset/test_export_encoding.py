@@ -154,7 +154,7 @@ def test_an_export_says_how_its_images_are_encoded(tiny, tmp_path, capsys):
         for folder in ("first", "again")
     ]
     assert trees[0] == trees[1]
-    for format in FORMATS:
+    for format in (f for f in FORMATS if f != "labels"):  # which has no images
         done = export(tiny, format, tmp_path / format, gain=1.5)
         card = (tmp_path / format / "README.md").read_text()
         for words in (

@@ -112,7 +112,7 @@ def test_refined_maximum_is_the_least_squares_one():
 
     # What the extractor takes for likely beforehand, in units of the noise: the outer level's first order, the slope
     # over b, the kurtosis, the inner level's first order.
-    lean, first = [0.01 * 55.0] * 2, [0.15 * 55.0] * 2
+    lean, first = [0.006 * 55.0] * 2, [0.15 * 55.0] * 2
     likely = 4.0 / np.array([*first, 0.15 * 55.0 / e.semi_axes_px[1], 1.0, *lean])
 
     def residual(p):

@@ -120,10 +120,9 @@ def test_a_moving_head_smears_the_glint_about_its_place(renderer):
 
 def test_rows_of_an_interlaced_camera_show_two_moments(renderer):
     still = shot(renderer)
-    moving = {"motion": {"head_mm_s": [0, 100, 0], "steps": 2}, "sensor": {"exposure_ms": 0.5}}
     short = shot(renderer, sensor={"exposure_ms": 0.5})
-    moving["sensor"]["field_delay_ms"] = 10.0
-    comb = shot(renderer, **moving)
+    sensor = {"exposure_ms": 0.5, "field_delay_ms": 10.0}
+    comb = shot(renderer, sensor=sensor, motion={"head_mm_s": [0, 100, 0], "steps": 2})
 
     def place(image, parity):
         rows = np.arange(image.irradiance.shape[0]) % 2 == (parity + image.window[1]) % 2

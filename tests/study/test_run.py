@@ -116,7 +116,7 @@ BAD = [
     (["study", "guestrin2006", "-o", "out", "--spp", "0"], 2, "--spp: must be >= 1"),
     (["study", "guestrin2006", "-o", "taken"], 2, "taken: is not empty"),
     (["study", "guestrin2006", "-o", "file"], 2, "file: exists and is not a folder"),
-    (["study", "guestrin2006", "-o", "file/deeper"], 1, "file/deeper"),
+    (["study", "guestrin2006", "-o", "file/deeper"], 2, "file/deeper"),
 ]
 
 
