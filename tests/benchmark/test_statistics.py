@@ -28,7 +28,7 @@ from eyerender.geometry.ellipse import Ellipse
 def test_wilson_is_that_of_scipy():
     for part, whole in ((0, 20), (7, 20), (20, 20), (390, 400)):
         known = binomtest(part, whole).proportion_ci(0.95, method="wilson")
-        assert wilson(part, whole) == pytest.approx((known.low, known.high))
+        np.testing.assert_allclose(wilson(part, whole), (known.low, known.high), rtol=1e-9)
     assert wilson(0, 0) is None
 
 
@@ -46,8 +46,9 @@ def test_intervals_cover_the_rate_of_simulated_subjects(subjects, images, rate, 
         right = rng.random((subjects, images)) < np.reshape(own, (-1, 1))
         low, high = subject_interval(right.ravel().astype(float), np.ones(right.size), names)
         covered += low <= rate <= high
-    # 0.93 is asked for; the standard error of a coverage of 0.95 is 0.011 in 400 trials.
-    assert covered >= 0.93 * trials
+    # A coverage of 0.93 is asked for; its standard error is 0.011 in 400 trials, if it is 0.95.
+    missed = 1.0 - covered / trials
+    assert missed <= 0.07
 
 
 def test_wilson_covers_the_rate_of_independent_images():

@@ -30,6 +30,7 @@ from eyerender.design.unknowns import (
 from eyerender.design.varied import images_of, lines_of_sight, slopes_of
 from eyerender.gaze.estimate import angular_error_deg
 
+PLAIN = {"targets": False, "robust": "none"}
 RIGS = ("head_mounted", "guestrin2006", "blignaut2014")
 EYES = ("E1", "E2", "E3", "E4", "E5")
 
@@ -89,13 +90,18 @@ def noisy(frames, noise, draws, seed, slippage_mm=0.0):
     theta[:, 3:6] = slippage_mm * rng.standard_normal((draws, 3))
     views = case.views.take(np.zeros(draws, dtype=int))
     images = images_of(views, theta, 30)
+    seen = er.trace(frames.take(np.zeros(draws, dtype=int)))
+    return with_noise(seen, images, noise, rng), theta, scene
+
+
+def with_noise(seen, images, noise, rng):
+    """Observations whose features are those of `images`, with noise."""
     normal, length = outline_normals(images.outline_px, np.asarray(np.isfinite(images.outline_px).all(axis=2)))
     shift = rng.standard_normal(length.shape) * noise.outline_px[0] / np.sqrt(length)
-    seen = er.trace(frames.take(np.zeros(draws, dtype=int)))
     glints = images.glints_px + rng.standard_normal(images.glints_px.shape) * noise.glint_px[0][:, None]
     pupil = replace(seen.pupil, points_px=images.outline_px + shift[..., None] * normal)
     # Each draw is an instant of its own, because equal fixations of one camera are different frames.
-    return replace(seen, pupil=pupil, glints=replace(seen.glints, xy_px=glints)), theta, scene
+    return replace(seen, pupil=pupil, glints=replace(seen.glints, xy_px=glints))
 
 
 def one_frame(rig):
@@ -160,6 +166,31 @@ def test_chi_square_and_intervals_over_noisy_draws(rig):
     )
     inside = np.abs(theta - truth)[:, free] < 1.96 * deviation
     assert np.abs(inside[:, :2].mean(axis=0) - 0.95).max() < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", RIGS[:2])
+def test_chi_square_of_fits_of_a_person_over_many_frames(rig):
+    """500 people from the prior, five frames of each with slippage: the pooled chi^2 lies in its 99 % band."""
+    frames = frames_of(rig, most=5)
+    frames = frames.take(frames.index.camera == frames.index.camera[0])
+    noise = FeatureNoise.of(0.07, 0.0085, rig=frames.scene.rig)
+    spread = {"corneal_radius_mm": 0.1, "asphericity": 0.05, "pupil_depth_mm": 0.1}
+    unknowns = Unknowns(slippage_mm=0.3, **spread)
+    case, _ = case_of(frames)
+    exact, rng = er.trace(frames), np.random.default_rng(11)
+    columns = [NAMES.index(name) for name in ("corneal_radius", "asphericity", "pupil_depth")]
+    chi2, dof = 0.0, 0
+    for _ in range(500):
+        theta = case.theta.copy()
+        theta[:, columns] += np.array([*spread.values()]) * rng.standard_normal(3)
+        theta[:, 3:6] = 0.3 * rng.standard_normal((len(theta), 3))
+        seen = with_noise(exact, images_of(case.views, theta, 30), noise, rng)
+        (fit,) = fit_eye(
+            seen, frames.scene.rig, unknowns, prior=frames.scene.eye_spec, noise=noise, start=theta, **PLAIN
+        )
+        chi2, dof = chi2 + float(fit.chi2.sum()), dof + fit.dof
+    assert abs(stats.norm.ppf(stats.chi2.cdf(chi2, dof))) < 2.576
 
 
 @pytest.mark.parametrize("what", ["glints", "outlines"])
