@@ -52,8 +52,6 @@ from eyerender.dataset.shard import Staged, commit, write_shard  # noqa: E402
 from eyerender.dataset.spec import DatasetSpec, GeometryKind, find_dataset  # noqa: E402
 from eyerender.dataset.worker import Job  # noqa: E402
 from eyerender.folders.imagefile import write_picture  # noqa: E402
-from eyerender.rendering import renderer  # noqa: E402
-from eyerender.rendering.output.geometry import geometry_of, window_hits  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "scripts" / "recipes"
@@ -302,6 +300,10 @@ class Bench:
 @contextmanager
 def geometry_timed() -> Iterator[list[float]]:
     """A list that gets the seconds that geometry of pixels takes for each image that is made while the block runs."""
+    # Importing the renderer loads Mitsuba, which must not happen before a backend has been chosen.
+    from eyerender.rendering import renderer
+    from eyerender.rendering.output.geometry import geometry_of, window_hits
+
     spent: list[float] = []
 
     def timed(bound: Any, job: Any, scene: Any) -> Any:
