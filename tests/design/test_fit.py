@@ -30,7 +30,6 @@ from eyerender.design.unknowns import (
 from eyerender.design.varied import images_of, lines_of_sight, slopes_of
 from eyerender.gaze.estimate import angular_error_deg
 
-PLAIN = {"targets": False, "robust": "none"}
 RIGS = ("head_mounted", "guestrin2006", "blignaut2014")
 EYES = ("E1", "E2", "E3", "E4", "E5")
 

@@ -44,7 +44,7 @@ def _errors(condition: str, settings: ExtractionSettings, seeds: range = SEEDS) 
 # Allowed medians: those of the full bench (40 images a row). Of six images the median scatters by about a quarter, the
 # refined fit is a third below the bar or better, so a failure is a defect. In the rows of MORE it is a fifth below,
 # which takes more images.
-MORE = ("noise2-17px", "noise2-13px", "noise16")
+MORE = ("noise2-17px", "noise2-13px", "noise16", "shading")
 
 
 @pytest.mark.parametrize(
