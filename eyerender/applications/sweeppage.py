@@ -59,16 +59,17 @@ def _answer(front: Sequence[Mapping[str, Any]]) -> str:
     few = min(good, key=lambda row: (row["leds"], row["noise_deg"]))
     text = (
         f"In short: among the layouts that see two glints and 60 % of the pupil's outline in 95 % of all cases, layout "
-        f"{best['number']} has the least noise, {_degrees(best['noise_deg'])} with {_leds(best)}."
+        f"{best['number']} has the least noise, {_degrees(best['noise_deg'])} with {leds_of(best)}."
     )
     if few["leds"] == best["leds"]:
         return f"{text} No such layout needs fewer LEDs."
     return (
-        f"{text} Layout {few['number']} needs the fewest LEDs and has {_degrees(few['noise_deg'])} with {_leds(few)}."
+        f"{text} Layout {few['number']} needs the fewest LEDs and has {_degrees(few['noise_deg'])} with {leds_of(few)}."
     )
 
 
-def _leds(row: Mapping[str, Any]) -> str:
+def leds_of(row: Mapping[str, Any]) -> str:
+    """Return the number of a layout's LEDs as text."""
     return f"{row['leds']} LED{'' if row['leds'] == 1 else 's'}"
 
 

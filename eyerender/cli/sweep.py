@@ -64,10 +64,11 @@ def sweep(
 def _text(found: dict[str, Any], report: Path) -> str:
     if not found["complete"]:
         return f"{found['missing']} of {found['layouts']} layouts are still missing"
+    from ..applications.sweeppage import leds_of
+
     best = [row for row in found["rows"] if row["pareto"]]
     lines = [f"{found['layouts']} layouts, {len(best)} of them on the Pareto front"]
     for row in sorted(best, key=lambda row: row["noise_deg"] or float("inf"))[:8]:
         noise = "not seen" if row["noise_deg"] is None else f"{row['noise_deg']:.4f} deg"
-        leds = f"{row['leds']} LED{'' if row['leds'] == 1 else 's'}"
-        lines.append(f"layout {row['number']}: noise {noise}, dropout {100 * row['dropout']:.1f} %, {leds}")
+        lines.append(f"layout {row['number']}: noise {noise}, dropout {100 * row['dropout']:.1f} %, {leds_of(row)}")
     return "\n".join([*lines, "", f"report: {report}"])

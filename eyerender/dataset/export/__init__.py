@@ -89,6 +89,8 @@ def export(
     folder = ImageFolder.load(path)
     if folder.dataset.get("kind") != "dataset":
         raise InputError("is not a generated dataset (its kind is not 'dataset')", source=str(Path(path) / DATASET))
+    if format == "labels":
+        labels.check_packed(folder)
     digest = folder.dataset.get("digest")
     for problem in verify_finished(folder.path, digest) if folder.unfinished else verify_dataset(folder.path):
         raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(path))
@@ -130,12 +132,14 @@ def _check_options(format: str, bits: int, encoding: Curve | None, gain: float |
     if format not in FORMATS:
         raise InputError(f"must be one of {', '.join(FORMATS)}, not {format!r}", source="--format")
     check(bits, encoding, gain)
+    if format in _PICTURELESS:
+        for option, given in (("bits", bits != 8), ("encoding", encoding is not None), ("gain", gain is not None)):
+            if given:
+                raise InputError(f"the layout {format} has no images", source=f"--{option}")
     if bits == 16 and format not in _SIXTEEN_BITS:
         raise InputError(f"the layout {format} holds 8 bits; {', '.join(_SIXTEEN_BITS)} can hold 16", source="--bits")
     if shuffle is not None and format in _ORDERED:
         raise InputError(_ORDERED[format], source="--shuffle")
-    if format in _PICTURELESS and (encoding is not None or gain is not None):
-        raise InputError(f"the layout {format} has no images", source="--encoding" if gain is None else "--gain")
 
 
 def _encoding(items: Items, bits: int, curve: Curve, gain: float | None) -> Encoding:

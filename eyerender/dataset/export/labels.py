@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
+from ...folders.imagefolder import ImageFolder
 from ...folders.packed import PackedLines
 from .item import Item, Items
 from .parquet import labels_of, libraries, schema_of, type_of
@@ -21,14 +22,22 @@ from .parquet import labels_of, libraries, schema_of, type_of
 _ENCODING = ("encoding", "gain", "source_bit_depth")  # of exported pictures
 
 
-def write(items: Items, out: Path) -> None:
-    """Write one file of labels for each shard.
+def check_packed(folder: ImageFolder) -> None:
+    """Check that a dataset has packed shards.
 
     Raises:
-        InputError: the dataset has no packed shards, or pyarrow is not installed.
+        InputError: it has not.
     """
-    if not isinstance(items.folder.entries.lines, PackedLines):
-        raise InputError("is not of the layout webdataset; use csv or parquet", source=str(items.folder.path))
+    if not isinstance(folder.entries.lines, PackedLines):
+        raise InputError("is not of the layout webdataset; use csv or parquet", source=str(folder.path))
+
+
+def write(items: Items, out: Path) -> None:
+    """Write one file of labels for each shard of a dataset with packed shards.
+
+    Raises:
+        InputError: pyarrow is not installed.
+    """
     pa, parquet = libraries("labels")
     (out / "labels").mkdir()
     items.order = np.arange(len(items))

@@ -1,6 +1,6 @@
 """The pixel model of a pupil's boundary: two levels and the blurred convex edge between them.
 
-    I = inner(u, d) (1 - E) + outer(u, d) E + slope R, in which d becomes R beside E and d - R beside 1 - E
+    I = inner(u) (1 - E) + outer(u) E + inner'(u) (d - R) + outer'(u) R
     R(d) = d Phi(z) + s phi(z)
     E(d) = Phi(z) + (kappa s / 2) phi(z) - (g / 24) (z^3 - 3 z) phi(z),   z = d / s
 
@@ -10,9 +10,10 @@ distribution and its density. The second term of E is the first order in s kappa
 the blur heavier tails than a normal distribution; g is its excess kurtosis (Edgeworth series).
 
 outer is a Fourier series in u = t + angle: the ellipse's parameter t counted from the image's x axis, so it does not
-turn with the axes of a nearly round ellipse. inner is a series of first order. Lamps beside the camera light one side
-more, and this light continues across the boundary: the terms of first order are planes, (1 + d / sqrt(a b)) cos u. The
-slope multiplies a blurred ramp R: the iris may become brighter or darker outwards on all sides.
+turn with the axes of a nearly round ellipse. inner is a series of first order. R is a blurred ramp. Lamps beside the
+camera shade pupil and iris like a plane, so the terms of first order continue across the boundary: inner' and outer',
+the changes per px, are these terms over sqrt(a b). outer' also has a constant, the slope, because the iris may become
+brighter or darker outwards on all sides.
 """
 
 from __future__ import annotations
@@ -143,9 +144,10 @@ def turn_harmonics(place: Floats, count: int, basis: Floats) -> None:
 
 @inlined
 def local_levels(place: Floats, count: int, numbers: Floats, basis: Floats, out: Floats) -> None:
-    """Write what light does about `count` positions, as columns of out (4 BLOCK,).
+    """Write the terms of the model's level at `count` positions, as columns of out (4 BLOCK,).
 
-    These are inner level, step, slope inside and change of slope: the level is inner + step E + within d + bend R.
+    The level is inner + step E + within d + bend R, where within is the slope inside and bend the change of the slope
+    across the boundary.
 
     Args:
         place: (8 BLOCK,) of `places`.

@@ -38,7 +38,7 @@ FIXED = SHAPE + 7
 # Standard deviations of parameters that are expected to be near 0: the harmonics of the outer level, in steps (under a
 # lid nothing else constrains them); its change over a semi-axis b, in steps (caused by lamps beside the camera); the
 # kurtosis of the blur; the lean of the inner level, in steps (scattered light, and shading of a pupil that is not
-# black: with 0.003 the centre of a shaded pupil was off by 0.02 px).
+# black: with 0.003 the centres of drawn pupils in light from one side were off by 0.03 px, with 0.006 by 0.015 px).
 HARMONIC_SD, SLOPE_SD, KURTOSIS_SD, LEAN_SD = 0.15, 0.15, 1.0, 0.006
 KURTOSIS_LIMITS = (-1.5, 3.0)  # outside these limits the edge would not be monotonic
 STILL_PX = 1.5e-2  # a fit ends with a step smaller than this
