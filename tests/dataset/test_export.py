@@ -463,7 +463,7 @@ def test_what_cannot_be_exported_is_refused(tiny, tmp_path):
     (tmp_path / "taken").mkdir()
     write_png(tmp_path / "taken" / "a.png", np.zeros((4, 4), np.uint8))
     for format in FORMATS:
-        with pytest.raises(InputError, match="is not empty"):
+        with pytest.raises(InputError, match="is not of the layout" if format == "labels" else "is not empty"):
             export(tiny, format, tmp_path / "taken")
     with pytest.raises(InputError, match="no such folder"):
         export(tmp_path / "nowhere", "coco", tmp_path / "out")
