@@ -24,8 +24,9 @@ import numpy as np
 
 from ..arrays import ArrayValue, Floats, frozen, remembered
 from ..geometry.vectors import crosses
+from ..optics.trace import trace
 from .entrance import entrance_pupil
-from .landmarks import incident_node
+from .landmarks import path_to_retina
 from .model import EyeModel
 
 EDGE = 1.25  # half width of the grid, in semi-axes of the stop; uneven margins reach beyond 1
@@ -36,6 +37,7 @@ _DISC_DEG, _DISC_RADIUS_DEG = (15.5, -1.5), 2.9
 _FOVEA_SHARE, _FOVEA_DEG = 0.92, 2.5
 _NODES = 169  # sample points of the pupil
 _UP = frozen([0.0, 0.0, 1.0])
+_ASIDE, _BEFORE_MM = (0.01, -0.01), 50.0  # slopes of rays to the retina, and their start before the entrance pupil
 _VANISHED = 210.0  # squared gap, in sigma^2, beyond which a Gaussian is 0 in single precision
 _REACH = 12.0  # halo widths, beyond which a lamp returns less than a hundred-thousandth of its halo's peak
 
@@ -150,15 +152,14 @@ def _sums(seen: Floats, lit: Floats, sigma: float, fall: float) -> tuple[Floats,
 
 @remembered
 def retinal_scale_mm(eye: EyeModel) -> float:
-    """Compute the height on the retina per angle (mm/rad) in air about the entrance pupil.
+    """Compute the height on the retina per angle in air about the entrance pupil, near the optic axis (mm/rad).
 
-    Without a lens it is D w / u, with D the distance of the stop from the fovea, and u = n w / m by Lagrange's
-    invariant. An eye with a lens is nearly in focus; then it is the distance of the nodes from the fovea.
+    It is the geometric mean over two meridians.
     """
-    if eye.back:
-        return float(np.linalg.norm(eye.fovea_mm - incident_node(eye)))
-    depth = float(np.linalg.norm(eye.fovea_mm - eye.stop.centre_mm))
-    return depth * entrance_pupil(eye)[1] / float(eye.front_indices[-1])
+    outward = np.array([[1.0, s, 0.0] for s in _ASIDE] + [[1.0, 0.0, s] for s in _ASIDE]) / np.hypot(1.0, _ASIDE[0])
+    found = trace(path_to_retina(eye), 1.0, entrance_pupil(eye)[0] + _BEFORE_MM * outward, -outward)
+    heights = np.linalg.norm(found.points_mm[-1, ::2] - found.points_mm[-1, 1::2], axis=-1)
+    return float(np.sqrt(heights.prod()) / (2.0 * np.arctan(_ASIDE[0])))
 
 
 def _inner_index(eye: EyeModel) -> float:

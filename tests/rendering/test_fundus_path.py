@@ -23,6 +23,7 @@ def ball():
     """The ball as an eye: its stop is at the apex, the screen a plane."""
     eye = load_eye("E2").build(pupil_diameter_mm=2 * PUPIL)
     front = surface_of(PlacedSpec(shape=SphereSpec(kind="sphere", radius_mm=RADIUS)))
+    screen = surface_of(PlacedSpec(shape=SphereSpec(kind="sphere", radius_mm=1e6), position_mm=(-DEPTH, 0.0, 0.0)))
     stop = replace(
         eye.stop, centre_mm=np.array([-1e-3, 0, 0]), rotation=np.eye(3), semi_axes_mm=np.array([PUPIL, PUPIL])
     )
@@ -33,6 +34,7 @@ def ball():
         back=(),
         back_indices=(),
         stop=stop,
+        retina=screen,
         fovea_mm=np.array([-DEPTH, 0.0, 0.0]),
         chief_ray=replace(eye.chief_ray, direction=np.array([0.5, np.sqrt(0.75), 0.0])),  # the fovea is far away
         sclera=Sphere(eye.sclera.centre_mm, 1e6),  # and nothing is reflected twice
