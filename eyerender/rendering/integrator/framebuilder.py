@@ -37,6 +37,7 @@ from .request import BoundFrame
 
 _REGIONS, _TEXTURES = 4, 8  # cached
 _SUBJECTS = 32  # then recordings are forgotten, because those of sizes that never come back take 3 MB each
+_FEWEST_PX = 40.0  # across the iris; in smaller images there are fewer samples than nodes of its grid
 _FARTHEST_MM = 60.0  # half the largest width of the grid over the background's plane
 
 
@@ -189,7 +190,8 @@ class FrameBuilder:
             )
         gridded = not surroundings.obstructed or (isinstance(surroundings, RegionScene) and surroundings.skin.is_sheet)
         points = lamps.points * max(len(lamps), 1)
-        sizes = _GridSizes(gridded, len(lamps) if lamps.gridded else 0, size.side**2, points)
+        worthwhile = lamps.gridded and _across_iris(job) > _FEWEST_PX
+        sizes = _GridSizes(gridded, len(lamps) if worthwhile else 0, size.side**2, points)
         factors = host.returned.factors
         sent_factors = upload_array(factors) if len(lamps) and factors.any() else None
         caches = frame.caches
@@ -255,3 +257,8 @@ class FrameBuilder:
                 self._textures.pop(next(iter(self._textures)))
             self._textures[key] = Textures.of(job.look)
         return self._textures[key]
+
+
+def _across_iris(job: RenderJob) -> float:
+    """Return the width of the iris in the picture, px."""
+    return 2 * float(job.eye.iris_root_radius_mm) * float(job.camera.scale_at(job.t))
