@@ -7,6 +7,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from eyerender.arrays import frozen
+from eyerender.rendering.integrator import framebuilder
+from eyerender.rig.camera import Camera
 from eyerender.rig.light import Lamp
 from tests.support.render_oracles import RINGS_MM, flux_on_rings, ring_points
 from tests.support.render_rigs import MODELS, PLAIN, LampRig, eye_of, iris_irradiance, job_of, remote_rig
@@ -77,3 +79,18 @@ def test_points_without_a_path_lie_in_the_shadow(renderer):
     assert np.all(gap[lit] < 0.1)
     assert np.median(gap[~lit]) > 0.1
     assert np.mean(gap[~lit] > 0.01) > 0.9
+
+
+def test_a_small_iris_without_a_grid_is_lit_as_with_one(renderer, monkeypatch):
+    # The grid may be off by a thousandth in a cell, and represents the lamp by four points of its disc.
+    eye = eye_of("E4")
+    camera = Camera(
+        resolution_px=(640, 480), position_mm=(520.0, 0.0, -300.0), look_at_mm=(0.0, 0.0, 0.0), focal_length_px=1500.0
+    ).build()
+    job = job_of(eye, LampRig(camera, remote_rig().lights), (300, 220, 40, 40), look=PLAIN)
+    without = renderer.radiance(job, spp=16)
+    monkeypatch.setattr(framebuilder, "_FEWEST_PX", 0.0)
+    with_grid = renderer.radiance(job, spp=16)
+    assert np.any(without != with_grid)
+    np.testing.assert_allclose(without, with_grid, rtol=5e-3)
+    assert without.mean() == pytest.approx(with_grid.mean(), rel=1e-4)
