@@ -299,18 +299,24 @@ class Bench:
 
 @contextmanager
 def geometry_timed() -> Iterator[list[float]]:
-    """A list that gets the seconds that geometry of pixels takes for each image that is made while the block runs."""
+    """A list that gets the seconds that geometry of pixels takes for each image that is made while the block runs.
+
+    They are those of masks with geometry without those of masks alone.
+    """
     # Importing the renderer loads Mitsuba, which must not happen before a backend has been chosen.
     from eyerender.rendering import renderer
     from eyerender.rendering.output.geometry import geometry_of, window_hits
+    from eyerender.rendering.output.labels import part_labels
 
     spent: list[float] = []
 
     def timed(bound: Any, job: Any, scene: Any) -> Any:
         window_hits(bound, job, scene)()  # whatever was launched before it is done now
         start = time.process_time()
+        part_labels(bound, job.window)()
+        masks = time.process_time()
         geometry_of(job, window_hits(bound, job, scene)())
-        spent.append(time.process_time() - start)
+        spent.append(time.process_time() - masks - (masks - start))
         return window_hits(bound, job, scene)
 
     with patch.object(renderer, "window_hits", timed):

@@ -160,8 +160,12 @@ def _marks(
     bound: BoundFrame, job: RenderJob, surroundings: Background | RegionScene
 ) -> Callable[[], tuple[PartLabels | None, Any, Bools | None, Hits | None]]:
     """Start computing labels, margins of the lids (px), highlights and geometry, as far as the job wants them."""
-    labels = part_labels(bound, job.window) if job.labels else lambda: None
     hits = window_hits(bound, job, surroundings) if job.geometry else lambda: None
-    return lambda: (
-        labels(), bound.host.lid_margins_px, highlights(bound, job.window) if job.highlights else None, hits()
-    )  # fmt: skip
+    labels = part_labels(bound, job.window) if job.labels and not job.geometry else lambda: None
+
+    def read() -> tuple[PartLabels | None, Any, Bools | None, Hits | None]:
+        found = hits()
+        bright = highlights(bound, job.window) if job.highlights else None
+        return labels() if found is None else found.labels, bound.host.lid_margins_px, bright, found
+
+    return read

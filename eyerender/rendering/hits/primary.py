@@ -59,12 +59,18 @@ def intersect(
     `coherent` states that neighbouring rays are similar, as those of a camera.
     """
     eye = EyeShape(frame=frame).ray_intersect(o, d)
-    if frame.structure.obstacles:
-        ray = segment(o, d, eye.distance)
-        hit = TriangleHit.of(frame.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active))
-    else:
-        hit = TriangleHit.on_plane(frame.backdrop_x, o, d, eye.distance)
+    hit = hit_before(frame, o, d, eye.distance, active, coherent=coherent)
     return behind(eye, hit, active), hit
+
+
+def hit_before(
+    frame: Frame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float, active: mi.Bool, *, coherent: bool = True
+) -> TriangleHit:
+    """Intersect rays (scene's frame) with everything but the eye, up to a distance."""
+    if not frame.structure.obstacles:
+        return TriangleHit.on_plane(frame.backdrop_x, o, d, nearest)
+    ray = segment(o, d, nearest)
+    return TriangleHit.of(frame.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active))
 
 
 def behind(eye: SurfaceInteraction, hit: TriangleHit, active: mi.Bool) -> SurfaceInteraction:

@@ -1,5 +1,6 @@
 """Geometry of a window: depth, normals, coordinates on the iris, and what each pixel's centre shows, of one ray each.
 
+The same ray gives the raster labels, so masks have the same bits whether geometry is wanted or not.
 The device finds the surface of each ray in single precision. On the host, in double precision, the ray is intersected
 with the tangent plane there, and on the eye with its exact surface by Newton's method.
 """
@@ -16,17 +17,19 @@ import numpy as np
 
 from ...arrays import ArrayValue, Bools, Bytes, Floats, Indices, Singles, frozen, sealed
 from ...eye.model import EyeModel
-from ...folders.imagefolder import FRAME, IRIS, PUPIL, SCLERA
+from ...folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ...geometry.surfaces import Surface, Xyz
 from ...optics.interface import dot
 from ...region.mesh import sheet_codes
-from ..hits.primary import facing, intersect
+from ..hits.eyeshape import EyeShape
+from ..hits.primary import behind, facing, hit_before
 from ..integrator.request import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
-from ..records.frame import Frame
+from ..records.frame import Frame, aligned_copy
 from ..records.job import RenderJob
 from ..records.recording import recorded
 from ..scene.region import RegionScene
+from .labels import PartLabels, part_of
 
 NOTHING, SKIN, UPPER_LID, LOWER_LID, LASHES, BROW, CARUNCLE, TEARS = 0, 5, 6, 7, 8, 9, 10, 11
 """Instances in addition to the parts of a mask."""
@@ -72,17 +75,17 @@ class Hits(ArrayValue):
         point: (3, n) mm.
         normal: (3, n) unit normals of the surface without its relief, toward the camera.
         inner: (3, n) mm in the plane of the iris.
-        part: (n,) part of the eye, `SKIN` for the surroundings.
-        cornea: (n,) whether the cornea is met, also where its rim is opaque.
+        labels: raster labels of the window, those of `part_labels`.
         instance: (n,) code of the instance.
+        cornea: (n,) whether the cornea is met, also where its rim is opaque.
     """
 
     point: Singles | None
     normal: Singles | None
     inner: Singles | None
-    part: Bytes
-    cornea: Bools
+    labels: PartLabels
     instance: Bytes
+    cornea: Bools
 
 
 def window_hits(bound: BoundFrame, job: RenderJob, scene: object) -> Callable[[], Hits]:
@@ -93,49 +96,55 @@ def window_hits(bound: BoundFrame, job: RenderJob, scene: object) -> Callable[[]
         job: its job, whose kinds of geometry are wanted.
         scene: the surroundings of the eye.
     """
-    count = job.window[2] * job.window[3]
+    shape = job.window[3], job.window[2]
+    codes = mi.UInt8(aligned_copy(_codes(scene))) if isinstance(scene, RegionScene) else None
     wanted = "depth" in job.geometry or "normals" in job.geometry, "iris_coordinates" in job.geometry
-    surface, inner, (part, cornea, face) = _hits(bound.frame.bare(), Pixels.of(job.window), count, wanted)
+    surface, inner, seen = _hits(bound.frame.bare(), Pixels.of(job.window), shape[0] * shape[1], codes, wanted)
 
     def read() -> Hits:
-        parts, numbers = part.numpy().astype(np.uint8), face.numpy()
-        instance = parts.copy()
-        if isinstance(scene, RegionScene):
-            np.copyto(instance, _codes(scene)[numbers], where=parts == SKIN)
         point, normal = (None, None) if surface is None else (sealed(v.numpy()) for v in surface)
-        met = frozen(cornea.numpy() > 0, np.bool_)
-        within = None if inner is None else sealed(inner.numpy())
-        rays = {"point": point, "normal": normal, "inner": within}
-        return Hits(**rays, part=sealed(parts), cornea=met, instance=sealed(instance))
+        part, amodal, instance, cornea = (v.numpy() for v in seen)
+        return Hits(
+            point=point,
+            normal=normal,
+            inner=None if inner is None else sealed(inner.numpy()),
+            labels=PartLabels(*(frozen(v.reshape(shape), np.uint8) for v in (part, amodal))),
+            instance=frozen(instance, np.uint8),
+            cornea=frozen(cornea, np.bool_),
+        )
 
     return read
 
 
 @recorded
 def _hits(
-    frame: Frame, pixels: Pixels, count: int, wanted: tuple[bool, bool]
-) -> tuple[tuple[mi.Vector3f, mi.Vector3f] | None, mi.Vector3f | None, tuple[mi.UInt8, mi.UInt8, mi.UInt32]]:
-    """Return points with normals, and places in the plane of the iris, if wanted; parts, on cornea, triangles."""
+    frame: Frame, pixels: Pixels, count: int, codes: mi.UInt8 | None, wanted: tuple[bool, bool]
+) -> tuple[tuple[mi.Vector3f, mi.Vector3f] | None, mi.Vector3f | None, tuple[mi.UInt8, mi.UInt8, mi.UInt8, mi.Bool]]:
+    """Return points with normals, and places in the plane of the iris, if wanted; the other attributes of `Hits`.
+
+    codes: codes of the instances of a region's triangles.
+    """
     u, v = pixels.at(dr.arange(mi.UInt32, count))
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
-    si, hit = intersect(frame, o, d, mi.Bool(True))
-    clear = si.cornea & (si.opacity < 0.5)
-    inside = dr.select(si.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
-    part = dr.select(clear, inside, dr.select(si.cornea | si.sclera, mi.UInt8(SCLERA), mi.UInt8(NOTHING)))
+    eye = EyeShape(frame=frame).ray_intersect(o, d)
+    hit = hit_before(frame, o, d, eye.distance, mi.Bool(True))
+    si = behind(eye, hit, mi.Bool(True))
+    amodal = part_of(eye)
+    part = instance = dr.select(si.other, mi.UInt8(BACKGROUND), amodal)
     away = dr.dot(si.normal, frame.vector_to_eye(d)) > 0
-    point, normal, face = si.point, dr.select(away, -si.normal, si.normal), mi.UInt32(0)
-    if frame.region is not None:
+    point, normal = si.point, dr.select(away, -si.normal, si.normal)
+    if codes is not None:
         face = frame.region.face(hit)
-        part = dr.select(si.other, mi.UInt8(SKIN), part)
+        instance = dr.select(si.other, dr.gather(mi.UInt8, codes, face, si.other), amodal)
         if wanted[0]:
             skin = frame.region.surface(face, hit.prim_uv, si.other)
             point = dr.select(si.other, frame.point_to_eye(skin.point), point)
             normal = dr.select(si.other, facing(frame, skin.smooth, d), normal)
     surface = (point, normal) if wanted[0] else None
     inner = si.inner if wanted[1] else None
-    cornea = dr.select(si.cornea, mi.UInt8(1), mi.UInt8(0))
-    dr.eval(surface, inner, part, cornea, face)
-    return surface, inner, (part, cornea, face)
+    seen = part, amodal, instance, si.cornea
+    dr.eval(surface, inner, seen)
+    return surface, inner, seen
 
 
 def _codes(scene: RegionScene) -> Bytes:
@@ -194,7 +203,7 @@ def _on_eye(job: RenderJob, hits: Hits, axes: Floats) -> list[tuple[Indices, Flo
     """
     assert hits.point is not None
     assert hits.normal is not None
-    sclera = (hits.part == SCLERA) & ~hits.cornea
+    sclera = (hits.instance == SCLERA) & ~hits.cornea
     found = []
     for met, surface in ((hits.cornea, job.eye.front[0]), (sclera, _Sphere.of(job.eye))):
         rows = np.flatnonzero(met)
@@ -272,8 +281,8 @@ def _on_iris(job: RenderJob, hits: Hits) -> Singles:
     v = np.array([0.0, 0.0, 1.0]) - normal * normal[2]
     v -= u * float(u @ v)
     v /= np.linalg.norm(v)
-    seen = np.flatnonzero((hits.part == IRIS) | (hits.part == PUPIL))
-    out = np.full((hits.part.size, 2), np.nan, dtype=np.float32)
+    seen = np.flatnonzero((hits.instance == IRIS) | (hits.instance == PUPIL))
+    out = np.full((hits.instance.size, 2), np.nan, dtype=np.float32)
     out[seen] = (hits.inner.T[seen] - np.asarray(stop.centre_mm)) @ np.stack([u, v], axis=1)
     return sealed(out.reshape(job.window[3], job.window[2], 2))
 

@@ -65,12 +65,17 @@ def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8
     u, v = pixels.at(dr.arange(mi.UInt32, count))
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
     eye = EyeShape(frame=frame).ray_intersect(o, d)
-    clear = eye.cornea & (eye.opacity < 0.5)
-    inside = dr.select(eye.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
-    amodal = dr.select(clear, inside, dr.select(eye.globe, mi.UInt8(SCLERA), mi.UInt8(BACKGROUND)))
+    amodal = part_of(eye)
     part = dr.select(hidden(frame, eye, o, d), mi.UInt8(BACKGROUND), amodal)
     dr.eval(amodal, part)
     return part, amodal
+
+
+def part_of(eye: SurfaceInteraction) -> mi.UInt8:
+    """Return the part of the eye at hits on it, as in `PartLabels`; the opaque rim of a cornea is sclera."""
+    clear = eye.cornea & (eye.opacity < 0.5)
+    inside = dr.select(eye.pupil, mi.UInt8(PUPIL), mi.UInt8(IRIS))
+    return dr.select(clear, inside, dr.select(eye.globe, mi.UInt8(SCLERA), mi.UInt8(BACKGROUND)))
 
 
 def highlights(bound: BoundFrame, window: Window) -> Bools:

@@ -30,7 +30,7 @@ class RenderedWindow(ArrayValue):
         irradiance: (height, width) W/m^2 of the sensor.
         dn: (height, width) digital numbers of the sensor.
         bit_depth: bits of `dn`.
-        labels: raster labels, if requested.
+        labels: raster labels, if they or geometry were requested.
         glints: the glints, the mirror images of order 1.
         purkinje: (order, table) of the other mirror images that were requested.
         failed_paths: number of light paths that did not converge; they are missing from the irradiance.
@@ -76,7 +76,7 @@ class RawFrame(ArrayValue):
         exposed: the light of the frame; for an interlaced camera that of even rows, and that of odd rows.
         blur: defocus of the job.
         mirrored: positions and energies of the glints.
-        labels: raster labels, if they were requested.
+        labels: raster labels, if they or geometry were requested.
         failed: number of light paths that did not converge.
         lid_margins_px: landmarks along the lids, where there are any.
         highlights: (height, width) highlights of wet and oily surfaces, if they were requested.
