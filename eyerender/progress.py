@@ -13,6 +13,12 @@ Say = Callable[[str], None]
 T = TypeVar("T")
 
 
+def notify(progress: Progress | None, done: int, total: int, note: str) -> None:
+    """Report progress, if anybody listens."""
+    if progress is not None:
+        progress(done, total, note)
+
+
 def followed(items: Sequence[T], progress: Progress | None) -> Iterator[T]:
     """Yield items and report progress after each; the first report, with 0 items done, states the total."""
     return followed_by(items, len(items), progress)
@@ -40,9 +46,7 @@ def one_behind(items: Iterable[T]) -> Iterator[T]:
 
 def followed_by(items: Iterable[T], total: int, progress: Progress | None) -> Iterator[T]:
     """Yield items from an iterator that has no length, and report progress out of `total` like `followed`."""
-    if progress is not None:
-        progress(0, total, "")
+    notify(progress, 0, total, "")
     for k, item in enumerate(items):
         yield item
-        if progress is not None:
-            progress(k + 1, total, "")
+        notify(progress, k + 1, total, "")

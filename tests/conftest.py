@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 
 import pytest
 
@@ -26,6 +27,15 @@ try:
 except BackendError:
     if os.environ.get("CI"):
         raise
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _single_workers_in_process() -> Iterator[None]:
+    """Start no process for runs of one worker, except where a test runs the command itself."""
+    from tests.support.in_process import single_workers_in_process
+
+    with single_workers_in_process():
+        yield
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

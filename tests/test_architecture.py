@@ -6,7 +6,9 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -78,7 +80,8 @@ ORDER = [
 RENDERING = ["records", "scene", "materials", "hits", "transport", "glints", "integrator", "output", "renderer"]
 
 
-def modules():
+@cache
+def modules() -> list[Path]:
     return sorted(p for p in PACKAGE.rglob("*.py") if "data" not in p.relative_to(PACKAGE).parts)
 
 
@@ -87,16 +90,46 @@ def room(path: Path) -> str:
     return parts[0]
 
 
-def imports_of_names(path: Path):
-    """The same with the name that is imported, which may be a module, at its end."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom):
-            for alias in node.names:
-                single = ast.ImportFrom(node.module, [alias], node.level, lineno=node.lineno)
-                yield f"{resolved(path, single)}.{alias.name}", node.lineno
-        elif isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, node.lineno
+class Facts(NamedTuple):
+    """What the tests ask of a module."""
+
+    imports: list[tuple[str, int]]  # (level-resolved dotted module, line), inside functions and TYPE_CHECKING too
+    names: list[str]  # the same without lines, with the name that is imported, which may be a module, at its end
+    sizes: list[tuple[str, int, int]]  # (name, lines of the body without docstring, parameters) of every function
+    positional_records: list[str]  # dataclasses with more than four fields whose fields may be given in order
+    aliases: list[tuple[str, str]]  # (name, definition) of the type aliases at the top
+
+
+@cache
+def facts(path: Path) -> Facts:
+    """Parse a module, once for all tests."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    nodes = list(statements(tree))
+    module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+    return Facts(
+        imports=[found for node in nodes for found in imports_of(path, node)],
+        names=[name for node in nodes for name in names_of(path, node)],
+        sizes=[size for node in nodes for size in size_of(module, node)],
+        positional_records=[node.name for node in nodes if isinstance(node, ast.ClassDef) and is_positional(node)],
+        aliases=[alias for node in tree.body for alias in alias_of(node)],
+    )
+
+
+def statements(node: ast.AST):
+    """All statements below a node. Only they import and define, and there are far fewer of them than of nodes."""
+    for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for inner in getattr(node, block, ()):
+            yield inner
+            yield from statements(inner)
+
+
+def names_of(path: Path, node: ast.AST):
+    if isinstance(node, ast.ImportFrom):
+        for alias in node.names:
+            yield f"{resolved(path, node)}.{alias.name}"
+    elif isinstance(node, ast.Import):
+        for alias in node.names:
+            yield alias.name
 
 
 def resolved(path: Path, node: ast.ImportFrom) -> str:
@@ -106,39 +139,52 @@ def resolved(path: Path, node: ast.ImportFrom) -> str:
     return ".".join((*base, *((node.module or "").split(".") if node.module else ())))
 
 
-def imports(path: Path):
-    """(level-resolved dotted module, line) of every import, inside functions and TYPE_CHECKING too."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, node.lineno
-        elif isinstance(node, ast.ImportFrom):
-            stem = resolved(path, node)
-            if node.module is None or stem == "eyerender":
-                for alias in node.names:
-                    yield f"{stem}.{alias.name}", node.lineno
+def imports_of(path: Path, node: ast.AST):
+    if isinstance(node, ast.ImportFrom) and node.module is not None and resolved(path, node) != "eyerender":
+        yield resolved(path, node), node.lineno
+    elif isinstance(node, (ast.Import, ast.ImportFrom)):
+        for name in names_of(path, node):
+            yield name, node.lineno
+
+
+def size_of(module: str, node: ast.AST):
+    if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        body = node.body[1:] if ast.get_docstring(node, clean=False) is not None else node.body
+        lines = body[-1].end_lineno - body[0].lineno + 1 if body else 0
+        names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+        yield f"{module}.{node.name}", lines, len(names) - (names[:1] in (["self"], ["cls"]))
+
+
+def is_positional(node: ast.ClassDef) -> bool:
+    made = [ast.unparse(d) for d in node.decorator_list if ast.unparse(d).startswith("dataclass")]
+    fields = [n for n in node.body if isinstance(n, ast.AnnAssign) and "ClassVar" not in ast.unparse(n.annotation)]
+    return bool(made) and len(fields) > 4 and "kw_only=True" not in made[0]
+
+
+def alias_of(node: ast.AST):
+    kinds = {"NDArray", "Callable", "Literal", "Annotated", "tuple", "list", "dict"}
+    if isinstance(node, ast.Assign) and isinstance(node.value, (ast.Subscript, ast.BinOp)):
+        definition = ast.unparse(node.value).replace("npt.", "")
+        of_a_type = isinstance(node.value, ast.Subscript) and definition.split("[")[0] in kinds
+        if of_a_type or " | " in definition:
+            yield ast.unparse(node.targets[0]), definition
+
+
+def test_imports_point_down():
+    for path in modules():
+        here = room(path)
+        assert here in FLOORS, f"{here} has no floor"
+        for name, line in facts(path).imports:
+            parts = name.split(".")
+            if parts[0] != "eyerender" or len(parts) < 2 or parts[1] in (here, "__version__") or here == "__init__":
+                continue
+            place, there = f"{path}:{line}: {here} imports {name}", parts[1]
+            assert there in FLOORS, f"{place}, which has no floor"
+            if FLOORS[there] == FLOORS[here]:
+                assert {here, there} <= set(ORDER), f"{place}, its neighbour"
+                assert ORDER.index(there) < ORDER.index(here), place
             else:
-                yield stem, node.lineno
-
-
-@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_point_down(path):
-    here = room(path)
-    assert here in FLOORS, f"{here} has no floor"
-    for name, line in imports(path):
-        parts = name.split(".")
-        if parts[0] != "eyerender" or len(parts) < 2 or parts[1] == here or here == "__init__":
-            continue
-        there = parts[1]
-        if there == "__version__":
-            continue
-        assert there in FLOORS, f"{path.name}:{line}: {name} has no floor"
-        if FLOORS[there] == FLOORS[here]:
-            assert here in ORDER, f"{path.name}:{line}: {here} imports its neighbour {there}"
-            assert there in ORDER, f"{path.name}:{line}: {here} imports its neighbour {there}"
-            assert ORDER.index(there) < ORDER.index(here), f"{path.name}:{line}: {here} imports {there}"
-        else:
-            assert FLOORS[there] < FLOORS[here], f"{path.name}:{line}: {here} imports {there}, which is above it"
+                assert FLOORS[there] < FLOORS[here], f"{place}, which is above it"
 
 
 def test_sub_packages_of_the_renderer_have_one_direction():
@@ -146,7 +192,7 @@ def test_sub_packages_of_the_renderer_have_one_direction():
         parts = path.relative_to(PACKAGE).with_suffix("").parts
         if parts[0] != "rendering" or parts[1] == "__init__":
             continue
-        for name, line in imports(path):
+        for name, line in facts(path).imports:
             there = name.split(".")
             if there[:2] == ["eyerender", "rendering"] and there[2] != parts[1]:
                 assert RENDERING.index(there[2]) < RENDERING.index(parts[1]), f"{path}:{line}: {name}"
@@ -173,7 +219,7 @@ def test_no_circle_of_imports_inside_packages():
     }
     graph = {}
     for name, path in names.items():
-        used = {found if found in names else found.rpartition(".")[0] for found, _ in imports_of_names(path)}
+        used = {found if found in names else found.rpartition(".")[0] for found in facts(path).names}
         graph[name] = {u for u in used if u in names and u != name}
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == [("b", "c")]
     assert [c for c in circles(graph) if not all(m.startswith("eyerender.cli") for m in c)] == []
@@ -207,36 +253,13 @@ POSITIONAL = {
 }  # fmt: skip
 
 
-def sizes(path: Path):
-    """(name, lines of the body without docstring, parameters) of every function."""
-    module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            body = node.body[1:] if ast.get_docstring(node) is not None else node.body
-            lines = body[-1].end_lineno - body[0].lineno + 1 if body else 0
-            names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
-            yield f"{module}.{node.name}", lines, len(names) - (names[:1] in (["self"], ["cls"]))
-
-
-def positional_records(path: Path):
-    """Names of the dataclasses with more than four fields whose fields may be given in order."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ClassDef):
-            made = [ast.unparse(d) for d in node.decorator_list if ast.unparse(d).startswith("dataclass")]
-            fields = [
-                n for n in node.body if isinstance(n, ast.AnnAssign) and "ClassVar" not in ast.unparse(n.annotation)
-            ]
-            if made and len(fields) > 4 and "kw_only=True" not in made[0]:
-                yield node.name
-
-
 def test_functions_and_records_are_of_a_size_to_read():
     """Bodies of at most 60 lines, at most 8 parameters (but for commands), and large records by keyword."""
-    found = [one for path in modules() for one in sizes(path)]
+    found = [one for path in modules() for one in facts(path).sizes]
     long = {name for name, lines, _ in found if lines > 60}
     wide = {name for name, _, count in found if count > 8 and not name.startswith("cli.")}
     assert long | wide == LARGE.keys()
-    assert {name for path in modules() for name in positional_records(path)} == POSITIONAL
+    assert {name for path in modules() for name in facts(path).positional_records} == POSITIONAL
 
 
 @pytest.mark.parametrize(
@@ -248,12 +271,12 @@ def test_functions_and_records_are_of_a_size_to_read():
     ],
 )
 def test_heavy_libraries_stay_in_their_packages(libraries, homes):
-    users = {room(p) for p in modules() for name, _ in imports(p) if name.split(".")[0] in libraries}
+    users = {room(p) for p in modules() for name, _ in facts(p).imports if name.split(".")[0] in libraries}
     assert users == homes
 
 
 def test_datasets_use_opencv_for_nothing_but_videos():
-    users = [p.name for p in modules() if room(p) == "dataset" and "cv2" in {name for name, _ in imports(p)}]
+    users = [p.name for p in modules() if room(p) == "dataset" and "cv2" in {name for name, _ in facts(p).imports}]
     assert users == ["video.py"]
 
 
@@ -266,7 +289,7 @@ def test_observers_are_siblings(observer):
         name.split(".")[1]
         for p in modules()
         if room(p) in own
-        for name, _ in imports(p)
+        for name, _ in facts(p).imports
         if name.startswith("eyerender.")
     }
     assert not used & other
@@ -283,20 +306,8 @@ def test_what_reproduces_a_papers_software_stays_in_the_studies():
     assert not list((PACKAGE / "report").rglob("*study*"))
 
 
-def aliases():
-    """(name, definition) of every type alias at the top of a module."""
-    kinds = {"NDArray", "Callable", "Literal", "Annotated", "tuple", "list", "dict"}
-    for path in modules():
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.Assign) and isinstance(node.value, (ast.Subscript, ast.BinOp)):
-                definition = ast.unparse(node.value).replace("npt.", "")
-                of_a_type = isinstance(node.value, ast.Subscript) and definition.split("[")[0] in kinds
-                if of_a_type or " | " in definition:
-                    yield ast.unparse(node.targets[0]), definition
-
-
 def test_a_type_alias_is_defined_once():
-    found = list(aliases())
+    found = [alias for path in modules() for alias in facts(path).aliases]
     assert {"Floats", "Bools", "Progress", "Window"} <= {name for name, _ in found}
     names = [name for name, _ in found]
     assert sorted({n for n in names if names.count(n) > 1}) == []

@@ -17,7 +17,7 @@ from ..imaging.comparison import Comparison, compare
 from ..imaging.imageobserver import ImageObserver, scene_of
 from ..imaging.images import render_folder
 from ..plausibility import saturation_warnings
-from ..progress import Progress
+from ..progress import Progress, notify
 from ..report.comparison import Timing, write_report
 from ..scene import Scene, load_scene
 
@@ -62,8 +62,7 @@ def run_quickstart(
 
     def step(offset: int, what: str) -> Progress:
         def show(done: int, _total: int, _note: str) -> None:
-            if progress is not None:
-                progress(offset + done, 2 * count + 1, what)
+            notify(progress, offset + done, 2 * count + 1, what)
 
         return show
 
@@ -88,8 +87,7 @@ def run_quickstart(
     result = _compared(images, loaded, Regression(), "", step(count, "extracting"))
     timings.append(Timing("extracting and calibrating", time.monotonic() - start))
     write_report(folder / REPORT, loaded, result, images.entries, timings)
-    if progress is not None:
-        progress(2 * count + 1, 2 * count + 1, "done")
+    notify(progress, 2 * count + 1, 2 * count + 1, "done")
     return result
 
 

@@ -36,7 +36,7 @@ from ..gaze.estimate import ray_errors_deg
 from ..gaze.store import choose_estimator
 from ..imaging.imageobserver import ImageObserver
 from ..population.people import Person
-from ..progress import Progress
+from ..progress import Progress, notify
 from ..report.page import Card, Figure, Page, Section, Table, write_page
 from ..report.style import figure, svg
 from ..scene import Scene
@@ -193,8 +193,7 @@ def estimator_errors(
                 rows = np.flatnonzero(seen.index.camera == camera)
                 found = ray_errors_deg(seen.take(rows), _taken(rays, rows))
                 errors[name][k, seen.index.fixation[rows]] = np.fmin(errors[name][k, seen.index.fixation[rows]], found)
-        if progress is not None:
-            progress(k + 1, len(subjects), "people with images" if images else "estimators")
+        notify(progress, k + 1, len(subjects), "people with images" if images else "estimators")
     for name, found in errors.items():
         without = float(np.isnan(found).mean(axis=1).max(initial=0.0))
         if not reasons[name] and without > 0.05:

@@ -22,7 +22,7 @@ from ..imaging.capture import make_renderer, render_windows
 from ..population.people import PopulationSpec
 from ..population.statistics import Moments, Refusals, Survey, pieces, refusals, survey
 from ..population.table import Source, Table, default_table
-from ..progress import Progress
+from ..progress import Progress, notify
 from ..report.page import Card, Figure, Page, Section, write_page
 from ..report.page import Table as PageTable
 from ..report.style import ANALYTIC, IMAGE, figure, svg
@@ -224,8 +224,7 @@ def _faces(
         )
         yield eight_bit(both, 2.0**scene.spec.sensor.bit_depth - 1), text
         done += 1
-        if progress is not None:
-            progress(done, size.faces, "faces")
+        notify(progress, done, size.faces, "faces")
 
 
 def page_of(found: Result, sheet: Image.Image | None) -> Page:

@@ -29,7 +29,7 @@ from ..design.unknowns import Unknowns
 from ..errors import EyerenderError, InputError
 from ..folders.outfolder import clear, refuse_non_empty
 from ..processes import process_pool
-from ..progress import Progress, Say
+from ..progress import Progress, Say, notify
 from ..scene import Scene
 from ..scene.spec import SceneSpec
 from ..storage.files import make_folder, read_json, write_json
@@ -94,8 +94,7 @@ def run_sweep(
         for number, record in _evaluated(spec, missing, how.workers):
             write_json(_path(folder, number), {"schema": LAYOUT_SCHEMA, **record})
             done += 1
-            if progress is not None:
-                progress(done, len(mine), "layouts")
+            notify(progress, done, len(mine), "layouts")
     with final_lock(folder, say):
         absent = sum(not _path(folder, layout.number).is_file() for layout in layouts)
         if absent:

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..folders.imagefile import read_any_image
 from ..folders.imagefolder import IRIS, PUPIL, versions
 from ..folders.outfolder import refuse_non_empty, staged
-from ..progress import Progress
+from ..progress import Progress, notify
 from ..report.benchmark import Thumbnail, write_bench_report
 from ..storage.files import write_json
 from .answercache import AnswerCache, check_reference, image_key
@@ -79,11 +79,9 @@ def bench_extractors(
     def step(name: str) -> None:
         nonlocal done
         done += 1
-        if progress is not None:
-            progress(done, total, name)
+        notify(progress, done, total, name)
 
-    if progress is not None:
-        progress(0, total, "")
+    notify(progress, 0, total, "")
     caches = [AnswerCache.of(extractor, files) for extractor, files in zip(chosen, sources, strict=True)]
     asked = ask_extractors(chosen, images, options, keys=keys, caches=caches, step=step)
     runs = [_classified(run, images) for run in asked]

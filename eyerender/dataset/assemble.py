@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,66 +57,62 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
     if plan.spec.is_packed:
         return _assemble_packed(plan, folder)
     statistics = Statistics()
-    shards = plan.spec.shards
     with written(folder / FAILURES) as file:
-        for shard in shards:
-            done = read_done(folder, shard)
+        for _, done in _finished(plan, folder, file):
             statistics.take_shard(done)
-            for rejection in done["rejections"]:
-                file.write((json.dumps(rejection) + "\n").encode())
     with written(folder / METADATA) as file:
-        for line in _lines(folder, shards, statistics.take_line):
+        for line in _lines(folder, plan.spec.shards, statistics.take_line):
             file.write(line)
         found = statistics.to_mapping()
         if found["images"] == 0:
             raise EyerenderError(f"{folder}: no sample of this spec can be made; see {FAILURES} for the reasons")
     sums = {name: sum_of(folder / name) for name in (METADATA, FAILURES)}
     write_json(folder / CROISSANT, croissant(plan, sums[METADATA]["sha256"]))
-    write_text(folder / CARD, data_card(plan, found))
-    dataset = {
-        "schema": DATASET_SCHEMA,
-        "kind": "dataset",
-        "digest": plan.digest,
-        **plan.to_mapping(),
-        "versions": run_versions(),
-        "backends": sorted(statistics.backends),
-        "conventions": CONVENTIONS,
-        "statistics": found,
-        "checksums": sums,
-    }
-    write_json(folder / DATASET, dataset)
-    return found
+    return _described(plan, folder, DATASET_SCHEMA, {}, statistics, sums)
 
 
 def _assemble_packed(plan: Plan, folder: Path) -> dict[str, Any]:
     """Merge the summaries of packed shards: image index, failures and statistics. No metadata is read."""
     statistics, splits, parts = Statistics(), sorted(plan.spec.splits), []
     with written(folder / FAILURES) as file:
-        for shard in plan.spec.shards:
-            done = read_done(folder, shard)
+        for shard, done in _finished(plan, folder, file):
             statistics.take_packed(done)
             parts.append(packed_index(done, shard, splits, str(folder / SHARDS / shard_name(shard) / DONE)))
-            for rejection in done["rejections"]:
-                file.write((json.dumps(rejection) + "\n").encode())
     rows = np.concatenate(parts)
     if not len(rows):
         raise EyerenderError(f"{folder}: no sample of this spec can be made; see {FAILURES} for the reasons")
     statistics.take_index(rows, splits)
     with written(folder / INDEX) as file:
         np.save(file, rows, allow_pickle=False)
+    sums = {name: sum_of(folder / name) for name in (INDEX, FAILURES)}
+    return _described(plan, folder, PACKED_SCHEMA, {"splits": splits}, statistics, sums)
+
+
+def _finished(plan: Plan, folder: Path, failures: BinaryIO) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield every shard with its summary, and write its rejections to the file of failures."""
+    for shard in plan.spec.shards:
+        done = read_done(folder, shard)
+        yield shard, done
+        failures.writelines((json.dumps(rejection) + "\n").encode() for rejection in done["rejections"])
+
+
+def _described(
+    plan: Plan, folder: Path, schema: str, more: dict[str, Any], statistics: Statistics, sums: dict[str, Any]
+) -> dict[str, Any]:
+    """Write the card and dataset.json of a complete dataset; return its statistics."""
     found = statistics.to_mapping()
     write_text(folder / CARD, data_card(plan, found))
     dataset = {
-        "schema": PACKED_SCHEMA,
+        "schema": schema,
         "kind": "dataset",
         "digest": plan.digest,
         **plan.to_mapping(),
-        "splits": splits,
+        **more,
         "versions": run_versions(),
         "backends": sorted(statistics.backends),
         "conventions": CONVENTIONS,
         "statistics": found,
-        "checksums": {name: sum_of(folder / name) for name in (INDEX, FAILURES)},
+        "checksums": sums,
     }
     write_json(folder / DATASET, dataset)
     return found

@@ -15,7 +15,7 @@ from ..errors import InputError, Warn
 from ..folders.imagefile import preview as eight_bit
 from ..imaging.capture import make_renderer, render_windows
 from ..plausibility import is_saturated, saturation_warnings
-from ..progress import Progress
+from ..progress import Progress, notify
 from ..scene import Scene, is_dataset, load_scene, refuse_folder, shipped_files
 from ..storage.files import written
 from .maker import Maker
@@ -72,8 +72,7 @@ def preview(
     for total, tile, is_white in maker:
         tiles.append(tile)
         saturated += is_white
-        if progress is not None:
-            progress(len(tiles), total, "")
+        notify(progress, len(tiles), total, "")
     if warn is not None:
         warn(saturation_warnings(saturated, len(tiles), what.source))
     with written(path) as file:

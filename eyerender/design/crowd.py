@@ -12,7 +12,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..processes import mapper
-from ..progress import Progress
+from ..progress import Progress, notify
 from .noise import FeatureNoise
 from .people import Figures, Survey, figures_of
 
@@ -64,8 +64,7 @@ def _reported(results: Iterator[Figures], counts: Sequence[int], progress: Progr
     done = 0
     for part, count in zip(results, counts, strict=True):
         done += count
-        if progress is not None:
-            progress(done, sum(counts), "people")
+        notify(progress, done, sum(counts), "people")
         yield part
 
 

@@ -18,11 +18,11 @@ from ..arrays import Floats, Objects
 from ..errors import InputError
 from ..observation import Observations
 from ..rig.rig import RigLike
-from .determined import Terms, monomials
+from .determined import Terms
 from .estimate import GazePoints, GazeRays
 from .rays import camera_of, chosen_lights, glints_of, screen_of, target_directions
 from .recalibration import angles_of, direction_of
-from .regression import EyeFit, Regression
+from .regression import EyeFit, Regression, mapped
 
 Feature = Literal["pupil-glint", "pupil"]
 
@@ -85,16 +85,7 @@ class DirectionRegression:
             raise InputError("the estimator is not calibrated; call fit first")
         index = observations.index
         features, reason = self.features(observations, rig)
-        angles = np.full((len(observations), 2), np.nan)
-        for eye in np.unique(index.eye):
-            rows = np.flatnonzero(index.eye == eye)
-            fit = self.fits.get(int(eye))
-            if fit is None:
-                reason[rows] = "this eye is not calibrated"
-                continue
-            u = (features[rows] - fit.origin) / fit.scale
-            x_terms, y_terms = self.terms
-            angles[rows] = np.stack([monomials(u, x_terms) @ fit.a, monomials(u, y_terms) @ fit.b], axis=-1)
+        angles = mapped(self.fits, self.terms, features, index.eye, reason)
         return GazeRays.of(index.eye_position_mm + index.head_mm, direction_of(angles), reason)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:

@@ -15,14 +15,14 @@ import numpy as np
 
 from ..observation import Observations
 from ..rig.rig import RigGeometry, RigLike
-from .estimate import GazePoints, GazeRays
+from .estimate import GazeRays
 from .guestrin import GuestrinEizenman
 from .parameters import MEAN_EYE, EyeParameters
-from .recalibration import Recalibration, RecalibrationKind
+from .recalibration import Recalibrated, Recalibration, RecalibrationKind
 
 
 @dataclass(frozen=True, slots=True)
-class Hennessey:
+class Hennessey(Recalibrated):
     """Optic axis of an assumed eye, corrected by a polynomial.
 
     Args:
@@ -46,18 +46,6 @@ class Hennessey:
         rig = rig.build()
         rays = self.optic_axes(observations, rig)
         return replace(self, correction=Recalibration(self.recalibration).fit(observations, rays, rig))
-
-    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """Estimate gaze points on the screen's plane."""
-        rig = rig.build()
-        correction = self.correction or Recalibration(self.recalibration)
-        return correction.apply(observations, self.optic_axes(observations, rig), rig)
-
-    def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
-        """Estimate rays of gaze; no screen is needed unless the correction acts on the screen."""
-        rig = rig.build()
-        correction = self.correction or Recalibration(self.recalibration)
-        return correction.apply_to_rays(observations, self.optic_axes(observations, rig), rig)
 
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Compute optic axes of the assumed eye: rays from the centre of corneal curvature."""

@@ -9,6 +9,7 @@ fitted by least squares for each eye.
 from __future__ import annotations
 
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -18,7 +19,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..observation import EYES, Observations
-from ..rig.rig import RigLike
+from ..rig.rig import RigGeometry, RigLike
 from .determined import UndeterminedWarning, shortfall
 from .estimate import GazePoints, GazeRays
 from .rays import screen_of, targets_on_screen, unit
@@ -109,6 +110,30 @@ class Recalibration:
             elif self.kind == "angle":
                 direction[rows] = direction_of(monomials(angles_of(direction[rows])) @ A.T)
         return GazeRays.of(rays.origin_mm, direction, reason)
+
+
+class Recalibrated(ABC):
+    """An estimator of optic axes whose estimates a polynomial corrects."""
+
+    __slots__ = ()
+    recalibration: RecalibrationKind
+    correction: Recalibration | None
+
+    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
+        """Estimate gaze points on the screen's plane."""
+        rig = rig.build()
+        correction = self.correction or Recalibration(self.recalibration)
+        return correction.apply(observations, self.optic_axes(observations, rig), rig)
+
+    def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
+        """Estimate rays of gaze; no screen is needed unless the correction acts on the screen."""
+        rig = rig.build()
+        correction = self.correction or Recalibration(self.recalibration)
+        return correction.apply_to_rays(observations, self.optic_axes(observations, rig), rig)
+
+    @abstractmethod
+    def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
+        """Compute optic axes from the centre of corneal curvature, one row per observation."""
 
 
 def angles_of(direction: Floats) -> Floats:

@@ -77,6 +77,22 @@ class EyeFit:
     b: Floats
 
 
+def mapped(
+    fits: Mapping[int, EyeFit], terms: tuple[Terms, Terms], vectors: Floats, eyes: Ints, reason: Objects
+) -> Floats:
+    """Evaluate the polynomials of each eye at vectors (n, 2), (n, 2); eyes without a fit get NaN and a reason."""
+    out = np.full(vectors.shape, np.nan)
+    for eye in np.unique(eyes):
+        rows = np.flatnonzero(eyes == eye)
+        fit = fits.get(int(eye))
+        if fit is None:
+            reason[rows] = "this eye is not calibrated"
+            continue
+        u = (vectors[rows] - fit.origin) / fit.scale
+        out[rows] = np.stack([monomials(u, terms[0]) @ fit.a, monomials(u, terms[1]) @ fit.b], axis=-1)
+    return out
+
+
 @dataclass(frozen=True, slots=True)
 class Regression:
     """Polynomial regression on the vector from one light's glint to the pupil.
@@ -158,17 +174,7 @@ class Regression:
             raise InputError("the estimator is not calibrated; call fit first")
         screen = screen_of(rig.build())
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
-        x_terms, y_terms = self.terms
-        on_screen = np.full((len(observations), 2), np.nan)
-        for eye in np.unique(observations.index.eye):
-            rows = np.flatnonzero(observations.index.eye == eye)
-            fit = self.fits.get(int(eye))
-            if fit is None:
-                reason[rows] = "this eye is not calibrated"
-                continue
-            u = (v[rows] - fit.origin) / fit.scale
-            on_screen[rows] = np.stack([monomials(u, x_terms) @ fit.a, monomials(u, y_terms) @ fit.b], axis=-1)
-        return GazePoints.of(screen.world(on_screen), reason)
+        return GazePoints.of(screen.world(mapped(self.fits, self.terms, v, observations.index.eye, reason)), reason)
 
     def _solve(self, design: Floats, wanted: Floats, eye: str) -> Floats:
         solution, _, rank, _ = np.linalg.lstsq(design, wanted, rcond=None)

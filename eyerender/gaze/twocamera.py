@@ -18,16 +18,16 @@ from ..errors import InputError
 from ..observation import Observations
 from ..rig.rig import RigGeometry, RigLike
 from .cornea import line_to_centre
-from .estimate import GazePoints, GazeRays
+from .estimate import GazeRays
 from .rays import FeatureRays, feature_rays, unit
-from .recalibration import Recalibration, RecalibrationKind
+from .recalibration import Recalibrated, Recalibration, RecalibrationKind
 
 # Below this sine two lines or planes count as parallel, because rounding would determine where they meet.
 _PARALLEL = 1e-7
 
 
 @dataclass(frozen=True, slots=True)
-class ShihWuLiu:
+class ShihWuLiu(Recalibrated):
     """Optic axis from two cameras, corrected by a polynomial.
 
     Observations of the two cameras are paired by head position, fixation and eye; both get the same estimate.
@@ -56,18 +56,6 @@ class ShihWuLiu:
         rows = np.flatnonzero(observations.index.camera == self.cameras[0])
         part = GazeRays.of(rays.origin_mm[rows], rays.direction[rows], rays.reason[rows].copy())
         return replace(self, correction=Recalibration(self.recalibration).fit(observations.take(rows), part, rig))
-
-    def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
-        """Estimate gaze points on the screen's plane."""
-        rig = rig.build()
-        correction = self.correction or Recalibration(self.recalibration)
-        return correction.apply(observations, self.optic_axes(observations, rig), rig)
-
-    def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
-        """Estimate rays of gaze; no screen is needed unless the correction acts on the screen."""
-        rig = rig.build()
-        correction = self.correction or Recalibration(self.recalibration)
-        return correction.apply_to_rays(observations, self.optic_axes(observations, rig), rig)
 
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Compute optic axes from the centre of corneal curvature, one row per observation."""

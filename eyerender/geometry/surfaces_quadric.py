@@ -119,11 +119,6 @@ class Quadric(Surface):
         """Return (A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c) in the eye frame; numbers or (n,) arrays."""
         return self._eye
 
-    @property
-    def axial_coefficients(self) -> tuple[Floats | float, Floats | float, Floats | float] | None:
-        """Return (A_xx, b_x, c) of y^2 + z^2 + A_xx x^2 + 2 b_x x + c = 0 in the eye frame; None for others."""
-        return (self._eye[0], self._eye[6], self._eye[9]) if self._axial else None
-
     def seen_from(self, origin_mm: Floats, rotation: Floats) -> Quadric:
         """Express the surface in another frame p', where p = rotation p' + origin_mm."""
         back = np.swapaxes(rotation, -1, -2)

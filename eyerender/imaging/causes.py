@@ -22,7 +22,7 @@ from ..backends.choose import BackendChoice
 from ..errors import InputError
 from ..gaze.budget import ESTIMATOR
 from ..observation import Observations, concatenate
-from ..progress import Progress
+from ..progress import Progress, notify
 from ..rig.exposure import recorded
 from ..rig.imaging import Ambient, Lens
 from ..rig.sensor import Sensor
@@ -100,8 +100,7 @@ def _image_steps(
             note(cause, 0, image)
             for seed in range(seeds) if scene is own and sensor.noise else ():
                 note("noise", seed, exposed_again(image, sensor, seed))
-            if progress is not None:
-                progress(k * len(frames) + done, len(scenes) * len(frames), "")
+            notify(progress, k * len(frames) + done, len(scenes) * len(frames), "")
     steps: dict[str, list[Observations]] = {}
     for (cause, _), seen in rows.items():
         steps.setdefault(cause, []).append(concatenate(seen))

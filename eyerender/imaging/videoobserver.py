@@ -14,7 +14,7 @@ from ..extraction import Extraction
 from ..extraction.overlay import overlay as drawn
 from ..extraction.video import VideoReader, VideoWriter, follow
 from ..observation import RECORD
-from ..progress import Progress
+from ..progress import Progress, notify
 from ..scene import Scene
 from ..storage.files import written
 from .imageobserver import ImageObserver, colour_warning
@@ -97,8 +97,7 @@ def observe_video(
                     file.write(_line(line, frame.time_s, one))
             count, pupils, coloured = count + 1, pupils + len(found), coloured + frame.colour
             ok += sum(one.pupil.ok for one in found)
-            if progress is not None:
-                progress(count, max(reader.count, count), "")
+            notify(progress, count, max(reader.count, count), "")
     if coloured and warn is not None:
         warn([colour_warning(coloured, "frames")])
     return VideoSummary(

@@ -20,7 +20,7 @@ from ..errors import InputError, UnfinishedRunWarning
 from ..folders.imagefolder import Entries, ImageEntry, ImageFolder
 from ..folders.packed import PackedLines
 from ..processes import ordered
-from ..progress import Progress
+from ..progress import Progress, notify
 from .faults import Fault
 from .figures import groups_of, numbers_of
 from .labels import contradictions
@@ -109,8 +109,7 @@ def read(path: str | Path, *, limit: int, workers: int, progress: Progress | Non
         for row in part:
             store.take(done, row)
             done += 1
-        if progress is not None:
-            progress(done, len(rows), "")
+        notify(progress, done, len(rows), "")
     return store.contents(folder, rows)
 
 

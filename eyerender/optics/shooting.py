@@ -103,13 +103,7 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
     """
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *target, *aim)))
     source, target = _spread(source, shape), _spread(target, shape)
-    direction = unit(minus(_spread(aim, shape), source))
-    shot = _shoot(path, n_start, source, direction, target)
-    for _ in range(_FAST_STEPS):
-        if not ((shot.status == Status.OK) & ~_settled(shot, 1.0)).any():
-            break
-        direction = _stepped(direction, shot, 1.0)
-        shot = _shoot(path, n_start, source, direction, target)
+    direction, shot = _undamped(path, n_start, source, target, _spread(aim, shape), _FAST_STEPS)
     settled = (shot.status == Status.OK) & _settled(shot, 100.0)
     if not settled.all():
         direction, shot = _rescue(
@@ -149,6 +143,16 @@ def correct(
         aim: (m,) points at which they are aimed first.
         steps: largest number of undamped Newton steps.
     """
+    direction, shot = _undamped(path, n_start, source, target, aim, steps)
+    settled = _settled(shot, 100.0) & (shot.residual_mm <= RESIDUAL_LIMIT_MM)
+    mark(shot.status, ~settled, Status.NOT_CONVERGED)
+    return Corrected(direction, shot.first, shot.last, shot.turning, shot.residual_mm, shot.determinant, shot.status)
+
+
+def _undamped(
+    path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz, steps: int
+) -> tuple[Xyz, _Shot]:
+    """Run undamped Newton steps from rays towards `aim`; return the directions at the source, and the rays."""
     direction = unit(minus(aim, source))
     shot = _shoot(path, n_start, source, direction, target)
     for _ in range(steps):
@@ -156,9 +160,7 @@ def correct(
             break
         direction = _stepped(direction, shot, 1.0)
         shot = _shoot(path, n_start, source, direction, target)
-    settled = _settled(shot, 100.0) & (shot.residual_mm <= RESIDUAL_LIMIT_MM)
-    mark(shot.status, ~settled, Status.NOT_CONVERGED)
-    return Corrected(direction, shot.first, shot.last, shot.turning, shot.residual_mm, shot.determinant, shot.status)
+    return direction, shot
 
 
 class RayTube(NamedTuple):

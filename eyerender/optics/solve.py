@@ -44,24 +44,6 @@ class ApparentPoints(ArrayValue):
     status: Statuses
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MirrorPoints(ArrayValue):
-    """Points at which a surface reflects light from a source to a viewpoint.
-
-    Attributes:
-        points_mm: (..., 3) points on the surface.
-        directions: (..., 3) unit vectors from there to the viewpoint.
-        residual_mm: (...,) distance by which the traced ray misses the source, 1e-9 at most. It is measured at 1000 mm
-            if the source is farther away.
-        status: (...,).
-    """
-
-    points_mm: Floats
-    directions: Floats
-    residual_mm: Floats
-    status: Statuses
-
-
 class Rays(NamedTuple):
     """Rays from a viewpoint to a point through surfaces, one array per coordinate.
 
@@ -111,21 +93,6 @@ def apparent_points(
     )
 
 
-def mirror_points(
-    surface: Surface, source_mm: npt.ArrayLike, viewpoint_mm: npt.ArrayLike, *, rim_mm: FloatLike = np.inf
-) -> MirrorPoints:
-    """Compute where a surface reflects a source to a viewpoint outside: the first Purkinje image.
-
-    Args:
-        surface: the mirror.
-        source_mm: (..., 3) sources.
-        viewpoint_mm: (..., 3) viewpoints; they broadcast against the sources.
-        rim_mm: rim radius of the surface (the limbus).
-    """
-    rays = mirrored_rays(surface, components(source_mm), components(viewpoint_mm), rim_mm=rim_mm)
-    return MirrorPoints(join(rays.exit), -join(rays.way), rays.residual_mm, rays.status)
-
-
 def refracted_rays(
     surfaces: Sequence[Surface],
     indices: Sequence[FloatLike],
@@ -152,7 +119,16 @@ def refracted_rays(
 
 
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
-    """Compute `mirror_points` on components."""
+    """Compute where a surface reflects a source to a viewpoint outside: the first Purkinje image.
+
+    The residual is measured at 1000 mm if the source is farther away.
+
+    Args:
+        surface: the mirror.
+        source: components of the sources.
+        viewpoint: components of the viewpoints; they broadcast against the sources.
+        rim_mm: rim radius of the surface (the limbus).
+    """
     path = (Crossing(surface=surface, n_after=1.0, reflects=True, rim_mm=rim_mm, beyond_rim=Status.OUTSIDE_LIMBUS),)
     graphs = graphs_of(surface)
     if graphs is None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
-from ..progress import Progress
+from ..progress import Progress, notify
 from .model import SIDES, Model
 from .people import PopulationSpec
 
@@ -172,8 +172,7 @@ def refusals(population: PopulationSpec, n: int, seed: int = 0, *, progress: Pro
             except InputError as error:
                 stays[subject] = False
                 reasons[f"{error.path}: {error.reason}" if error.path else error.reason] += 1
-        if progress is not None:
-            progress(subject + 1, n, "eyes built")
+        notify(progress, subject + 1, n, "eyes built")
     shifts = {}
     for name, parts in values.items():
         x = np.concatenate(parts)

@@ -118,7 +118,7 @@ def inner_margins(spec: Region, globe: Globe, motions: tuple[Floats, Floats], co
         Points (k, columns, 3) mm, mirrored back for a left eye.
     """
     turn, shift = motions
-    mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    mirror = globe.mirror
     _, a, upper, on_globe, _ = _columns(columns)
     yz, _ = _outline(spec, globe.radius_mm, np.arcsin(np.clip(turn[:, 2, 0], -1, 1)), a, upper)
     moved = mirror * (turn @ globe.centre_mm + shift)

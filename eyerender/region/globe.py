@@ -61,6 +61,11 @@ class Globe(ArrayValue):
         )
 
     @property
+    def mirror(self) -> Floats:
+        """Factors (3,) between a right eye's frame and the region's: -1 along y for a left eye."""
+        return np.array([1.0, -1.0 if self.mirrored else 1.0, 1.0])
+
+    @property
     def centre(self) -> Floats:
         """Centre of the sclera's sphere in the region's frame, (3,) mm."""
         return _posed(self).centre
@@ -68,12 +73,12 @@ class Globe(ArrayValue):
     @property
     def rest(self) -> Floats:
         """Centre of the sphere of the unrotated eye, (3,) mm."""
-        return self._mirror(self.centre_mm)
+        return np.asarray(self.mirror * self.centre_mm)
 
     @property
     def axis(self) -> Floats:
         """Direction of the optic axis in the region's frame."""
-        return self._mirror(self.M[:, 0])
+        return np.asarray(self.mirror * self.M[:, 0])
 
     @property
     def elevation_rad(self) -> float:
@@ -124,9 +129,6 @@ class Globe(ArrayValue):
         out += posed.centre
         return np.asarray(out)
 
-    def _mirror(self, vector: Floats) -> Floats:
-        return vector * np.array([1.0, -1.0, 1.0]) if self.mirrored else np.asarray(vector)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Posed:
@@ -140,12 +142,11 @@ class _Posed:
 
 @remembered
 def _posed(globe: Globe) -> _Posed:
-    mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
     bulge = np.zeros((_POLAR, _TURNS + 1))
     if globe.cornea is not None:
         bulge = _table(globe.cornea, globe.limbus_radius_mm, tuple(globe.centre_mm.tolist()), globe.radius_mm)
-    centre = mirror * (globe.M @ globe.centre_mm + globe.t)
-    return _Posed(sealed(centre), mirror[:, None] * globe.M, bulge, float(np.max(bulge)))
+    centre = globe.mirror * (globe.M @ globe.centre_mm + globe.t)
+    return _Posed(sealed(centre), globe.mirror[:, None] * globe.M, bulge, float(np.max(bulge)))
 
 
 @lru_cache(maxsize=32)

@@ -89,8 +89,7 @@ class LidMargins(ArrayValue):
 
 def lid_margins(spec: Region, globe: Globe) -> LidMargins:
     """Compute only the lids' inner edges, without the surrounding mesh."""
-    mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
-    upper, lower = (frozen(edge * mirror) for edge in _margins(contour(spec, globe)))
+    upper, lower = (frozen(edge * globe.mirror) for edge in _margins(contour(spec, globe)))
     return LidMargins(upper, lower)
 
 

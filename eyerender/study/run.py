@@ -15,7 +15,7 @@ from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
 from ..folders.outfolder import clear, refuse_non_empty
 from ..processes import mapper
-from ..progress import Progress, Say
+from ..progress import Progress, Say, notify
 from ..scene import Scene
 from ..storage.files import read_json, write_json, write_text
 from ..storage.lock import writer_lock
@@ -186,13 +186,11 @@ def _collected(
 ) -> list[Any]:
     """Run a job on each item and collect the results in order."""
     out = []
-    if progress is not None:
-        progress(0, len(items), "")
+    notify(progress, 0, len(items), "")
     with mapper(min(workers, len(items))) as mapped:
         for k, part in enumerate(mapped(job, items)):
             out.append(part)
-            if progress is not None:
-                progress(k + 1, len(items), names[k])
+            notify(progress, k + 1, len(items), names[k])
     return out
 
 

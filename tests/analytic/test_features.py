@@ -251,7 +251,8 @@ def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them
     """The narrowest pupil, from where the ray crosses the stop's plane on its way in and out, found here by tracing."""
     cameras, lights = rig()
     camera, spec, narrowest = cameras[0], load_eye(name), []
-    for elevation in (-25.0, -27.5, -33.0):
+    # A ray through the gradient lens of E5 takes a hundred times as long as one through shells.
+    for elevation in (-25.0, -33.0) if (name, order) == ("E5", 4) else (-25.0, -27.5, -33.0):
         pose = Poses.from_degrees(1.0, elevation)
 
         def status(diameter, pose=pose, orders=(1, 2, order)):

@@ -150,11 +150,13 @@ def unfinished(wheel: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(wheel, tmp_path / "lib"))
 
 
+@pytest.mark.packaging
 def test_wheel_renders_without_its_links(unfinished: Path) -> None:
     verdict = run_probe(VARIANT, unfinished)
     assert verdict.ok, verdict.detail
 
 
+@pytest.mark.packaging
 def test_libraries_of_the_wheel_stay_out_of_the_way_of_others(unfinished: Path) -> None:
     """Exceptions of another C++ library, loaded afterwards, must not end in LLVM's runtime."""
     done = python(
@@ -181,6 +183,7 @@ def test_libraries_of_the_wheel_stay_out_of_the_way_of_others(unfinished: Path) 
     assert done.stdout.split() == ["True", "caught"]
 
 
+@pytest.mark.packaging
 def test_wheel_is_found_without_site_packages(wheel: Path) -> None:
     """`python -S` with PYTHONPATH processes no .pth file."""
     code = "from eyerender.backends.choose import choose_backend; print(choose_backend('llvm').library)"
@@ -253,6 +256,7 @@ def test_library_that_does_not_load_is_refused_but_not_for_good(cache: Path, tmp
     assert not list(cache.rglob("*.json"))
 
 
+@pytest.mark.packaging
 def test_cache_that_cannot_be_written_is_done_without(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     assert probe(VARIANT, good).ok
@@ -279,6 +283,7 @@ def test_library_that_ends_the_process_is_survived(cache: Path, tmp_path: Path) 
     assert verdict == Verdict(False, "rendering with it ends the process (SIGABRT)")
 
 
+@pytest.mark.packaging
 def test_bad_library_that_the_user_names_is_passed_over(good: Path, tmp_path: Path) -> None:
     """Versions that this machine has and that do not render stand for those a user may name."""
     bad = [path for path in candidates() if path != good and not probe(VARIANT, path).ok]
@@ -299,6 +304,7 @@ def test_bad_library_that_the_user_names_is_passed_over(good: Path, tmp_path: Pa
     assert result == "[1, 1.5]"
 
 
+@pytest.mark.packaging
 def test_mitsuba_imported_before_with_a_good_library_works(good: Path) -> None:
     preload = f"""
         from pathlib import Path
@@ -411,6 +417,7 @@ def point_apt_at(source: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(apt_module, "PAUSES_S", (0.0, 0.0))
 
 
+@pytest.mark.packaging
 @needs_archive
 @needs_compiler
 def test_library_that_drjit_lacks_is_fetched_once(archive: Path, absent: Path, good: Path) -> None:

@@ -40,3 +40,9 @@ def rendered(tmp_path_factory):
     except BackendError as error:
         pytest.skip(f"nothing to render with: {error}")
     return folder
+
+
+@pytest.fixture
+def no_report(monkeypatch):
+    """A bench whose report is not drawn, which takes longer than the bench itself."""
+    monkeypatch.setattr("eyerender.benchmark.run.write_bench_report", lambda *_: None)

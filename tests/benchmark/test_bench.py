@@ -114,6 +114,7 @@ def test_the_folder_holds_report_table_and_json(bench):
     assert "<script" not in page
 
 
+@pytest.mark.usefixtures("no_report")
 def test_an_earlier_bench_is_replaced_and_other_files_are_not(bench, drawn, tmp_path, capsys):
     out = shutil.copytree(bench[0], tmp_path / "bench")
     dead = ["--extractor", f"{sys.executable} -c 0"]
@@ -127,6 +128,7 @@ def test_an_earlier_bench_is_replaced_and_other_files_are_not(bench, drawn, tmp_
 
 
 @pytest.mark.render
+@pytest.mark.usefixtures("no_report")
 def test_glints_of_rendered_images_are_named_by_light(rendered, tmp_path):
     target = tmp_path / "results.json"
     argv = ["bench-extractors", str(rendered), "-o", str(tmp_path / "out"), "--extractor", "own-fast"]

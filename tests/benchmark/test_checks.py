@@ -77,6 +77,7 @@ def test_only_what_is_new_is_asked(drawn, counting, tmp_path):
     assert len(asked_first()) == 7
 
 
+@pytest.mark.usefixtures("no_report")
 def test_failures_are_not_stored(drawn, tmp_path, monkeypatch):
     (tmp_path / "cache").mkdir()
     monkeypatch.setattr(answercache, "cache_folder", lambda: tmp_path / "cache")

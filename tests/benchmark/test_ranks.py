@@ -25,7 +25,14 @@ def results(path, shares, images=40):
     return path
 
 
-@pytest.mark.parametrize(("second", "tau"), [((0.2, 0.4, 0.9), 1.0), ((0.9, 0.4, 0.2), -1.0), ((0.2, 0.9, 0.4), 1 / 3)])
+@pytest.mark.parametrize(
+    ("second", "tau"),
+    [
+        pytest.param((0.2, 0.4, 0.9), 1.0, marks=pytest.mark.slow),
+        pytest.param((0.9, 0.4, 0.2), -1.0, marks=pytest.mark.slow),
+        ((0.2, 0.9, 0.4), 1 / 3),
+    ],
+)
 def test_tau_of_shares(tmp_path, monkeypatch, capsys, second, tau):
     names = ("a", "b", "c")
     paths = [

@@ -32,10 +32,18 @@ def test_wilson_is_that_of_scipy():
     assert wilson(0, 0) is None
 
 
-@pytest.mark.parametrize(("subjects", "images", "rate", "alike"), [
-    (10, 4, 0.8, 0.3), (10, 10, 0.5, 0.3), (10, 10, 0.95, 0.1), (30, 4, 0.8, 0.0), (30, 4, 0.95, 0.3),
-    (100, 4, 0.98, 0.1), (100, 2, 0.8, 0.3),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("subjects", "images", "rate", "alike"),
+    [
+        (10, 4, 0.8, 0.3),
+        pytest.param(10, 10, 0.5, 0.3, marks=pytest.mark.slow),
+        pytest.param(10, 10, 0.95, 0.1, marks=pytest.mark.slow),
+        (30, 4, 0.8, 0.0),
+        pytest.param(30, 4, 0.95, 0.3, marks=pytest.mark.slow),
+        pytest.param(100, 4, 0.98, 0.1, marks=pytest.mark.slow),
+        pytest.param(100, 2, 0.8, 0.3, marks=pytest.mark.slow),
+    ],
+)
 def test_intervals_cover_the_rate_of_simulated_subjects(subjects, images, rate, alike):
     """Each subject has a rate of its own from a beta distribution with the given intra-class correlation."""
     rng, trials = np.random.default_rng(5), 400

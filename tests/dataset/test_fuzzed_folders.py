@@ -249,7 +249,7 @@ def test_lies_that_fuzzing_found(four, tmp_path, file, keys, value, action):
 
 
 def test_harmed_folders(four, tmp_path):
-    fuzz(four, tmp_path, 60, ACTIONS)
+    fuzz(four, tmp_path, 30, ACTIONS)
 
 
 @pytest.mark.slow

@@ -127,7 +127,8 @@ def test_rows_of_a_table_are_drawn_whole_with_their_weights(tmp_path):
         **{PUPIL: {"var": "row.pupil"}, "scene.subject.ipd_mm": {"var": "row.ipd"}},
     )
     made = Plan.load(path)
-    pairs = [(pupil(made.draw(i).scene), made.draw(i).scene["subject"]["ipd_mm"]) for i in range(400)]
+    scenes = [made.draw(i).scene for i in range(400)]
+    pairs = [(pupil(scene), scene["subject"]["ipd_mm"]) for scene in scenes]
     assert set(pairs) == {(3.0, 60.0), (5.0, 66.0)}
     assert abs(pairs.count((3.0, 60.0)) / 400 - 0.25) < 3 * math.sqrt(0.25 * 0.75 / 400)
     (tmp_path / "people.csv").write_text("pupil,ipd,w\n3,sixty,1\n")

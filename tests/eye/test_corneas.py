@@ -19,7 +19,7 @@ from eyerender.eye.meshes import eye_meshes
 from eyerender.eye.parts import TopographySpec, ZernikeSpec
 from eyerender.eye.pose import Poses
 from eyerender.eye.topography import read_topography
-from eyerender.optics.solve import apparent_points, mirror_points
+from eyerender.optics.solve import apparent_points
 from eyerender.rig.camera import PinholeCamera
 from eyerender.status import Status
 from tests.support.corneas import (
@@ -32,6 +32,7 @@ from tests.support.corneas import (
     zernike_of,
 )
 from tests.support.eye_meshes import crossing
+from tests.support.mirror import mirror_points
 
 LIGHTS = np.array([[580.0, -60.0, -150.0], [590.0, 80.0, -140.0], [600.0, 5.0, 160.0]])
 
@@ -62,7 +63,7 @@ def test_features_of_an_expanded_conic_are_those_of_the_conic():
 
         surface["shape"] = zernike_of(depth, 5.0, 14).to_mapping()
     expanded = er.EyeSpec.from_mapping(data)
-    exact, found = (seen([spec.build()], purkinje=(1, 2, 3, 4)) for spec in (conic, expanded))
+    exact, found = (seen([spec.build()], 4, purkinje=(1, 2, 3, 4)) for spec in (conic, expanded))
     assert np.array_equal(exact.glint_status, found.glint_status)
     assert (exact.glint_status[..., 0] == Status.OK).all()
     assert np.abs(exact.points_px - found.points_px).max() < 1e-4

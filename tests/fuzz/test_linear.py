@@ -14,10 +14,10 @@ from eyerender.region.head import _objects
 from eyerender.rig.opencv import read_opencv
 from eyerender.storage.files import read_json
 
-SIZE = 200_000
-# What is linear takes 1.6 s of processor time at most (a file of so many broken lines). A step that is quadratic as a
-# search for the ends of comments was takes 40 s, and its time grows with the square of the size.
-LIMIT_S = 8.0
+SIZE = 100_000
+# What is linear takes 0.8 s of processor time at most (a file of so many broken lines). A step that is quadratic as a
+# search for the ends of comments was takes 10 s, and its time grows with the square of the size.
+LIMIT_S = 4.0
 TEXTS = {
     "camera.xml": ["<" + "<!--", "<?x <!-- ", "<!-- -", "<a>", "<a b='", "<a>&#65;", "<![CDATA[", "<a><m>1 "],
     "camera.json": ["[", '{"a":', '{"a": "\\', "1", "{" + " "],

@@ -120,15 +120,15 @@ def fuzz_files(examples: int, path: Any) -> None:
 
 def test_mutated_records(tmp_path):
     # Guestrin's search takes a second a case; it has its turn in the long run.
-    fuzz_records(60, tmp_path / "records.json", NAMES[:-1])
+    fuzz_records(30, tmp_path / "records.json", NAMES[:-1])
 
 
 def test_mutated_calibrations(tmp_path):
-    fuzz_calibrations(100, tmp_path / "calibration.json")
+    fuzz_calibrations(50, tmp_path / "calibration.json")
 
 
 def test_garbled_files(tmp_path):
-    fuzz_files(60, tmp_path / "file.json")
+    fuzz_files(30, tmp_path / "file.json")
 
 
 @pytest.mark.slow

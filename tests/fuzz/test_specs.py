@@ -132,12 +132,12 @@ def fuzz_files(kind: str, examples: int, path: Any) -> None:
     cases()
 
 
-@pytest.mark.parametrize(("kind", "examples"), [("scene", 150), ("dataset", 60), ("eye", 60)])
+@pytest.mark.parametrize(("kind", "examples"), [("scene", 75), ("dataset", 25), ("eye", 30)])
 def test_mutated_mappings(kind, examples):
     fuzz_mappings(kind, examples)
 
 
-@pytest.mark.parametrize(("kind", "examples"), [("scene", 25), ("dataset", 15), ("eye", 25)])
+@pytest.mark.parametrize(("kind", "examples"), [("scene", 15), ("dataset", 8), ("eye", 15)])
 def test_garbled_files(kind, examples, tmp_path):
     fuzz_files(kind, examples, tmp_path / "file.yaml")
 

@@ -13,9 +13,10 @@ from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.geometry.transforms import tilt_rotation
 from eyerender.optics.purkinje import purkinje_points
 from eyerender.optics.shooting import connect
-from eyerender.optics.solve import apparent_points, mirror_points
+from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
 from eyerender.status import Status
+from tests.support.mirror import mirror_points
 from tests.support.paths import load
 from tests.support.surfaces import quadric_of
 
@@ -299,11 +300,11 @@ def test_a_solver_that_starts_astray_is_caught():
     """What Newton leaves unfinished is not reported as found: rays that are, pass their viewpoints when traced."""
     eye = load_eye("E4").build()
     rng = np.random.default_rng(5)
-    inside = rng.uniform([-9.0, -6.0, -6.0], [-1.0, 6.0, 6.0], (2000, 3))
-    seen_from = rng.uniform([-5.0, -60.0, -60.0], [40.0, 60.0, 60.0], (2000, 3))
+    inside = rng.uniform([-9.0, -6.0, -6.0], [-1.0, 6.0, 6.0], (500, 3))
+    seen_from = rng.uniform([-5.0, -60.0, -60.0], [40.0, 60.0, 60.0], (500, 3))
     found = apparent_points(eye.front, eye.front_indices, inside, seen_from)
     ok = found.status == Status.OK
-    assert 200 < ok.sum() < 1900
+    assert 50 < ok.sum() < 475
     out = trace(
         outward_path(eye.front, eye.front_indices), eye.front_indices[-1], inside[ok], found.inner_directions[ok]
     )

@@ -13,10 +13,11 @@ from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.kappa import kappa_deg, pupillary_axis, with_kappa
 from eyerender.eye.pose import Poses
-from eyerender.optics.solve import apparent_points, mirror_points
+from eyerender.optics.solve import apparent_points
 from eyerender.population.synteyes import SyntEyes
 from tests.eye.test_corneas import LIGHTS, camera
 from tests.support.corneas import GOLDEN, GOLDEN_BACK, GOLDEN_LENS
+from tests.support.mirror import mirror_points
 
 # Biometry of the eye in visisipy's tests/test_synteyes.py.
 CCT, ACD, LT, AL = 0.5675980419300763, 2.6237068010504445, 4.418377549556682, 24.498505342346316

@@ -7,10 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eyerender.eye.catalogue import load_eye
-from eyerender.optics.solve import apparent_points, mirror_points
+from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import inward_path, outward_path, trace
 from eyerender.status import Status
 from tests.support.fuzzing import budget
+from tests.support.mirror import mirror_points
 from tests.support.scenes import MODELS, points
 
 # Two places before the eye, at a table or on the head.

@@ -92,7 +92,7 @@ def remote(side_px: int, side_mm: float, lights) -> LampRig:
     )
 
 
-@pytest.mark.parametrize("model", ["E2", "E4"])
+@pytest.mark.parametrize("model", ["E2", pytest.param("E4", marks=pytest.mark.slow)])
 def test_an_even_sky_lights_sclera_surround_and_iris_as_in_the_stock_path_integrator(renderer, tmp_path, model):
     # The stock integrator finds an even sky through the cornea without trouble. Everything takes part: its shadows by
     # globe and surround, the way through the cornea, and what surfaces send to each other. The oracle's noise is .4 %.

@@ -36,7 +36,7 @@ def as_measured(kind: str) -> Any:
     return EyeSpec.from_mapping(data).build(pupil_diameter_mm=4.0)
 
 
-@pytest.mark.parametrize("kind", ["zernike", "grid"])
+@pytest.mark.parametrize("kind", ["zernike", pytest.param("grid", marks=pytest.mark.slow)])
 def test_a_conic_as_a_measured_cornea_gives_its_picture(renderer, kind):
     rig = head_rig()
     exact, found = (
@@ -136,7 +136,7 @@ def test_flux_and_place_of_a_glint_against_backward_tracing(renderer, name):
     assert np.linalg.norm(centroid(done.irradiance, window) - place) < 3e-3
 
 
-@pytest.mark.parametrize("name", ["zernike", "grid"])
+@pytest.mark.parametrize("name", [pytest.param("zernike", marks=pytest.mark.slow), "grid"])
 def test_light_on_the_iris_behind_measured_corneas_against_a_forward_light_tracer(renderer, name):
     eye = eye_with(SHAPES[name]).build()
     lamp = frozen((30.0, -6.0, -14.0))

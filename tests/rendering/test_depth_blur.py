@@ -130,7 +130,9 @@ def test_a_glint_is_blurred_by_the_depth_of_its_virtual_image(renderer):
     # The virtual image is 3.4 mm behind the apex, that of the iris 3.1 mm.
     job = replace(job, window=(x - 32, y - 32, 64, 64), lens=Lens(focus_mm=60.0), sensor=Sensor(noise=False))
     done = renderer.render(job, spp=1)
-    spots = np.array([renderer.render(seen_from(job, q), spp=1).glints.xy_px[0] for q in aperture(job, 256)])
+    half = aperture(job, 40)
+    both = np.concatenate([half, -half])  # so that the mean of few points is the middle of the lens
+    spots = np.array([renderer.render(seen_from(job, q), spp=1).glints.xy_px[0] for q in both])
     np.testing.assert_allclose(centroid(done.irradiance, done.window), done.glints.xy_px[0], atol=5e-3)
     np.testing.assert_allclose(spots.mean(axis=0), done.glints.xy_px[0], atol=5e-3)
     v, u = np.mgrid[:64, :64]

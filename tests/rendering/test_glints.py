@@ -37,7 +37,9 @@ def test_glint_centroids_of_point_lamps_against_fermat(renderer, model, rig_name
         checked += 1
 
 
-@pytest.mark.parametrize(("rig_name", "radius_mm"), [("remote", 60.0), ("head", 3.0)])
+@pytest.mark.parametrize(
+    ("rig_name", "radius_mm"), [("remote", 60.0), pytest.param("head", 3.0, marks=pytest.mark.slow)]
+)
 def test_flux_and_place_of_a_large_disc_against_backward_tracing(renderer, rig_name, radius_mm):
     # Camera rays are mirrored at the cornea and counted where they end on the disc; 24 x 24 rays a pixel leave .1 %.
     rig = RIGS[rig_name](radius_mm=radius_mm)

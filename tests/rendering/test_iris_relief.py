@@ -85,7 +85,7 @@ def exported(job, folder, depth: int, pattern: IrisPattern, cornea: bool):
     return mi.load_file(str(path))
 
 
-@pytest.mark.parametrize(("camera_deg", "lamp_deg"), [(35.0, -50.0), (0.0, 40.0)])
+@pytest.mark.parametrize(("camera_deg", "lamp_deg"), [(35.0, -50.0), pytest.param(0.0, 40.0, marks=pytest.mark.slow)])
 def test_parallax_slopes_and_shadows_are_those_of_triangles(renderer, tmp_path, camera_deg, lamp_deg):
     # Without refraction, point lamps leave the oracle without noise. What remains are the softness of our shadows and
     # the cells of our grid; the relief itself changes the pixels by 15 to 30 %.

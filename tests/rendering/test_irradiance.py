@@ -14,7 +14,7 @@ from tests.support.render_oracles import RINGS_MM, flux_on_rings, ring_points
 from tests.support.render_rigs import MODELS, PLAIN, LampRig, eye_of, iris_irradiance, job_of, remote_rig
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", [pytest.param(m, marks=[pytest.mark.slow] * (m in ("E1", "E3"))) for m in MODELS])
 @pytest.mark.parametrize("lamp", [(500.0, 0.0, -150.0), (30.0, -6.0, -14.0)], ids=["remote", "head"])
 def test_irradiance_of_iris_rings_against_a_forward_light_tracer(renderer, model, lamp):
     # 640 k rays leave some .02 % of counting error at the rings' borders; single precision and Newton's tolerance are

@@ -18,8 +18,8 @@ pytestmark = pytest.mark.render
     [
         ("head", "E2", "right", 0.5, (0.0, 0.0), 0.0),
         ("head", "E2", "left", 4.0, (20.0, -15.0), 0.3),
-        ("head", "E4", "right", 0.0, (-20.0, 15.0), 0.6),
-        ("remote", "E2", "right", 2.5, (10.0, -18.0), 0.0),
+        pytest.param("head", "E4", "right", 0.0, (-20.0, 15.0), 0.6, marks=pytest.mark.slow),
+        pytest.param("remote", "E2", "right", 2.5, (10.0, -18.0), 0.0, marks=pytest.mark.slow),
     ],
 )
 def test_views_change_no_pixel(renderer, monkeypatch, name, model, side, radius_mm, pose, blink):

@@ -47,7 +47,7 @@ def test_the_waves_on_the_device_are_the_radius_of_the_stop(renderer, side):
     assert not np.any(eye.stop.contains(middle + (points - middle) * (1 + 1e-5)))
 
 
-@pytest.mark.parametrize("rig_name", RIGS)
+@pytest.mark.parametrize("rig_name", ["remote", pytest.param("head", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("model", "side"), [pytest.param("E2", "left", marks=pytest.mark.slow), ("E4", "right")])
 def test_the_rendered_edge_is_the_analytic_outline(renderer, model, side, rig_name):
     # As for ellipses: a black and a grey pupil, whose quotient is the iris' share of each pixel.
@@ -115,7 +115,7 @@ def drawn_scene(rig_name, side, seed, pupil_mm=4.0):
     return Scene.of(SceneSpec.from_mapping(data))
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("side", [pytest.param("right", marks=pytest.mark.slow), "left"])
 def test_both_observers_have_the_margin_of_a_scene(renderer, side):
     from eyerender.analytic.observer import trace
     from eyerender.imaging.capture import render_job

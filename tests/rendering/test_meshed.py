@@ -10,10 +10,10 @@ import pytest
 from eyerender.errors import InputError
 from eyerender.eye.meshes import cornea_patches, eye_meshes
 from eyerender.imaging.capture import render_job
-from eyerender.optics.solve import mirror_points
 from eyerender.scene.shipped import load_scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.mesh_errors import mesh_errors, mesh_job
+from tests.support.mirror import mirror_points
 from tests.support.render_rigs import RIGS, eye_of, head_rig, job_of
 
 DEFAULT_MM = 0.1

@@ -151,7 +151,7 @@ def test_subjects_share_a_scene_and_its_recordings(renderer):
     assert np.array_equal(pictures(make_renderer("auto", 1), few), found)
 
 
-@pytest.mark.parametrize("place", [(600.0, 0.0, -120.0), (42.0, -38.0, -16.0)])
+@pytest.mark.parametrize("place", [pytest.param((600.0, 0.0, -120.0), marks=pytest.mark.slow), (42.0, -38.0, -16.0)])
 def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, monkeypatch, place):
     """Rays through their pixels without hairs meet the sheet, and the picture is what it is without them."""
     import drjit as dr
@@ -192,7 +192,7 @@ def test_tiles_said_to_be_plain_show_nothing_but_skin_and_thin_hairs(renderer, m
     assert np.all(quick >= slow)
 
 
-@pytest.mark.parametrize("lamps", [1, 2])
+@pytest.mark.parametrize("lamps", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_plain_tiles_leave_no_seam_where_fine_shadows_begin(renderer, monkeypatch, lamps):
     """With few lamps the samples of a group about the lids have rays of their own; one group may have both kinds."""
     from eyerender.imaging.capture import render_job

@@ -118,7 +118,7 @@ def test_lens_distortion_moves_the_picture_as_the_camera_says(renderer):
 
 
 @pytest.mark.parametrize("model", ["E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop"])
-@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("side", ["right", pytest.param("left", marks=pytest.mark.slow)])
 def test_every_eye_shows_all_its_parts_and_no_crack(renderer, model, side):
     rig = head_rig()
     eye = eye_of(model, side)

@@ -26,7 +26,7 @@ MATTE = PLAIN.model_copy(
 )
 
 
-@pytest.mark.parametrize(("depth", "tolerance"), [(2, 2e-3), (24, 8e-3)])
+@pytest.mark.parametrize(("depth", "tolerance"), [(2, 2e-3), pytest.param(24, 8e-3, marks=pytest.mark.slow)])
 def test_sclera_and_surround_against_path(renderer, tmp_path, depth, tolerance):
     # Means over thousands of pixels. The light between surfaces is interpolated; this window shows the surround only
     # where it changes most, in the first millimetres beside the globe.

@@ -40,7 +40,7 @@ def test_eye_section_shows_its_parts_where_the_model_has_them(name):
 
 
 def test_left_eye_is_drawn_mirrored():
-    right, left = (eye_section(load_eye("E5").build(eye=side)) for side in ("right", "left"))
+    right, left = (eye_section(load_eye("E1").build(eye=side)) for side in ("right", "left"))
     fovea = [next(li for li in f.axes[0].lines if li.get_label() == "fovea").get_ydata()[0] for f in (right, left)]
     assert fovea[0] == pytest.approx(-fovea[1])
     assert "temporal" in left.axes[0].get_ylabel()

@@ -202,8 +202,13 @@ def test_known_feature_errors_and_paired_differences():
     assert observers_compared.gaze(a[:1], b[:1], "c", "image", "E2", "x") is None
 
 
-def test_conditions():
-    part = conditions_part("E2")
+@pytest.fixture(scope="module")
+def conditions():
+    return conditions_part("E2")
+
+
+def test_conditions(conditions):
+    part = conditions
     for tracker in TRACKERS:
         centre = part.head_maps[tracker][2, 2]
         assert centre == np.nanmin(part.head_maps[tracker]) or tracker == "model-based"
@@ -227,9 +232,9 @@ def test_conditions():
     assert q["model-based"]["at_plus"] < q["model-based"]["base"] < q["model-based"]["at_minus"]
 
 
-def test_shifts_of_mirrored_pupils_cancel_in_the_mean_of_both_eyes():
+def test_shifts_of_mirrored_pupils_cancel_in_the_mean_of_both_eyes(conditions):
     """The shift moves the gaze of each eye horizontally; the mean of both hides that."""
-    part = conditions_part("E2")
+    part = conditions
     both, right = (part.diameters[f"interpolation, {who}, {SHIFTED}"] for who in ("both eyes", "right eye"))
     base = right[2]
     # .06 mm per mm, 2 mm from the calibration: .12 mm at 4.2 mm from the centre of curvature are 1.6 degrees.

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.stats import qmc
 
 from eyerender.geometry.surfaces import components
-from eyerender.optics.solve import mirror_points
 from eyerender.rendering.records.job import RenderJob
 from eyerender.rig.light import Lamp
+from tests.support.mirror import mirror_points
 
 from .render_oracles import corneal_share
 

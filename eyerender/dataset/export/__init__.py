@@ -17,7 +17,7 @@ from ...errors import InputError
 from ...folders.exported import EXPORT
 from ...folders.imagefolder import DATASET, ImageFolder
 from ...folders.outfolder import staged
-from ...progress import Progress
+from ...progress import Progress, notify
 from ...storage.files import write_json, write_text
 from ..assemble import verify_dataset, verify_finished
 from ..validation.problems import WRONG
@@ -97,8 +97,7 @@ def export(
     total = len(folder.entries)
 
     def step(done: int) -> None:
-        if progress is not None:
-            progress(done, total, "")
+        notify(progress, done, total, "")
 
     step(0)
     items = Items(folder, step, workers=workers, shuffle=shuffle)

@@ -37,7 +37,6 @@ from ...rig.camera import PinholeCamera
 from ...rig.light import Lamp
 from ...status import Status
 from ..hits.meshes import MirrorPoints, SurfaceMesh
-from ..records.job import ring_radius_mm
 from .cutdiscs import POINT, Nodes, cut_nodes, quadrature, rim
 
 _PARALLAX_MM = 0.05
@@ -238,7 +237,7 @@ class GlintScene:
 
         The polynomial only decides which points are visible; their positions and energies are exact.
         """
-        if float(ring_radius_mm(lamp)) > 0 or not np.all(image.found):
+        if lamp.inner_radius_mm > 0 or not np.all(image.found):
             return None
         e1, e2 = disc_basis(lamp)
         offset = (image.source_mm - lamp.position_mm) / float(lamp.radius_mm)
@@ -421,7 +420,7 @@ def _across(x: float, y: float, z: float) -> tuple[Floats, Floats]:
 def disc_points(light: Lamp, point: Floats) -> Floats:
     """Compute points (k, 3) of a lamp's disc or ring in the world, from points (k, 2) of the unit disc."""
     e1, e2 = disc_basis(light)
-    outer, inner = float(light.radius_mm), ring_radius_mm(light)
+    outer, inner = float(light.radius_mm), light.inner_radius_mm
     r2 = _dot(point, point)
     # Equal areas on the disc stay equal on the ring: r^2 runs from inner^2 to outer^2.
     stretch = np.sqrt(inner**2 + r2 * (outer**2 - inner**2)) / np.sqrt(np.maximum(r2, 1e-300))

@@ -325,7 +325,7 @@ class LampTable(ArrayValue):
         """Create the table from lamps in the world for an eye at x_world = M x + t."""
         rows = [
             [*(M.T @ (lamp.position_mm - t)), *(M.T @ lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
-             lamp.lobe_exponent, ring_radius_mm(lamp)]
+             lamp.lobe_exponent, lamp.inner_radius_mm]
             for lamp in lights
         ]  # fmt: skip
         return cls(np.reshape(rows, (-1, 10)), suns)
@@ -366,11 +366,6 @@ def returned_light(job: RenderJob) -> FundusLight:
     )
     lamps = LampTable.of(job.lights, job.M, job.t).rows[:, :3]
     return fundus_light(job.eye, lamps, job.M.T @ (job.camera.nodal_point_mm - job.t), job.focus_dpt, spread)
-
-
-def ring_radius_mm(lamp: Lamp) -> float:
-    """Return the radius of the dark middle of a ring-shaped lamp (mm); 0 for points and discs."""
-    return lamp.inner_radius_mm
 
 
 def _shape(surface: Surface, limbus_mm: float) -> Floats:

@@ -96,7 +96,7 @@ class GlobeCells:
     @classmethod
     def of(cls, posed: RegionMesh, globe: Globe, reach_mm: float) -> GlobeCells:
         """Select the cells of a pose; light spreads up to `reach_mm` from under a lid."""
-        centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+        centre = globe.centre * globe.mirror
         y, z = (v + c for v, c in zip(_globe_cells(globe.radius_mm), centre[1:], strict=True))
         upper, lower = (m[np.argsort(m[:, 1])] for m in (posed.upper_margin, posed.lower_margin))
         over = np.maximum(z - np.interp(y, upper[:, 1], upper[:, 2]), np.interp(y, lower[:, 1], lower[:, 2]) - z)

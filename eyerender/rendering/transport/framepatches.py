@@ -268,5 +268,5 @@ def _others(
         return *both, (0.0, 0.0, 1.0)
     globe = job.globe
     points, inner = plane_patches(globe, -job.look.backdrop_distance_mm)
-    centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    centre = globe.centre * globe.mirror
     return points, np.tile([1.0, 0.0, 0.0], (len(points), 1)), (float(centre[1]), float(centre[2]), inner)

@@ -93,12 +93,12 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
 
 def _relative_to_globe(globe: Globe, points: Floats) -> Floats:
     """Return points (n, 3) of the scene's frame relative to the centre of a globe at rest."""
-    return np.asarray(points - globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
+    return np.asarray(points - globe.centre * globe.mirror)
 
 
 def _coordinates(mesh: RegionMesh, globe: Globe) -> Floats:
     """Return coordinates (n, 4) of vertices: their points (mm), and a fourth one that grows across the lid margins."""
-    height = globe.clearance(mesh.vertices * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0]))
+    height = globe.clearance(mesh.vertices * globe.mirror)
     return np.column_stack([mesh.vertices, _STEEP * (np.clip(height, _LOW_MM, _TOP_MM) - _LOW_MM)])
 
 
@@ -141,17 +141,16 @@ class GlobePatches(ArrayValue):
 
 def globe_patches(globe: Globe, mesh: RegionMesh | None) -> GlobePatches:
     """Choose patches on a posed globe, between the lids of a region or on the front of the bare globe."""
-    mirror = np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
-    centre = globe.centre * mirror
+    centre = globe.centre * globe.mirror
     if mesh is None:
-        return _on_front(globe, centre, mirror)
+        return _on_front(globe, centre)
     y, low, high = _opening(globe, centre, mesh)
     share = (np.arange(GLOBE_ROWS) + 0.5) / GLOBE_ROWS
     z = low + share[:, None] * (high - low)
     dy, dz = np.broadcast_to(y - centre[1], z.shape), z - centre[2]
     dx = np.sqrt(np.maximum(globe.radius_mm**2 - dy * dy - dz * dz, 1.0))
     table = np.concatenate([centre, [y[0], (GLOBE_COLUMNS - 1) / (y[-1] - y[0])], np.stack([low, high], 1).ravel()])
-    return _on_globe(globe, centre, mirror, np.stack([dx, dy, dz], -1).reshape(-1, 3), table, GLOBE_COLUMNS, GLOBE_ROWS)
+    return _on_globe(globe, centre, np.stack([dx, dy, dz], -1).reshape(-1, 3), table, GLOBE_COLUMNS, GLOBE_ROWS)
 
 
 def _opening(globe: Globe, centre: Floats, mesh: RegionMesh) -> tuple[Floats, Floats, Floats]:
@@ -167,20 +166,18 @@ def _opening(globe: Globe, centre: Floats, mesh: RegionMesh) -> tuple[Floats, Fl
     return y, low, np.maximum(high, low + 1e-3)
 
 
-def _on_front(globe: Globe, centre: Floats, mirror: Floats) -> GlobePatches:
+def _on_front(globe: Globe, centre: Floats) -> GlobePatches:
     at = np.linspace(-WIDEST, WIDEST, MAP_SIDE)
     a, b = (v.ravel() for v in np.meshgrid(at, at))
     polar = np.minimum(np.hypot(a, b), np.pi - 0.01)
     s = np.sinc(polar / np.pi)
     table = np.concatenate([centre, np.zeros(2 + 2 * GLOBE_COLUMNS)])
-    return _on_globe(globe, centre, mirror, np.stack([np.cos(polar), a * s, b * s], -1), table, MAP_SIDE, MAP_SIDE)
+    return _on_globe(globe, centre, np.stack([np.cos(polar), a * s, b * s], -1), table, MAP_SIDE, MAP_SIDE)
 
 
-def _on_globe(
-    globe: Globe, centre: Floats, mirror: Floats, way: Floats, table: Floats, columns: int, rows: int
-) -> GlobePatches:
+def _on_globe(globe: Globe, centre: Floats, way: Floats, table: Floats, columns: int, rows: int) -> GlobePatches:
     way = way / np.linalg.norm(way, axis=1, keepdims=True)
-    points = centre + globe.radial(way * mirror)[:, None] * way
+    points = centre + globe.radial(way * globe.mirror)[:, None] * way
     return GlobePatches(points=points, normals=way, table=table, columns=columns, rows=rows)
 
 
@@ -193,7 +190,7 @@ def plane_patches(globe: Globe, plane_x: float) -> tuple[Floats, float]:
 
     Their distances from the globe grow by a constant factor, from `PLANE_FIRST_MM`.
     """
-    centre = globe.centre * np.array([1.0, -1.0 if globe.mirrored else 1.0, 1.0])
+    centre = globe.centre * globe.mirror
     inner = np.sqrt(max(globe.radius_mm**2 - (plane_x - centre[0]) ** 2, 1.0)) + 0.05
     growth = np.log1p(PLANE_MM / PLANE_FIRST_MM) / (RINGS - 1)
     radius = inner + PLANE_FIRST_MM * np.expm1(growth * np.arange(RINGS))
