@@ -45,6 +45,7 @@ def describe(found: Any) -> dict[str, float]:
         "radius_px": math.sqrt(float(np.prod(pupil.semi_axes_px[0]))) if pupil.ok[0] else math.nan,
         "px_per_mm": float(scale),
         "speed_deg_s": math.hypot(*spec.motion.eye_deg_s) if spec.motion else 0.0,
+        "field_delay_ms": spec.sensor.field_delay_ms,
         "window": float(bool(spec.ambient and spec.ambient.panels)),
         "exposure": exposure(spec),
         "psf_px": spec.sensor.psf_sigma_px,
@@ -106,6 +107,7 @@ def main() -> None:
         "a glint within 3 px of the edge": table["glint_from_edge_px"] < 3,
         "a window": table["window"] > 0,
         "motion": table["speed_deg_s"] > 50,
+        "interlaced": table["field_delay_ms"] > 0,
         "clipped skin (exposure > 1)": table["exposure"] > 1.0,
     }
     print(f"{len(rows)} samples, {len(failed)} cannot be made")

@@ -58,6 +58,18 @@ def test_every_hard_case_has_its_share(drawn):
     assert max(shares.values()) < 0.5, shares
 
 
+def test_a_few_per_cent_are_interlaced_and_show_two_moments(drawn):
+    plan, _ = drawn
+    scenes = [plan.draw(i).scene for i in range(plan.spec.count)]
+    interlaced = [s for s in scenes if s["sensor"]["field_delay_ms"]]
+    assert 0.02 < len(interlaced) / len(scenes) < 0.08
+    for scene in interlaced:
+        sensor, camera = scene["sensor"], scene["rig"]["cameras"][0]
+        assert sensor["field_delay_ms"] >= sensor["exposure_ms"]  # the first field ends before the second begins
+        turn = np.radians(np.hypot(*scene["motion"]["eye_deg_s"])) * 1e-3 * sensor["field_delay_ms"]
+        assert turn * 10.5 * camera["focal_length_px"] / 400 > 1.0  # px; the pupil is 10.5 mm from the eye's centre
+
+
 def test_images_vary_in_size_blur_noise_and_compression(drawn):
     _, scenes = drawn
     sensor = [s["sensor"] for s in scenes]
