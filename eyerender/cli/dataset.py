@@ -272,9 +272,10 @@ def export_dataset(
             overwrite=overwrite,
             progress=steps,
         )
-    image = done["image"]
-    how = f"{bits} bits, {image['encoding']}, gain {image['gain']:g}"
-    emit(done, f"{done['images']} images as {format} in {output} ({how})", json)
+    text = f"{done['images']} images as {format} in {output}"
+    if image := done["image"]:  # the layout labels has none
+        text += f" ({bits} bits, {image['encoding']}, gain {image['gain']:g})"
+    emit(done, text, json)
     return 0
 
 

@@ -237,7 +237,8 @@ def test_a_run_whatever_call_fails(two, tmp_path, capsys, resumed):
 def test_an_export_whatever_call_fails(two, tmp_path, capsys, layout):
     if layout == "parquet":
         pytest.importorskip("pyarrow")
-    assert run(["generate", str(two), str(tmp_path / "data")]) == 0
+    files = ["--layout", "webdataset" if layout == "labels" else "files"]
+    assert run(["generate", str(two), str(tmp_path / "data"), *files]) == 0
     sweep(export_case(tmp_path / "data", layout), tmp_path, capsys, None)
 
 

@@ -11,6 +11,7 @@ from pathlib import PurePosixPath
 import numpy as np
 import pytest
 
+from eyerender.cli.main import run
 from eyerender.dataset.export import export
 from eyerender.dataset.merge import merge
 from eyerender.dataset.status import status
@@ -89,7 +90,7 @@ def test_it_is_validated_and_exported(tiny, packed, tmp_path):
     assert pictures[0] == pictures[1]
 
 
-def test_labels_of_each_shard_are_exported_in_the_order_of_its_tar(tiny, packed, tmp_path, monkeypatch):
+def test_labels_of_each_shard_are_exported_in_the_order_of_its_tar(tiny, packed, tmp_path, monkeypatch, capsys):
     """`datasets` reads pictures and labels side by side, without a copy of the pictures."""
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     import datasets
@@ -114,6 +115,11 @@ def test_labels_of_each_shard_are_exported_in_the_order_of_its_tar(tiny, packed,
         export(tiny, "labels", tmp_path / "other")
     with pytest.raises(InputError, match="--gain: the layout labels has no images"):
         export(packed, "labels", tmp_path / "other", gain=2.0)
+    assert run(["export-dataset", str(packed), "--format", "labels", "-o", str(tmp_path / "command")]) == 0
+    assert capsys.readouterr().out == f"{len(entries)} images as labels in {tmp_path / 'command'}\n"
+    assert [p.read_bytes() for p in sorted((tmp_path / "command" / "labels").iterdir())] == [
+        p.read_bytes() for p in files
+    ]
 
 
 def test_loaders_of_image_folders_read_its_export(tiny, packed, tmp_path):
