@@ -162,11 +162,11 @@ def _with_variables(node: Any, variables: Mapping[str, Any]) -> Any:
 
 
 def possible(node: Any) -> list[Any]:
-    """Return every value that a node of a template can take; none for random numbers."""
+    """Return every value that a node of a template can take; none for random numbers and for what is no valid draw."""
     if not is_draw(node):
         return [node]
-    values = [node.get("value")] if node.get("draw") == "fixed" else node.get("values") or []
-    return [leaf for value in values for leaf in possible(value)]
+    values = [node.get("value")] if node.get("draw") == "fixed" else node.get("values")
+    return [leaf for value in values for leaf in possible(value)] if isinstance(values, list | tuple) else []
 
 
 def _label(draw: Draw, value: Any, k: int) -> Any:

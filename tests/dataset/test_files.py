@@ -87,6 +87,7 @@ def spec_in(place: Path, **more) -> Path:
             {"heads/bar.ply", "rooms/day.npy"},
         ),
         ({"region": {"lids": {}}, "ambient": {"irradiance_w_m2": {"draw": "uniform", "low": 0, "high": 1}}}, set()),
+        ({"ambient": {"map": {"file": {"draw": "choice", "values": 3}}}}, set()),  # its draw is refused later
     ],
 )
 def test_files_are_found_wherever_a_draw_may_name_them(tmp_path, scene, expected):
