@@ -162,7 +162,7 @@ def _with_variables(node: Any, variables: Mapping[str, Any]) -> Any:
 
 
 def possible(node: Any) -> list[Any]:
-    """Return every value that a node of a template can take; none for random numbers and for what is no valid draw."""
+    """Return every value that a node of a template can take; none for random numbers and invalid draws."""
     if not is_draw(node):
         return [node]
     values = [node.get("value")] if node.get("draw") == "fixed" else node.get("values")

@@ -76,7 +76,8 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
     group = group.reshape(-1)
     middle = np.stack([np.bincount(group, c) for c in w.T], axis=1) / count[:, None]
     away = np.linalg.norm(w - middle[group], axis=1)
-    order = np.lexsort((np.round(away, 6), group))  # two vertices are equally far from their middle
+    # Two vertices are equally far from their middle. Rounded, the first one is chosen on every processor.
+    order = np.lexsort((np.round(away, 6), group))
     chosen = solid[order[np.searchsorted(group[order], np.arange(len(first)))]]
     near, weight = _neighbours(mesh.normals, where, chosen, size[first])
     nearest = near[np.arange(len(near)), np.argmax(weight, axis=1)]
