@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import Self
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Ints
 from .biconic_kernels import Jet, Slopes
 from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit, shift, turn, turn_back
 
 STEPS = 12
 SETTLED_MM = 1e-7
 """Newton converges quadratically: an error of 1e-7 before the last step leaves less than 1e-14 after it."""
+_TOGETHER = 5  # Newton steps of all rays; almost all that meet the surface have settled by then
 _SEARCHED_MM = 4.0
 _SAMPLES = 41
 _HALVINGS = 30
@@ -86,49 +88,69 @@ class GraphSurface(Surface):
         possible = np.asarray((square >= 0.0) & np.isfinite(t))
         return np.where(possible, t, 0.0), possible
 
-    def _newton(self, start: Xyz, way: Xyz, guess: Floats, wanted: Bools) -> tuple[Floats, Floats]:
-        """Take Newton steps from `guess`; return the distance and the error before the last step."""
+    def _newton(self, start: Xyz, way: Xyz, guess: Floats, wanted: Bools, steps: int = STEPS) -> tuple[Floats, Floats]:
+        """Take Newton steps from `guess`; return the distance and the error before the last step.
+
+        After some steps, only the rays that have not settled take further ones: those that miss the surface never do.
+        """
         (ox, oy, oz), (dx, dy, dz) = start, way
         t, error = guess, np.full_like(guess, np.inf)
-        for _ in range(STEPS):
+        for step in range(1, steps + 1):
             sag = self.slopes(oy + t * dy, oz + t * dz)
             error = ox + t * dx - sag.x
             t = t - error / (dx - sag.y * dy - sag.z * dz)
-            if not np.max(np.abs(error), where=wanted & np.isfinite(error), initial=0.0) > SETTLED_MM:
+            late = wanted & np.isfinite(error) & (np.abs(error) > SETTLED_MM)
+            if not late.any():
+                break
+            if step == _TOGETHER and late.ndim:
+                rows = np.nonzero(late)
+                few, own, ways = self._rays(rows, late.shape, start, way)
+                t[rows], error[rows] = few._newton(own, ways, t[rows], late[rows], steps - step)
                 break
         return t, error
+
+    def _rays(self, rows: tuple[Ints, ...], shape: tuple[int, ...], start: Xyz, way: Xyz) -> tuple[Self, Xyz, Xyz]:
+        """Take rays with their surfaces: rows of arrays of a shape."""
+        own, ways = ([np.broadcast_to(a, shape)[rows] for a in vector] for vector in (start, way))
+        return self.take(rows[0]), (own[0], own[1], own[2]), (ways[0], ways[1], ways[2])
 
     def _searched(
         self, start: Xyz, way: Xyz, guess: Floats, t: Floats, error: Floats, lost: Bools, inward: bool
     ) -> tuple[Floats, Floats]:
         """Search `lost` rays: bisect the first change of sign near the guess, then apply Newton's method."""
-        rows = np.nonzero(lost) if lost.ndim else (np.zeros(1, dtype=np.intp),)
         shape = lost.shape or (1,)
-        few = self.take(rows[0])
-        (ox, oy, oz), (dx, dy, dz) = (tuple(np.broadcast_to(a, shape)[rows] for a in vector) for vector in (start, way))
-        near = np.broadcast_to(guess, shape)[rows]
+        t, error = (np.array(np.broadcast_to(a, shape)) for a in (t, error))
+        rows = np.nonzero(lost.reshape(shape))
+        few, own, ways = self._rays(rows, shape, start, way)
+        low, high = few._bracketed(own, ways, np.broadcast_to(guess, shape)[rows], inward)
+        t[rows], crosses = np.nan, ~np.isnan(low)
+        if crosses.any():
+            rows, low, high = tuple(row[crosses] for row in rows), low[crosses], high[crosses]
+            few, own, ways = self._rays(rows, shape, start, way)
+            for _ in range(_HALVINGS):
+                middle = 0.5 * (low + high)
+                behind = few._side(own, ways, middle, inward) <= 0.0
+                low, high = np.where(behind, low, middle), np.where(behind, middle, high)
+            t[rows], error[rows] = few._newton(own, ways, 0.5 * (low + high), ~np.isnan(low))
+        return t.reshape(lost.shape), error.reshape(lost.shape)
 
-        def side(s: Floats) -> Floats:
-            """Return a positive number before the crossing, a negative one behind it, else NaN."""
-            value = ox + s * dx - few.local_sag(oy + s * dy, oz + s * dz)
-            return value if inward else -value
-
+    def _bracketed(self, start: Xyz, way: Xyz, near: Floats, inward: bool) -> tuple[Floats, Floats]:
+        """Find distances before and behind the first crossing within `_SEARCHED_MM` of a guess, else NaN."""
         low, high = np.full(near.shape, np.nan), np.full(near.shape, np.nan)
-        before, value = near - _SEARCHED_MM, side(near - _SEARCHED_MM)
+        before, value = near - _SEARCHED_MM, self._side(start, way, near - _SEARCHED_MM, inward)
         for k in range(1, _SAMPLES):
             after = near - _SEARCHED_MM + 2.0 * _SEARCHED_MM * k / (_SAMPLES - 1)
-            there = side(after)
+            there = self._side(start, way, after, inward)
             found = np.isnan(low) & (value > 0.0) & (there <= 0.0)
             low, high = np.where(found, before, low), np.where(found, after, high)
             before, value = after, there
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (low + high)
-            behind = side(middle) <= 0.0
-            low, high = np.where(behind, low, middle), np.where(behind, middle, high)
-        better, left = few._newton((ox, oy, oz), (dx, dy, dz), 0.5 * (low + high), ~np.isnan(low))
-        t, error = np.array(np.broadcast_to(t, shape)), np.array(np.broadcast_to(error, shape))
-        t[rows], error[rows] = better, left
-        return t.reshape(lost.shape), error.reshape(lost.shape)
+        return low, high
+
+    def _side(self, start: Xyz, way: Xyz, t: Floats, inward: bool) -> Floats:
+        """Return a positive number at distances before the crossing, a negative one behind it, else NaN."""
+        (ox, oy, oz), (dx, dy, dz) = start, way
+        value = ox + t * dx - self.local_sag(oy + t * dy, oz + t * dz)
+        return value if inward else -value
 
     def value_at(self, point: Xyz) -> Floats:
         """Evaluate the implicit function F = 2 (x - h(y, z))."""

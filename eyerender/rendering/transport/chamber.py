@@ -45,7 +45,7 @@ RAYS = 256  # rays from each point
 _ROWS, _FINE = 8, 4  # points on the cornea's rim: across it, and in each sector
 _FAR_MM = 8.0  # distance of what rays that leave the eye meet: so far apart are two rays at an angle of 1
 _ALIKE = (1, 4, 6, 4, 1)  # weights of what neighbouring sectors find
-_SAME_MM = 0.005  # chambers of depths and radii that differ by less are one
+_SAME_MM = 0.02  # chambers of depths and radii that differ by less are one; iris light changes by up to .1 %
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,9 +76,9 @@ class Chamber:
 def chamber_of(eye: EyeModel, film: float) -> Chamber:
     """Compute the chamber of an eye with a film of this index on its cornea; pupil and albedos have no influence.
 
-    As the pupil of a person changes, the centre of the stop moves within the plane of the iris, and by about a
-    micrometre across it. Depth and root are therefore rounded to `_SAME_MM`, so that all images of a person share one
-    chamber, whichever comes first. If the plane is tilted, each pupil has its own chamber.
+    As pupil and accommodation of a person change, the centre of the stop moves within the plane of the iris, and by a
+    few micrometres across it. Depth and root are therefore rounded to `_SAME_MM`, so that most images of a person share
+    one chamber, whichever comes first. If the plane is tilted, each pupil has its own chamber.
     """
     root_mm = float(eye.iris_root_radius_mm)
     if np.array_equal(eye.stop.normal, [1.0, 0.0, 0.0]):
