@@ -143,7 +143,9 @@ class Skin(Spec):
     sheen: Share = Field(
         default=0.5, description="strength of the rough specular reflection of lamps by oily skin (chosen)"
     )
-    wet_albedo: float = _number(0.40, 0.25, 0.55, "albedo of the lid margins and the caruncle (chosen)")
+    wet_albedo: float = _number(
+        0.40, 0.25, 0.55, "albedo of the caruncle and of the moist inner edges of the lid margins (chosen)"
+    )
     map: Literal["off"] | None = Field(
         default=None,
         description="`off` for photometry: skin, margins and caruncle are smooth and matte, with `albedo` everywhere",

@@ -79,6 +79,33 @@ def test_the_map_is_its_specs_and_strengths_darken_their_own_places():
     assert far.min() < 0.9
 
 
+def test_roots_of_lashes_darken_a_strip_at_the_lash_line_and_not_the_whole_margin():
+    def profile(**lashes_of):
+        spec = Region.from_mapping({"seed": 6, "lashes": lashes_of})
+        return np.median(skin_map(spec)[:SHEET_ROWS, 300:460, 0], axis=1)
+
+    rows = (sheet_v(np.linspace(0, 1, ROWS)) * len(skin_map(Region(seed=6)))).astype(int)
+    line, middle = rows[CONJUNCTIVA + MARGIN - 1], rows[CONJUNCTIVA + MARGIN // 2]
+    few, many, made_up = profile(upper_count=0), profile(upper_count=150), profile(upper_count=150, mascara=1.0)
+    assert many[line] < 0.9 * few[line]
+    assert made_up[line] < 0.8 * many[line]
+    assert many[middle] == pytest.approx(few[middle], rel=0.03)
+    assert many[middle] > 0.9 * many[rows[CONJUNCTIVA + MARGIN + 3]]  # the margin is skin there
+
+
+def test_lashes_and_their_dark_strip_end_before_the_nose():
+    with_lashes, without = (
+        skin_map(Region.from_mapping({"seed": 6, "lashes": {"upper_count": n, "lower_count": n // 2}}))[..., 0]
+        for n in (150, 0)
+    )
+    rows = (sheet_v(np.linspace(0, 1, ROWS)) * len(without)).astype(int)
+    line = rows[CONJUNCTIVA + MARGIN - 1]
+    loss = 1 - with_lashes[line] / without[line]
+    turn = 2 * np.pi * np.arange(len(loss)) / len(loss)
+    np.testing.assert_allclose(loss[np.cos(turn) > 0.76], loss[0], atol=1e-3)
+    assert np.mean(loss[np.abs(np.cos(turn)) < 0.4]) > loss[0] + 0.05
+
+
 def test_a_skin_without_a_map_is_even_and_matte():
     data = yaml.safe_load("{seed: 6, skin: {map: off, albedo: 0.47}}")  # YAML reads `off` as false
     even = Region.from_mapping(data)
