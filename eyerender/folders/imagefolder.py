@@ -12,7 +12,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NoReturn, TypeGuard, overload
 
@@ -491,6 +491,14 @@ class ImageFolder:
         found = concatenate(parts)
         # Head positions are counted over all images.
         return replace(found, index=replace(found.index, head=count_heads(found.index.head_mm)))
+
+
+@lru_cache(maxsize=2)
+def opened_entries(path: str) -> Entries:
+    """Return the images of a folder that another process has opened; each process opens it once."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnfinishedRunWarning)  # the other process has given it
+        return ImageFolder.load(path).entries
 
 
 def shard_name(shard: int) -> str:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Floats, Indices
 from ...errors import InputError
+from ...geometry.transforms import normalize
 
 CORNEA_RADIUS_MM = 7.8
 # Distances in a typical adult eye: apex to centre of rotation, and from there to the entrance pupil and to the cornea's
@@ -58,10 +59,10 @@ def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLik
     """
     centre, camera = np.asarray(centre_mm, dtype=np.float64), np.asarray(camera_mm, dtype=np.float64)
     lights = np.atleast_2d(np.asarray(lights_mm, dtype=np.float64))
-    normal = _unit(_unit(camera - centre) + _unit(lights - centre))
+    normal = normalize(normalize(camera - centre) + normalize(lights - centre))
     for _ in range(40):
         point = centre + radius_mm * normal
-        updated = _unit(_unit(camera - point) + _unit(lights - point))
+        updated = normalize(normalize(camera - point) + normalize(lights - point))
         done = float(np.abs(updated - normal).max()) < 1e-12
         normal = updated
         if done:
@@ -103,7 +104,7 @@ def predict_glints(
     K3, R3, t3 = (np.asarray(value, dtype=np.float64) for value in (K, R, t_mm))
     camera = -R3.T @ t3
     pixel = np.append(np.asarray(pupil_px, dtype=np.float64), 1.0)
-    ray = _unit(R3.T @ np.linalg.solve(K3, pixel))
+    ray = normalize(R3.T @ np.linalg.solve(K3, pixel))
     eye = np.asarray(eye_mm, dtype=np.float64)
     if not np.isfinite(eye).all():
         if abs(ray[0]) < 1e-9:
@@ -115,7 +116,7 @@ def predict_glints(
     missed = nearest - rotation
     reach2 = ROTATION_TO_PUPIL_MM**2 - float(missed @ missed)
     pupil = nearest - math.sqrt(max(reach2, 0.0)) * ray
-    gaze = _unit(pupil - rotation)
+    gaze = normalize(pupil - rotation)
     cornea = rotation + ROTATION_TO_CORNEA_MM * gaze
     # The pupil's ray itself is exact. Errors from the model's assumed lengths are removed along it.
     cornea = cornea + (pupil - (rotation + ROTATION_TO_PUPIL_MM * gaze)) if reach2 > 0.0 else cornea
@@ -159,7 +160,9 @@ def assign_lights(
         return _unassigned(m, "the rig has no lights" if m else None)
     middle = lights.mean(axis=0)
     reach = tolerance_px + slack * np.hypot(*(lights - middle).T)
-    search = _Search(glints, lights, middle, reach, scale_range, shift_sd_px)
+    search = _Search(
+        glints=glints, lights=lights, middle=middle, reach=reach, scale_range=scale_range, shift_sd=shift_sd_px
+    )
     found: list[tuple[float, tuple[int, ...], Floats, float]] = []
     for shift, scale in search.promising():
         shift, scale = search.refitted(search.match(shift, scale), shift, scale)
@@ -220,11 +223,7 @@ def identify(
     return assign_lights(glints_px, predicted, shift_sd_px=max(position_sd_mm * scale, 2.0))
 
 
-def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Search:
     """Search for a layout: the glints (m, 2) and lights (l, 2) to match, px, and what is plausible.
 
