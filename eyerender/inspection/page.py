@@ -243,7 +243,13 @@ def _difference(first: Inspection, second: Inspection, moved: Sequence[Shift]) -
     a, b = first.contents, second.contents
     beyond = [shift for shift in moved if shift.distance > shift.chance]
     rows = [
-        [s.column, f"{s.distance:.3f}", f"{s.chance:.3f}", f"{s.medians[0]:.4g}", f"{s.medians[1]:.4g}", _of(s.counts)]
+        [
+            s.column,
+            f"{s.distance:.3f}",
+            f"{s.chance:.3f}",
+            *(f"{m:.4g}" for m in s.medians),
+            "{} and {}".format(*s.counts),
+        ]
         for s in moved
     ]
     groups = [
@@ -260,10 +266,6 @@ def _difference(first: Inspection, second: Inspection, moved: Sequence[Shift]) -
         "histograms": [_both(first, second, shift) for shift in beyond[:_SHIFTS]],
         "only": [(only_in(a, b), str(a.folder.path)), (only_in(b, a), str(b.folder.path))],
     }
-
-
-def _of(counts: tuple[int, int]) -> str:
-    return "{} and {}".format(*counts)
 
 
 def _both(first: Inspection, second: Inspection, shift: Shift) -> PageValues:
