@@ -17,14 +17,7 @@ import numpy as np
 from ..analytic.observer import trace
 from ..arrays import Floats, Ints, finite_or_none
 from ..backends.choose import BackendChoice
-from ..design.crowd import (
-    OUTLINE,
-    SHIFTS_MM,
-    coverage_of,
-    figures_of_people,
-    figures_of_shifts,
-    users_of,
-)
+from ..design.crowd import OUTLINE, SHIFTS_MM, coverage_of, figures_of_people, figures_of_shifts, users_of
 from ..design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
 from ..design.people import CALIBRATION_CELLS, GRID, LOST, Figures, Survey, place_of
 from ..design.safety import NOTE, eye_exposure

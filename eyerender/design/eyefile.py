@@ -9,19 +9,7 @@ import numpy as np
 from ..arrays import Floats
 from ..eye.kappa import angles_of, pupillary_axis, with_kappa
 from ..eye.spec import EyeSpec
-from .unknowns import (
-    ASPHERICITY,
-    CENTRE,
-    DEPTH,
-    ELLIPTICITY,
-    KAPPA,
-    LOCAL,
-    POSITION,
-    RADIUS,
-    ROTATION,
-    SHIFT,
-    TORICITY,
-)
+from .unknowns import ASPHERICITY, CENTRE, DEPTH, ELLIPTICITY, KAPPA, LOCAL, POSITION, RADIUS, ROTATION, SHIFT, TORICITY
 
 
 def changed_file(spec: EyeSpec, theta: Floats) -> EyeSpec:

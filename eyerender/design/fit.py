@@ -27,16 +27,7 @@ from .eyefile import changed_file
 from .features import Measured, Residuals, measured, residuals, sized
 from .information import EyeInformation, eye_information
 from .noise import FeatureNoise
-from .unknowns import (
-    ANGLES,
-    AZIMUTH,
-    COUNT,
-    ELEVATION,
-    LOCAL,
-    PERSON,
-    PUPIL,
-    Unknowns,
-)
+from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, PERSON, PUPIL, Unknowns
 from .varied import (
     Views,
     diameters_mm,

@@ -23,16 +23,7 @@ from ..arrays import Bytes, Ints, Singles
 from ..errors import InputError, Refuse, UnfinishedRunWarning
 from ..observation import EYES, Observations, concatenate, count_heads
 from ..rig.camera import Window
-from ..storage.files import (
-    MAX_FILE_BYTES,
-    inside,
-    is_plain,
-    read_bytes,
-    read_json,
-    shown,
-    write_bytes,
-    write_json,
-)
+from ..storage.files import MAX_FILE_BYTES, inside, is_plain, read_bytes, read_json, shown, write_bytes, write_json
 from ..storage.jsonlines import JsonLines, LineFiles
 from ..versions import package_version
 from .imagefile import MAX_IMAGE_BYTES, array_of, image_of

@@ -31,10 +31,7 @@ GIVEN, RAYS, GLINTS = "given", "rays", "glints"
 
 
 def predictions(
-    estimator: GazeEstimator,
-    observations: Observations,
-    rig: RigGeometry,
-    screen_px: tuple[float, float] | None = None,
+    estimator: GazeEstimator, observations: Observations, rig: RigGeometry, screen_px: tuple[float, float] | None = None
 ) -> dict[str, Any]:
     """Estimate the gaze of every observation, and of every frame with both eyes.
 

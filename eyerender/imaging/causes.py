@@ -70,11 +70,7 @@ def budget_steps(
         raise InputError("there are no targets to compare the gaze with; use a scene with 'targets' instead of 'poses'")
     exact = trace(frames)
     simple = _with_eye(frames, reference)
-    steps = {
-        ESTIMATOR: [with_stop_centre(trace(simple))],
-        "eye model": [with_stop_centre(exact)],
-        "optics": [exact],
-    }
+    steps = {ESTIMATOR: [with_stop_centre(trace(simple))], "eye model": [with_stop_centre(exact)], "optics": [exact]}
     if not images:
         return steps
     steps.update(_image_steps(frames, seeds, make_renderer(backend, threads), progress))

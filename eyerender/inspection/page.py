@@ -134,9 +134,7 @@ def _dataset(found: Inspection, *, several: bool) -> PageValues:
         "fault_lines": [[kind, found.name(at), detail] for kind, own in faults.items() for at, detail in own[:100]],
         "outliers": [
             pictures.tile(
-                o.at,
-                [found.name(o.at), *(f"{r.column}: {r.value:.4g}; {r.usual}" for r in o.reasons)],
-                marked=True,
+                o.at, [found.name(o.at), *(f"{r.column}: {r.value:.4g}; {r.usual}" for r in o.reasons)], marked=True
             )
             for o in found.outliers
         ],
