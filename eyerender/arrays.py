@@ -40,6 +40,11 @@ def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
     return array
 
 
+def finite_or_none(value: Any) -> float | None:
+    """Convert NaN and infinities to None, because JSON has none."""
+    return float(value) if np.isfinite(value) else None
+
+
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
 

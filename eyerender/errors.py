@@ -112,11 +112,7 @@ class Problems:
         """Return the first recorded error, which carries the others."""
         first, *others = self._listed
         return InputError(
-            first.reason,
-            source=first.source,
-            path=first.path,
-            others=others,
-            unlisted=self._count - len(self._listed),
+            first.reason, source=first.source, path=first.path, others=others, unlisted=self._count - len(self._listed)
         )
 
 

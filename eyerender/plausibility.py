@@ -228,11 +228,7 @@ def _differences(one: Any, other: Any, path: str) -> Iterator[str]:
 
 
 def _misplaced(
-    place: Floats,
-    what: str,
-    screen: ScreenPlane | None,
-    eyes_mm: Mapping[str, Floats],
-    heads_mm: Mapping[str, Floats],
+    place: Floats, what: str, screen: ScreenPlane | None, eyes_mm: Mapping[str, Floats], heads_mm: Mapping[str, Floats]
 ) -> tuple[str, str] | None:
     """Return code and reason of a warning about one position; None if it is plausible."""
     if np.linalg.norm(place) < _LEAST_DISTANCE_MM:

@@ -23,6 +23,11 @@ Result = TypeVar("Result")
 _PENDING = 3  # tasks per process of `ordered` that are at work or wait, which limits what is in memory
 
 
+def usable_cpus() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @contextmanager
 def signals_held() -> Iterator[None]:
     """Block Ctrl-C while children start; they inherit the signal mask."""

@@ -39,10 +39,10 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_in
 from .backends.choose import BackendChoice
 from .dataset.plan import Plan
 from .dataset.realise import frames_of
-from .dataset.run import usable_cpus
 from .dataset.spec import DatasetSpec, GeometryKind
 from .errors import InputError
 from .folders.imagefolder import ImageFolder
+from .processes import usable_cpus
 from .region.mesh import LID_MARKS
 
 if TYPE_CHECKING:
@@ -250,7 +250,8 @@ class StreamDataset(IterableDataset[Any]):
             ("threads", 1 if threads is None else threads, 1, math.inf),
         ):
             if not low <= value <= high:
-                raise InputError(f"must be {_range(low, high)}, not {value}", path=name)
+                allowed = f">= {low}" if high == math.inf else f"{low} to {high}"
+                raise InputError(f"must be {allowed}, not {value}", path=name)
         pictures = self.plan.spec.labels.pictures
         missing = [part for part in self.parts if part in _PICTURES and _PICTURES[part] not in pictures]
         if missing:
@@ -369,10 +370,6 @@ def _samples(plan: Plan, split: str | None) -> Sequence[int]:
         raise InputError(f"must be one of {', '.join(spec.splits)}, not {split!r}", path="split")
     own = {s for s in range(spec.selection.subject_count) if plan.split_of(s) == split}
     return [i for i in spec.selection.samples if spec.selection.subject_of(i) in own]
-
-
-def _range(low: float, high: float) -> str:
-    return f">= {low}" if high == math.inf else f"{low} to {high}"
 
 
 def _item(

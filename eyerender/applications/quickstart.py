@@ -92,11 +92,7 @@ def run_quickstart(
 
 
 def compare_folder(
-    path: str | Path,
-    *,
-    estimator: GazeEstimator | None = None,
-    name: str = "",
-    progress: Progress | None = None,
+    path: str | Path, *, estimator: GazeEstimator | None = None, name: str = "", progress: Progress | None = None
 ) -> Comparison:
     """Extract the features of a folder's images and compare them with the exact ones, in pixels and in gaze error.
 

@@ -15,17 +15,9 @@ from typing import Any
 import numpy as np
 
 from ..analytic.observer import trace
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, finite_or_none
 from ..backends.choose import BackendChoice
-from ..design.crowd import (
-    OUTLINE,
-    SHIFTS_MM,
-    coverage_of,
-    figures_of_people,
-    figures_of_shifts,
-    finite_or_none,
-    users_of,
-)
+from ..design.crowd import OUTLINE, SHIFTS_MM, coverage_of, figures_of_people, figures_of_shifts, users_of
 from ..design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
 from ..design.people import CALIBRATION_CELLS, GRID, LOST, Figures, Survey, place_of
 from ..design.safety import NOTE, eye_exposure
@@ -37,7 +29,7 @@ from ..gaze.store import choose_estimator
 from ..imaging.imageobserver import ImageObserver
 from ..population.people import Person
 from ..progress import Progress, notify
-from ..report.page import Card, Figure, Page, Section, Table, write_page
+from ..report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
 from ..report.style import figure, svg
 from ..scene import Scene
 from ..scene.people import Population
@@ -314,13 +306,13 @@ def _write_gaze(path: Path, survey: Survey, found: Figures) -> None:
 
 def page_of(scene: Scene, survey: Survey, found: Figures, data: dict[str, Any]) -> Page:
     """Compose the report's page."""
-    share = data["coverage"]["outline_and_2_glints"]
+    share, cornea = data["coverage"]["outline_and_2_glints"], data["safety"].get("cornea_share")
     cards = [
         Card(f"{100 * share:.1f} %", "of people and directions with two glints and 60 % of the outline"),
-        Card(_degrees(data["frame_to_frame_deg"]["U50E95"]), "noise of gaze, median person (U50E95, noise only)"),
-        Card(_degrees(data["bound_deg"]["U95E95"]),
+        Card(degrees_text(data["frame_to_frame_deg"]["U50E95"]), "noise of gaze, median person (U50E95, noise only)"),
+        Card(degrees_text(data["bound_deg"]["U95E95"]),
              "after a calibration, 95th-percentile person (U95E95, noise only)"),
-        Card(_cornea_share(data["safety"]), f"of the corneal limit ({NOTE})"),
+        Card("not known" if cornea is None else f"{100 * cornea:.1f} %", f"of the corneal limit ({NOTE})"),
     ]  # fmt: skip
     sections = (
         _gaze_section(survey, found), _who_section(survey, found, data), _slippage_section(data), _bias_section(data),
@@ -345,25 +337,17 @@ def _answer(data: dict[str, Any]) -> str:
     if noise["U50E95"] is None:
         parts.append("For the median person, the features do not determine gaze in every direction.")
     else:
-        parts.append(f"The sensor's noise moves the gaze of the median person by {_degrees(noise['U50E95'])}.")
+        parts.append(f"The sensor's noise moves the gaze of the median person by {degrees_text(noise['U50E95'])}.")
     if bound["U50E95"] is not None:
         parts.append(
-            f"After a calibration on nine targets the bound is {_degrees(bound['U50E95'])}, of which the noise of "
-            f"fixation alone is {_degrees(float(fixation))}."
+            f"After a calibration on nine targets the bound is {degrees_text(bound['U50E95'])}, of which the noise of "
+            f"fixation alone is {degrees_text(float(fixation))}."
         )
     known = {name: one["U50E95"] for name, one in data["estimators"].items() if one["U50E95"] is not None}
     if known:
         best = min(known, key=lambda name: known[name])
-        parts.append(f"The best estimator, {best}, has model errors of {_degrees(known[best])}.")
+        parts.append(f"The best estimator, {best}, has model errors of {degrees_text(known[best])}.")
     return " ".join(parts)
-
-
-def _degrees(value: float | None) -> str:
-    return "not seen" if value is None else f"{value:.3g}°"
-
-
-def _cornea_share(safety: dict[str, Any]) -> str:
-    return f"{100 * safety['cornea_share']:.1f} %" if "cornea_share" in safety else "not known"
 
 
 def _gaze_section(survey: Survey, found: Figures) -> Section:
@@ -398,7 +382,7 @@ def _who_section(survey: Survey, found: Figures, data: dict[str, Any]) -> Sectio
     population = Population.from_mapping(survey.population)
     rows = [
         [str(found.subject[k]), f"{100 * covered[k]:.0f} %", f"{found.glints[k].mean():.1f}",
-         f"{100 * found.outline[k].mean():.0f} %", _degrees(finite_or_none(noise[k])),
+         f"{100 * found.outline[k].mean():.0f} %", degrees_text(finite_or_none(noise[k])),
          *_traits_of(population.person(int(found.subject[k]), survey.seed))]
         for k in worst
     ]  # fmt: skip
@@ -442,7 +426,7 @@ def _slippage_section(data: dict[str, Any]) -> Section:
             ax.set_ylabel("eye up (mm)")
             drawn.append(Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over the place of the eye.", True))
     table = [
-        [f"{row['shift_mm'][0]:+.1f} mm", _degrees(row["noise_deg"]), f"{100 * row['covered_2_glints']:.1f} %"]
+        [f"{row['shift_mm'][0]:+.1f} mm", degrees_text(row["noise_deg"]), f"{100 * row['covered_2_glints']:.1f} %"]
         for row in away
     ]
     text = f"The first {_SLIPPING} people in all directions, with the eye shifted against the rig."
@@ -454,8 +438,8 @@ def _bias_section(data: dict[str, Any]) -> Section:
     tables = []
     for key, what in (("estimators", "exact features"), ("estimators_on_images", "rendered images of 25 targets")):
         rows = [
-            [name, _degrees(v["U50E95"]) if v["U50E95"] is not None else "—",
-             _degrees(v["U95E95"]) if v["U95E95"] is not None else "—", v["reason"] or ""]
+            [name, degrees_text(v["U50E95"]) if v["U50E95"] is not None else "—",
+             degrees_text(v["U95E95"]) if v["U95E95"] is not None else "—", v["reason"] or ""]
             for name, v in data[key].items()
         ]  # fmt: skip
         count = max((v["people"] for v in data[key].values()), default=0)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from ..arrays import finite_or_none
 from ..backends.choose import BackendChoice
 from ..dataset.sheet import contact_sheet
 from ..errors import InputError
@@ -77,7 +78,7 @@ class Result:
             "quantities": {
                 m.name: {
                     "mean": m.mean, "mean_error": m.mean_error, "sd": m.sd, "sd_error": m.sd_error,
-                    "expected_mean": _or_none(m.expected_mean), "expected_sd": _or_none(m.expected_sd),
+                    "expected_mean": finite_or_none(m.expected_mean), "expected_sd": finite_or_none(m.expected_sd),
                 }
                 for m in s.moments
             },
@@ -379,10 +380,6 @@ def _picture(sheet: Image.Image) -> str:
 
 def _number(value: float) -> str:
     return "-" if not np.isfinite(value) else f"{value:.4g}"
-
-
-def _or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 __all__ = ["Population", "run_survey"]

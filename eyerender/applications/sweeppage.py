@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..report.page import Card, Figure, Page, Section, Table, write_page
+from ..report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
 from ..report.style import ANALYTIC, IMAGE, figure, svg
 
 _MOST_ROWS = 60
@@ -59,13 +59,12 @@ def _answer(front: Sequence[Mapping[str, Any]]) -> str:
     few = min(good, key=lambda row: (row["leds"], row["noise_deg"]))
     text = (
         f"In short: among the layouts that see two glints and 60 % of the pupil's outline in 95 % of all cases, layout "
-        f"{best['number']} has the least noise, {_degrees(best['noise_deg'])} with {leds_of(best)}."
+        f"{best['number']} has the least noise, {degrees_text(best['noise_deg'])} with {leds_of(best)}."
     )
     if few["leds"] == best["leds"]:
         return f"{text} No such layout needs fewer LEDs."
-    return (
-        f"{text} Layout {few['number']} needs the fewest LEDs and has {_degrees(few['noise_deg'])} with {leds_of(few)}."
-    )
+    noise = degrees_text(few["noise_deg"])
+    return f"{text} Layout {few['number']} needs the fewest LEDs and has {noise} with {leds_of(few)}."
 
 
 def leds_of(row: Mapping[str, Any]) -> str:
@@ -108,8 +107,8 @@ def _table(front: Sequence[Mapping[str, Any]]) -> Table:
     """Return the table of the front, least noise first."""
     ordered = sorted(front, key=lambda row: np.inf if row["noise_deg"] is None else row["noise_deg"])
     rows = [
-        [str(row["number"]), _values(row["values"]), _degrees(row["noise_deg"]),
-         _degrees(row["frame_to_frame_deg"]["U95E95"]), f"{100 * row['dropout']:.1f} %", str(row["leds"]),
+        [str(row["number"]), _values(row["values"]), degrees_text(row["noise_deg"]),
+         degrees_text(row["frame_to_frame_deg"]["U95E95"]), f"{100 * row['dropout']:.1f} %", str(row["leds"]),
          "not known" if row["cornea_share"] is None else f"{100 * row['cornea_share']:.2g} %",
          " ".join(map(str, row["chosen"]))]
         for row in ordered[:_MOST_ROWS]
@@ -126,7 +125,3 @@ def _values(values: Mapping[str, Any]) -> str:
 
     shown = {name: value for name, value in values.items() if name != "number"}  # it has a column of its own
     return "; ".join(f"{name} {text(value)}" for name, value in shown.items()) or "the scene's own"
-
-
-def _degrees(value: float | None) -> str:
-    return "not seen" if value is None else f"{value:.3g}°"

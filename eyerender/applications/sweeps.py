@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools
+from ..arrays import Bools, finite_or_none
 from ..design.choice import choose_lights, noise_of_some
-from ..design.crowd import coverage_of, finite_or_none, users_of
+from ..design.crowd import coverage_of, users_of
 from ..design.noise import sensor_noise
 from ..design.people import Survey, figures_of, sites_seen
 from ..design.safety import eye_exposure

@@ -160,13 +160,10 @@ def layouts_of(spec: SweepSpec, scene: Scene) -> list[Layout]:
         chosen = dict(zip(names, values, strict=True))
         data = _applied(base, spec.sweep, chosen)
         SceneSpec.from_mapping(data, source=f"layout {number}").rig.build()
-        lights = chosen.get("number") or _light_count(data)
+        leds = (led["ring"]["count"] if led.get("ring") else 1 for led in data["rig"]["lights"])
+        lights = chosen.get("number") or sum(leds)
         found.append(Layout(number=number, values=chosen, scene=data, lights=lights))
     return found
-
-
-def _light_count(data: Mapping[str, Any]) -> int:
-    return sum(led["ring"]["count"] if led.get("ring") else 1 for led in data["rig"]["lights"])
 
 
 Axis = tuple[str, list[Any]]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import sys
 from dataclasses import dataclass
 
+from ..processes import usable_cpus
 from ..storage.cachefolder import cache_folder
 from ..versions import package_version
 from .choose import BackendName, BackendState, cuda_state
@@ -44,7 +44,7 @@ def doctor_report() -> DoctorReport:
         backends=states,
         python=f"{platform.python_version()} ({sys.executable})",
         platform=platform.platform(),
-        cpu=f"{cpu_name()}, {_cpu_count()} usable",
+        cpu=f"{cpu_name()}, {usable_cpus()} usable",
         packages=tuple((package, package_version(package)) for package in packages),
         cache=str(cache_folder() or "none (no private folder)"),
     )
@@ -57,7 +57,3 @@ def _llvm_state() -> BackendState:
             return BackendState("llvm", True, f"{examined.verdict.detail}, {examined.path}")
         refused.append(f"{examined.path}: {examined.verdict.detail}")
     return BackendState("llvm", False, "; ".join(refused) or "no libLLVM on this machine", llvm_fix())
-
-
-def _cpu_count() -> int:
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1

@@ -187,12 +187,8 @@ def _installed() -> list[Path]:
             folders += sorted(Path("/usr").glob(pattern))
         folders += sorted(Path("/home/linuxbrew/.linuxbrew/opt").glob("llvm*/lib"))
         found = _loader_cache()
-    return _libraries(folders) + found
-
-
-def _libraries(folders: list[Path]) -> list[Path]:
     patterns = ("libLLVM-*.so*", "libLLVM.so*", "libLLVM*.dylib", "LLVM-C.dll")
-    return [path for folder in folders for pattern in patterns for path in folder.glob(pattern)]
+    return [path for folder in folders for pattern in patterns for path in folder.glob(pattern)] + found
 
 
 def _loader_cache() -> list[Path]:

@@ -145,7 +145,7 @@ def _load(path: Path, eye_error_mm: float, pupil_class: int | None) -> list[Labe
     if _is_ideal(path):
         return _load_ideal(path)
     if is_own(path):
-        return _load_own(path, pupil_class)
+        return _with_hints(path, own_labels(path, pupil_class), None)
     layout = None if (path / DATASET).exists() else layout_of(path)
     if layout is not None:
         return _with_hints(path, read_layout(path, layout), stated_gamma(path))
@@ -166,10 +166,6 @@ def _load(path: Path, eye_error_mm: float, pupil_class: int | None) -> list[Labe
         hints = _hints(entry, truth, k, scene_rig, eye_error_mm)
         out.append(replace(image, hints=hints))
     return out
-
-
-def _load_own(folder: Path, pupil_class: int | None) -> list[LabelledImage]:
-    return _with_hints(folder, own_labels(folder, pupil_class), None)
 
 
 def _with_hints(folder: Path, labels: Iterable[Labelled], gamma: float | None) -> list[LabelledImage]:
@@ -213,7 +209,7 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int) -> LabelledImage
     image = entry.image()
     x0, y0, width, height = entry.window
     corner = np.array([x0, y0], dtype=np.float64)
-    labels = entry.labels
+    labels, lids = entry.labels, entry.labels.get("lid_margins_px") or {}
     pupil, glints = truth.pupil, truth.glints
     visible = _visible(labels)
     there = bool(pupil.ok[row] and pupil.in_image[row]) and visible != 0.0
@@ -253,7 +249,7 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int) -> LabelledImage
         factors | _ellipse_factors(ellipse, visible),
         subject=str(entry.line.get("subject", "")),
         iris=_iris(labels, corner),
-        lids_px=_lids(labels, corner),
+        lids_px=tuple(np.asarray(lids[lid], dtype=np.float64).reshape(-1, 2) - corner for lid in sorted(lids)),
         mask_path=entry.mask_path,
         conditions=tuple(of_scene(entry.line, ellipse, corner)),
         hidden_glints_px=tuple(hidden),
@@ -272,11 +268,6 @@ def _iris(labels: Mapping[str, Any], corner: Floats) -> Ellipse | None:
         return None
     centre = np.asarray(outline["centre_px"], dtype=np.float64) - corner
     return Ellipse(centre, outline["semi_axes_px"], outline["angle_rad"])
-
-
-def _lids(labels: Mapping[str, Any], corner: Floats) -> tuple[Floats, ...]:
-    margins = labels.get("lid_margins_px") or {}
-    return tuple(np.asarray(margins[lid], dtype=np.float64).reshape(-1, 2) - corner for lid in sorted(margins))
 
 
 def _visible(labels: Mapping[str, Any]) -> float | None:

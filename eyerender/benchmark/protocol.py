@@ -115,12 +115,12 @@ class Reply:
         line: the answer as it was sent.
     """
 
-    ellipse: Ellipse | None
-    reason: str | None
-    confidence: float | None
-    glints: tuple[tuple[tuple[float, float], int | None], ...]
-    cpu_s: float | None
-    wall_s: float | None
+    ellipse: Ellipse | None = None
+    reason: str | None = None
+    confidence: float | None = None
+    glints: tuple[tuple[tuple[float, float], int | None], ...] = ()
+    cpu_s: float | None = None
+    wall_s: float | None = None
     error: str | None = None
     line: str = ""
 
@@ -135,15 +135,7 @@ class Reply:
         if data.get("id") != request_id:
             raise InputError(f"must be {request_id}, not {shown(data.get('id'))}", path="id")
         if data.get("error") is not None:
-            return cls(
-                ellipse=None,
-                reason=None,
-                confidence=None,
-                glints=(),
-                cpu_s=None,
-                wall_s=None,
-                error=_words(data["error"]) or "no reason given",
-            )
+            return cls(error=_words(data["error"]) or "no reason given")
         record = data.get("record")
         if not isinstance(record, dict) or not isinstance(record.get("pupil"), dict):
             raise InputError("must hold the pupil", path="record")

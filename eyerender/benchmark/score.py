@@ -101,20 +101,23 @@ class Score:
 def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str, ...]) -> Score:
     """Score one answer."""
     glints = score_glints(image, reply) if "glints" in reports else None
-    times = (reply.cpu_s, reply.wall_s, trip_s)
     if reply.error is not None:
         return failed(image, reply.error, "glints" in reports)
     found, true = reply.ellipse, image.pupil
-    if image.centre_px is not None:
-        return _score_of_centre(image.centre_px, reply, glints, trip_s)
-    if true is None:
-        outcome: Outcome = "absent" if found is None else "false"
-        return Score(
-            outcome, reply.reason, None, None, None, None, None, reply.confidence, glints, *times, found, False
-        )
+    known: dict[str, Any] = {"confidence": reply.confidence, "glints": glints, "ellipse": found}
+    known |= {"cpu_s": reply.cpu_s, "wall_s": reply.wall_s, "trip_s": trip_s, "by_centre": image.centre_px is not None}
+    if image.centre_px is None and true is None:
+        return Score("absent" if found is None else "false", reply.reason, with_pupil=False, **known)
     if found is None:
-        reason = reply.reason or "gave no reason"
-        return Score("none", reason, None, None, None, None, None, reply.confidence, glints, *times)
+        return Score("none", reply.reason or "gave no reason", **known)
+    if image.centre_px is not None:
+        # The distance of the centre decides where no more is known.
+        dx, dy = (found.centre_px - np.array(image.centre_px)).tolist()
+        distance = math.hypot(dx, dy)
+        right = distance <= RIGHT_PX
+        reason = None if right else f"is {distance:.1f} px from the pupil's centre"
+        return Score("right" if right else "wrong", reason, (dx, dy), **known)
+    assert true is not None
     overlap = iou(found, true)
     dx, dy = (found.centre_px - true.centre_px).tolist()
     da, db = (found.semi_axes_px - true.semi_axes_px).tolist()
@@ -127,25 +130,9 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
         _turn_deg(found, true),
         overlap,
         float(np.mean(np.abs(signed_distance(found, image.outline_px)))),
-        reply.confidence,
-        glints,
-        *times,
-        found,
         radius_px=math.sqrt(float(true.semi_axes_px.prod())),
+        **known,
     )
-
-
-def _score_of_centre(true_px: tuple[float, float], reply: Reply, glints: GlintScore | None, trip_s: float) -> Score:
-    """Score an answer by the distance of its centre, where no more is known."""
-    known: dict[str, Any] = {"confidence": reply.confidence, "glints": glints, "by_centre": True}
-    known |= {"cpu_s": reply.cpu_s, "wall_s": reply.wall_s, "trip_s": trip_s}
-    if reply.ellipse is None:
-        return Score("none", reply.reason or "gave no reason", **known)
-    dx, dy = (reply.ellipse.centre_px - np.array(true_px)).tolist()
-    distance = math.hypot(dx, dy)
-    right = distance <= RIGHT_PX
-    reason = None if right else f"is {distance:.1f} px from the pupil's centre"
-    return Score("right" if right else "wrong", reason, (dx, dy), ellipse=reply.ellipse, **known)
 
 
 def failed(image: LabelledImage, reason: str, reports_glints: bool) -> Score:

@@ -22,7 +22,6 @@ from PIL import Image
 
 SCHEMA = "eyerender/extractor/1"
 PUPIL_LABS = "pupil-detectors"
-CHESHM = ("PuRe", "ElSe", "ExCuSe", "Swirski2D")
 
 
 def main(name: str) -> int:

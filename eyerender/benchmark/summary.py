@@ -120,20 +120,15 @@ def efficiency(scores: Sequence[Score], sigmas_px: Sequence[float | None]) -> di
 
 def failures(scores: Sequence[Score], images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
     """Return every reason for a wrong, missing or unusable answer, with its count and first image."""
-    seen: dict[tuple[Outcome, str], dict[str, Any]] = {}
-    members: dict[tuple[Outcome, str], list[Score]] = {}
+    members: dict[tuple[Outcome, str], list[tuple[Score, str]]] = {}
     for s, image in zip(scores, images, strict=True):
-        if s.outcome in ("right", "absent"):
-            continue
-        key: tuple[Outcome, str] = (s.outcome, failure_kind(s))
-        entry = seen.setdefault(key, {"outcome": s.outcome, "reason": "", "count": 0})
-        entry["count"] += 1
-        entry.setdefault("first", image.name)
-        members.setdefault(key, []).append(s)
-    for kind, entry in seen.items():
-        is_wrong = kind[0] == "wrong"
-        entry["reason"] = kind[1] if is_wrong else _joined([s.reason or kind[1] for s in members[kind]])
-    return sorted(seen.values(), key=lambda e: (-e["count"], e["outcome"], e["reason"]))
+        if s.outcome not in ("right", "absent"):
+            members.setdefault((s.outcome, failure_kind(s)), []).append((s, image.name))
+    found = []
+    for (outcome, kind), those in members.items():
+        reason = kind if outcome == "wrong" else _joined([s.reason or kind for s, _ in those])
+        found.append({"outcome": outcome, "reason": reason, "count": len(those), "first": those[0][1]})
+    return sorted(found, key=lambda e: (-e["count"], e["outcome"], e["reason"]))
 
 
 def failure_kind(score: Score) -> str:

@@ -197,11 +197,7 @@ def status(folder: Annotated[Path, Parameter(name="DIR")], /, *, watch: bool = F
 
 
 @app.command(name="merge")
-def merge(
-    *folders: Path,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
-    json: Result = None,
-) -> int:
+def merge(*folders: Path, output: Annotated[Path, Parameter(name=["--output", "-o"])], json: Result = None) -> int:
     """Join the parts of a dataset that machines without a shared file system made with `generate --shard K/N`.
 
     Args:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_module
-import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +11,7 @@ from cyclopts import Parameter
 
 from ..errors import InputError
 from ..observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
+from ..processes import usable_cpus
 from ..status import Status
 from .app import app
 from .options import AtLeastOne, EyeModel, Result, Strict
@@ -129,7 +129,7 @@ def extract(
     with progress("extracting") as steps:
         observed = observer.observe_files(
             images, scene=loaded, progress=steps, eyes=eyes, pictures=overlay, warn=heed,
-            processes=processes or len(os.sched_getaffinity(0)),
+            processes=processes or usable_cpus(),
         )  # fmt: skip
     records = list(observed.records(record))
     if output is not None:

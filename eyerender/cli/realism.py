@@ -51,6 +51,8 @@ def realism(
 
 def _table(data: dict[str, Any]) -> str:
     """Format one line per statistic: median and middle half of each folder's images, and the ratio of the medians."""
+    from ..realism.page import text
+
     folders, ratios = data["folders"], data["ratios"]
     lines = []
     for k, f in enumerate(folders):
@@ -64,9 +66,9 @@ def _table(data: dict[str, Any]) -> str:
         cells = ""
         for f in folders:
             s = f["figures"][name]
-            spread = f"[{_f(s['q25'])}, {_f(s['q75'])}]" if s["n"] else ""
-            cells += f"{_f(s['median']):>10} {spread:>19}"
-        lines.append(f"{name:<24}{cells}" + (f"{_f(ratios[name]):>9}" if ratios else ""))
+            spread = f"[{text(s['q25'])}, {text(s['q75'])}]" if s["n"] else ""
+            cells += f"{text(s['median']):>10} {spread:>19}"
+        lines.append(f"{name:<24}{cells}" + (f"{text(ratios[name]):>9}" if ratios else ""))
     return "\n".join([*lines, *_test(data)])
 
 
@@ -85,7 +87,3 @@ def _test(data: dict[str, Any]) -> list[str]:
         images = "{} and {}".format(*found["images"])
         lines.append(f"{kind:<24}{found['auc']:>10.2f} {f'[{low:.2f}, {high:.2f}]':>19}{images:>12}")
     return lines
-
-
-def _f(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"

@@ -8,7 +8,6 @@ from ..folders.imagefolder import CONVENTIONS
 from .done import run_versions
 from .plan import RANKED_SUBJECTS, Plan
 from .reading import IMAGEFOLDER, WHOLE
-from .spec import DatasetSpec
 
 _LABELS = """\
 - `records`: the record of the analytic observer: pose, target, apparent pupil (ellipse and boundary points), glints.
@@ -54,10 +53,6 @@ The pictures are in `shards/*/images.tar`, which `webdataset` and `datasets` rea
 pictures and labels, and `eyerender export-dataset` converts all of it. A line has these keys:"""
 
 
-def _licence(spec: DatasetSpec) -> str:
-    return "" if spec.licence is None else f"## Licence\n{spec.licence}\n\n"
-
-
 def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
     """Return the text of README.md."""
     spec = plan.spec
@@ -73,6 +68,7 @@ def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
         drawn = (
             " Each subject was drawn into a split at random, so the sizes of the splits are only close to their shares."
         )
+    licence = "" if spec.licence is None else f"## Licence\n{spec.licence}\n\n"
     size = statistics["pupil_semi_axis_px"]
     pupils = "" if size is None else f" The long semi-axis of the pupil is {size[0]:.1f} to {size[2]:.1f} px."
     return f"""# {spec.name}
@@ -104,7 +100,7 @@ The images are PNG files of `bit_depth` bits, 16 unless the spec says otherwise.
 - Pixels: {CONVENTIONS["pixels"]}.
 - Ellipses: {CONVENTIONS["ellipse"]}.
 
-{_licence(spec)}## What to know before training on it
+{licence}## What to know before training on it
 Lids and lashes are those of the scene. The textures of skin, iris and sclera are procedural. Their albedos at 850 nm
 were chosen, not measured. Test a network trained on this dataset on recorded images.
 

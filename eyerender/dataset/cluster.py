@@ -262,12 +262,7 @@ class _Driver:
 
     @staticmethod
     def _again(
-        shard: int,
-        reason: str,
-        pending: deque[int],
-        tries: Counter[int],
-        lost: dict[int, str],
-        send: SendEvent,
+        shard: int, reason: str, pending: deque[int], tries: Counter[int], lost: dict[int, str], send: SendEvent
     ) -> None:
         tries[shard] += 1
         if tries[shard] >= TRIES:

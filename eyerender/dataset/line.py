@@ -18,12 +18,7 @@ def image_name(sample: int, frame: int, frames: int, side: str) -> str:
 
 
 def image_line(
-    found: Realised,
-    row: int,
-    frames: int,
-    window: Window,
-    labels: dict[str, Any],
-    record_version: int = RECORD,
+    found: Realised, row: int, frames: int, window: Window, labels: dict[str, Any], record_version: int = RECORD
 ) -> tuple[str, dict[str, Any]]:
     """Return name and metadata of observation `row` of a sample; `frames` is the number of frames per sample."""
     sample, scene, observations = found.sample, found.scene, found.observations

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bytes
 from ..backends.choose import BackendChoice
 from ..errors import InputError
 from ..imaging.capture import BegunImage, EyeImage, begin_each, make_renderer, noiseless
@@ -103,7 +103,8 @@ class Maker:
             yield self._rest(found, ())
 
     def _rest(self, found: Realised, begun: tuple[BegunImage, ...]) -> Future[MadeSample]:
-        return self._beside.submit(lambda: MadeSample(found.index, tuple(self._images(found, begun)), found.rejections))
+        images = self._labelled(found, (b.image() for b in begun))  # whose work is done where it is read
+        return self._beside.submit(lambda: MadeSample(found.index, tuple(images), found.rejections))
 
     def _exposed(self, found: Realised) -> Realised:
         """Set the exposure of the sample's subject; if the subject's images are dark, keep that of the scene."""
@@ -135,9 +136,6 @@ class Maker:
             raise InputError(f"must be {len(found.frames)}, one for each eye in each frame, in order", path="images")
         return MadeSample(index, tuple(self._labelled(found, images)), found.rejections)
 
-    def _images(self, found: Realised, begun: tuple[BegunImage, ...]) -> Iterator[MadeImage]:
-        return self._labelled(found, (b.image() for b in begun))
-
     def _labelled(self, found: Realised, images: Iterable[EyeImage]) -> Iterator[MadeImage]:
         for image in images:
             assert found.observations is not None
@@ -148,34 +146,14 @@ class Maker:
             yield MadeImage(name, pictures, line, is_saturated(image.counts, image.scene.spec.sensor))
 
 
-def _amodal(image: EyeImage) -> Bytes:
-    labels = image.rendered.labels
-    assert labels is not None
-    return labels.amodal
-
-
-def _highlights(image: EyeImage) -> Bytes:
-    found = image.rendered.highlights
-    assert found is not None
-    return found.astype(np.uint8)
-
-
-def _geometry(name: str) -> Callable[[EyeImage], NDArray[Any]]:
-    def take(image: EyeImage) -> NDArray[Any]:
-        found: NDArray[Any] = getattr(image.rendered.geometry, name)
-        return found
-
-    return take
-
-
 _PICTURES: dict[str, Callable[[EyeImage], NDArray[Any]]] = {
-    "images": lambda image: image.counts,
-    "masks": lambda image: image.parts,
-    "amodal_masks": _amodal,
+    "images": attrgetter("counts"),
+    "masks": attrgetter("parts"),
+    "amodal_masks": attrgetter("rendered.labels.amodal"),
     "noiseless": noiseless,
-    "highlights": _highlights,
-    "depth": _geometry("depth"),
-    "normals": _geometry("normals"),
-    "iris_coordinates": _geometry("iris_coordinates"),
-    "instances": _geometry("instances"),
+    "highlights": lambda image: np.asarray(image.rendered.highlights, np.uint8),
+    "depth": attrgetter("rendered.geometry.depth"),
+    "normals": attrgetter("rendered.geometry.normals"),
+    "iris_coordinates": attrgetter("rendered.geometry.iris_coordinates"),
+    "instances": attrgetter("rendered.geometry.instances"),
 }

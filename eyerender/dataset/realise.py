@@ -37,9 +37,9 @@ class Realised:
     """A sample with its analytic observations; `sample` is None if it was given up."""
 
     index: int
-    sample: Sample | None
-    frames: Frames | None
-    observations: Observations | None
+    sample: Sample | None = None
+    frames: Frames | None = None
+    observations: Observations | None = None
     rejections: tuple[Rejection, ...]
     source: str = ""
 
@@ -131,13 +131,7 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
     try:
         reasons = plan.identity(subject)[1]
     except InputError as error:
-        return Realised(
-            index=index,
-            sample=None,
-            frames=None,
-            observations=None,
-            rejections=(Rejection(index, 0, str(error), "subject"),),
-        )
+        return Realised(index=index, rejections=(Rejection(index, 0, str(error), "subject"),))
     if sequence == 0:
         rejections += [Rejection(index, k, reason, "subject") for k, reason in enumerate(reasons)]
     last = None
@@ -161,7 +155,7 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
             rejections.append(Rejection(index, attempt, reason))
             continue
         return Realised(index=index, sample=sample, frames=posed, observations=found, rejections=tuple(rejections))
-    return Realised(index=index, sample=None, frames=None, observations=None, rejections=tuple(rejections))
+    return Realised(index=index, rejections=tuple(rejections))
 
 
 def _observed(plan: Plan, sample: Sample, frames: int | None) -> tuple[Frames, Observations]:

@@ -17,6 +17,7 @@ from ..errors import EyerenderError, InputError, Warn
 from ..folders.imagefolder import DATASET, LOG, finished
 from ..folders.outfolder import clear, refuse_non_empty
 from ..plausibility import saturation_warnings
+from ..processes import usable_cpus
 from ..progress import Progress, Say
 from ..storage.files import MAX_FILE_BYTES, make_folder, read_json, remove_file
 from ..storage.lock import LOCK, final_lock, run_lock
@@ -95,18 +96,13 @@ def generate(
     options = replace(options, **changes)
     if warn is not None:
         warn(plan.warnings())
-    done = _generate(plan, path, options, part, progress or (lambda *_: None), say or (lambda _: None))
+    told = progress or (lambda *_: None), say or (lambda _: None)
+    with opened_run(plan, path, options, part, *told) as (run, resumed):
+        done = run.make(resumed)
     if warn is not None:
         statistics = done.get("statistics", {})
         warn(saturation_warnings(statistics.get("images_saturated", 0), statistics.get("images", 0), str(path)))
     return done
-
-
-def _generate(
-    plan: Plan, path: str | Path, options: RunOptions, part: tuple[int, int], progress: Progress, say: Say
-) -> dict[str, Any]:
-    with opened_run(plan, path, options, part, progress, say) as (run, resumed):
-        return run.make(resumed)
 
 
 @contextmanager
@@ -163,11 +159,6 @@ def opened_run(
     finally:
         if created and folder.is_dir() and all(p.name.startswith(LOCK) for p in folder.iterdir()):
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def usable_cpus() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_count(options: RunOptions, shards: int) -> tuple[int, int]:

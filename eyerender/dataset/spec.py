@@ -26,7 +26,7 @@ MAX_COUNT = 10**9
 _LEAST_SHARDS = 16
 PACKED_SHARD = 1000  # samples of a packed shard by default, so that millions of images make some thousand files
 SPLIT_NAME = re.compile(r"[a-z][a-z0-9]*")
-
+_selection = lru_cache(maxsize=16)(Selection)
 
 GeometryKind = Literal["depth", "normals", "iris_coordinates", "instances"]
 
@@ -202,8 +202,14 @@ class DatasetSpec(FileSpec):
     def selection(self) -> Selection:
         """Which samples are made, and in which shards."""
         spread = self.choice == "spread" and self.count % self.planned_count > 0
-        sizes = self.count, self.planned_count, self.subject_count, self.shard_size
-        return _selection(*sizes, spread, self.seed if self.is_packed else None)
+        return _selection(
+            count=self.count,
+            planned=self.planned_count,
+            subjects=self.subject_count,
+            shard_size=self.shard_size,
+            spread=spread,
+            interleave=self.seed if self.is_packed else None,
+        )
 
     @property
     def is_packed(self) -> bool:
@@ -218,20 +224,6 @@ class DatasetSpec(FileSpec):
     def shard_samples(self, shard: int) -> Sequence[int]:
         """Return the samples of a shard."""
         return self.selection.shard_samples(shard)
-
-
-@lru_cache(maxsize=16)
-def _selection(
-    count: int, planned: int, subjects: int, shard_size: int, spread: bool, interleave: int | None
-) -> Selection:
-    return Selection(
-        count=count,
-        planned=planned,
-        subjects=subjects,
-        shard_size=shard_size,
-        spread=spread,
-        interleave=interleave,
-    )
 
 
 def shipped_datasets() -> dict[str, Path]:

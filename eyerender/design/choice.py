@@ -51,11 +51,7 @@ class SiteInformation(ArrayValue):
 
 
 def site_information(
-    frames: Frames,
-    rig: RigLike | None = None,
-    *,
-    unknowns: Unknowns | None = None,
-    noise: FeatureNoise | None = None,
+    frames: Frames, rig: RigLike | None = None, *, unknowns: Unknowns | None = None, noise: FeatureNoise | None = None
 ) -> SiteInformation:
     """Compute the information that each LED of a rig adds in each frame; see `er.information` for the arguments.
 

@@ -6,11 +6,10 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import repeat
-from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, finite_or_none
 from ..processes import mapper
 from ..progress import Progress, notify
 from .noise import FeatureNoise
@@ -83,8 +82,3 @@ def coverage_of(found: Figures) -> dict[str, float]:
         "outline": float(outline.mean()),
         **{f"outline_and_{k}_glints": float((outline & (found.glints >= k)).mean()) for k in (1, 2, 3)},
     }
-
-
-def finite_or_none(value: Any) -> float | None:
-    """Convert infinities to None, because JSON has none."""
-    return float(value) if np.isfinite(value) else None

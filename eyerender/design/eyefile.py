@@ -9,19 +9,7 @@ import numpy as np
 from ..arrays import Floats
 from ..eye.kappa import angles_of, pupillary_axis, with_kappa
 from ..eye.spec import EyeSpec
-from .unknowns import (
-    ASPHERICITY,
-    CENTRE,
-    DEPTH,
-    ELLIPTICITY,
-    KAPPA,
-    LOCAL,
-    POSITION,
-    RADIUS,
-    ROTATION,
-    SHIFT,
-    TORICITY,
-)
+from .unknowns import ASPHERICITY, CENTRE, DEPTH, ELLIPTICITY, KAPPA, LOCAL, POSITION, RADIUS, ROTATION, SHIFT, TORICITY
 
 
 def changed_file(spec: EyeSpec, theta: Floats) -> EyeSpec:
@@ -36,7 +24,8 @@ def changed_file(spec: EyeSpec, theta: Floats) -> EyeSpec:
     if not np.any(np.delete(theta, POSITION)[LOCAL:]):
         return spec
     data = spec.to_mapping()
-    own = _radius(data["cornea"][0]["shape"])
+    front = data["cornea"][0]["shape"]
+    own = float(front["radius_mm"] if "radius_mm" in front else np.mean(front["radii_mm"]))
     for surface in data["cornea"]:
         _scale(surface["shape"], (own + theta[RADIUS]) / own)
     data["cornea"][0]["shape"] = _flattened(data["cornea"][0]["shape"], float(theta[ASPHERICITY]))
@@ -89,10 +78,6 @@ def _make_toric(surface: dict[str, Any], straight: float, oblique: float) -> Non
     surface["shape"] = {"kind": "biconic", "radii_mm": [float(r) for r in radii], "conic_constants": conic}
     x, y, z = surface.get("tilt_deg", (0.0, 0.0, 0.0))
     surface["tilt_deg"] = [x + float(np.degrees(angle)), y, z]
-
-
-def _radius(shape: dict[str, Any]) -> float:
-    return float(shape["radius_mm"] if "radius_mm" in shape else np.mean(shape["radii_mm"]))
 
 
 def _scale(shape: dict[str, Any], factor: float) -> None:

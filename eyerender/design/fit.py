@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Ints
+from ..arrays import ArrayValue, Bools, Floats, Ints, finite_or_none
 from ..errors import InputError
 from ..eye.catalogue import load_eye
 from ..eye.spec import EyeSpec
@@ -27,16 +27,7 @@ from .eyefile import changed_file
 from .features import Measured, Residuals, measured, residuals, sized
 from .information import EyeInformation, eye_information
 from .noise import FeatureNoise
-from .unknowns import (
-    ANGLES,
-    AZIMUTH,
-    COUNT,
-    ELEVATION,
-    LOCAL,
-    PERSON,
-    PUPIL,
-    Unknowns,
-)
+from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, PERSON, PUPIL, Unknowns
 from .varied import (
     Views,
     diameters_mm,
@@ -149,9 +140,6 @@ class EyeFit(ArrayValue):
         degrees = np.where(ANGLES, np.degrees(1.0), 1.0)
         shared, spread = self.theta[0, LOCAL:] * degrees[LOCAL:], self.known.person_deviation * degrees[LOCAL:]
 
-        def number(value: float) -> float | None:
-            return float(value) if np.isfinite(value) else None
-
         return {
             "eye": self.eye,
             "chi2": float(self.chi2.sum()),
@@ -159,7 +147,7 @@ class EyeFit(ArrayValue):
             "converged": bool(self.converged.all()),
             "not_seen": list(self.known.unseen),
             "person": {
-                name: {"change": float(value), "deviation": number(sd)}
+                name: {"change": float(value), "deviation": finite_or_none(sd)}
                 for name, value, sd in zip(PERSON, shared, spread, strict=True)
             },
             "frames": [
@@ -171,7 +159,7 @@ class EyeFit(ArrayValue):
                     "slippage_mm": self.theta[k, 3:6].tolist(),
                     "origin_mm": self.origin_mm[k].tolist(),
                     "direction": self.direction[k].tolist(),
-                    "gaze_deviation_deg": number(self.known.gaze_deg[k]),
+                    "gaze_deviation_deg": finite_or_none(self.known.gaze_deg[k]),
                     "chi2": float(self.chi2[k]),
                 }
                 for k in range(len(self.theta))
@@ -467,16 +455,12 @@ def solve(problem: Problem, theta: Floats, steps: int = _STEPS) -> tuple[Floats,
         theta = np.where(good[:, None], trial, theta)
         damping = np.where(good, damping / 10.0, damping * 10.0)
         settled |= (good & gain) | (np.abs(step).max(axis=1) < _SETTLED) | (damping > _STUCK)
-        if problem.robust != "none" and most > 1.0 and not _all_in_core(weights):
+        in_core = (weights.outline == 1.0).all() and (weights.glints == 1.0).all()
+        if problem.robust != "none" and most > 1.0 and not in_core:
             settled[:] = False
         if settled.all():
             break
     return theta, settled
-
-
-def _all_in_core(weights: Weights) -> bool:
-    """Return whether every block has full weight."""
-    return bool((weights.outline == 1.0).all() and (weights.glints == 1.0).all())
 
 
 def without_wrong_outlines(problem: Problem, theta: Floats) -> Floats | None:

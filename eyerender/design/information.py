@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Ints
+from ..arrays import ArrayValue, Bools, Floats, Ints, finite_or_none
 from ..errors import InputError
 from ..observation import EYES
 from ..rig.rig import RigLike
@@ -342,18 +342,15 @@ def described(unseen: Floats, names: Sequence[str]) -> tuple[str, ...]:
 def _mapping(one: EyeInformation) -> dict[str, Any]:
     degrees = np.where(ANGLES, np.degrees(1.0), 1.0)
 
-    def number(value: float) -> float | None:
-        return float(value) if np.isfinite(value) else None
-
     person = one.person_deviation * degrees[LOCAL:]
     frame = one.frame_deviation * degrees[:LOCAL]
     return {
         "eye": one.eye,
         "fixation": one.fixation.tolist(),
         "head": one.head.tolist(),
-        "gaze_deg": [number(v) for v in one.gaze_deg],
-        "axis_deg": [number(v) for v in one.axis_deg],
-        "frame": {name: [number(v) for v in frame[:, k]] for k, name in enumerate(NAMES[:LOCAL])},
-        "person": {name: number(v) for name, v in zip(PERSON, person, strict=True)},
+        "gaze_deg": [finite_or_none(v) for v in one.gaze_deg],
+        "axis_deg": [finite_or_none(v) for v in one.axis_deg],
+        "frame": {name: [finite_or_none(v) for v in frame[:, k]] for k, name in enumerate(NAMES[:LOCAL])},
+        "person": {name: finite_or_none(v) for name, v in zip(PERSON, person, strict=True)},
         "unseen": list(one.unseen),
     }

@@ -89,7 +89,8 @@ def sensor_noise(
     lights = rig.lights if lights is None else lights
     side = scene.spec.subject.eyes[0]
     eye_mm = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
-    irradiance = sum(corneal_irradiance_mw_mm2(lamp, eye_mm) for lamp in lights)
+    # Lamps light a cornea that faces them with I / d^2.
+    irradiance = sum(intensity / distance**2 for intensity, distance in (_towards(lamp, eye_mm) for lamp in lights))
     radiance = scene.spec.look.iris_albedo / np.pi * irradiance * _CORNEAL_TRANSMITTANCE**2
     blur = float(np.hypot(sensor.psf_sigma_px, 1.0 / np.sqrt(12.0)))
     read = read_noise_e(sensor)
@@ -148,12 +149,6 @@ def glint_deviation(energy_e: float, spread_px: float, background_e: float, read
     # Half of the squared radial slope lies along each axis, and the spread cancels: slope r / spread, area spread^2.
     information = np.pi * np.sum(density * r) * (_REACH / _SAMPLES)
     return float(1.0 / np.sqrt(information)) if information > 0 else np.inf
-
-
-def corneal_irradiance_mw_mm2(lamp: Lamp, point_mm: Floats) -> float:
-    """Compute the irradiance (mW/mm^2) of a lamp on a surface that faces it: I / d^2."""
-    intensity, distance = _towards(lamp, point_mm)
-    return intensity / distance**2
 
 
 def glint_energy(

@@ -294,7 +294,9 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | N
         out = np.zeros((*points.shape[1:], COUNT))
         out[..., traced_columns] = np.moveaxis(central, 0, -1)
         out[..., POSITION] = out[..., SLIPPAGE]
-        out[..., ROTATION] = np.einsum("nkax,nx->nka", out[..., SLIPPAGE], _by_rotation(theta))
+        # The motion of a turned eye per depth of its rotation centre is that of x' = M (x - c) + c.
+        by_rotation = turned(theta)[:, :, 0] - np.array([1.0, 0.0, 0.0])
+        out[..., ROTATION] = np.einsum("nkax,nx->nka", out[..., SLIPPAGE], by_rotation)
         out[..., SHIFT] = out[..., CENTRE] * widening[:, None, None, None]
         exists: Bools = np.asarray(np.isfinite(out).all(axis=(2, 3)))
         return np.where(exists[..., None, None], out, 0.0), exists & ok[:n]
@@ -308,11 +310,6 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | N
         glint_ok=traced.glint_ok[:n],
     )
     return Slopes(images=first, outline=outline, glints=glints, outline_ok=outline_ok, glint_ok=glint_ok)
-
-
-def _by_rotation(theta: Floats) -> Floats:
-    """Compute the motion (n, 3) of a turned eye per depth of its rotation centre, from x' = M (x - c) + c."""
-    return np.asarray(turned(theta)[:, :, 0] - np.array([1.0, 0.0, 0.0]))
 
 
 def turned(theta: Floats) -> Floats:

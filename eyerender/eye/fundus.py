@@ -125,9 +125,11 @@ def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: 
         core *= (1 - spread.halo_share) / (2 * np.pi * sigma**2)
         halo *= spread.halo_share / (2 * np.pi * spread.halo_rad**2)
         factors[k] = (core + halo) * weight
-    f, index = retinal_scale_mm(eye), _inner_index(eye)
+    f, index = retinal_scale_mm(eye), float((eye.back_indices or eye.front_indices)[-1])
     rho = spread.reflectance * _relative_reflectance(eye, out_of_pupil, plane, theta_c, spread.disc_gain)
-    even = len(nodes) * weight * spread.reflectance / (1 - spread.reflectance) / _retina_area_mm2(eye)
+    # The retina is a sphere 1 mm, the thickness of the wall, inside the sclera's.
+    area_mm2 = float(4 * np.pi * (float(eye.sclera.radius_mm) - 1.0) ** 2)
+    even = len(nodes) * weight * spread.reflectance / (1 - spread.reflectance) / area_mm2
     return FundusLight(rho * (factors / f**2 + even) / (np.pi * index**2))
 
 
@@ -160,15 +162,6 @@ def retinal_scale_mm(eye: EyeModel) -> float:
     found = trace(path_to_retina(eye), 1.0, entrance_pupil(eye)[0] + _BEFORE_MM * outward, -outward)
     heights = np.linalg.norm(found.points_mm[-1, ::2] - found.points_mm[-1, 1::2], axis=-1)
     return float(np.sqrt(heights.prod()) / (2.0 * np.arctan(_ASIDE[0])))
-
-
-def _inner_index(eye: EyeModel) -> float:
-    return float((eye.back_indices or eye.front_indices)[-1])
-
-
-def _retina_area_mm2(eye: EyeModel) -> float:
-    """Compute the inner area of the globe (mm^2): a sphere 1 mm, the thickness of the wall, inside the sclera's."""
-    return float(4 * np.pi * (float(eye.sclera.radius_mm) - 1.0) ** 2)
 
 
 @remembered

@@ -36,12 +36,7 @@ class Shells(NamedTuple):
 
 
 def lens_shells(
-    front: Surface,
-    back: Surface,
-    centre_mm: Floats,
-    indices: tuple[float, float, float],
-    rim_mm: float,
-    layers: Layers,
+    front: Surface, back: Surface, centre_mm: Floats, indices: tuple[float, float, float], rim_mm: float, layers: Layers
 ) -> Shells:
     """Compute the shells of the lens between two surfaces.
 

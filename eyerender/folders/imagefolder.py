@@ -12,7 +12,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NoReturn, TypeGuard, overload
 
@@ -23,16 +23,7 @@ from ..arrays import Bytes, Ints, Singles
 from ..errors import InputError, Refuse, UnfinishedRunWarning
 from ..observation import EYES, Observations, concatenate, count_heads
 from ..rig.camera import Window
-from ..storage.files import (
-    MAX_FILE_BYTES,
-    inside,
-    is_plain,
-    read_bytes,
-    read_json,
-    shown,
-    write_bytes,
-    write_json,
-)
+from ..storage.files import MAX_FILE_BYTES, inside, is_plain, read_bytes, read_json, shown, write_bytes, write_json
 from ..storage.jsonlines import JsonLines, LineFiles
 from ..versions import package_version
 from .imagefile import MAX_IMAGE_BYTES, array_of, image_of
@@ -491,6 +482,14 @@ class ImageFolder:
         found = concatenate(parts)
         # Head positions are counted over all images.
         return replace(found, index=replace(found.index, head=count_heads(found.index.head_mm)))
+
+
+@lru_cache(maxsize=2)
+def opened_entries(path: str) -> Entries:
+    """Return the images of a folder that another process has opened; each process opens it once."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnfinishedRunWarning)  # the other process has given it
+        return ImageFolder.load(path).entries
 
 
 def shard_name(shard: int) -> str:

@@ -154,7 +154,8 @@ def budget(
     task = _Task(built, estimator, calibration, binocular)
     anew = [np.stack([task.errors(task.fits(one), one) for one in found]) for _, found in chain]
     names = [name for name, _ in chain]
-    base = names.index(transfer_from) if transfer_from is not None else _last_exact(names)
+    exact = (k for k, name in enumerate(names) if name not in IMAGE_CAUSES)
+    base = max(exact, default=0) if transfer_from is None else names.index(transfer_from)
     fits = task.fits(chain[base][1][0])
     kept = [np.stack([task.errors(fits, one) for one in found]) for _, found in chain[base:]]
     usable: Bools = np.all([np.isfinite(e).all(axis=(0, 2)) for e in (*anew, *kept)], axis=0)
@@ -293,11 +294,6 @@ def _check(chain: Sequence[tuple[str, list[Observations]]]) -> None:
             )
             if not same:
                 raise InputError("its observations are not of the frames of the first step", path=name)
-
-
-def _last_exact(names: Sequence[str]) -> int:
-    exact = [k for k, name in enumerate(names) if name not in IMAGE_CAUSES]
-    return exact[-1] if exact else 0
 
 
 def _cause(name: str, before: Floats, after: Floats, eye: Ints) -> Cause:

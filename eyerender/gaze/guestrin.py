@@ -249,14 +249,7 @@ class _Goals:
 class _Model:
     """Calibration data of one eye, evaluated at many sets of parameters at once."""
 
-    def __init__(
-        self,
-        estimator: GuestrinEizenman,
-        rays: FeatureRays,
-        rows: Ints,
-        goals: _Goals,
-        sign: float,
-    ) -> None:
+    def __init__(self, estimator: GuestrinEizenman, rays: FeatureRays, rows: Ints, goals: _Goals, sign: float) -> None:
         self.estimator, self.goals, self.sign = estimator, goals, sign
         self.origin, self.pupil = rays.origin_mm[rows], rays.pupil[rows]
         low, high = estimator.bounds.lower.cornea_radius_mm, estimator.bounds.upper.cornea_radius_mm

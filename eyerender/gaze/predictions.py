@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Objects
+from ..arrays import Bools, Floats, Objects, finite_or_none
 from ..errors import InputError
 from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry
@@ -31,10 +31,7 @@ GIVEN, RAYS, GLINTS = "given", "rays", "glints"
 
 
 def predictions(
-    estimator: GazeEstimator,
-    observations: Observations,
-    rig: RigGeometry,
-    screen_px: tuple[float, float] | None = None,
+    estimator: GazeEstimator, observations: Observations, rig: RigGeometry, screen_px: tuple[float, float] | None = None
 ) -> dict[str, Any]:
     """Estimate the gaze of every observation, and of every frame with both eyes.
 
@@ -103,7 +100,7 @@ def _ray_predictions(estimator: RayEstimator, observations: Observations, rig: R
             "origin_mm": _numbers(rays.origin_mm[i]),
             "direction": _numbers(rays.direction[i]),
             "target_mm": _numbers(observations.index.target_mm[i]),
-            "error_deg": _number(errors["deg"][i]),
+            "error_deg": finite_or_none(errors["deg"][i]),
         }
         for i in range(len(observations))
     ]
@@ -209,7 +206,7 @@ def _figures(values: Floats) -> dict[str, float]:
 
 
 def _errors_of(errors: dict[str, Floats], i: int) -> dict[str, float | None]:
-    return {f"error_{unit}": _number(errors[unit][i]) for unit in ("mm", "px", "deg")}
+    return {f"error_{unit}": finite_or_none(errors[unit][i]) for unit in ("mm", "px", "deg")}
 
 
 def _identity(observations: Observations, i: int) -> dict[str, Any]:
@@ -225,7 +222,3 @@ def _identity(observations: Observations, i: int) -> dict[str, Any]:
 
 def _numbers(values: Floats) -> list[float] | None:
     return [float(v) for v in values] if np.isfinite(values).all() else None
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -18,16 +18,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, Objects
 from ..errors import InputError, Problems
-from ..observation import (
-    EYES,
-    MAX_GLINTS,
-    GlintFeatures,
-    Index,
-    Observations,
-    PoseTruth,
-    PupilFeatures,
-    count_heads,
-)
+from ..observation import EYES, MAX_GLINTS, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, count_heads
 from ..rig.light import MAX_LIGHTS
 from ..rig.rig import RigLike
 from ..rig.screen import ScreenPlane
@@ -48,9 +39,7 @@ _EYE_WORDS = {
 
 
 def observations_from_csv(
-    path: str | Path,
-    columns: str | Path | Mapping[str, Any] | CsvColumns | None = None,
-    rig: RigLike | None = None,
+    path: str | Path, columns: str | Path | Mapping[str, Any] | CsvColumns | None = None, rig: RigLike | None = None
 ) -> Observations:
     """Read a table of pupils, glints and targets.
 

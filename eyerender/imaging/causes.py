@@ -70,11 +70,7 @@ def budget_steps(
         raise InputError("there are no targets to compare the gaze with; use a scene with 'targets' instead of 'poses'")
     exact = trace(frames)
     simple = _with_eye(frames, reference)
-    steps = {
-        ESTIMATOR: [with_stop_centre(trace(simple))],
-        "eye model": [with_stop_centre(exact)],
-        "optics": [exact],
-    }
+    steps = {ESTIMATOR: [with_stop_centre(trace(simple))], "eye model": [with_stop_centre(exact)], "optics": [exact]}
     if not images:
         return steps
     steps.update(_image_steps(frames, seeds, make_renderer(backend, threads), progress))
@@ -86,7 +82,7 @@ def _image_steps(
 ) -> dict[str, list[Observations]]:
     """Observe the steps that need images; each image is exposed, observed and dropped before the next."""
     observer, sensor = ImageObserver(), frames.scene.spec.sensor
-    ideal, own = ideal_scene(frames.scene), _noiseless_scene(frames.scene)
+    ideal, own = ideal_scene(frames.scene), without_noise(frames.scene)
     apart = ideal.spec != own.spec
     rows: dict[tuple[str, int], list[Observations]] = {}
 
@@ -140,7 +136,8 @@ def exposed_again(image: EyeImage, sensor: Sensor, seed: int) -> EyeImage:
     return replace(image, frame=image.frame.of_scene(scene), counts=stored(scene, dn))
 
 
-def _noiseless_scene(scene: Scene) -> Scene:
+def without_noise(scene: Scene) -> Scene:
+    """Replace the sensor of a scene by one without noise."""
     sensor = scene.spec.sensor.model_copy(update={"noise": False})
     return scene.replaced(scene.spec.model_copy(update={"sensor": sensor}))
 

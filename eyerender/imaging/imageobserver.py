@@ -210,10 +210,7 @@ class ImageObserver:
                 cut, corner = _around(image, corner, camera.project(eye_mm)[0], 16.0 * px_per_mm)
             # Human pupils are 2 to 8 mm wide, the cornea magnifies them by up to 1.2, and tilt foreshortens them.
             settings = self.settings.model_copy(
-                update={
-                    "radius_min_px": max(0.6 * px_per_mm, 3.0),
-                    "radius_max_px": max(5.0 * px_per_mm, 8.0),
-                }
+                update={"radius_min_px": max(0.6 * px_per_mm, 3.0), "radius_max_px": max(5.0 * px_per_mm, 8.0)}
             )
             found = extract(cut, bit_depth=depth, gamma=gamma if gamma != 1 else self.gamma, settings=settings)
             lights, reasons = _lights(found, corner, scene, camera, eye_mm)

@@ -237,13 +237,7 @@ def settled_exposure_ms(scene: Scene, level: float, renderer: Renderer, *, share
 
 
 def export_scene(
-    scene: Scene,
-    path: str | Path,
-    *,
-    frame: int = 0,
-    side: str | None = None,
-    spp: int = 64,
-    overwrite: bool = False,
+    scene: Scene, path: str | Path, *, frame: int = 0, side: str | None = None, spp: int = 64, overwrite: bool = False
 ) -> dict[str, Any]:
     """Write one frame as PLY meshes and a Mitsuba XML file, which the stock `mitsuba` command renders directly.
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from ..arrays import Bools, Bytes, Floats, remembered
+from ..arrays import Bools, Bytes, Floats, finite_or_none, remembered
 from ..errors import InputError
 from ..eye.entrance import entrance_pupil_mm
 from ..eye.fixation import fixations
@@ -70,8 +70,8 @@ def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
     points = truth.pupil.points_px[row]
     whole = bool(truth.pupil.ok[row]) and len(points) > 2
     return {
-        "pupil_visible_fraction": _share(done.labels.visible_fraction(PUPIL)),
-        "iris_visible_fraction": _share(done.labels.visible_fraction(IRIS)),
+        "pupil_visible_fraction": finite_or_none(done.labels.visible_fraction(PUPIL)),
+        "iris_visible_fraction": finite_or_none(done.labels.visible_fraction(IRIS)),
         "failed_paths": done.failed_paths,
         "pupil_visible_arcs_deg": visible_arcs_deg(image.parts, PUPIL, points, image.window[:2]) if whole else None,
         "glints": [
@@ -301,10 +301,6 @@ def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any
         "visible_share": float(table.share[k]),
         "spot_xy_px": spot.tolist() if lit else None,
     }
-
-
-def _share(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _space(

@@ -55,7 +55,7 @@ def near_duplicates(thumbnails: Bytes, digests: Sequence[bytes]) -> list[Pair]:
         return []
     unit = _unit(thumbnails[places])
     reach = float(np.sqrt(2 * (1 - CORRELATION)))
-    axes = _principal(unit)
+    axes = unit @ np.linalg.eigh(unit.T @ unit)[1][:, -_AXES:]  # coordinates along some principal axes
     k = min(_NEIGHBOURS + 1, len(places))
     # Distances along some axes are at most those of the thumbnails, so no pair within reach is missed by them.
     _, neighbours = cKDTree(axes).query(axes, k=k, distance_upper_bound=reach, workers=-1)
@@ -72,9 +72,3 @@ def _unit(thumbnails: Bytes) -> Floats:
     rows = thumbnails.reshape(len(thumbnails), -1).astype(np.float32)
     rows -= rows.mean(axis=1, keepdims=True)
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-
-
-def _principal(unit: Floats) -> Floats:
-    """Coordinates along the principal axes of some vectors."""
-    _, axes = np.linalg.eigh(unit.T @ unit)
-    return np.asarray(unit @ axes[:, -_AXES:])

@@ -13,6 +13,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from ..dataset.export.gaze import yaw_pitch_deg
+from ..dataset.validation.problems import is_number
 from ..folders.imagefolder import ImageEntry
 
 GLINTS = 8  # lights whose reflections are columns of their own
@@ -100,16 +101,16 @@ def _glints(glints: Any, origin: tuple[int, int]) -> Iterator[tuple[str, float]]
 
 def _numbers(value: Any) -> Iterator[tuple[str, float]]:
     """Numbers in a drawn value, and what their names end with."""
-    if _is_number(value):
+    if is_number(value):
         yield "", float(value)
     elif isinstance(value, list):
         for k, one in enumerate(value):
-            if _is_number(one):
+            if is_number(one):
                 yield f"[{k}]", float(one)
 
 
 def _one(name: str, value: Any) -> Iterator[tuple[str, float]]:
-    if _is_number(value):
+    if is_number(value):
         yield name, float(value)
 
 
@@ -121,9 +122,5 @@ def _mapping(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _is_point(value: Any, size: int) -> TypeGuard[Sequence[float]]:
-    return isinstance(value, Sequence) and len(value) == size and all(map(_is_number, value))
+    return isinstance(value, Sequence) and len(value) == size and all(map(is_number, value))

@@ -134,9 +134,7 @@ def _dataset(found: Inspection, *, several: bool) -> PageValues:
         "fault_lines": [[kind, found.name(at), detail] for kind, own in faults.items() for at, detail in own[:100]],
         "outliers": [
             pictures.tile(
-                o.at,
-                [found.name(o.at), *(f"{r.column}: {r.value:.4g}; {r.usual}" for r in o.reasons)],
-                marked=True,
+                o.at, [found.name(o.at), *(f"{r.column}: {r.value:.4g}; {r.usual}" for r in o.reasons)], marked=True
             )
             for o in found.outliers
         ],
@@ -243,7 +241,13 @@ def _difference(first: Inspection, second: Inspection, moved: Sequence[Shift]) -
     a, b = first.contents, second.contents
     beyond = [shift for shift in moved if shift.distance > shift.chance]
     rows = [
-        [s.column, f"{s.distance:.3f}", f"{s.chance:.3f}", f"{s.medians[0]:.4g}", f"{s.medians[1]:.4g}", _of(s.counts)]
+        [
+            s.column,
+            f"{s.distance:.3f}",
+            f"{s.chance:.3f}",
+            *(f"{m:.4g}" for m in s.medians),
+            "{} and {}".format(*s.counts),
+        ]
         for s in moved
     ]
     groups = [
@@ -260,10 +264,6 @@ def _difference(first: Inspection, second: Inspection, moved: Sequence[Shift]) -
         "histograms": [_both(first, second, shift) for shift in beyond[:_SHIFTS]],
         "only": [(only_in(a, b), str(a.folder.path)), (only_in(b, a), str(b.folder.path))],
     }
-
-
-def _of(counts: tuple[int, int]) -> str:
-    return "{} and {}".format(*counts)
 
 
 def _both(first: Inspection, second: Inspection, shift: Shift) -> PageValues:

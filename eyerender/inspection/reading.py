@@ -5,10 +5,9 @@ At most a given number of images is read, spread evenly over the dataset. Of eac
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,8 @@ import numpy as np
 
 from ..arrays import Bytes, Ints, Objects, Singles
 from ..dataset.validation.problems import WRONG
-from ..errors import InputError, UnfinishedRunWarning
-from ..folders.imagefolder import Entries, ImageEntry, ImageFolder
+from ..errors import InputError
+from ..folders.imagefolder import Entries, ImageEntry, ImageFolder, opened_entries
 from ..folders.packed import PackedLines
 from ..processes import ordered
 from ..progress import Progress, notify
@@ -185,16 +184,8 @@ class _Store:
         )
 
 
-@lru_cache(maxsize=2)
-def _entries(path: str) -> Entries:
-    """Images of a folder, which each process opens once."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnfinishedRunWarning)  # `read` has given it
-        return ImageFolder.load(path).entries
-
-
 def _read_in_process(path: str, rows: Sequence[int]) -> list[_Row]:
-    return _read_rows(_entries(path), rows)
+    return _read_rows(opened_entries(path), rows)
 
 
 def _read_rows(entries: Entries, rows: Sequence[int]) -> list[_Row]:

@@ -24,6 +24,7 @@ from ..observation import Observations
 from ..report.overlay import feature_marks
 from ..report.style import ANALYTIC, IMAGE
 from ..scene import Frames, Scene
+from ..scene.spec import SceneSpec
 from .drawing import LEGEND, Strokes, apex_mm, strokes
 from .painter import GOAL_SPP, MAX_REASON, Order, Painter, Shown, line_of
 from .readout import calibrated, feature_table, gaze_line
@@ -201,8 +202,8 @@ class Tab:
             ui.label(spec.description).classes("lead")
             ui.space()
             with ui.element("div").classes("buttons"):
-                _button("Save YAML", self._save_yaml)
-                _button("Save Python", self._save_python)
+                _button("Save YAML", lambda: self._save(SceneSpec.to_yaml, "yaml", "application/yaml"))
+                _button("Save Python", lambda: self._save(python_source, "py", "text/x-python"))
                 self._undo_button = _button("Undo", self._undo)
                 _button("Start again", lambda: self._apply(lambda _: Setup.of(self._studio.scene), refresh=True))
         with ui.element("div").classes("desk"):
@@ -381,16 +382,10 @@ class Tab:
         place, apex = camera.nodal_point_mm, apex_mm(self._frames, self._row)
         self._rig.look_from(place, place + camera.axis * float((apex - place) @ camera.axis))
 
-    def _save_yaml(self) -> None:
-        self._save(lambda: self._setup.saved().to_yaml(), "yaml", "application/yaml")
-
-    def _save_python(self) -> None:
-        self._save(lambda: python_source(self._setup.saved()), "py", "text/x-python")
-
-    def _save(self, text: Callable[[], str], suffix: str, kind: str) -> None:
+    def _save(self, text: Callable[[SceneSpec], str], suffix: str, kind: str) -> None:
         try:
             name = "".join(c if c.isalnum() or c in "-_" else "_" for c in self._setup.origin.name)
-            ui.download.content(text().encode(), f"{name}.{suffix}", kind)
+            ui.download.content(text(self._setup.saved()).encode(), f"{name}.{suffix}", kind)
         except EyerenderError as error:
             self._complain(f"Not saved: {line_of(error)}")
 

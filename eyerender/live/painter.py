@@ -318,10 +318,7 @@ def coarser(job: RenderJob, side: int) -> RenderJob:
     size = (-(-width // side), -(-height // side))
     camera = replace(old, K=frozen(K), resolution_px=size)
     sensor = job.sensor.model_copy(
-        update={
-            "pixel_pitch_um": job.sensor.pixel_pitch_um * side,
-            "psf_sigma_px": job.sensor.psf_sigma_px / side,
-        }
+        update={"pixel_pitch_um": job.sensor.pixel_pitch_um * side, "psf_sigma_px": job.sensor.psf_sigma_px / side}
     )
     return replace(job, camera=camera, sensor=sensor, window=(0, 0, *size))
 

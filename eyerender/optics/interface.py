@@ -17,11 +17,7 @@ from ..geometry.surfaces import Xyz
 def reflect(direction: Xyz, normal: Xyz) -> Xyz:
     """Reflect directions: w = d - 2 (d.N) N."""
     double = 2.0 * dot(direction, normal)
-    return (
-        direction[0] - double * normal[0],
-        direction[1] - double * normal[1],
-        direction[2] - double * normal[2],
-    )
+    return (direction[0] - double * normal[0], direction[1] - double * normal[1], direction[2] - double * normal[2])
 
 
 def refract(direction: Xyz, normal: Xyz, n_before: FloatLike, n_after: FloatLike) -> tuple[Xyz, Bools]:

@@ -432,10 +432,7 @@ def _basis(direction: Xyz) -> tuple[Xyz, Xyz]:
     sign = np.copysign(1.0, x)
     a = -1.0 / (sign + x)
     b = y * z * a
-    return (
-        (-sign * y, 1.0 + sign * y * y * a, sign * b),
-        (-z, b, sign + z * z * a),
-    )
+    return ((-sign * y, 1.0 + sign * y * y * a, sign * b), (-z, b, sign + z * z * a))
 
 
 def _triple(a: Xyz, b: Xyz, c: Xyz) -> Floats:

@@ -189,12 +189,7 @@ class Person(Spec):
         return float(np.clip(near, table.constant("smallest_pupil_mm"), table.constant("largest_pupil_mm")))
 
     def eye(
-        self,
-        side: Side,
-        *,
-        luminance_cd_m2: float | None = None,
-        field_deg: float | None = None,
-        demand_d: float = 0.0,
+        self, side: Side, *, luminance_cd_m2: float | None = None, field_deg: float | None = None, demand_d: float = 0.0
     ) -> EyeSpec:
         """Return the eye file of one eye, written as a right eye as all eye files are.
 

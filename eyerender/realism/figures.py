@@ -23,6 +23,7 @@ RADIUS_PX = 50.0  # R in the resized picture
 CLIPPED_CODE = 245.0  # out of 255; cameras clip slightly below full scale, and JPEG lowers clipped codes by a few
 BANDS_R = ((0.0, 0.02), (0.02, 0.04), (0.04, 0.08), (0.08, 0.16))
 _HIGHLIGHTS_R = 2.0  # margins, lash roots and caruncle lie between the cornea and this radius
+_LIMBUS_R = np.linspace(0.75, 1.35, 121)  # about which the limbus is looked for
 _LEAST_PX = 40  # pixels of an area from which a level is taken
 _LEAST_TEXTURE_PX = 150
 
@@ -146,7 +147,7 @@ def measure(picture: EyePicture, scaled: Scaled | None = None) -> dict[str, floa
         "lash : lid skin": _lashes(s),
         "limbal ring : mid iris": _limbal_ring(s),
         "pupil edge (R)": _pupil_edge(s),
-        "limbus (R)": _limbus_edge(s),
+        "limbus (R)": edge_width(_rays(s, _LIMBUS_R, 15), _LIMBUS_R),
     }
     iris_bands = texture(s.level, iris_at)
     skin_bands = texture(s.level, skin_at) if skin is not None else [None] * len(BANDS_R)
@@ -244,11 +245,6 @@ def _pupil_edge(s: Scaled) -> float | None:
     y = s.pupil.centre_px[1] + p * sin + q * cos
     width = edge_width(_sampled(s, x, y), radii)
     return None if width is None else width * float(np.sqrt(a * b)) / RADIUS_PX
-
-
-def _limbus_edge(s: Scaled) -> float | None:
-    radii = np.linspace(0.75, 1.35, 121)
-    return edge_width(_rays(s, radii, 15), radii)
 
 
 def edge_width(rays: Floats, radii: Floats) -> float | None:

@@ -76,10 +76,7 @@ def _tested(one: Sequence[tuple[Bytes, ...]], other: Sequence[tuple[Bytes, ...]]
         images=(len(shown[0]), len(shown[1])),
         auc=_auc(answer, second),
         interval=_interval(answer, second, seed),
-        revealing=(
-            tuple(flat[k] for k in certain[0][:_REVEALING]),
-            tuple(flat[k] for k in certain[1][:_REVEALING]),
-        ),
+        revealing=(tuple(flat[k] for k in certain[0][:_REVEALING]), tuple(flat[k] for k in certain[1][:_REVEALING])),
     )
 
 

@@ -41,7 +41,8 @@ def _draw(ax: Any, eye: EyeModel, across: int) -> None:
     for k, surface in enumerate(eye.front):
         rim = _axis_distance(surface, x, s, across) <= eye.limbus_radius_mm
         if k:  # the back of the cornea ends at the iris
-            rim &= x >= _iris_x(eye, s, across)
+            normal, centre = eye.stop.normal, eye.stop.centre_mm
+            rim &= x >= centre[0] - (s - centre[across]) * normal[across] / normal[0]
         _curve(ax, surface, x, s, across, rim, _CORNEA, 1.8, "cornea" if k == 0 else None)
     shells = shelled(eye)
     # A gradient lens has dozens of shells, so they get a grid that is no larger than they are.
@@ -90,12 +91,6 @@ def _points(x: Floats, s: Floats, across: int) -> Floats:
 def _axis_distance(surface: Surface, x: Floats, s: Floats, across: int) -> Floats:
     local = surface.to_local(_points(x, s, across))
     return np.hypot(local[..., 1], local[..., 2])
-
-
-def _iris_x(eye: EyeModel, s: Floats, across: int) -> Floats:
-    """Compute x of the iris' plane at the coordinate across."""
-    normal, centre = eye.stop.normal, eye.stop.centre_mm
-    return np.asarray(centre[0] - (s - centre[across]) * normal[across] / normal[0])
 
 
 def _iris(ax: Any, eye: EyeModel, across: int) -> None:

@@ -64,6 +64,11 @@ class Page:
     sections: Sequence[Section] = field(default_factory=tuple)
 
 
+def degrees_text(value: float | None) -> str:
+    """Format an angle for reading."""
+    return "not seen" if value is None else f"{value:.3g}°"
+
+
 def write_page(path: Path, page: Page) -> None:
     """Write one self-contained HTML file; on an error, nothing is left."""
     write_template(path, "page.html.j2", {"page": page})

@@ -419,10 +419,7 @@ def distort(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
     k1, k2, p1, p2, k3 = k
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+    return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
 
 
 def distortion_jacobian(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any, Any]:

@@ -72,8 +72,7 @@ def checked(diameter_px: float) -> float:
     """
     if diameter_px > MAX_CONFUSION_PX:
         raise InputError(
-            f"the picture would be blurred over {diameter_px:.3g} px; at most {MAX_CONFUSION_PX}",
-            path="lens.focus_mm",
+            f"the picture would be blurred over {diameter_px:.3g} px; at most {MAX_CONFUSION_PX}", path="lens.focus_mm"
         )
     return diameter_px
 

@@ -34,12 +34,9 @@ def aimed(lights: Any) -> Any:
     return [{"aim_mm": NEAREST_EYE, **light} if isinstance(light, Mapping) else light for light in lights]
 
 
-def _aim_tag(value: Any) -> str:
-    return "TextSpec" if isinstance(value, str) else "PointSpec"
-
-
 Aim = Annotated[
-    Annotated[Literal["nearest_eye"], Tag("TextSpec")] | Annotated[Vec3, Tag("PointSpec")], Discriminator(_aim_tag)
+    Annotated[Literal["nearest_eye"], Tag("TextSpec")] | Annotated[Vec3, Tag("PointSpec")],
+    Discriminator(lambda value: "TextSpec" if isinstance(value, str) else "PointSpec"),
 ]
 
 

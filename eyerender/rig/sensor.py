@@ -43,8 +43,7 @@ class Sensor(Spec):
         default=None, description="system gain K; default: full scale at 98 % of the full well"
     )
     black_level_dn: NonNegative | None = Field(
-        default=None,
-        description="code of no light; default: 1/256 of full scale (an OV9281 has 16/256)",
+        default=None, description="code of no light; default: 1/256 of full scale (an OV9281 has 16/256)"
     )
     bit_depth: Literal[8, 10, 12, 16] = Field(default=16, description="bits of the stored numbers")
     psf_sigma_px: Annotated[float, Field(ge=0, le=20)] = Field(

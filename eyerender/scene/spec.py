@@ -33,11 +33,10 @@ Count = Annotated[int, Field(ge=1, le=1000)]
 MAX_OBSERVATIONS = 200_000
 
 
-def _model_tag(value: Any) -> str:
-    return "EyeSpec" if isinstance(value, Mapping | EyeSpec) else "name"
-
-
-Model = Annotated[Annotated[str, Tag("name")] | Annotated[EyeSpec, Tag("EyeSpec")], Discriminator(_model_tag)]
+Model = Annotated[
+    Annotated[str, Tag("name")] | Annotated[EyeSpec, Tag("EyeSpec")],
+    Discriminator(lambda value: "EyeSpec" if isinstance(value, Mapping | EyeSpec) else "name"),
+]
 
 
 class Eye(Spec):
@@ -92,14 +91,10 @@ class Eye(Spec):
 MOST_ACCOMMODATION_D = 20.0
 
 
-def _accommodation_tag(value: Any) -> str:
-    return "TextSpec" if isinstance(value, str) else "NumberSpec"
-
-
 Accommodation = Annotated[
     Annotated[Literal["targets"], Tag("TextSpec")]
     | Annotated[float, Field(ge=0, le=MOST_ACCOMMODATION_D), Tag("NumberSpec")],
-    Discriminator(_accommodation_tag),
+    Discriminator(lambda value: "TextSpec" if isinstance(value, str) else "NumberSpec"),
 ]
 
 

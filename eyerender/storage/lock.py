@@ -77,13 +77,7 @@ def final_lock(folder: Path, warn: Say) -> Iterator[None]:
 
 
 def _take(
-    stack: contextlib.ExitStack,
-    path: Path,
-    *,
-    shared: bool,
-    folder: Path,
-    warn: Say,
-    wait: bool = False,
+    stack: contextlib.ExitStack, path: Path, *, shared: bool, folder: Path, warn: Say, wait: bool = False
 ) -> None:
     while True:
         try:

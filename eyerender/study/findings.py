@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -120,22 +119,16 @@ def guestrin(
 
 def blignaut(outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str) -> list[Finding]:
     """Test findings B1 to B11, by eye model."""
-    tested = _Blignaut(outcomes)
-    tests = (
-        _best_functions, _drops, _spherical, _shares, _five_targets, _alike, _deviations,
-    )  # fmt: skip
-    return [
-        Finding(t.id, protocol, observer, t.rule, float(t.value), t.threshold, bool(t.verdict), t.detail, t.sentence)
-        for test in tests
-        for t in test(tested)
-    ]
+    tested = _Blignaut(outcomes, protocol, observer)
+    tests = (_best_functions, _drops, _spherical, _shares, _five_targets, _alike, _deviations)
+    return [finding for test in tests for finding in test(tested)]
 
 
 class _Blignaut:
     """Best functions and mean errors (deg) by eye model and calibration set."""
 
-    def __init__(self, outcomes: Mapping[str, list[Outcome]]) -> None:
-        self.outcomes = outcomes
+    def __init__(self, outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str) -> None:
+        self.outcomes, self.protocol, self.observer = outcomes, protocol, observer
         self.best = {m: {c: best(o, c) for c in lit.CALIBRATION_SETS} for m, o in outcomes.items()}
         self.error = {m: {c: _mean(b) for c, b in found.items()} for m, found in self.best.items()}
 
@@ -150,35 +143,17 @@ class _Blignaut:
         """Return those of the given eye models that were run."""
         return [m for m in wanted if m in self.error]
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Test:
-    """A tested statement of [29]."""
-
-    id: str
-    rule: str
-    value: float
-    threshold: str
-    verdict: bool
-    detail: str
-    sentence: str
+    def finding(
+        self, id: str, rule: str, value: float, threshold: str, verdict: bool, detail: str, key: str = ""
+    ) -> Finding:
+        """Create the finding of a tested statement of [29], whose sentence has the finding's name or a key."""
+        sentence = lit.SENTENCES[key or id]
+        return Finding(id, self.protocol, self.observer, rule, float(value), threshold, bool(verdict), detail, sentence)
 
 
 _SETS = tuple(lit.CALIBRATION_SETS.items())
 # The paper does not define "negligible" and "acceptable"; these levels are chosen.
 NEGLIGIBLE_DEG, ALIKE_DEG, ACCEPTABLE_DEG = 0.01, 0.05, 1.0
-
-
-def _test(id: str, rule: str, value: float, threshold: str, verdict: bool, detail: str, key: str = "") -> _Test:
-    return _Test(
-        id=id,
-        rule=rule,
-        value=value,
-        threshold=threshold,
-        verdict=verdict,
-        detail=detail,
-        sentence=lit.SENTENCES[key or id],
-    )
 
 
 def _mean(outcome: Outcome | None) -> float:
@@ -190,7 +165,7 @@ def _terms(function: str) -> int:
     return max(len(terms.split("+")) for terms in FUNCTIONS[function])
 
 
-def _best_functions(b: _Blignaut) -> Iterator[_Test]:
+def _best_functions(b: _Blignaut) -> Iterator[Finding]:
     """Test B1; C5 has a separate sentence, and for C9 the function that the paper names is tested."""
     for c in lit.CALIBRATION_SETS:
         named, (measured, _) = lit.PAPER_BEST[c], lit.blignaut_best(c)
@@ -202,25 +177,25 @@ def _best_functions(b: _Blignaut) -> Iterator[_Test]:
             detail += f"; the experiment's own figures have {measured} as the best: share {own:g}"
         if c == "C5":
             rule = f"{c}: no model's best function is {named}: share of models whose best it is"
-            yield _test("B1", rule, share, "= 0", share == 0, detail, "B1 C5")
+            yield b.finding("B1", rule, share, "= 0", share == 0, detail, "B1 C5")
         else:
             rule = f"{c}: every model's best function is {named}, as the paper names it: share of models"
-            yield _test("B1", rule, share, "= 1", share == 1, detail)
+            yield b.finding("B1", rule, share, "= 1", share == 1, detail)
 
 
-def _drops(b: _Blignaut) -> Iterator[_Test]:
+def _drops(b: _Blignaut) -> Iterator[Finding]:
     """Test B2 and B3: the gain by more targets."""
     drop = {m: 1 - e["C9"] / e["C5"] for m, e in b.error.items()}
     least = min(drop.values())
     rule = "errors decrease markedly from C5 to C9: smallest relative decrease"
-    yield _test("B2", rule, least, ">= 0.25", least >= 0.25, _by_model(drop) + "; in the experiment 0.416")
+    yield b.finding("B2", rule, least, ">= 0.25", least >= 0.25, _by_model(drop) + "; in the experiment 0.416")
     gain = {m: abs(e["C14"] - e["C135"]) for m, e in b.error.items()}
     most = max(gain.values())
     rule = "C135 betters C14 by less than .01 deg in every model: largest difference (deg)"
-    yield _test("B3", rule, most, "< 0.01", most < 0.01, _by_model(gain, 5))
+    yield b.finding("B3", rule, most, "< 0.01", most < 0.01, _by_model(gain, 5))
 
 
-def _spherical(b: _Blignaut) -> Iterator[_Test]:
+def _spherical(b: _Blignaut) -> Iterator[Finding]:
     """Test B4, with all functions and with those that the targets determine."""
     spherical, other = b.models(lit.SPHERICAL), b.models(("E2", "E4", "E5"))
     if not (spherical and other):
@@ -230,10 +205,10 @@ def _spherical(b: _Blignaut) -> Iterator[_Test]:
             ratio = min(error[m][c] for m in spherical) / max(error[m][c] for m in other)
             rule = f"{c}, {which}: spherical models err 70 % more than the others, to a percent: smallest ratio"
             detail = ", ".join(f"{m} {error[m][c]:.4f}" for m in (*spherical, *other))
-            yield _test("B4", rule, ratio, ">= 1.695", ratio >= 1.695, detail)
+            yield b.finding("B4", rule, ratio, ">= 1.695", ratio >= 1.695, detail)
 
 
-def _shares(b: _Blignaut) -> Iterator[_Test]:
+def _shares(b: _Blignaut) -> Iterator[Finding]:
     """Test B5: the ratio of simulated to measured errors."""
     for c in lit.CALIBRATION_SETS:
         measured_deg = lit.blignaut_best(c)[1]
@@ -241,10 +216,10 @@ def _shares(b: _Blignaut) -> Iterator[_Test]:
         low, high = min(share_of.values()), max(share_of.values())
         rule = f"{c}: the simulated best error is 10 to 20 % of the measured one: the share furthest off"
         value = low if 0.1 - low > high - 0.2 else high
-        yield _test("B5", rule, value, "0.10 to 0.20", low >= 0.1 and high <= 0.2, _by_model(share_of))
+        yield b.finding("B5", rule, value, "0.10 to 0.20", low >= 0.1 and high <= 0.2, _by_model(share_of))
 
 
-def _five_targets(b: _Blignaut) -> Iterator[_Test]:
+def _five_targets(b: _Blignaut) -> Iterator[Finding]:
     """Test B6 and B7: the errors with five targets."""
     errors = {m: e["C5"] for m, e in b.error.items()}
     least = min(errors.values())
@@ -252,12 +227,12 @@ def _five_targets(b: _Blignaut) -> Iterator[_Test]:
         f"C5: no function errs by less than {ACCEPTABLE_DEG:g} deg (a chosen level) in any model: smallest error (deg)"
     )
     measured = f"; in the experiment {lit.blignaut_best('C5')[1]:.2f}"
-    yield _test("B6", rule, least, f">= {ACCEPTABLE_DEG:g}", least >= ACCEPTABLE_DEG, _by_model(errors) + measured)
+    yield b.finding("B6", rule, least, f">= {ACCEPTABLE_DEG:g}", least >= ACCEPTABLE_DEG, _by_model(errors) + measured)
     rule = "C5: errors under .3 deg are achievable: smallest error (deg)"
-    yield _test("B7", rule, least, "< 0.3", least < 0.3, _by_model(errors))
+    yield b.finding("B7", rule, least, "< 0.3", least < 0.3, _by_model(errors))
 
 
-def _alike(b: _Blignaut) -> Iterator[_Test]:
+def _alike(b: _Blignaut) -> Iterator[Finding]:
     """Test B8 to B10: models with similar errors."""
     sets = tuple(lit.CALIBRATION_SETS)
     pairs = [(m, n) for m, n in (("E1", "E3"), ("E2", "E4")) if {m, n} <= set(b.error)]
@@ -265,30 +240,30 @@ def _alike(b: _Blignaut) -> Iterator[_Test]:
         apart = {f"{m}-{n}": max(abs(b.error[m][c] - b.error[n][c]) for c in sets) for m, n in pairs}
         most = max(apart.values())
         rule = "E1 errs as E3 and E2 as E4 with every set: largest difference (deg; the level is chosen)"
-        yield _test("B8", rule, most, f"< {NEGLIGIBLE_DEG:g}", most < NEGLIGIBLE_DEG, _by_model(apart, 4))
+        yield b.finding("B8", rule, most, f"< {NEGLIGIBLE_DEG:g}", most < NEGLIGIBLE_DEG, _by_model(apart, 4))
     others = b.models(lit.CONIC) if "E5" in b.error else []
     if others:
         p = {f"E5-{m}, {c}": _p(b.best["E5"][c], b.best[m][c]) for m in others for c in sets}
         least = min(p.values())
         rule = "E5 does not differ from E2 and E4: smallest p of two-sample t-tests over the frames"
-        yield _test("B9", rule, least, ">= 0.05", least >= _ALPHA, _by_model(p, 2))
+        yield b.finding("B9", rule, least, ">= 0.05", least >= _ALPHA, _by_model(p, 2))
     if len(b.error) > 1:
         ranges = {c: float(np.ptp([e[c] for e in b.error.values()])) for c in sets[2:]}
         most = max(ranges.values())
         rule = "the models err alike beyond C9: largest range over the models (deg; the level is chosen)"
-        yield _test("B10", rule, most, f"< {ALIKE_DEG:g}", most < ALIKE_DEG, _by_model(ranges, 4))
+        yield b.finding("B10", rule, most, f"< {ALIKE_DEG:g}", most < ALIKE_DEG, _by_model(ranges, 4))
 
 
-def _deviations(b: _Blignaut) -> Iterator[_Test]:
+def _deviations(b: _Blignaut) -> Iterator[Finding]:
     """Test B11: measured minus simulated errors."""
     off = {c: [lit.blignaut_best(c)[1] - e[c] for e in b.error.values()] for c in lit.CALIBRATION_SETS}
     detail = ", ".join(f"{c} {min(v):.3f} to {max(v):.3f}" for c, v in off.items())
     most = max(max(v) for v in off.values())
     rule = "the largest deviation from the experiment is that of C5 (deg)"
-    yield _test("B11", rule, most, "> 1", most > 1 and most == max(off["C5"]), detail)
+    yield b.finding("B11", rule, most, "> 1", most > 1 and most == max(off["C5"]), detail)
     least = min(min(v) for v in off.values())
     rule = "the smallest deviation from the experiment is that of C135 (deg)"
-    yield _test("B11", rule, least, ">= 0.40", least >= 0.40 and least == min(off["C135"]), detail)
+    yield b.finding("B11", rule, least, ">= 0.40", least >= 0.40 and least == min(off["C135"]), detail)
 
 
 def _p(one: Outcome | None, other: Outcome | None) -> float:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ..arrays import Ints, frozen
 from ..errors import InputError
 from ..folders.imagefolder import DATASET, METADATA, RUN, ImageEntry
+from ..imaging.causes import without_noise
 from ..observation import EYES, Observations
 from ..progress import Progress, Say
 from ..rig.exposure import expose_again
@@ -245,12 +246,6 @@ def _begun(folder: Path, plan: Any) -> bool:
         return bool(found["digest"] == plan.digest and found["versions"] == run_versions())
     except (InputError, KeyError):
         return False
-
-
-def without_noise(scene: Scene) -> Scene:
-    """Replace the sensor of a scene by one without noise."""
-    sensor = scene.spec.sensor.model_copy(update={"noise": False})
-    return scene.replaced(scene.spec.model_copy(update={"sensor": sensor}))
 
 
 def _exposures(line: Mapping[str, Any]) -> list[tuple[str, str]]:

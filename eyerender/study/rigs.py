@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, finite_or_none
 from ..design.choice import SiteInformation, choose_lights, noise_of_some
-from ..design.crowd import OUTLINE, coverage_of, figures_of_people, finite_or_none, users_of
+from ..design.crowd import OUTLINE, coverage_of, figures_of_people, users_of
 from ..design.noise import sensor_noise
 from ..design.people import GRID, LOST, Figures, Survey, sites_seen
 from ..design.safety import eye_exposure

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..design.people import GRID, LOST
-from ..report.page import Card, Figure, Page, Section, Table, write_page
+from ..report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
 from ..report.style import figure, svg
 
 
@@ -56,15 +56,11 @@ def _percent(value: float) -> str:
     return f"{100 * value:.1f} %"
 
 
-def _degrees(value: float | None) -> str:
-    return "not seen" if value is None else f"{value:.3g}°"
-
-
 def _overview(rows: Any) -> Table:
     body = [
         [row["layout"], row["text"], _percent(row["lost"]), _percent(row["coverage"]["outline"]),
          *(_percent(row["coverage"][f"outline_and_{k}_glints"]) for k in (1, 2, 3)),
-         _degrees(row["frame_to_frame_deg"]["U50E95"]), _degrees(row["frame_to_frame_deg"]["U95E95"]),
+         degrees_text(row["frame_to_frame_deg"]["U50E95"]), degrees_text(row["frame_to_frame_deg"]["U95E95"]),
          f"{100 * row['cornea_share']:.2g} %"]
         for row in rows
     ]  # fmt: skip
@@ -98,7 +94,7 @@ def _who(rows: Any) -> Table:
 
 def _led_table(rows: Any) -> Table:
     body = [
-        [row["layout"], str(one["leds"]), _degrees(one["axis_deg_median"]), _degrees(one["axis_deg_p95"]),
+        [row["layout"], str(one["leds"]), degrees_text(one["axis_deg_median"]), degrees_text(one["axis_deg_p95"]),
          _percent(one["frames_with_1_glint"]), _percent(one["frames_with_2_glints"]), one["chosen"]]
         for row in rows
         for one in row["leds"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ from typing import Any
 from ..errors import EyerenderError, InputError
 from ..eye.catalogue import load_eye
 from ..folders.outfolder import clear, refuse_non_empty
-from ..processes import mapper
+from ..processes import mapper, usable_cpus
 from ..progress import Progress, Say, notify
 from ..scene import Scene
 from ..storage.files import read_json, write_json, write_text
@@ -107,7 +106,7 @@ def run_study(
             for observings in together_or_alone
             for eye, told in _models(name, eyes, protocols, observings)
         ]
-        count = options.workers or len(os.sched_getaffinity(0))
+        count = options.workers or usable_cpus()
         notes = [f"{eye}, {' and '.join(o.kind for o in observings)}" for observings, eye, _ in jobs]
         parts = _collected(partial(_job, name), jobs, notes, count, progress)
         rows, found, more, page = _SUMMARISE[name](parts, protocols)

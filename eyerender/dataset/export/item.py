@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, Generic, TypeVar
 
@@ -15,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Bytes, Floats, Ints
-from ...errors import InputError, UnfinishedRunWarning
+from ...errors import InputError
 from ...folders.imagefile import image_of, png_bytes
-from ...folders.imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, Entries, ImageEntry, ImageFolder
+from ...folders.imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, Entries, ImageEntry, ImageFolder, opened_entries
 from ...geometry.ellipse import Ellipse, signed_distance
 from ...processes import ordered
 from ..interleaving import scrambled
@@ -60,7 +59,9 @@ class Item:
         """
         depth = self.line.get("bit_depth")
         if not isinstance(depth, int) or isinstance(depth, bool) or not 1 <= depth <= 16:
-            raise InputError("must be 1 to 16", source=str(self.entry.source), path=self._where("bit_depth"))
+            raise InputError(
+                "must be 1 to 16", source=str(self.entry.source), path=f"line {self.entry.number}.bit_depth"
+            )
         return depth
 
     @cached_property
@@ -101,9 +102,6 @@ class Item:
         e = self.encoding
         own = {"bit_depth": e.bits, "encoding": e.curve, "gamma": e.to_mapping()["gamma"], "gain": e.gain}
         return {**self.line, **own, "source_bit_depth": self.bit_depth}
-
-    def _where(self, key: str) -> str:
-        return f"line {self.entry.number}.{key}"
 
     @cached_property
     def mask(self) -> Bytes:
@@ -209,13 +207,13 @@ class Items:
         splits: Counter[str] = Counter()
         samples = np.empty(len(self), dtype=np.int64)
         names = np.empty(len(self), dtype=np.int64)
-        for row, own in enumerate(self._each(_surveyed)):
-            samples[row], names[row] = own.sample, hash(own.name)
-            splits[own.split] += 1
-            self.bit_depths.add(own.bit_depth)
-            self.sizes.add(own.size)
-            self.lights = max(self.lights, own.lights)
-            self.file_name_bytes = max(self.file_name_bytes, own.file_name_bytes)
+        for row, (sample, name, split, depth, size, lights, length) in enumerate(self._each(_surveyed)):
+            samples[row], names[row] = sample, hash(name)
+            splits[split] += 1
+            self.bit_depths.add(depth)
+            self.sizes.add(size)
+            self.lights = max(self.lights, lights)
+            self.file_name_bytes = max(self.file_name_bytes, length)
         if len(np.unique(names)) < len(names):
             raise InputError("two images have the same file name", source=str(self.folder.path / METADATA))
         # Images of one sample keep their order in both cases.
@@ -289,7 +287,7 @@ class _Preparation(Generic[Prepared]):
 
     def __call__(self, rows: Ints) -> list[tuple[LinePlace, Prepared]]:
         found = []
-        for item in _items(_entries(self.folder), rows, self.encoding):
+        for item in _items(opened_entries(self.folder), rows, self.encoding):
             place = item.entry.source, item.entry.number
             try:
                 found.append((place, self.prepare(item)))
@@ -298,40 +296,13 @@ class _Preparation(Generic[Prepared]):
         return found
 
 
-@lru_cache(maxsize=1)
-def _entries(folder: str) -> Entries:
-    """Images of a folder, which each process opens once."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnfinishedRunWarning)  # the export has given it
-        return ImageFolder.load(folder).entries
-
-
 def wrong_labels(error: Exception, place: LinePlace) -> InputError:
     """Make the error for labels that are not as this package writes them: a line was changed by hand."""
     reason = f"cannot be exported, for it is not as this version writes it ({type(error).__name__}: {error})"
     return InputError(reason, source=str(place[0]), path=f"line {place[1]}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Surveyed:
-    """What must be known of an image before the first one is written."""
-
-    sample: int
-    name: str
-    split: str
-    bit_depth: int
-    size: tuple[int, int]
-    lights: int
-    file_name_bytes: int
-
-
-def _surveyed(item: Item) -> _Surveyed:
-    return _Surveyed(
-        sample=item.line["sample"],
-        name=item.name,
-        split=item.split,
-        bit_depth=item.bit_depth,
-        size=item.entry.window[2:],
-        lights=len(item.line["labels"]["glints"]),
-        file_name_bytes=len(item.entry.name.encode()),
-    )
+def _surveyed(item: Item) -> tuple[int, str, str, int, tuple[int, int], int, int]:
+    """Return an image's sample, name, split, bit depth, size, number of lights and length of its file name (bytes)."""
+    lights, length = len(item.line["labels"]["glints"]), len(item.entry.name.encode())
+    return item.line["sample"], item.name, item.split, item.bit_depth, item.entry.window[2:], lights, length

@@ -23,15 +23,8 @@ from .truth import DatasetTruth, SceneTruth
 
 # Labels that every image of a dataset has, whatever is visible.
 _ALWAYS = (
-    ("labels", "pupil", "amodal"),
-    ("labels", "pupil", "visible"),
-    ("labels", "iris", "amodal"),
-    ("labels", "iris", "visible"),
-    ("labels", "space", "world"),
-    ("labels", "space", "camera"),
-    ("labels", "pose"),
-    ("labels", "camera"),
-    ("parameters", "draws"),
+    *(f"labels.{part}.{kind}" for part in ("pupil", "iris") for kind in ("amodal", "visible")),
+    *("labels.space.world", "labels.space.camera", "labels.pose", "labels.camera", "parameters.draws"),
 )
 
 
@@ -92,10 +85,10 @@ class Lines:
             yield from _other_keys(line, self._first)
         for path in _ALWAYS:
             node: Any = line
-            for key in path:
+            for key in path.split("."):
                 node = node.get(key) if isinstance(node, dict) else None
-            if not isinstance(node, dict) or (not node and path[-1] != "draws"):
-                yield f"{'.'.join(path)} is empty"
+            if not isinstance(node, dict) or (not node and path != "parameters.draws"):
+                yield f"{path} is empty"
         yield from _agree(line)
 
     def finish(self, problems: Problems) -> None:

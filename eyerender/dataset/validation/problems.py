@@ -46,7 +46,7 @@ def differences(expected: Any, found: Any, tolerance: float, path: str = "") -> 
             yield from differences(a, b, tolerance, f"{path}.{k}")
     elif isinstance(expected, dict | list | tuple):
         yield _differ(path, found, expected)
-    elif _is_number(expected) and _is_number(found):
+    elif is_number(expected) and is_number(found):
         if not abs(found - expected) <= tolerance * (1 + abs(expected)):
             yield _differ(path, found, expected)
     elif expected != found or isinstance(expected, bool) != isinstance(found, bool):
@@ -70,7 +70,8 @@ def _same_angle(expected: dict[str, Any], found: dict[str, Any], tolerance: floa
     return bool((axes[0] - axes[1]) * abs(sin(b - a)) <= tolerance * (1 + axes[0]))
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Return whether a value is a number and no boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 

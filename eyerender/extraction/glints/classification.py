@@ -21,6 +21,7 @@ from ..result import GlintResult
 from ..settings import ExtractionSettings
 from .detection import optics_sigma
 from .fits import SpotFit
+from .prescreening import PIXEL
 
 # Largest counted steps by which the background is brighter than the iris; more is not worse, because the sclera is as
 # bright.
@@ -48,8 +49,6 @@ USUAL = (0.0, 0.0, 0.0, 0.0, math.log(10.0), 1.0)
 # Made by scripts/fit_glints.py: weights of the features and 1, and of the comparison.
 FIRST = np.array([-1.75, -2.86, 0.952, -6.06, 1.91, 2.83, 3.82, -3.34])
 SECOND = np.array([0.897, 0.769, 3.1, -2.2, 0.367, 0.996])
-
-_PIXEL = 1.0 / 12.0  # variance of a pixel; without it a spot of one row of pixels would be a line
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,10 +115,10 @@ def features(fit: SpotFit, eye: Eye) -> Floats:
     fit and of the bright patch) beyond ROUND and of the height in steps; the fourth power of the peak's level over the
     clip level, which hardly anything but lamps reaches; the visible share of the pupil boundary; and 1.
     """
-    step, wide2 = abs(eye.iris_dn - eye.pupil_dn), fit.sigma_px**2 + _PIXEL
+    step, wide2 = abs(eye.iris_dn - eye.pupil_dn), fit.sigma_px**2 + PIXEL
     width = wide2.prod(axis=1) ** 0.25
     (xx, xy), (_, yy) = fit.moments_px2.transpose(1, 2, 0)
-    mean, apart = 0.5 * (xx + yy) + _PIXEL, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+    mean, apart = 0.5 * (xx + yy) + PIXEL, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
     stretch = (mean + apart) / np.maximum(mean - apart, 1e-3) * wide2.max(axis=1) / wide2.min(axis=1)
     offset = fit.xy_px - eye.ellipse.centre_px
     cos, sin = math.cos(eye.ellipse.angle_rad), math.sin(eye.ellipse.angle_rad)
@@ -156,9 +155,9 @@ def compared(fit: SpotFit, logit: Floats, top_dn: float) -> Floats:
     """
     best = int(np.argmax(logit))
     visible = np.minimum(fit.amplitude_dn, np.maximum(top_dn - fit.background_dn, 1.0))
-    wide2 = (fit.sigma_px**2 + _PIXEL).prod(axis=1) ** 0.5 * (1.0 + np.log2(fit.amplitude_dn / visible))
+    wide2 = (fit.sigma_px**2 + PIXEL).prod(axis=1) ** 0.5 * (1.0 + np.log2(fit.amplitude_dn / visible))
     light, width = np.log(np.maximum(visible * np.sqrt(wide2), 1e-3)), 0.5 * np.log(wide2)
-    form = 0.5 * np.log((fit.sigma_px[:, 0] ** 2 + _PIXEL) / (fit.sigma_px[:, 1] ** 2 + _PIXEL))
+    form = 0.5 * np.log((fit.sigma_px[:, 0] ** 2 + PIXEL) / (fit.sigma_px[:, 1] ** 2 + PIXEL))
     near = (np.abs(one[:, None] - one) < most for one, most in zip((light, width, form), ALIKE, strict=True))
     alike = np.logical_and.reduce(list(near)) & ~np.eye(logit.size, dtype=bool)
     top = light[logit > 0.0].max(initial=float(light[best]))

@@ -112,12 +112,7 @@ def _best_edge(fitted: FittedSpots, blur_px: float) -> tuple[Floats, Floats]:
 
 
 def split_blends(
-    linear: Image,
-    known: Background,
-    starts: Starts,
-    fit: SpotFit,
-    widest_px: float,
-    limits: Limits,
+    linear: Image, known: Background, starts: Starts, fit: SpotFit, widest_px: float, limits: Limits
 ) -> tuple[Starts, SpotFit]:
     """Replace each unexplained spot by two if two fit it much better.
 

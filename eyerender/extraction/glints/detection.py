@@ -12,6 +12,7 @@ from ...arrays import Bools, Floats, Indices, Singles
 from ...geometry.ellipse import Ellipse
 from ...jit import compiled, inlined
 from ..preprocessing import Image, Prepared, as_image
+from ..pupil.edges import nearest
 from ..pupil.glare import around
 from ..settings import ExtractionSettings
 from ..statistics import select
@@ -113,13 +114,6 @@ def search_reach(ellipse: Ellipse, settings: ExtractionSettings) -> float:
 
 
 @inlined
-def _level(image: Image, x: float, y: float) -> float:
-    """Return the level of the pixel nearest to a point."""
-    column = int(np.rint(min(max(x, 0.0), image.shape[1] - 1.0)))
-    return image[int(np.rint(min(max(y, 0.0), image.shape[0] - 1.0))), column]
-
-
-@inlined
 def _is_free(xy: Floats, disc: Floats, outer: float, k: int, x: float, y: float) -> bool:
     """Return whether a point on the ring of spot k lies in no other spot's disc."""
     for m in range(disc.size):
@@ -146,7 +140,7 @@ def _above_ring(smooth: Image, xy: Floats, width: Floats) -> Floats:
             if -0.5 < x < smooth.shape[1] - 0.5 and -0.5 < y < smooth.shape[0] - 0.5:
                 ring += 1
                 if _is_free(xy, disc, outer, k, x, y):
-                    level[count] = _level(smooth, x, y)
+                    level[count] = nearest(smooth, x, y)
                     count += 1
         out[k] = math.inf
         if count > 0.25 * ring:
@@ -195,7 +189,7 @@ def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> Indices:
             least, first, last = np.inf, 0.0, 0.0
             for j in range(2 * size):
                 t = j / (2 * size - 1.0)
-                last = _level(smooth, xy[i, 0] + t * (xy[k, 0] - xy[i, 0]), xy[i, 1] + t * (xy[k, 1] - xy[i, 1]))
+                last = nearest(smooth, xy[i, 0] + t * (xy[k, 0] - xy[i, 0]), xy[i, 1] + t * (xy[k, 1] - xy[i, 1]))
                 first = last if j == 0 else first
                 least = min(least, last)
             if least >= min(first, last) - dip:

@@ -17,6 +17,7 @@ from ...arrays import Bools, Floats
 from ...jit import compiled, inlined
 from ..preprocessing import Image
 from ..products import solve
+from .detection import SMOOTH_PX
 from .fits import SpotFit
 from .gaussian_model import PARAMETERS, SAME_LIGHT, WITH_EDGE, Descent, Limits, descend, lost, prior, promising
 from .windows import WINDOWS, SpotPixels, Windows, cut, light_of_others, shining_pairs, window_radius
@@ -25,7 +26,6 @@ from .windows import WINDOWS, SpotPixels, Windows, cut, light_of_others, shining
 # numbers are for spots whose fit is promising or whose misfit still falls.
 TURNS, PATIENCE, WANDERING_PX = (1, 4), (1, 2), 0.3
 FEW_CLIPPED = 2  # a spot with more clipped pixels has a flat top
-SMOOTH_PX = 0.7  # smoothing of the image in which detection estimated the widths
 UNEXPLAINED = 2.0  # misfit in noise standard deviations below which the Gaussian explains the pixels
 NEARLY_STILL_PX = 0.02  # a spot that moves less has settled, even if its neighbour still answers its moves
 

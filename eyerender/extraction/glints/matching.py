@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Floats, Indices
 from ...errors import InputError
+from ...geometry.transforms import normalize
 
 CORNEA_RADIUS_MM = 7.8
 # Distances in a typical adult eye: apex to centre of rotation, and from there to the entrance pupil and to the cornea's
@@ -58,10 +59,10 @@ def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLik
     """
     centre, camera = np.asarray(centre_mm, dtype=np.float64), np.asarray(camera_mm, dtype=np.float64)
     lights = np.atleast_2d(np.asarray(lights_mm, dtype=np.float64))
-    normal = _unit(_unit(camera - centre) + _unit(lights - centre))
+    normal = normalize(normalize(camera - centre) + normalize(lights - centre))
     for _ in range(40):
         point = centre + radius_mm * normal
-        updated = _unit(_unit(camera - point) + _unit(lights - point))
+        updated = normalize(normalize(camera - point) + normalize(lights - point))
         done = float(np.abs(updated - normal).max()) < 1e-12
         normal = updated
         if done:
@@ -103,7 +104,7 @@ def predict_glints(
     K3, R3, t3 = (np.asarray(value, dtype=np.float64) for value in (K, R, t_mm))
     camera = -R3.T @ t3
     pixel = np.append(np.asarray(pupil_px, dtype=np.float64), 1.0)
-    ray = _unit(R3.T @ np.linalg.solve(K3, pixel))
+    ray = normalize(R3.T @ np.linalg.solve(K3, pixel))
     eye = np.asarray(eye_mm, dtype=np.float64)
     if not np.isfinite(eye).all():
         if abs(ray[0]) < 1e-9:
@@ -115,7 +116,7 @@ def predict_glints(
     missed = nearest - rotation
     reach2 = ROTATION_TO_PUPIL_MM**2 - float(missed @ missed)
     pupil = nearest - math.sqrt(max(reach2, 0.0)) * ray
-    gaze = _unit(pupil - rotation)
+    gaze = normalize(pupil - rotation)
     cornea = rotation + ROTATION_TO_CORNEA_MM * gaze
     # The pupil's ray itself is exact. Errors from the model's assumed lengths are removed along it.
     cornea = cornea + (pupil - (rotation + ROTATION_TO_PUPIL_MM * gaze)) if reach2 > 0.0 else cornea
@@ -154,24 +155,19 @@ def assign_lights(
     """
     glints = np.asarray(glints_px, dtype=np.float64).reshape(-1, 2)
     lights = np.asarray(predicted_px, dtype=np.float64).reshape(-1, 2)
-    m, count = glints.shape[0], lights.shape[0]
-    if m == 0 or count == 0:
+    m = glints.shape[0]
+    if m == 0 or lights.shape[0] == 0:
         return _unassigned(m, "the rig has no lights" if m else None)
     middle = lights.mean(axis=0)
     reach = tolerance_px + slack * np.hypot(*(lights - middle).T)
+    search = _Search(
+        glints=glints, lights=lights, middle=middle, reach=reach, scale_range=scale_range, shift_sd=shift_sd_px
+    )
     found: list[tuple[float, tuple[int, ...], Floats, float]] = []
-    for shift, scale in _promising(
-        glints, lights=lights, middle=middle, reach=reach, scale_range=scale_range, sd=shift_sd_px
-    ):
-        match = _match(glints, lights=lights, middle=middle, reach=reach, shift=shift, scale=scale)
-        shift, scale = _refitted(
-            glints, lights=lights, middle=middle, match=match, shift=shift, scale=scale, span=scale_range
-        )
-        match = _match(glints, lights=lights, middle=middle, reach=reach, shift=shift, scale=scale)
-        merit = _merit(
-            glints, lights=lights, middle=middle, reach=reach, match=match, shift=shift, scale=scale, sd=shift_sd_px
-        )
-        found.append((merit, tuple(int(k) for k in match), shift, scale))
+    for shift, scale in search.promising():
+        shift, scale = search.refitted(search.match(shift, scale), shift, scale)
+        match = search.match(shift, scale)
+        found.append((search.merit(match, shift, scale), tuple(int(k) for k in match), shift, scale))
     found.sort(key=lambda item: -item[0])
     merit, names, shift, scale = found[0]
     if float(np.hypot(*shift)) > 4.0 * shift_sd_px:
@@ -184,7 +180,7 @@ def assign_lights(
     light = np.array(names, dtype=np.intp)
     residual = np.zeros(m)
     placed = light >= 0
-    residual[placed] = np.hypot(*(glints[placed] - _placed(lights[light[placed]], middle, shift, scale)).T)
+    residual[placed] = np.hypot(*search.offsets(light, shift, scale).T)
     stray = "no light's reflection is expected there: off the sclera, a lid or spectacles"
     reasons = tuple(None if ok else stray for ok in placed)
     return Assignment(light=light, reasons=reasons, residual_px=residual, shift_px=shift, scale=scale)
@@ -227,94 +223,90 @@ def identify(
     return assign_lights(glints_px, predicted, shift_sd_px=max(position_sd_mm * scale, 2.0))
 
 
-def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class _Search:
+    """Search for a layout: the glints (m, 2) and lights (l, 2) to match, px, and what is plausible.
 
+    A layout places the lights at middle + shift + scale (lights - middle).
 
-def _placed(lights: Floats, middle: Floats, shift: Floats, scale: float) -> Floats:
-    return np.asarray(middle + shift + scale * (lights - middle))
-
-
-def _promising(
-    glints: Floats, *, lights: Floats, middle: Floats, reach: Floats, scale_range: tuple[float, float], sd: float
-) -> list[tuple[Floats, float]]:
-    """Return the (shift, scale) pairs for which a one-to-one match is worth trying.
-
-    Every pair puts one light on one glint, or two lights on two glints. Those with the most glints near any light are
-    kept; among equals the most likely shift wins.
+    Attributes:
+        glints: the glints.
+        lights: expected glints of the lights.
+        middle: (2,) middle of the lights.
+        reach: (l,) largest distance of a glint from its light.
+        scale_range: limits of the scale.
+        shift_sd: standard deviation of the shift.
     """
-    m, count = glints.shape[0], lights.shape[0]
-    shift = (glints[:, None] - lights[None]).reshape(-1, 2)
-    scale = np.ones(shift.shape[0])
-    if m > 1 and count > 1:
-        i, j = (index.ravel() for index in np.nonzero(~np.eye(m, dtype=bool)))
-        k, n = np.triu_indices(count, 1)
-        apart, seen = (lights[n] - lights[k])[None], (glints[j] - glints[i])[:, None]
-        length2 = (apart**2).sum(axis=-1)
-        ratio = (seen * apart).sum(axis=-1) / np.maximum(length2, 1.0)
-        halfway = 0.5 * (lights[k] + lights[n]) - middle
-        offset = 0.5 * (glints[i] + glints[j])[:, None] - middle - ratio[..., None] * halfway
-        fair = (ratio >= scale_range[0]) & (ratio <= scale_range[1]) & (length2 > 1.0)
-        shift, scale = np.concatenate([shift, offset[fair]]), np.concatenate([scale, ratio[fair]])
-    placed = middle + shift[:, None] + scale[:, None, None] * (lights - middle)
-    gap = glints[None, :, None] - placed[:, None]
-    near = (np.hypot(gap[..., 0], gap[..., 1]) / reach).min(axis=2)
-    merit = np.maximum(1.0 - near**2, 0.0).sum(axis=1) - 0.5 * (shift**2).sum(axis=1) / sd**2
-    best = np.argsort(-merit, kind="stable")[:24]
-    return [(shift[i], float(scale[i])) for i in best]
 
+    glints: Floats
+    lights: Floats
+    middle: Floats
+    reach: Floats
+    scale_range: tuple[float, float]
+    shift_sd: float
 
-def _match(glints: Floats, *, lights: Floats, middle: Floats, reach: Floats, shift: Floats, scale: float) -> Indices:
-    """Return each glint's light (m,), one to one, with the least sum of squared misfits within reach; -1 for none."""
-    from scipy.optimize import linear_sum_assignment  # its import takes a third of a second
+    def promising(self) -> list[tuple[Floats, float]]:
+        """Return the (shift, scale) pairs for which a one-to-one match is worth trying.
 
-    offset = glints[:, None, :] - _placed(lights, middle, shift, scale)[None]
-    misfit = np.hypot(offset[..., 0], offset[..., 1]) / reach[None, :]
-    cost = np.where(misfit < 1.0, misfit**2 - 1.0, 0.0)  # not matching them costs nothing
-    rows, columns = linear_sum_assignment(cost)
-    match = np.full(glints.shape[0], -1, dtype=np.intp)
-    taken = misfit[rows, columns] < 1.0
-    match[rows[taken]] = columns[taken]
-    return match
+        Every pair puts one light on one glint, or two lights on two glints. Those with the most glints near any light
+        are kept; among equals the most likely shift wins.
+        """
+        glints, lights, middle = self.glints, self.lights, self.middle
+        m, count = glints.shape[0], lights.shape[0]
+        shift = (glints[:, None] - lights[None]).reshape(-1, 2)
+        scale = np.ones(shift.shape[0])
+        if m > 1 and count > 1:
+            i, j = (index.ravel() for index in np.nonzero(~np.eye(m, dtype=bool)))
+            k, n = np.triu_indices(count, 1)
+            apart, seen = (lights[n] - lights[k])[None], (glints[j] - glints[i])[:, None]
+            length2 = (apart**2).sum(axis=-1)
+            ratio = (seen * apart).sum(axis=-1) / np.maximum(length2, 1.0)
+            halfway = 0.5 * (lights[k] + lights[n]) - middle
+            offset = 0.5 * (glints[i] + glints[j])[:, None] - middle - ratio[..., None] * halfway
+            fair = (ratio >= self.scale_range[0]) & (ratio <= self.scale_range[1]) & (length2 > 1.0)
+            shift, scale = np.concatenate([shift, offset[fair]]), np.concatenate([scale, ratio[fair]])
+        placed = middle + shift[:, None] + scale[:, None, None] * (lights - middle)
+        gap = glints[None, :, None] - placed[:, None]
+        near = (np.hypot(gap[..., 0], gap[..., 1]) / self.reach).min(axis=2)
+        merit = np.maximum(1.0 - near**2, 0.0).sum(axis=1) - 0.5 * (shift**2).sum(axis=1) / self.shift_sd**2
+        best = np.argsort(-merit, kind="stable")[:24]
+        return [(shift[i], float(scale[i])) for i in best]
 
+    def match(self, shift: Floats, scale: float) -> Indices:
+        """Return each glint's light (m,), one to one, with the least squared misfits within reach; -1 for none."""
+        from scipy.optimize import linear_sum_assignment  # its import takes a third of a second
 
-def _refitted(
-    glints: Floats,
-    *,
-    lights: Floats,
-    middle: Floats,
-    match: Indices,
-    shift: Floats,
-    scale: float,
-    span: tuple[float, float],
-) -> tuple[Floats, float]:
-    """Compute the least-squares shift and scale of a match."""
-    placed = match >= 0
-    if not placed.any():
-        return shift, scale
-    seen, expected = glints[placed], lights[match[placed]] - middle
-    spread = expected - expected.mean(axis=0)
-    total = float((spread**2).sum())
-    if total > 1.0:
-        scale = float(np.clip((spread * (seen - seen.mean(axis=0))).sum() / total, *span))
-    return np.asarray((seen - scale * expected).mean(axis=0) - middle), scale
+        offset = self.glints[:, None, :] - (self.middle + shift + scale * (self.lights - self.middle))[None]
+        misfit = np.hypot(offset[..., 0], offset[..., 1]) / self.reach[None, :]
+        cost = np.where(misfit < 1.0, misfit**2 - 1.0, 0.0)  # not matching them costs nothing
+        rows, columns = linear_sum_assignment(cost)
+        match = np.full(self.glints.shape[0], -1, dtype=np.intp)
+        taken = misfit[rows, columns] < 1.0
+        match[rows[taken]] = columns[taken]
+        return match
 
+    def refitted(self, match: Indices, shift: Floats, scale: float) -> tuple[Floats, float]:
+        """Compute the least-squares shift and scale of a match."""
+        placed = match >= 0
+        if not placed.any():
+            return shift, scale
+        seen, expected = self.glints[placed], self.lights[match[placed]] - self.middle
+        spread = expected - expected.mean(axis=0)
+        total = float((spread**2).sum())
+        if total > 1.0:
+            scale = float(np.clip((spread * (seen - seen.mean(axis=0))).sum() / total, *self.scale_range))
+        return np.asarray((seen - scale * expected).mean(axis=0) - self.middle), scale
 
-def _merit(
-    glints: Floats,
-    *,
-    lights: Floats,
-    middle: Floats,
-    reach: Floats,
-    match: Indices,
-    shift: Floats,
-    scale: float,
-    sd: float,
-) -> float:
-    placed = match >= 0
-    offset = glints[placed] - _placed(lights[match[placed]], middle, shift, scale)
-    misfit2 = (offset**2).sum(axis=1) / reach[match[placed]] ** 2
-    return float(np.sum(1.0 - misfit2)) - 0.5 * float(shift @ shift) / sd**2
+    def offsets(self, match: Indices, shift: Floats, scale: float) -> Floats:
+        """Compute the offsets (k, 2) of the matched glints from their lights in a layout."""
+        placed = match >= 0
+        expected = self.middle + shift + scale * (self.lights[match[placed]] - self.middle)
+        return np.asarray(self.glints[placed] - expected)
+
+    def merit(self, match: Indices, shift: Floats, scale: float) -> float:
+        """Compute how well a layout explains the glints: matches minus squared misfits and a penalty for its shift."""
+        misfit2 = (self.offsets(match, shift, scale) ** 2).sum(axis=1) / self.reach[match[match >= 0]] ** 2
+        return float(np.sum(1.0 - misfit2)) - 0.5 * float(shift @ shift) / self.shift_sd**2
 
 
 def _contradicts(first: tuple[int, ...], second: tuple[int, ...]) -> bool:

@@ -19,7 +19,7 @@ LEAST_PEAK = 0.75
 MOST_CLIPPED = 1  # clipped pixels; a spot with more is not judged
 NARROWEST_PX = 0.9  # a narrower spot is mostly a single pixel
 EXPLAINED = 2.0  # a misfit below this many standard deviations of the noise is accepted
-PIXEL = 1.0 / 12.0  # variance of a pixel, px^2
+PIXEL = 1.0 / 12.0  # variance of a pixel, px^2; without it a spot of one row of pixels would be a line
 LONGEST = 2.5  # largest elongation of the bright patch; glints, and two that touch, reach 2.0
 
 

@@ -35,15 +35,8 @@ ELONGATION = 0.07
 def distance_slopes(ellipse: Ellipse, place: Place) -> Floats:
     """Compute derivatives (5, n) of the signed distance by cx, cy and the shape matrix (aa, bb, ab), ellipse's axes."""
     cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    out = np.empty((SHAPE, place.nx.size))
-    np.subtract(place.ny * sin, place.nx * cos, out=out[0])
-    np.multiply(place.nx, -sin, out=out[1])
-    out[1] -= place.ny * cos
-    np.multiply(place.nx, -place.cos_t, out=out[2])
-    np.multiply(place.ny, -place.sin_t, out=out[3])
-    np.multiply(place.nx, -place.sin_t, out=out[4])
-    out[4] -= place.ny * place.cos_t
-    return out
+    nx, ny, c, s = place.nx, place.ny, place.cos_t, place.sin_t
+    return np.array([ny * sin - nx * cos, -nx * sin - ny * cos, -nx * c, -ny * s, -nx * s - ny * c])
 
 
 def sector_excess(plain: Floats, inverse: Floats, sums: Floats) -> float:

@@ -61,12 +61,7 @@ class EdgePoints:
 
 
 def find_edges(
-    inpainted: Inpainted,
-    candidate: Candidate,
-    noise_dn: float,
-    filter_px: float,
-    *,
-    band: float,
+    inpainted: Inpainted, candidate: Candidate, noise_dn: float, filter_px: float, *, band: float
 ) -> EdgePoints:
     """Detect edge points within `band` times the semi-axes of the candidate's outline (at least 4 px).
 

@@ -84,13 +84,6 @@ def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
     return bins, out
 
 
-@inlined
-def _clear(values: Floats) -> None:
-    """Set values (n,) to 0, in place."""
-    for k in range(values.size):
-        values[k] = 0.0
-
-
 @compiled("i8[::1], f8[:,::1], f8[::1], b1[::1], f8[::1], f8[::1]")
 def _displacements(
     bins: Indices, look: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
@@ -104,8 +97,8 @@ def _displacements(
     place, edge, residual, steep = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(n), np.empty(n)
     whole, weight, further = displaced.copy(), np.empty(SECTORS), np.empty(SECTORS)
     for _ in range(2):  # the levels are not linear in a displacement as large as the blur
-        _clear(weight)
-        _clear(further)
+        weight.fill(0.0)
+        further.fill(0.0)
         for start in range(0, n, BLOCK):
             count = min(BLOCK, n - start)
             for i in range(count):

@@ -7,8 +7,6 @@ points beyond it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ...arrays import Bools, Floats
@@ -26,20 +24,8 @@ CLEAR = 0.15  # share of b: edge points farther from the ellipse do not belong t
 SHADED = 0.6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Outline:
-    """Shares of the outline and numbers of edge points, as `Goodness` describes them."""
-
-    open: float
-    beyond: float
-    within: float
-    shaded: float
-    pale: float
-    mirrored: float
-
-
-def outline_of(found: PupilCandidate, ellipse: Ellipse) -> Outline:
-    """Examine the levels along an ellipse around a candidate."""
+def outline_of(found: PupilCandidate, ellipse: Ellipse) -> dict[str, float]:
+    """Examine the levels along an ellipse around a candidate; return the fields of `Goodness` that describe them."""
     boundary, candidate, edges, inpainted = found.boundary, found.candidate, found.edges, found.inpainted
     b = float(ellipse.semi_axes_px[1])
     about = ellipse.numbers()
@@ -48,18 +34,11 @@ def outline_of(found: PupilCandidate, ellipse: Ellipse) -> Outline:
     others = edges.points_px[~boundary.inliers]
     levels = (candidate.inside_dn, candidate.inside_dn + DARK * candidate.step_dn)
     held = holding(about, boundary.points_px)
-    hollow, beyond, within, *own = _along(
-        about, held, others, inpainted.linear, inpainted.corner, patch, (away, max(CLEAR * b, 1.0)), levels
-    )
-    points, (shaded, pale, mirrored) = max(boundary.points_px.shape[0], 1), own
-    return Outline(
-        open=hollow / SECTORS,
-        beyond=beyond / points,
-        within=within / points,
-        shaded=shaded / SECTORS,
-        pale=pale / SECTORS,
-        mirrored=mirrored / SECTORS,
-    )
+    counts = _along(about, held, others, inpainted.linear, inpainted.corner, patch, (away, max(CLEAR * b, 1.0)), levels)
+    points = max(boundary.points_px.shape[0], 1)
+    names = ("open", "beyond", "within", "shaded", "pale", "mirrored")
+    wholes = (SECTORS, points, points, SECTORS, SECTORS, SECTORS)
+    return {name: count / whole for name, count, whole in zip(names, counts, wholes, strict=True)}
 
 
 @compiled(

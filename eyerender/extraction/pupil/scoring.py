@@ -142,7 +142,6 @@ def score(candidate: PupilCandidate) -> ScoredCandidate:
 def goodness_of(found: PupilCandidate, fit: PixelFit | None) -> Goodness:
     """Measure how well a boundary explains the image, from its edges or the pixel model."""
     boundary, image = found.boundary, found.image
-    about = outline_of(found, boundary.ellipse if fit is None else fit.ellipse)
     if fit is None:
         model, ellipse, covariance, inside = found.model, boundary.ellipse, found.boundary.covariance, found.interior
     else:
@@ -163,12 +162,7 @@ def goodness_of(found: PupilCandidate, fit: PixelFit | None) -> Goodness:
         uneven_px=0.0 if fit is None else fit.uneven_px,
         leverage=leverage(boundary.ellipse, boundary.sums),
         refined=fit is not None,
-        open=about.open,
-        beyond=about.beyond,
-        within=about.within,
-        shaded=about.shaded,
-        pale=about.pale,
-        mirrored=about.mirrored,
+        **outline_of(found, ellipse),
     )
 
 

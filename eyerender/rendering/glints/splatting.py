@@ -62,9 +62,7 @@ class Mirrored:
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         hidden = inside & table.visible & covered[np.where(inside, row, 0), np.where(inside, column, 0)]
         glints = replace(
-            table,
-            share=frozen(np.where(hidden, 0.0, table.share)),
-            visible=frozen(table.visible & ~hidden, np.bool_),
+            table, share=frozen(np.where(hidden, 0.0, table.share)), visible=frozen(table.visible & ~hidden, np.bool_)
         )
         reasons = tuple(_FRAMED if h else reason for h, reason in zip(hidden, self.reasons, strict=True))
         return Mirrored(glints, self.others, reasons)

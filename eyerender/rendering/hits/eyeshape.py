@@ -57,7 +57,7 @@ class EyeShape:
         ol, dl = front.point_in(oe), front.vector_in(de)
         tc, on_cornea, facing = front.meet(ol, dl)
         yl = ol + tc * dl
-        on_cornea &= (_from_axis(yl) < frame.limbus.radius) & (yl.x > frame.limbus.floor)
+        on_cornea &= (dr.sqrt(yl.y * yl.y + yl.z * yl.z) < frame.limbus.radius) & (yl.x > frame.limbus.floor)
         ts, on_sclera = intersect_sphere(oe - frame.sclera.centre, de, frame.sclera.radius)
         # The sphere's front is behind the cornea, so a ray that meets the sphere first has met no clear cornea. This
         # avoids cracks even where the rim of a tilted or toric cornea is not a circle of the sphere.
@@ -156,11 +156,6 @@ def _beyond_root(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
     scale = (frame.iris.root_radius + EPSILON_MM) * dr.rsqrt(dr.maximum(x.y * x.y + x.z * x.z, 1e-12))
     y, z = x.y * scale, x.z * scale
     return mi.Vector3f(centre.x - (n.y * (y - centre.y) + n.z * (z - centre.z)) / n.x, y, z)
-
-
-def _from_axis(x: mi.Vector3f) -> mi.Float:
-    """Compute the distance from the axis of the surface in whose frame points are given."""
-    return dr.sqrt(x.y * x.y + x.z * x.z)
 
 
 def intersect_sphere(o: mi.Vector3f, d: mi.Vector3f, radius: mi.Float) -> tuple[mi.Float, mi.Bool]:

@@ -26,6 +26,7 @@ from ...arrays import Bools, Floats, Ints
 from ...eye.meshes import Patch, cornea_patches
 from ...eye.model import EyeModel
 from ...geometry.surfaces import Surface as ExactSurface
+from ...geometry.transforms import normalize
 from ..records.frame import aligned_copy, upload_array
 from ..records.surfaces import Bundle, NormalForm, Surface
 
@@ -154,8 +155,8 @@ class SurfaceMesh:
         x, n, _, normal_slope, there = self._at(q)
         miss, _ = _unevenness(x, n, _, normal_slope, lamp, node)
         found &= there & (np.max(np.abs(miss), axis=1) < _PARALLEL)
-        out, arrive = _unit(x - node), _unit(x - lamp)
-        N = _unit(n)
+        out, arrive = normalize(x - node), normalize(x - lamp)
+        N = normalize(n)
         tube = _tube(out, x, N, n, normal_slope, lamp, node)
         point, normal, arrives, leaves = (p @ self.rotation.T for p in (x, N, arrive, -out))
         point = point + self.origin
@@ -300,7 +301,7 @@ def _tube(out: Floats, x: Floats, N: Floats, n: Floats, normal_slope: Floats, la
     c = -np.sum(N * out, axis=1)
     w = out + 2 * c[:, None] * N
     helper = np.where(np.abs(out[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    e1 = _unit(np.cross(out, helper))
+    e1 = normalize(np.cross(out, helper))
     ends = []
     for e in (e1, np.cross(out, e1)):
         v = s[:, None] * e
@@ -310,7 +311,3 @@ def _tube(out: Floats, x: Floats, N: Floats, n: Floats, normal_slope: Floats, la
         dc = -(np.sum(e * N, axis=1) + np.sum(out * dN, axis=1))
         ends.append(dy + rest[:, None] * (e + 2 * (dc[:, None] * N + c[:, None] * dN)))
     return np.asarray(np.abs(np.sum(w * np.cross(*ends), axis=1)))
-
-
-def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))

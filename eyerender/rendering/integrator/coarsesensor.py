@@ -47,10 +47,7 @@ class CoarseSensor:
         side = blocks * block
         (fx, fy), (cx, cy) = np.diag(job.camera.K)[:2] / side, (job.camera.K[:2, 2] + 0.5) / side - 0.5
         focal, principal = ((dr.opaque(mi.Float, a), dr.opaque(mi.Float, b)) for a, b in ((fx, fy), (cx, cy)))
-        coarse = replace(
-            frame,
-            camera=replace(frame.camera, focal=focal, principal=principal),
-        )
+        coarse = replace(frame, camera=replace(frame.camera, focal=focal, principal=principal))
         window: Window = (0, 0, -(-width // side), -(-height // side))
         film = start(BoundFrame(coarse, HostData(job, None)), window, _SAMPLES, job.seed, layered=False)
         return cls(film, blocks, (-(-height // block), -(-width // block)))

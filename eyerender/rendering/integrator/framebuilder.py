@@ -22,14 +22,15 @@ from ..records.frame import Frame, Lights, Structure, upload_array
 from ..records.job import LampTable, RenderJob, boundary_waves, kinds, panel_lamps, panel_table, tables
 from ..records.recording import forget, recorded
 from ..scene.background import Background, Obstacle
-from ..scene.head import place_scene
+from ..scene.head import HeadScene
 from ..scene.region import RegionScene
 from ..transport.diffusion import DiffusedLight
 from ..transport.environment import Ambience, Maps, bright_lamps
+from ..transport.framepatches import Patches
 from ..transport.fundusirradiance import FundusIrradiance
 from ..transport.globeirradiance import GlobeIrradiance
 from ..transport.irisirradiance import IrisIrradiance
-from ..transport.radiosity import RadiositySolver
+from ..transport.radiosity import PendingField
 from ..transport.reliefmapping import IrisRelief, ReliefShape, ReliefSize, relief_shape
 from ..transport.shadowmaps import ShadowMaps
 from .hostdata import HostData
@@ -50,32 +51,19 @@ class _Next:
     host: Future[HostData] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _GridSizes:
-    """Sizes of the grids behind the cornea.
-
-    Attributes:
-        gridded: whether there is a grid over the iris.
-        lamps: number of lamps whose light is on that grid.
-        nodes: number of nodes of the relief.
-        points: number of points on all lamps that light the relief.
-    """
-
-    gridded: bool
-    lamps: int
-    nodes: int
-    points: int
-
-
 @recorded
 def _grids_behind_cornea(
     frame: Frame, shape: ReliefShape | None, side: mi.UInt32, points: mi.UInt32, factors: mi.Float | None,
-    sizes: _GridSizes,
+    lamps: int | None, relief: tuple[int, int],
 ) -> tuple[IrisIrradiance | None, IrisRelief, FundusIrradiance]:  # fmt: skip
-    """Fill the irradiance grids behind the cornea: on the iris, on its relief, and on the fundus."""
+    """Fill the irradiance grids behind the cornea: on the iris, on its relief, and on the fundus.
+
+    The grid on the iris holds the light of `lamps` lamps; None: there is none. The numbers of `relief` are those of its
+    nodes, and of the points on all lamps that light it.
+    """
     pupil = FundusIrradiance.build(frame, factors)
-    on_iris = IrisIrradiance.build(frame, sizes.lamps, points) if sizes.gridded else None
-    return on_iris, IrisRelief.build(frame, shape, side, points, (sizes.nodes, sizes.points)), pupil
+    on_iris = None if lamps is None else IrisIrradiance.build(frame, lamps, points)
+    return on_iris, IrisRelief.build(frame, shape, side, points, relief), pupil
 
 
 class FrameBuilder:
@@ -95,7 +83,7 @@ class FrameBuilder:
         self._replaced: deque[Any] = deque(maxlen=_REGIONS)  # subjects whose scenes were reused for others
         self._maps = Maps()
         self.meshes = Meshes()
-        self._radiosity = RadiositySolver()
+        self._patches = Patches()
         self._shapes: EyeCache[ReliefShape] = EyeCache()
         self._next: _Next | None = None
 
@@ -166,7 +154,7 @@ class FrameBuilder:
         job = host.job
         parts = panel_lamps(job.ambient, job.anchor_mm) + bright_lamps(job.ambient.map, self._maps, job.anchor_mm)
         panels = LampTable.of(parts, job.M, job.t)
-        pending = self._radiosity.gather(frame, job, host.lamps, panels, host.patches, surroundings)
+        pending = PendingField.gather(self._patches, frame, job, host.lamps, panels, host.patches, surroundings)
         if after is not None:
             self._expect(after)
         gathered = pending.read()
@@ -189,14 +177,15 @@ class FrameBuilder:
                 lambda: relief_shape(frame.bare(), heights, side, dr.opaque(mi.UInt32, size.about), size),
             )
         gridded = not surroundings.obstructed or (isinstance(surroundings, RegionScene) and surroundings.skin.is_sheet)
-        points = lamps.points * max(len(lamps), 1)
-        worthwhile = lamps.gridded and _across_iris(job) > _FEWEST_PX
-        sizes = _GridSizes(gridded, len(lamps) if worthwhile else 0, size.side**2, points)
+        iris_px = 2 * float(job.eye.iris_root_radius_mm) * float(job.camera.scale_at(job.t))
+        worthwhile = lamps.gridded and iris_px > _FEWEST_PX
+        on_grid = (len(lamps) if worthwhile else 0) if gridded else None
+        relief = size.side**2, lamps.points * max(len(lamps), 1)
         factors = host.returned.factors
         sent_factors = upload_array(factors) if len(lamps) and factors.any() else None
         caches = frame.caches
         caches.iris, caches.relief, caches.fundus = _grids_behind_cornea(
-            frame, shape, side, dr.opaque(mi.UInt32, lamps.points), sent_factors, sizes
+            frame, shape, side, dr.opaque(mi.UInt32, lamps.points), sent_factors, on_grid, relief
         )
 
     def _host_data(self, job: RenderJob) -> tuple[HostData, Background | RegionScene]:
@@ -238,7 +227,7 @@ class FrameBuilder:
                 if full:
                     self._regions.pop(next(iter(self._regions)))
                 forget()
-                surroundings = place_scene(spec, globe, known)
+                surroundings = (RegionScene if spec.head is None else HeadScene)(spec, globe, known)
             else:
                 surroundings = self._regions.pop(oldest)
                 self._replaced.append(oldest)
@@ -257,8 +246,3 @@ class FrameBuilder:
                 self._textures.pop(next(iter(self._textures)))
             self._textures[key] = Textures.of(job.look)
         return self._textures[key]
-
-
-def _across_iris(job: RenderJob) -> float:
-    """Return the width of the iris in the picture, px."""
-    return 2 * float(job.eye.iris_root_radius_mm) * float(job.camera.scale_at(job.t))

@@ -5,9 +5,9 @@ maximises the smallest distance between points. A regular lattice locates edges 
 samples (Sloan and Joe 1994, chapter 4). Its mean is always the pixel's centre: a random shift would move the image, but
 not the computed glints, by up to 1 / (2 N) px. All seeds share the lattice, so averaging over seeds keeps its error.
 
-Positions on the lamps: sample k is at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1 (Roberts 2018).
-The shift is a hash of the pixel's position on the sensor and the seed (Tea: Zafar, Olano and Curtis 2010), so that soft
-shadows show noise rather than bands. Nothing depends on threads, the window, or earlier renderings.
+Positions on the lamps follow `sequence`. Its shift is a hash of the pixel's position on the sensor and the seed (Tea:
+Zafar, Olano and Curtis 2010), so that soft shadows show noise rather than bands. Nothing depends on threads, the
+window, or earlier renderings.
 """
 
 from __future__ import annotations
@@ -21,10 +21,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...rig.camera import Window, distort, distorted_area, is_imaged, newton_step
-from ..records.frame import Frame
+from ..records.frame import Frame, sequence
 
-_PHI = 1.324717957244746
-_ALPHA = tuple(round(_PHI ** -(k + 1) * 2**32) for k in range(2))
 _UNDISTORT_STEPS = 6
 _UNDISTORTED = 1e-4  # largest accepted residual of Newton's method, in units of the focal length
 _CALLS = 3  # pairs of further numbers of a sample
@@ -131,12 +129,7 @@ class Samples:
         """Compute two further random numbers of sample `k`, [0, 1)^2; each `call` has its own shift per pixel."""
         tea: Any = mi.sample_tea_32
         pixel = (self.u & mi.UInt32(0xFFFF)) | (self.v << mi.UInt32(16))
-        return mi.Point2f(
-            *(
-                mi.Float((shift + k * mi.UInt32(alpha)) >> 8) * (2.0**-24)
-                for shift, alpha in zip(tea(pixel, self.keys[call]), _ALPHA, strict=True)
-            )
-        )
+        return mi.Point2f(*sequence(k, tea(pixel, self.keys[call])))
 
     def ray(self, frame: Frame, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
         """Compute the camera ray of sample `k`, as in `camera_ray`."""

@@ -17,7 +17,7 @@ from ..materials.albedo import iris_albedo, stop_coordinates
 from ..materials.gloss import film_normal, film_reflectance
 from ..records.frame import Frame
 from ..records.recording import syntax
-from ..transport.directlight import lamp_light, on_relief
+from ..transport.directlight import irradiance_through_cornea, on_relief, onto_matte
 
 _FLAT_MM = 1e-2  # distance from the plane of the background
 
@@ -31,7 +31,8 @@ def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float
     known, outer_known = mi.Bool(False), mi.Float(0)
     if frame.caches.globe is not None:
         outer_known, known = frame.caches.globe.at(frame, si)
-    outer, inner, failures = lamp_light(frame, si, u, v, known)
+    outer = onto_matte(frame, si, u, v, si.matte & ~known)
+    inner, failures = irradiance_through_cornea(frame, si.inner, si.lit_inside, u, v)
     albedo = outer_albedo(frame, si)
     received = of_surroundings(frame, si, known)
     rest = indirect(frame, si, d, albedo, inner, received)

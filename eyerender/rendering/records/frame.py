@@ -25,6 +25,7 @@ from .surfaces import Surface
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
 SMALL = 0.02  # radius over distance of lamps whose shadows of hairs are finer than a pixel
 ALL, BITS = 0xFFFFFFFF, 32  # marks of lamps
+_ALPHA = tuple(round(1.324717957244746 ** -(k + 1) * 2**32) for k in range(2))
 _LIGHT_ROW = 12  # position 3, axis 3, radius, intensity, lobe exponent, inner radius, 2 unused
 
 
@@ -62,6 +63,15 @@ def _apart(buffer: mi.Float, first: mi.UInt32, count: int) -> list[mi.Float]:
 def quotient(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
     """Compute floor(a / b) of numbers below a million in floating point; integer division does not vectorise."""
     return mi.UInt32((mi.Float(a) + 0.5) / mi.Float(b))
+
+
+def sequence(k: mi.UInt32, shift: tuple[Any, Any] = (0, 0)) -> tuple[mi.Float, mi.Float]:
+    """Return points k of a sequence that fills [0, 1)^2 evenly (Roberts 2018); `shift` is in units of 2^-32.
+
+    Point k is at frac(shift + k alpha), alpha = (phi^-1, phi^-2), phi^3 = phi + 1.
+    """
+    u, v = (mi.Float((s + k * mi.UInt32(a)) >> 8) * 2.0**-24 for s, a in zip(shift, _ALPHA, strict=True))
+    return u, v
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,11 +20,6 @@ _DEPTH_MM = 4.0
 _RINGS, _TURNS = 40, 240
 
 
-def place_scene(spec: Region, globe: Globe, known: RegionMesh | None) -> RegionScene:
-    """Create the scene of a spec: its head mesh, or the procedural region, whose mesh may already be computed."""
-    return (RegionScene if spec.head is None else HeadScene)(spec, globe, known)
-
-
 class HeadScene(RegionScene):
     """The Mitsuba scene of a head mesh around one eye.
 

@@ -34,7 +34,7 @@ from ...eye.model import EyeModel, Stop
 from ...geometry.surfaces import Surface
 from ...region.limbus import lower, upwards
 from ...region.look import LIMBAL_RING, Look
-from .chamberrays import ChamberShape, Walls, air_side, trace_inside
+from .chamberrays import Walls, air_side, trace_inside
 
 IRIS_RINGS, TURNS = 16, 16  # points in the plane of the iris, over radius and angle
 ROOT_RINGS = 14  # rings on iris and pupil; the others lie beyond the root
@@ -85,7 +85,7 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
         depth, root_mm = (_SAME_MM * round(v / _SAME_MM) for v in (float(eye.stop.centre_mm[0]), root_mm))
         eye = replace(eye, stop=replace(eye.stop, centre_mm=frozen([depth, 0.0, 0.0])))
     return _chamber(
-        ChamberShape(
+        Walls(
             front=tuple(eye.front), indices=tuple(float(n) for n in eye.front_indices), film=film,
             centre=tuple(np.asarray(eye.stop.centre_mm).tolist()), normal=tuple(np.asarray(eye.stop.normal).tolist()),
             limbus=float(eye.limbus_radius_mm), root=root_mm, sclera_x=float(eye.sclera.centre_mm[0]),
@@ -231,10 +231,9 @@ def _radius(ring: Floats, root: float, reach: float) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def _chamber(shape: ChamberShape) -> Chamber:
-    walls = Walls.of(shape)
-    reach = walls.rim + walls.slope * max(walls.top - walls.centre[0], 0)
-    root = min(shape.root, 0.99 * reach)
+def _chamber(walls: Walls) -> Chamber:
+    reach = walls.limbus + walls.slope * max(walls.top - walls.centre[0], 0)
+    root = min(walls.root, 0.99 * reach)
     points, normals, valid = _choose_patches(walls, root, reach)
     exchange = np.zeros((PATCHES, PATCHES))
     leaving = np.zeros((PATCHES, RAYS, 7))
@@ -255,7 +254,7 @@ def _chamber(shape: ChamberShape) -> Chamber:
 
 
 def _choose_patches(walls: Walls, root: float, reach: float) -> tuple[Floats, Floats, Bools]:
-    n, c = walls.normal, walls.centre
+    n, c = np.array(walls.normal), np.array(walls.centre)
     ring, turn = np.arange(IRIS) // TURNS, np.arange(IRIS) % TURNS
     radius, angle = _radius(np.asarray(ring + 0.5, dtype=float), root, reach), 2 * np.pi * (turn + 0.5) / TURNS
     y, z = radius * np.cos(angle), radius * np.sin(angle)
@@ -268,7 +267,7 @@ def _choose_patches(walls: Walls, root: float, reach: float) -> tuple[Floats, Fl
     share = (np.arange(TURNS * LEVELS) % LEVELS + 0.5) / LEVELS
     foot = c[0] - (n[1] * reach * np.cos(angle) + n[2] * reach * np.sin(angle)) / n[0]
     x = walls.top + share * (foot - walls.top)
-    r = walls.rim + walls.slope * (walls.top - x)
+    r = walls.limbus + walls.slope * (walls.top - x)
     wall = np.stack([x, r * np.cos(angle), r * np.sin(angle)], axis=-1)
     steep = np.hypot(1.0, walls.slope)
     across = np.stack([np.full_like(x, -walls.slope), -np.cos(angle), -np.sin(angle)], axis=-1) / steep

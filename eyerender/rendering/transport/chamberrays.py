@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
@@ -20,9 +21,12 @@ _WALL_MM = 1.0  # thickness of the sclera
 _SECTORS = 16  # sectors over which the foot of the wall is averaged
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChamberShape:
-    """The properties of an eye that determine its chamber; hashable.
+@dataclass(frozen=True, kw_only=True)
+class Walls:
+    """Surfaces around the chamber of an eye; hashable.
+
+    The wall is a cone about x with the radius of the limbus at x = `top`, which grows by `slope` per mm downwards. If
+    the cornea has a back surface, which meets the plane of the iris, the wall is the cornea's rim in front of it.
 
     Attributes:
         front: refracting surfaces from outside inwards.
@@ -46,42 +50,24 @@ class ChamberShape:
     sclera_x: float
     sclera_radius: float
 
+    @cached_property
+    def top(self) -> float:
+        """Compute x of the upper edge of the wall, mm."""
+        front = self.front[0]
+        return float(np.asarray(front.origin_mm)[0] + front.sag(np.array(self.limbus), np.array(0.0)))
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Walls:
-    """Surfaces around the chamber: refracting ones outside in, their indices, film, iris plane and wall.
-
-    The wall is a cone about x with radius `rim` at x = `top`, which grows by `slope` per mm downwards. If the cornea
-    has a back surface, which meets the plane of the iris, the wall is the cornea's rim in front of it.
-    """
-
-    front: tuple[Surface, ...]
-    indices: tuple[float, ...]
-    film: float
-    centre: Floats
-    normal: Floats
-    rim: float
-    top: float
-    slope: float
-
-    @classmethod
-    def of(cls, shape: ChamberShape) -> Walls:
-        """Create the walls of a chamber."""
-        centre, limbus = np.array(shape.centre), shape.limbus
-        front = shape.front[0]
-        top = float(np.asarray(front.origin_mm)[0] + front.sag(np.array(limbus), np.array(0.0)))
-        bottom = centre[0] - _BELOW_MM
-        inner_radius = shape.sclera_radius - _WALL_MM
-        wide = np.sqrt(max(inner_radius**2 - (bottom - shape.sclera_x) ** 2, limbus**2))
-        if len(shape.front) > 1:
+    @cached_property
+    def slope(self) -> float:
+        """Compute the growth of the wall's radius downwards."""
+        bottom = self.centre[0] - _BELOW_MM
+        inner_radius = self.sclera_radius - _WALL_MM
+        wide = np.sqrt(max(inner_radius**2 - (bottom - self.sclera_x) ** 2, self.limbus**2))
+        if len(self.front) > 1:
             # The wall stands where the back of the cornea meets the plane of the iris.
             angle = 2 * np.pi * np.arange(_SECTORS) / _SECTORS
-            foot = chamber_rim(shape.front[-1], centre, np.array(shape.normal), limbus, angle)
-            bottom, wide = min(centre[0], top - 0.1), float(np.mean(foot))
-        return cls(
-            front=shape.front, indices=shape.indices, film=shape.film, centre=centre, normal=np.array(shape.normal),
-            rim=limbus, top=top, slope=(wide - limbus) / (top - bottom),
-        )  # fmt: skip
+            foot = chamber_rim(self.front[-1], np.array(self.centre), np.array(self.normal), self.limbus, angle)
+            bottom, wide = min(self.centre[0], self.top - 0.1), float(np.mean(foot))
+        return float((wide - self.limbus) / (self.top - bottom))
 
     @property
     def layer(self) -> int:
@@ -101,7 +87,7 @@ class Walls:
 
     def to_wall(self, o: Floats, d: Floats) -> Floats:
         """Compute the distance (n,) to the wall above the plane, infinite where it is not met."""
-        r, s = self.rim + self.slope * (self.top - o[:, 0]), -self.slope * d[:, 0]
+        r, s = self.limbus + self.slope * (self.top - o[:, 0]), -self.slope * d[:, 0]
         a = d[:, 1] ** 2 + d[:, 2] ** 2 - s * s
         b = o[:, 1] * d[:, 1] + o[:, 2] * d[:, 2] - r * s
         c = o[:, 1] ** 2 + o[:, 2] ** 2 - r * r
@@ -196,7 +182,7 @@ def _surface_distances(walls: Walls, rays: _Rays) -> tuple[Floats, Floats]:
         if k == 0:
             hit = rays.o[here] + np.where(np.isfinite(t), t, 0)[:, None] * rays.d[here]
             local = surface.to_local(hit)
-            t[(np.hypot(local[:, 1], local[:, 2]) > walls.rim) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
+            t[(np.hypot(local[:, 1], local[:, 2]) > walls.limbus) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
         outer[here] = t
         here = rays.layer == k
         hit = surface.hit(components(rays.o[here] + _AHEAD_MM * rays.d[here]), components(rays.d[here]), True)

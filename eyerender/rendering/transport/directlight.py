@@ -132,29 +132,11 @@ def shadowless(frame: Frame, lamp: mi.UInt32, x: mi.Vector3f, on_sheet: mi.Bool)
     return mi.Bool(False) if maps is None else maps.at(lamp, x, on_sheet)
 
 
-def lamp_light(
-    frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, known: mi.Bool
-) -> tuple[mi.Float, mi.Float, mi.UInt32]:
-    """Compute the light of the lamps on a bare eye.
-
-    Args:
-        frame: the frame.
-        view: the lit points.
-        u: first coordinate on each lamp's disc, [0, 1).
-        v: second coordinate.
-        known: where the light at the first surface is already known.
-
-    Returns:
-        Irradiance (mW/mm^2) at the first surface where it is matte, irradiance in the plane of the iris, and number of
-        failed paths.
-    """
-    direct = _onto_matte(frame, view, u, v, view.matte & ~known)
-    return direct, *irradiance_through_cornea(frame, view.inner, view.lit_inside, u, v)
-
-
 @syntax
-def _onto_matte(frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, wanted: mi.Bool) -> mi.Float:
-    """Compute the direct irradiance of the first surface from all lamps.
+def onto_matte(frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, wanted: mi.Bool) -> mi.Float:
+    """Compute the direct irradiance (mW/mm^2) of the first surface of a bare eye from all lamps, where `wanted`.
+
+    `u` and `v` are coordinates on each lamp's disc, [0, 1).
 
     The cornea is convex, so it does not shadow itself where it faces a lamp.
     """

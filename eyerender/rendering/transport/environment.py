@@ -114,15 +114,13 @@ class Ambience:
 
         Overlapping panels add up, and they do not hide the map behind them.
         """
-        return self.panels.radiance(o, d, active) + self._mapped(d, active)
+        mapped = self.scale * self.texture.eval(self._place(d, self.rows), active)[0]
+        return self.panels.radiance(o, d, active) + mapped
 
     def soft(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Compute the radiance (mW/mm^2/sr) of uniform light and the map's soft part in directions (scene's frame)."""
         value = self.texture.eval(self._place(d, self.rows), active)[0]
         return self.even * dr.inv_pi + self.scale * dr.minimum(value, self.ceiling)
-
-    def _mapped(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        return self.scale * self.texture.eval(self._place(d, self.rows), active)[0]
 
     def _place(self, v: mi.Vector3f, rows: mi.Float | float) -> mi.Point2f:
         """Map directions (scene's frame) to a texture with `rows` rows, and one additional row at both ends."""

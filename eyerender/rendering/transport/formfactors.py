@@ -17,12 +17,12 @@ from ...arrays import Floats, Ints, Reals, remembered
 from ..hits.interaction import SurfaceInteraction, outer_albedo
 from ..hits.primary import TriangleHit, appearance, intersect
 from ..materials.albedo import iris_albedo
-from ..records.frame import Frame
+from ..records.frame import Frame, sequence
 from .chamber import IRIS_RINGS
 from .chamber import TURNS as IRIS_TURNS
 from .framepatches import RAYS, FramePatches
 from .patches import RINGS, TURNS
-from .patchtables import PatchTables, gather_rows, sequence
+from .patchtables import PatchTables, gather_rows
 from .radiosityfield import RadiosityField
 
 START_MM = 0.02  # above a surface, where rays begin

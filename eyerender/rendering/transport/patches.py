@@ -62,7 +62,9 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
     solid = np.arange(ends[0])
     if len(ends) > 4:  # a head mesh: what is neither hair nor tears
         solid = np.append(solid, np.arange(ends[3], ends[4]))
-    where = _coordinates(mesh, globe)
+    # Coordinates (n, 4) of vertices: their points (mm), and a fourth one that grows across the lid margins.
+    height = globe.clearance(mesh.vertices * globe.mirror)
+    where = np.column_stack([mesh.vertices, _STEEP * (np.clip(height, _LOW_MM, _TOP_MM) - _LOW_MM)])
     p, n, w = mesh.vertices[solid], mesh.normals[solid], where[solid]
     level = np.maximum(np.round(2 * np.log2(np.maximum(np.linalg.norm(p, axis=1), 1e-3) / _NEAR_MM)), 0)
     out = _relative_to_globe(globe, p)
@@ -95,12 +97,6 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
 def _relative_to_globe(globe: Globe, points: Floats) -> Floats:
     """Return points (n, 3) of the scene's frame relative to the centre of a globe at rest."""
     return np.asarray(points - globe.centre * globe.mirror)
-
-
-def _coordinates(mesh: RegionMesh, globe: Globe) -> Floats:
-    """Return coordinates (n, 4) of vertices: their points (mm), and a fourth one that grows across the lid margins."""
-    height = globe.clearance(mesh.vertices * globe.mirror)
-    return np.column_stack([mesh.vertices, _STEEP * (np.clip(height, _LOW_MM, _TOP_MM) - _LOW_MM)])
 
 
 def _neighbours(normals: Floats, where: Floats, chosen: Ints, size: Floats) -> tuple[Ints, Singles]:

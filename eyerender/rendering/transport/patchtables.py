@@ -16,13 +16,6 @@ from .framepatches import LANES, RAYS, FramePatches, round_up
 
 _PATCHES = 256  # lanes for patches in multiples of this, so that recordings serve many subjects and poses
 _SMALL, _SPOTS = 0.02, 16  # radius over distance of lamps of which one point is enough; points of larger ones
-_ALPHA = (0.7548776662466927, 0.5698402909980532)
-
-
-def sequence(i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Return points i of a sequence that fills [0, 1)^2 evenly."""
-    u, v = ((mi.Float((i * mi.UInt32(round(a * 2**32))) >> 8) * 2.0**-24) for a in _ALPHA)
-    return u, v
 
 
 def gather_rows(buffer: mi.Float, width: int, i: mi.UInt32, active: mi.Bool | bool = True) -> list[mi.Float]:

@@ -35,37 +35,6 @@ _ROUNDS = 6
 _UNLIT = (0.0, 1.0, 0.0, 0.0)  # numbers of a patch without interreflection, as in `RadiosityField`
 
 
-class RadiositySolver:
-    """Solver of the radiosity of a frame; caches what does not change between frames of a subject."""
-
-    def __init__(self) -> None:
-        self._patches = Patches()
-
-    def gather(
-        self, frame: Frame, job: RenderJob, lamps: LampTable, panels: LampTable, globe: GlobePatches,
-        place: Background | RegionScene,
-    ) -> PendingField:  # fmt: skip
-        """Start computing the direct light on the patches of a frame, and the form factors between them.
-
-        Args:
-            frame: the frame, with the region and the ambient light.
-            job: its job.
-            lamps: its lamps.
-            panels: parts of its panels, and the bright parts of its map, as lamps.
-            globe: the patches of the globe.
-            place: its surroundings.
-        """
-        region = place if isinstance(place, RegionScene) else None
-        patches = self._patches.of(job, globe, region)
-        field = RadiosityField.dark(job.interreflection, patches.interior.chamber, globe, patches.plane)
-        lanes = Lanes.of(patches, lamps, panels)
-        gathered = None
-        if job.interreflection or frame.structure.ambient:
-            tables = PatchTables.upload(patches, lamps, lanes)
-            gathered = gather_light(frame, Lights.upload(panels), field, tables, lanes)
-        return PendingField(region=region, patches=patches, field=field, lanes=lanes, gathered=gathered)
-
-
 @dataclass(slots=True, kw_only=True)
 class PendingField:
     """A radiosity field without light yet: the device may be busy until `read`, and may work on during `solve`."""
@@ -75,6 +44,32 @@ class PendingField:
     field: RadiosityField
     lanes: Lanes
     gathered: Gathered | None
+
+    @classmethod
+    def gather(
+        cls, cache: Patches, frame: Frame, job: RenderJob, lamps: LampTable, panels: LampTable, globe: GlobePatches,
+        place: Background | RegionScene,
+    ) -> PendingField:  # fmt: skip
+        """Start computing the direct light on the patches of a frame, and the form factors between them.
+
+        Args:
+            cache: patches that do not change between frames of a subject.
+            frame: the frame, with the region and the ambient light.
+            job: its job.
+            lamps: its lamps.
+            panels: parts of its panels, and the bright parts of its map, as lamps.
+            globe: the patches of the globe.
+            place: its surroundings.
+        """
+        region = place if isinstance(place, RegionScene) else None
+        patches = cache.of(job, globe, region)
+        field = RadiosityField.dark(job.interreflection, patches.interior.chamber, globe, patches.plane)
+        lanes = Lanes.of(patches, lamps, panels)
+        gathered = None
+        if job.interreflection or frame.structure.ambient:
+            tables = PatchTables.upload(patches, lamps, lanes)
+            gathered = gather_light(frame, Lights.upload(panels), field, tables, lanes)
+        return cls(region=region, patches=patches, field=field, lanes=lanes, gathered=gathered)
 
     def read(self) -> PatchLight | None:
         """Copy the device's results; None if there is neither interreflection nor light from surroundings."""

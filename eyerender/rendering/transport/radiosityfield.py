@@ -13,16 +13,7 @@ from ...arrays import Floats
 from ..records.frame import upload_array, upload_scalars
 from .chamber import IRIS_RINGS, ROOT_RINGS, Chamber
 from .chamber import TURNS as IRIS_TURNS
-from .patches import (
-    GLOBE_COLUMNS,
-    MAP_SIDE,
-    PLANE_FIRST_MM,
-    PLANE_MM,
-    RINGS,
-    TURNS,
-    WIDEST,
-    GlobePatches,
-)
+from .patches import GLOBE_COLUMNS, MAP_SIDE, PLANE_FIRST_MM, PLANE_MM, RINGS, TURNS, WIDEST, GlobePatches
 
 
 @dataclass(kw_only=True)

@@ -97,10 +97,7 @@ def _mark_triangles(
     a, b, c, special = skin.corners(index)
     normal = dr.cross(b - a, c - a)
     limit = view.radius * dr.norm(normal)
-    front = dr.minimum(
-        dr.minimum(dr.dot(normal, view.origin - a), dr.dot(normal, view.origin - b)),
-        dr.dot(normal, view.origin - c),
-    )
+    front = reduce(dr.minimum, [dr.dot(normal, view.origin - corner) for corner in (a, b, c)])
     places = [view.place(p) for p in (a, b, c)]
     edge = _Edge.longest([p.u for p in places], [p.v for p in places])
     _mark(marks, lamp, places, mi.Float(0), edge, view.scale, special | (front <= limit))
@@ -247,13 +244,5 @@ def _frame(lamp: Lamp, anchor_mm: Floats, reach_mm: float) -> list[float]:
     e1 /= np.linalg.norm(e1)
     widest = np.arcsin(min(reach_mm / max(distance, 1e-9), 1.0))
     half = min(float(np.tan(widest / 2)), _LARGEST)
-    return [
-        *origin,
-        *e1,
-        *crosses(axis, e1),
-        *axis,
-        0.5 * _CELLS / half,
-        float(lamp.radius_mm),
-        distance + reach_mm,
-        0,
-    ]
+    numbers = 0.5 * _CELLS / half, float(lamp.radius_mm), distance + reach_mm, 0
+    return [*origin, *e1, *crosses(axis, e1), *axis, *numbers]

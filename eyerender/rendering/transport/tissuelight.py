@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..hits.interaction import EPSILON_MM
-from ..records.frame import Frame
+from ..records.frame import Frame, sequence
 from ..records.recording import syntax
 from ..scene.diffusiongrids import SIDE
 from ..scene.region import SHEET_COLUMNS
@@ -27,7 +27,6 @@ _LID_MM = 4.5  # thicker than any lid
 _BETWEEN_MM = 0.05  # smallest distance between the two surfaces of a lid
 _JOINT_MM, _ABOVE_MM = 0.05, 0.15  # height above the globe at which the light on conjunctiva and globe is computed
 _KEYS = (0x51CA, 0x1A3B)
-_ALPHA = (0.7548776662466927, 0.5698402909980532)
 
 
 @dataclass(kw_only=True)
@@ -133,8 +132,8 @@ def _lamp_on_skin(scene: TissueScene, grid: SheetGrid, cells: _Cells, i: mi.UInt
     count = dr.select(before, dr.select(clear & ~scene.wide, 1, scene.skin_rays), 0)
     k, flux, free = mi.UInt32(0), mi.Vector3f(0), mi.Float(0)
     while dr.hint(k < count, label="points of a lamp", exclude=[scene, grid, cells, frame, lamp]):
-        s, t = _sequence(cells.index, 0, k)
-        u, v = _sequence(cells.index, 1, k)
+        s, t = _shifted(cells.index, 0, k)
+        u, v = _shifted(cells.index, 1, k)
         start = frame.point_to_eye(_skin_point(frame, grid, cells.row, cells.column, s, t)[0])
         source = lamp.point(u, *dr.sincos(v * (2 * dr.pi)))
         hidden = lamp_blocked(frame, start, source, True, True, ~clear)
@@ -189,11 +188,11 @@ def _lamp_on_globe(scene: TissueScene, index: mi.UInt32, i: mi.UInt32) -> tuple[
     frame, lamp = scene.frame, scene.frame.lights[i]
     k, total, free = mi.UInt32(0), mi.Float(0), mi.Float(0)
     while dr.hint(k < scene.globe_rays, label="in cells", exclude=[scene, frame, lamp]):
-        s, t = _sequence(index, 0, k)
+        s, t = _shifted(index, 0, k)
         row, column = mi.Float(index // SIDE) + t - 0.5, mi.Float(index % SIDE) + s - 0.5
         x, normal = _globe_surface(frame, globe_direction(row, column))
         x += _ABOVE_MM * normal
-        u, v = _sequence(index, 1, k)
+        u, v = _shifted(index, 1, k)
         source = lamp.point(u, *dr.sincos(v * (2 * dr.pi)))
         lit = irradiance(lamp, source, x, normal)
         local = frame.surfaces[0].point_in(x)
@@ -245,10 +244,6 @@ def _next_surface(
     return hit
 
 
-def _sequence(index: mi.UInt32, key: int, k: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Return point k of a sequence that fills [0, 1)^2 evenly, shifted from cell to cell."""
-    shift = mi.sample_tea_32(index, mi.UInt32(_KEYS[key]))
-    u, v = (
-        mi.Float((s + k * mi.UInt32(round(a * 2**32))) >> 8) * (2.0**-24) for s, a in zip(shift, _ALPHA, strict=True)
-    )
-    return u, v
+def _shifted(index: mi.UInt32, key: int, k: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """Return point k of a sequence that is shifted from cell to cell."""
+    return sequence(k, mi.sample_tea_32(index, mi.UInt32(_KEYS[key])))
