@@ -14,7 +14,7 @@ from PIL import Image
 from tests.support.paths import ROOT
 
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
-QUICK = ("01", "11")
+QUICK = ("01",)
 SMALL = re.compile(r"^(\w+(?:, \w+)*) = .*  # small: (.*)$", re.M)
 SAVED = """
 import matplotlib.pyplot as plt

@@ -215,7 +215,7 @@ def test_the_short_example_of_the_documentation():
 
 @pytest.mark.render
 def test_a_picture_in_memory_is_the_one_in_the_folder(tmp_path):
-    scene = er.load_scene("quickstart").with_(spp=2)
+    scene = er.load_scene("quickstart").with_(spp=2, targets={"grid": [2, 2]})
     frames = scene.frames()
     er.render_folder(scene, tmp_path / "out")
     entry = er.ImageFolder.load(tmp_path / "out").entries[3]

@@ -44,7 +44,7 @@ def warned(**changes):
 
 
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))
-@pytest.mark.parametrize("eye", [None, "E1", "E5"])
+@pytest.mark.parametrize("eye", [None, pytest.param("E1", marks=pytest.mark.slow), "E5"])
 def test_shipped_scenes_give_no_warning(name, eye):
     assert load_scene(name, eye=eye).warnings() == []
 

@@ -69,7 +69,7 @@ def _leave_out_empty_panels(fig: Any) -> None:
     width, height = fig.get_size_inches()
     fig.set_size_inches(max(5.4, width * columns / grid.ncols), height * rows / grid.nrows)
     first, way = panels[0], panels[0].get_ylabel()
-    names = [label.get_text() for label in first.get_yticklabels()]
+    names = [] if full[0] is first else [label.get_text() for label in first.get_yticklabels()]
     for ax in panels:
         if ax not in full:
             ax.remove()

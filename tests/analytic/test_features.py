@@ -245,7 +245,13 @@ def test_purkinje_images_of_a_four_surface_eye():
 
 @pytest.mark.parametrize(
     ("name", "order", "side"),
-    [("E3", 3, "right"), ("E4", 3, "left"), ("E4", 4, "right"), ("E5", 3, "right"), ("E5", 4, "left")],
+    [
+        ("E3", 3, "right"),
+        ("E4", 3, "left"),
+        ("E4", 4, "right"),
+        ("E5", 3, "right"),
+        pytest.param("E5", 4, "left", marks=pytest.mark.slow),
+    ],
 )
 def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them_pass(name, order, side):
     """The narrowest pupil, from where the ray crosses the stop's plane on its way in and out, found here by tracing."""
@@ -255,13 +261,13 @@ def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them
     for elevation in (-25.0, -33.0) if (name, order) == ("E5", 4) else (-25.0, -27.5, -33.0):
         pose = Poses.from_degrees(1.0, elevation)
 
-        def status(diameter, pose=pose, orders=(1, 2, order)):
+        def status(diameter, orders, pose=pose):
             eye = spec.build(eye=side, pupil_diameter_mm=diameter)
             seen = features([eye], [0], pose, np.zeros((1, 3)), [camera], [0], lights[:1], purkinje=orders)
             return seen.glint_status[0, 0].tolist()
 
         # Not through the pupil: the cornea's images do not care.
-        assert status(0.05)[:2] == [0, 0]
+        assert status(0.05, (1, 2)) == [0, 0]
         eye = spec.build(eye=side, pupil_diameter_mm=4.0)
         turning = Turning.of(pose)
         place = join(into_eye(turning, eye, components(-(camera.t @ camera.R)[None])))
@@ -289,8 +295,8 @@ def test_the_iris_hides_images_of_the_lens_from_the_pupil_on_that_just_lets_them
                 reach.append(np.linalg.norm(across[1:] / eye.stop.semi_axes_mm))
         assert len(reach) == 2
         narrowest.append(4.0 * max(reach))
-        assert status(narrowest[-1] * 1.0001)[2] == Status.OK
-        assert status(narrowest[-1] * 0.9999)[2] == Status.BEHIND_IRIS
+        assert status(narrowest[-1] * 1.0001, (order,)) == [Status.OK]
+        assert status(narrowest[-1] * 0.9999, (order,)) == [Status.BEHIND_IRIS]
     assert np.ptp(narrowest) > 0.25  # not the same for every pose
 
 

@@ -66,7 +66,7 @@ def visible(eye, things, place):
         return seen & off.all(axis=0) & above & np.isfinite(exits).all(axis=-1)
 
 
-@pytest.mark.parametrize("name", ["E1", "E2", "E4", "E5"])
+@pytest.mark.parametrize("name", ["E1", "E2", "E4", pytest.param("E5", marks=pytest.mark.slow)])
 def test_beyond_90_degrees_is_seen_what_physics_lets_be_seen(name):
     """Every boundary point, from 16 places 75 to 118 degrees off the axis, near and far."""
     rng = np.random.default_rng(4)

@@ -239,6 +239,7 @@ def test_the_set_up_script_refuses_what_it_does_not_know(tmp_path, script):
 
 
 @pytest.mark.packaging
+@pytest.mark.usefixtures("no_report")
 def test_own_images_with_a_table_or_masks(drawn, tmp_path):
     """The drawn images again, labelled in the two ways that people label their own, give the same outcome."""
     known = load_labelled(drawn)
@@ -325,8 +326,10 @@ def test_a_broken_table_names_the_line(line, message, tmp_path):
     assert "line 2" in str(error.value)
 
 
-def test_failures_have_thumbnails(drawn, tmp_path):
+def test_failures_have_thumbnails(drawn, tmp_path, monkeypatch):
     """An extractor that finds another ellipse: the report shows the first of its failures."""
+    for other in ("factor_figure", "curve_figure"):
+        monkeypatch.setattr(f"eyerender.report.benchmark.{other}", lambda *_: "<svg></svg>")
     given = "tests.benchmark.test_bench:beside"
     bench_extractors(drawn, tmp_path / "out", [f"beside={given}"])
     assert "the first images of every kind of failure" in (tmp_path / "out" / "report.html").read_text()

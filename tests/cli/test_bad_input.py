@@ -386,7 +386,7 @@ def command(*argv, env=None, **keys):
 
 @pytest.mark.packaging
 @pytest.mark.render
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_an_interrupted_run_says_so_and_leaves_nothing(place, tmp_path_factory, number):
     hook = stages.environment(tmp_path_factory.mktemp("stages"), Path("out"), match=r"\.png$", at=2, how="stop")
     process = command("render", "blignaut2014", "-o", "out", env=hook, start_new_session=True)

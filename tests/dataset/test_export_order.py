@@ -27,8 +27,15 @@ def order_of(folder):
         return [int(row["sample"]) for row in csv.DictReader(file)]
 
 
+# A file of labels for each image, one for many, and archives; the other formats are tried among the long proofs.
+KINDS = ("yolo-seg", "coco", "webdataset")
+
+
 @pytest.mark.packaging
-@pytest.mark.parametrize("format", [name for name in FORMATS if name != "labels"])
+@pytest.mark.parametrize(
+    "format",
+    [pytest.param(name, marks=() if name in KINDS else pytest.mark.slow) for name in FORMATS if name != "labels"],
+)
 def test_the_number_of_processes_changes_no_byte(tiny, tmp_path, format):
     shuffle = None if format == "teyed" else 3
     for workers in (1, 2):

@@ -255,4 +255,4 @@ def test_harmed_folders(four, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_many_harmed_folders(four, tmp_path):
-    fuzz(four, tmp_path, 1000, ACTIONS)
+    fuzz(four, tmp_path, 400, ACTIONS)

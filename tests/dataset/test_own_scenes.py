@@ -148,7 +148,7 @@ def test_a_run_of_a_function_has_the_bytes_of_the_spec(tmp_path, layout):
 @pytest.mark.render
 @pytest.mark.packaging
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL])
 def test_a_run_of_a_function_survives_kills(tmp_path, number):
     folder, options = tmp_path / "out", ["--count", "48", "--seed", "3", "--workers", "2"]
     for images in (8, 24):

@@ -12,7 +12,7 @@ from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
 from eyerender.errors import BackendError
 from eyerender.imaging.images import render_folder
-from eyerender.scene import Scene, load_scene, shipped_scenes
+from eyerender.scene import Scene, is_dataset, load_scene, shipped_files, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import make
 
@@ -82,6 +82,10 @@ def test_all_are_covered():
         "head_mounted", "headset", "people_eyelink", "people_nvgaze", "people_openeds", "people_pupil_core",
         "quickstart", "stress", "webcam",
     ]  # fmt: skip
+
+
+def test_shipped_datasets_are_those_that_declare_themselves_so():
+    assert set(shipped_datasets()) == {name for name, path in shipped_files().items() if is_dataset(path)}
 
 
 @pytest.mark.packaging

@@ -121,16 +121,16 @@ def test_rows_of_a_table_are_drawn_whole_with_their_weights(tmp_path):
     (tmp_path / "people.csv").write_text("pupil,ipd,w\n3,60,1\n4,63,0\n5,66,3\n")
     path = write(
         tmp_path / "spec.yaml",
-        count=400,
+        count=150,
         subjects=None,
         variables={"row": {"draw": "table", "file": "people.csv", "weights": "w"}},
         **{PUPIL: {"var": "row.pupil"}, "scene.subject.ipd_mm": {"var": "row.ipd"}},
     )
     made = Plan.load(path)
-    scenes = [made.draw(i).scene for i in range(400)]
+    scenes = [made.draw(i).scene for i in range(150)]
     pairs = [(pupil(scene), scene["subject"]["ipd_mm"]) for scene in scenes]
     assert set(pairs) == {(3.0, 60.0), (5.0, 66.0)}
-    assert abs(pairs.count((3.0, 60.0)) / 400 - 0.25) < 3 * math.sqrt(0.25 * 0.75 / 400)
+    assert abs(pairs.count((3.0, 60.0)) / 150 - 0.25) < 3 * math.sqrt(0.25 * 0.75 / 150)
     (tmp_path / "people.csv").write_text("pupil,ipd,w\n3,sixty,1\n")
     with pytest.raises(InputError, match=r"people.csv: line 2: every cell must be a number"):
         Plan.load(path)

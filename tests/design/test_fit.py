@@ -41,8 +41,15 @@ def frames_of(name, eye="E2", most=9):
     return frames.take(rows[np.linspace(0, len(rows) - 1, most).astype(int)])
 
 
-@pytest.mark.parametrize("rig", RIGS)
-@pytest.mark.parametrize("eye", EYES)
+# Every eye once, with the rigs in turn; the other pairs are slow.
+PAIRS = [
+    pytest.param(rig, eye, marks=() if j % len(RIGS) == k else pytest.mark.slow)
+    for k, rig in enumerate(RIGS)
+    for j, eye in enumerate(EYES)
+]
+
+
+@pytest.mark.parametrize(("rig", "eye"), PAIRS)
 def test_exact_features_give_the_gaze_back(rig, eye):
     """From a prior eye with other numbers and a wrong position: gaze to 1e-6 deg, and what is seen of the person."""
     # The pupils of E3 and E4 touch the lens, so that they can only come forward.

@@ -134,16 +134,16 @@ def test_garbled_files(tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_many_mutated_records(tmp_path):
-    fuzz_records(1500, tmp_path / "records.json", NAMES)
+    fuzz_records(600, tmp_path / "records.json", NAMES)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_many_mutated_calibrations(tmp_path):
-    fuzz_calibrations(1000, tmp_path / "calibration.json")
+    fuzz_calibrations(400, tmp_path / "calibration.json")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_many_garbled_files(tmp_path):
-    fuzz_files(500, tmp_path / "file.json")
+    fuzz_files(250, tmp_path / "file.json")

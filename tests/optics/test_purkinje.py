@@ -106,7 +106,7 @@ class Meridian:
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("order", [2, 3, 4])
-@pytest.mark.parametrize("name", ["E3", "E4"])
+@pytest.mark.parametrize("name", [pytest.param("E3", marks=pytest.mark.slow), "E4"])
 def test_a_bundle_of_rays_finds_the_same_images_and_misses_the_same(name, order):
     """The first sign change of the miss, counted from the axis' side, among 40,000 rays over the cornea."""
     eye, plane = built(name), Meridian(name, order)
@@ -165,8 +165,14 @@ def test_the_optical_length_is_stationary(name, order, kind):
             assert np.abs(slope).max() < 2e-8
 
 
-@pytest.mark.parametrize("kind", ["remote", "head"])
-@pytest.mark.parametrize("name", ["E3", "E4", "E5"])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *((name, kind) for name in ("E3", "E4") for kind in ("remote", "head")),
+        ("E5", "remote"),
+        pytest.param("E5", "head", marks=pytest.mark.slow),
+    ],
+)
 def test_every_rig_gets_an_answer_and_the_same_one_backwards(name, kind):
     """Light that runs backwards takes the same way: source and viewpoint exchanged, the gradient lens included."""
     # A ray through the gradient lens of E5 takes a hundred times as long as one through shells.

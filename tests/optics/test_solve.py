@@ -296,15 +296,16 @@ def test_what_has_no_ray_says_so():
     assert far_side.status != Status.OK
 
 
-def test_a_solver_that_starts_astray_is_caught():
+@pytest.mark.parametrize("count", [100, pytest.param(500, marks=pytest.mark.slow)])
+def test_a_solver_that_starts_astray_is_caught(count):
     """What Newton leaves unfinished is not reported as found: rays that are, pass their viewpoints when traced."""
     eye = load_eye("E4").build()
     rng = np.random.default_rng(5)
-    inside = rng.uniform([-9.0, -6.0, -6.0], [-1.0, 6.0, 6.0], (500, 3))
-    seen_from = rng.uniform([-5.0, -60.0, -60.0], [40.0, 60.0, 60.0], (500, 3))
+    inside = rng.uniform([-9.0, -6.0, -6.0], [-1.0, 6.0, 6.0], (count, 3))
+    seen_from = rng.uniform([-5.0, -60.0, -60.0], [40.0, 60.0, 60.0], (count, 3))
     found = apparent_points(eye.front, eye.front_indices, inside, seen_from)
     ok = found.status == Status.OK
-    assert 50 < ok.sum() < 475
+    assert 0.1 < ok.mean() < 0.95
     out = trace(
         outward_path(eye.front, eye.front_indices), eye.front_indices[-1], inside[ok], found.inner_directions[ok]
     )

@@ -130,7 +130,7 @@ def test_a_glint_is_blurred_by_the_depth_of_its_virtual_image(renderer):
     # The virtual image is 3.4 mm behind the apex, that of the iris 3.1 mm.
     job = replace(job, window=(x - 32, y - 32, 64, 64), lens=Lens(focus_mm=60.0), sensor=Sensor(noise=False))
     done = renderer.render(job, spp=1)
-    half = aperture(job, 40)
+    half = aperture(job, 16)
     both = np.concatenate([half, -half])  # so that the mean of few points is the middle of the lens
     spots = np.array([renderer.render(seen_from(job, q), spp=1).glints.xy_px[0] for q in both])
     np.testing.assert_allclose(centroid(done.irradiance, done.window), done.glints.xy_px[0], atol=5e-3)
@@ -200,7 +200,7 @@ def test_the_width_of_the_blur_against_a_sampled_lens(matte, name, focus_mm):
     x, y, w, h = PATCHES[name]
     border = 16
     job = headset_job(focus_mm, (x - 5, y - 5, w + 10, h + 10))
-    truth = psf.blur(through_a_lens(matte, job, 64, 256), SIGMA_PX)
+    truth = psf.blur(through_a_lens(matte, job, 64, 64), SIGMA_PX)
     ours, sharp = blurred(matte, replace(job, window=(x - border, y - border, w + 2 * border, h + 2 * border)), 1024)
     m = (len(sharp) - len(ours)) // 2
     ours = psf.blur(ours[border - 5 : 5 - border, border - 5 : 5 - border], SIGMA_PX)

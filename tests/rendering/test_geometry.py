@@ -162,8 +162,14 @@ LASHES_OVER_PUPIL = Region(blink=0.6, lashes=Lashes(upper_length_mm=12.0))
 OPAQUE_RIM = Look(limbus_transmittance=0.0, limbus_width_mm=2.0)
 
 
-@pytest.mark.parametrize("kinds", [("instances",), ALL])
-@pytest.mark.parametrize("model", ["E2", "E4", "E5"])
+@pytest.mark.parametrize(
+    ("model", "kinds"),
+    [("E2", ("instances",)), ("E4", ALL)]
+    + [
+        pytest.param(model, kinds, marks=pytest.mark.slow)
+        for model, kinds in (("E2", ALL), ("E4", ("instances",)), ("E5", ("instances",)), ("E5", ALL))
+    ],
+)
 @pytest.mark.parametrize(
     "changes",
     [{}, {"region": Region()}, {"region": LASHES_OVER_PUPIL}, {"look": OPAQUE_RIM}],

@@ -17,8 +17,11 @@ from tests.support.render_rigs import depths_mm, eye_of, job_of, remote_rig
 EYES = ["E1", "E2", "E3", "E4", "E5", "E5-published"]
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-@pytest.mark.parametrize("model", EYES)
+@pytest.mark.parametrize(
+    ("model", "side"),
+    [*((model, "right") for model in EYES), ("E5", "left")]
+    + [pytest.param(model, "left", marks=pytest.mark.slow) for model in EYES if model != "E5"],
+)
 def test_bodies_are_closed_face_outwards_and_do_not_cross(model, side):
     eye = eye_of(model, side)
     meshes = eye_meshes(eye, rings=12, sectors=48)

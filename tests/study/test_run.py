@@ -75,6 +75,13 @@ def test_the_report_is_one_file(folders, name):
     assert "Findings" in page
 
 
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Reports without their figures, at which nobody looks."""
+    monkeypatch.setattr("eyerender.study.figures.svg", lambda _fig: "<svg></svg>")
+
+
+@pytest.mark.usefixtures("no_figures")
 def test_a_folder_of_the_same_study_is_run_again_and_another_is_refused(folders):
     first = (folders / "blignaut2014" / "summary.json").read_text()
     again = run_study("blignaut2014", folders / "blignaut2014", eyes=("E1",))
@@ -90,6 +97,7 @@ def test_processes_give_the_same_rows(tmp_path):
     assert one["rows"] == two["rows"]
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_protocol_and_eye_are_chosen_on_the_command_line(tmp_path, capsys):
     out = tmp_path / "out"
     assert run(["study", "guestrin2006", "-o", str(out), "--protocol", "published", "--eyes", "E3", "--json", "-"]) == 0
