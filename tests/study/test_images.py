@@ -16,6 +16,7 @@ from eyerender.analytic.observer import trace
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.validate import validate
 from eyerender.folders.imagefile import read_image
+from eyerender.imaging.causes import without_noise
 from eyerender.study import blignaut, guestrin
 from eyerender.study.images import (
     dataset_spec,
@@ -23,7 +24,6 @@ from eyerender.study.images import (
     make_images,
     read_images,
     shots,
-    without_noise,
 )
 from eyerender.study.observing import Observing
 from eyerender.study.options import StudyOptions

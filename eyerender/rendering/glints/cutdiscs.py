@@ -109,7 +109,7 @@ def _edges(visible: Visible) -> Floats:
 def _arcs(visible: Visible, r: Floats) -> tuple[Floats, Floats, Floats]:
     """Return visible arcs of circles of radii r (n,): index of the circle, and the angles of the arc's ends."""
     seen = _seen(visible, r, _ANGLES)
-    step = 2 * np.pi / _ANGLES
+    steps = 2 * np.pi / _ANGLES * np.arange(_ANGLES + 1)
     whole = np.flatnonzero(seen.all(axis=1))
     # An arc begins after a hidden point, and ends after a visible one.
     rises = np.roll(seen, -1, axis=1) & ~seen
@@ -122,7 +122,7 @@ def _arcs(visible: Visible, r: Floats) -> tuple[Floats, Floats, Floats]:
         points = _polar(np.broadcast_to(r[circle, None], angle.shape), angle)
         return np.asarray(visible(points).reshape(angle.shape) == before[:, None])
 
-    begin, end = np.split(_first_changes(k * step, (k + 1) * step, same), [len(which)])
+    begin, end = np.split(_first_changes(steps[k], steps[k + 1], same), [len(which)])
     # On each circle beginnings and ends alternate; an arc that contains angle 0 ends before it begins.
     for c in np.unique(which):
         here = which == c
