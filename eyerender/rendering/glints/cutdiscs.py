@@ -109,7 +109,7 @@ def _edges(visible: Visible) -> Floats:
 def _arcs(visible: Visible, r: Floats) -> tuple[Floats, Floats, Floats]:
     """Return visible arcs of circles of radii r (n,): index of the circle, and the angles of the arc's ends."""
     seen = _seen(visible, r, _ANGLES)
-    steps = 2 * np.pi / _ANGLES * np.arange(_ANGLES + 1)
+    steps = np.linspace(0, 2 * np.pi, _ANGLES + 1)
     whole = np.flatnonzero(seen.all(axis=1))
     # An arc begins after a hidden point, and ends after a visible one.
     rises = np.roll(seen, -1, axis=1) & ~seen
