@@ -375,6 +375,13 @@ READERS: dict[str, Reader] = {
 }
 
 
+def _compiled() -> list[str]:
+    """Return the modules with functions that numba compiles, which it cannot if they are instrumented."""
+    package = ROOT / "eyerender"
+    sources = [*package.glob("extraction/**/*.py"), *package.glob("*/*kernels.py")]
+    return [".".join(source.relative_to(ROOT).with_suffix("").parts) for source in sources]
+
+
 def main(name: str, seconds: str, seed: str, place: str) -> None:
     """Fuzz one reader."""
     import atheris
@@ -382,7 +389,7 @@ def main(name: str, seconds: str, seed: str, place: str) -> None:
     from tests.support.fuzzing import proper
 
     reader, folder = READERS[name], Path(place)
-    with atheris.instrument_imports(include=["eyerender"]):
+    with atheris.instrument_imports(include=["eyerender"], exclude=_compiled()):
         seeds = reader.seeds()
         for data in seeds:  # imports what the reader needs, so that it is instrumented
             proper(lambda data=data: reader.case(data, folder / "case"))  # type: ignore[misc]
@@ -400,9 +407,7 @@ def main(name: str, seconds: str, seed: str, place: str) -> None:
             os._exit(0)  # libFuzzer's own end does not join the threads of Mitsuba
         proper(lambda: reader.case(data, folder / "case"))
 
-    atheris.Setup(
-        origin=["fuzz", *(f"-{key}={value}" for key, value in options.items()), str(folder / "corpus")], scene=one
-    )
+    atheris.Setup(["fuzz", *(f"-{key}={value}" for key, value in options.items()), str(folder / "corpus")], one)
     atheris.Fuzz()
 
 
