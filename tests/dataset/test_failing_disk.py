@@ -160,7 +160,7 @@ class InThisProcess:
         self.job = job
 
     def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
-        maker = COOK if COOK.made else COOK.of(self.job.maker())
+        maker = COOK.of(self.job.maker())
         events.ready(maker.backend, "0")
         for shard in shards:
             try:
