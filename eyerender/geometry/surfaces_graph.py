@@ -123,7 +123,8 @@ class GraphSurface(Surface):
         rows = np.nonzero(lost.reshape(shape))
         few, own, ways = self._rays(rows, shape, start, way)
         low, high = few._bracketed(own, ways, np.broadcast_to(guess, shape)[rows], inward)
-        t[rows], crosses = np.nan, ~np.isnan(low)
+        t[rows] = np.nan
+        crosses = ~np.isnan(low)
         if crosses.any():
             rows, low, high = tuple(row[crosses] for row in rows), low[crosses], high[crosses]
             few, own, ways = self._rays(rows, shape, start, way)

@@ -207,13 +207,13 @@ class Items:
         splits: Counter[str] = Counter()
         samples = np.empty(len(self), dtype=np.int64)
         names = np.empty(len(self), dtype=np.int64)
-        for row, (sample, name, split, depth, size, lights, length) in enumerate(self._each(_surveyed)):
-            samples[row], names[row] = sample, hash(name)
-            splits[split] += 1
-            self.bit_depths.add(depth)
-            self.sizes.add(size)
-            self.lights = max(self.lights, lights)
-            self.file_name_bytes = max(self.file_name_bytes, length)
+        for row, own in enumerate(self._each(_surveyed)):
+            samples[row], names[row] = own.sample, hash(own.name)
+            splits[own.split] += 1
+            self.bit_depths.add(own.bit_depth)
+            self.sizes.add(own.size)
+            self.lights = max(self.lights, own.lights)
+            self.file_name_bytes = max(self.file_name_bytes, own.file_name_bytes)
         if len(np.unique(names)) < len(names):
             raise InputError("two images have the same file name", source=str(self.folder.path / METADATA))
         # Images of one sample keep their order in both cases.
@@ -302,7 +302,26 @@ def wrong_labels(error: Exception, place: LinePlace) -> InputError:
     return InputError(reason, source=str(place[0]), path=f"line {place[1]}")
 
 
-def _surveyed(item: Item) -> tuple[int, str, str, int, tuple[int, int], int, int]:
-    """Return an image's sample, name, split, bit depth, size, number of lights and length of its file name (bytes)."""
-    lights, length = len(item.line["labels"]["glints"]), len(item.entry.name.encode())
-    return item.line["sample"], item.name, item.split, item.bit_depth, item.entry.window[2:], lights, length
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Surveyed:
+    """What must be known of an image before the first one is written."""
+
+    sample: int
+    name: str
+    split: str
+    bit_depth: int
+    size: tuple[int, int]
+    lights: int
+    file_name_bytes: int
+
+
+def _surveyed(item: Item) -> _Surveyed:
+    return _Surveyed(
+        sample=item.line["sample"],
+        name=item.name,
+        split=item.split,
+        bit_depth=item.bit_depth,
+        size=item.entry.window[2:],
+        lights=len(item.line["labels"]["glints"]),
+        file_name_bytes=len(item.entry.name.encode()),
+    )

@@ -23,8 +23,15 @@ from .truth import DatasetTruth, SceneTruth
 
 # Labels that every image of a dataset has, whatever is visible.
 _ALWAYS = (
-    *(f"labels.{part}.{kind}" for part in ("pupil", "iris") for kind in ("amodal", "visible")),
-    *("labels.space.world", "labels.space.camera", "labels.pose", "labels.camera", "parameters.draws"),
+    "labels.pupil.amodal",
+    "labels.pupil.visible",
+    "labels.iris.amodal",
+    "labels.iris.visible",
+    "labels.space.world",
+    "labels.space.camera",
+    "labels.pose",
+    "labels.camera",
+    "parameters.draws",
 )
 
 
