@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import os
 import signal
+from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -51,8 +53,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is not quick where only quick tests are asked for."""
+    """Leave out what is not quick where only quick tests are asked for; put files with the longest proofs first."""
     if config.getoption("--fast"):
         is_quick = Quick(listed())
         config.hook.pytest_deselected(items=[item for item in items if not is_quick(item)])
         items[:] = [item for item in items if is_quick(item)]
+    longest_s: Counter[Path] = Counter()
+    for item in items:
+        allowed = item.get_closest_marker("timeout")
+        longest_s[item.path] = max(longest_s[item.path], int(allowed.args[0]) if allowed else 0)
+    items.sort(key=lambda item: -longest_s[item.path])  # the others keep their order
