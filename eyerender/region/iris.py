@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy import ndimage
 
-from ..arrays import Singles
+from ..arrays import Ints, Singles
 from ..spec import Spec
 from .contour import step
 from .noise import band_noise, nearest_two
@@ -203,7 +203,7 @@ class _Polar:
 
     def lattice(
         self, rng: np.random.Generator, rows: NDArray[Any], cell_mm: float, long_by: float
-    ) -> tuple[Singles, NDArray[np.intp], int]:
+    ) -> tuple[Singles, Ints, int]:
         """Cover rows of the map with random cells that are `long_by` times as long, along the radius, as wide.
 
         Returns the difference (mm) of the distances to the two nearest cells' middles, which is 0 on the walls, the
@@ -219,8 +219,9 @@ class _Polar:
         # The cells bend like the fibres beside them.
         x = (self.turn + 0.0025 * self.warp[some]) * around
         y = np.broadcast_to(self.s[some] * along, x.shape) + 0.02 * np.roll(self.warp[some], 97, axis=1)
-        first, second, *cells = (v[: len(rows)] for v in nearest_two(copies, x, y, which=True))
-        return np.asarray(second - first), np.stack(cells).astype(np.intp) % count, count
+        distances, cells = nearest_two(copies, x, y)
+        first, second = distances[:, : len(rows)]
+        return second - first, cells[:, : len(rows)] % count, count
 
     def empty(self) -> Singles:
         """Zeros over the map."""

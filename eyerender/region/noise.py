@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.spatial import cKDTree
 
-from ..arrays import Floats, Singles
+from ..arrays import Floats, Ints, Singles
+from . import noise_kernels as kernels
 
 _NEGLIGIBLE = 3.0  # times a band's upper end, where its gain is 1e-4
-_TOGETHER = 640  # blocks of points, which stay in the processor's cache
-_BLOCK, _CANDIDATES = 8, 12  # one position in twenty thousand would need more candidates
+_CANDIDATES = 12  # one position in twenty thousand would need more
 
 
 def gain(f: Floats, low: float, high: float) -> Floats:
@@ -73,65 +73,28 @@ def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Singles:
     x += wobble * band(seed + 1, size, (0, 40), (0, 40))
     y += wobble * stretch * band(seed + 2, size, (0, 40), (0, 40))
     copies = [seeds + extent * np.array([i, j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    first, second, _, _ = nearest_two(np.concatenate(copies), x, y)
+    (first, second), _ = nearest_two(np.concatenate(copies), x, y)
     return np.asarray(np.clip((second - first) / np.float32(0.45 * np.sqrt(stretch / cells)), 0, 1))
 
 
-def nearest_two(seeds: Floats, x: Floats, y: Floats, which: bool = False) -> tuple[Singles, Singles, Singles, Singles]:
-    """Compute distances of points (h, w) to the nearest and second nearest seed (n, 2), and the numbers of these seeds.
+def nearest_two(seeds: Floats, x: Floats, y: Floats) -> tuple[Singles, Ints]:
+    """Compute distances (2, h, w) of points to the nearest and second nearest seed (n, 2), and numbers of these seeds.
 
     The sides must be multiples of 8. Neighbouring points share a short list of candidates, which is much faster than a
-    search for each of them. The numbers are floats, and zero without `which`.
+    search for each of them.
     """
-    h, w = x.shape
-    shape = h // _BLOCK, _BLOCK, w // _BLOCK, _BLOCK
-
-    def blocks(v: Floats) -> Floats:
-        return v.reshape(shape).transpose(1, 3, 0, 2).reshape(_BLOCK * _BLOCK, -1)
-
-    def whole(v: Singles) -> Singles:
-        return v.reshape(_BLOCK, _BLOCK, *shape[::2]).transpose(2, 0, 3, 1).reshape(h, w)
-
-    bx, by = blocks(x), blocks(y)
-    middle = np.stack([bx.mean(axis=0), by.mean(axis=0)], axis=-1)
+    blocks = (x.shape[0] // kernels.BLOCK, kernels.BLOCK, x.shape[1] // kernels.BLOCK, kernels.BLOCK)
+    middle = np.stack([v.reshape(blocks).mean(axis=(1, 3)) for v in (x, y)], axis=-1)
     _, near = cKDTree(seeds).query(middle, k=_CANDIDATES)
-    found = np.zeros((4, *bx.shape), np.float32)
-    found[:2] = np.inf
-    for start in range(0, bx.shape[1], _TOGETHER):
-        part = slice(start, start + _TOGETHER)
-        first, second, one, two = found[..., part]
-        of_part = middle[part]
-        px, py = ((v[:, part] - m).astype(np.float32) for v, m in zip((bx, by), of_part.T, strict=True))
-        d, other = np.empty_like(px), np.empty_like(px)
-        for candidate in near[part].T:
-            sx, sy = (seeds[candidate] - of_part).astype(np.float32).T
-            np.square(np.subtract(px, sx, out=d), out=d)
-            d += np.square(np.subtract(py, sy, out=other), out=other)
-            if which:
-                closer, between = d < first, d < second
-                np.copyto(two, candidate.astype(np.float32), where=between)
-                np.copyto(two, one, where=closer)
-                np.copyto(one, candidate.astype(np.float32), where=closer)
-            np.minimum(second, np.maximum(first, d, out=other), out=second)
-            np.minimum(first, d, out=first)
-    first, second, one, two = found
-    return whole(np.sqrt(first)), whole(np.sqrt(second)), whole(one), whole(two)
+    distances, numbers = np.empty((2, *x.shape), np.float32), np.empty((2, *x.shape), np.intp)
+    x, y = (np.ascontiguousarray(v, dtype=float) for v in (x, y))
+    kernels.nearest_two(seeds, near, x, y, distances, numbers)
+    return distances, numbers
 
 
-class Padded:
-    """A square tile prepared for `Places`: every value with its difference to the next one in its row.
-
-    Both are integers in `unit`, packed into the halves of one number, because memory limits the speed of random reads.
-    """
-
-    def __init__(self, tile: Singles) -> None:
-        n = len(tile)
-        self.unit = np.float32(max(np.abs(tile).max(), 1e-30) / 16000)
-        values = np.empty((n + 2, n + 3), np.int32)
-        np.rint(tile * (1 / self.unit), out=values[:n, :n], casting="unsafe")
-        values[:n, n:] = values[:n, :3]
-        values[n:] = values[:2]
-        self.pairs = ((np.diff(values, axis=1) << 16) | (values[:, :-1] & 0xFFFF)).ravel()
+def padded(tile: Singles) -> Singles:
+    """Repeat the first two rows and columns of a periodic tile behind the last ones, for `Places.sample`."""
+    return np.pad(tile, (0, 2), "wrap")
 
 
 class Places:
@@ -139,30 +102,11 @@ class Places:
 
     def __init__(self, size: int, x: NDArray[Any], y: NDArray[Any], period_mm: float) -> None:
         self.size = size
-        (column, self._du), (row, self._dv) = (self._split(c * np.float32(1 / period_mm), size) for c in (x, y))
-        self._at, self._width = (row * np.int32(size + 2) + column).astype(np.intp), size + 2
+        turns = (c * np.float32(1 / period_mm) for c in (x, y))
+        self._u, self._v = ((c - np.floor(c)) * np.float32(size) for c in turns)
 
-    @staticmethod
-    def _split(turns: Singles, size: int) -> tuple[Any, Singles]:
-        """Split coordinates in texels into whole parts, from 0 to `size`, and fractions."""
-        turns -= np.floor(turns)
-        turns *= np.float32(size)
-        whole = turns.astype(np.int32)
-        turns -= whole.astype(np.float32)
-        return whole, turns
-
-    def sample(self, tile: Padded) -> Singles:
-        """Return the values of a tile at the positions."""
-        rows = []
-        for pairs in (tile.pairs, tile.pairs[self._width :]):
-            both = pairs.take(self._at)
-            row: Singles = (both >> 16).astype(np.float32)
-            row *= self._du
-            row += both.astype(np.int16).astype(np.float32)  # integer addition with other types takes longer
-            rows.append(row)
-        out, below = rows
-        below -= out
-        below *= self._dv
-        out += below
-        out *= tile.unit
-        return out
+    def sample(self, tile: Singles) -> Singles:
+        """Return the values of a `padded` tile at the positions."""
+        out = np.empty(self._u.size, np.float32)
+        kernels.sample(tile, self._u.ravel(), self._v.ravel(), out)
+        return out.reshape(self._u.shape)

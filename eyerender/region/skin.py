@@ -27,7 +27,7 @@ from .contour import step
 from .globe import Globe
 from .lids import CONJUNCTIVA, FACE, LID, MARGIN, ROWS, sheet, skin_depth
 from .look import Look
-from .noise import Padded, Places, band, furrows
+from .noise import Places, band, furrows, padded
 from .tears import waves
 
 SHEET_ROWS, BANDS = 960, 64
@@ -214,7 +214,7 @@ class _Tiles:
 
     def __init__(self, spec: Region) -> None:
         self.spec = spec
-        self._made: dict[object, Padded] = {}
+        self._made: dict[object, Singles] = {}
 
     def at(self, number: int, places: Places, across: tuple[float, float], up: tuple[float, float]) -> Singles:
         """Sample a band of noise (see `noise.band`) at positions."""
@@ -225,26 +225,26 @@ class _Tiles:
         key = places.size, *parts
         if key not in self._made:
             bands = [factor * band(self.spec.seed + number, places.size, *ends) for factor, number, *ends in parts]
-            self._made[key] = Padded(np.sum(bands, axis=0, dtype=np.float32))
+            self._made[key] = padded(np.sum(bands, axis=0, dtype=np.float32))
         return places.sample(self._made[key])
 
     @cached_property
-    def net(self) -> Padded:
+    def net(self) -> Singles:
         """Return the furrows of the face."""
-        return Padded(furrows(self.spec.seed, _TILE, 1700))
+        return padded(furrows(self.spec.seed, _TILE, 1700))
 
     @cached_property
-    def drawn(self) -> Padded:
+    def drawn(self) -> Singles:
         """Return the furrows of the lids, stretched horizontally."""
-        return Padded(furrows(self.spec.seed + 7, _TILE, 1500, 2.5))
+        return padded(furrows(self.spec.seed + 7, _TILE, 1500, 2.5))
 
     @cached_property
-    def hollows(self) -> Padded:
+    def hollows(self) -> Singles:
         """Return the depth (mm) of the face behind its surroundings, on a grid of 1 mm from (-76, -76)."""
         at = np.arange(-76.0, 76.5)
         depth = skin_depth(self.spec, Globe.sphere(), *np.meshgrid(at, at))
         behind = ndimage.gaussian_filter(depth, 4.5, mode="nearest") - depth
-        return Padded(behind.astype(np.float32))
+        return padded(behind.astype(np.float32))
 
     @cached_property
     def brow(self) -> tuple[Singles, Singles]:
@@ -315,7 +315,7 @@ class _Slow:
         return out.reshape(len(down), -1)
 
 
-def _hollows(behind: Padded, y: Singles, z: Singles) -> Singles:
+def _hollows(behind: Singles, y: Singles, z: Singles) -> Singles:
     """Compute the loss of light, -0.05 to 0.25, in hollows of the face."""
     y, z = (np.clip(v + 76.0, 0, 151.999) for v in (y, z))
     return np.asarray(np.clip(0.05 * Places(153, y, z, 153.0).sample(behind), -0.05, 0.25))
