@@ -78,7 +78,7 @@ def _displacements(
         residual, counted = level - expected, slope * use
         weight = np.bincount(bins, weights=counted * slope, minlength=SECTORS)
         further = np.bincount(bins, weights=counted * residual, minlength=SECTORS) / np.maximum(weight, 1e-9)
-        further = np.where(weight > 1e-9, np.clip(further, -sigma, sigma), 0.0)
+        further = np.where(weight > 1e-9, np.maximum(np.minimum(further, sigma), -sigma), 0.0)
         whole = whole + further
         if float(np.abs(further).max()) < LINEAR * sigma:
             break
