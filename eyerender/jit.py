@@ -21,7 +21,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import cache
@@ -31,6 +30,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numba
 from numba.core import config as numba_config
 from numba.core import sigutils
+from numba.core.dispatcher import Dispatcher
 
 from .storage.cachefolder import cache_folder
 
@@ -67,7 +67,6 @@ def used(folder: Path) -> Path:
 
 FOLDER = None if (_place := _folder()) is None else str(used(_place))
 FUNCTIONS: dict[Any, str] = {}  # the dispatchers that `compiled` made, and the types of their arguments
-_CODE: Counter[str] = Counter()  # bytes of bytecode per module
 # Helpers are called by compiled functions only.
 HELPER: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 ABOUT_S = 15  # time of compilation on two cores, for the message
@@ -137,7 +136,7 @@ def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> No
     """Compile the functions of a program, except those that other processes claimed.
 
     Functions of one module share helpers, which every process has to compile for itself. So workers with even numbers
-    begin with the modules of glints and those with odd numbers with the pupil's, the largest function first.
+    begin with the modules of glints and those with odd numbers with the pupil's, the largest module first.
 
     Args:
         claims: folder in which a process claims a function by creating a subfolder of the function's name.
@@ -147,8 +146,8 @@ def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> No
 
     def place(function: Any) -> tuple[bool, int, str]:
         module = function.py_func.__module__
-        pupil = ".pupil." in module
-        return pupil, _CODE[module] if pupil else -_CODE[module], module
+        pupil, size = ".pupil." in module, _code_size(module)
+        return pupil, size if pupil else -size, module
 
     ordered = sorted(functions(program), key=place)
     collecting = gc.isenabled()
@@ -161,6 +160,12 @@ def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> No
     finally:
         if collecting:
             gc.enable()
+
+
+def _code_size(module: str) -> int:
+    """Count the bytes of bytecode of all numba functions in the names of a module, imported helpers included."""
+    names = vars(sys.modules[module]).values()
+    return sum(len(one.py_func.__code__.co_code) for one in names if isinstance(one, Dispatcher))
 
 
 def functions(program: Program = EXTRACTOR) -> list[Any]:
@@ -184,7 +189,6 @@ def compiled(types: str = "") -> Callable[[Function], Function]:
     def decorate(function: Function) -> Function:
         made = _dispatcher(function)
         FUNCTIONS[made] = types
-        _CODE[function.__module__] += len(function.__code__.co_code)
         return cast(Function, made)
 
     return decorate
@@ -219,5 +223,4 @@ def inlined(function: Function) -> Function:
 
 
 def _helper(function: Function, **options: Any) -> Function:
-    _CODE[function.__module__] += len(function.__code__.co_code)
     return cast(Function, njit(**HELPER, **options)(function))

@@ -55,7 +55,8 @@ def biconic_jet(constants: tuple[FloatLike, ...], y: Floats, z: Floats) -> Jet:
     """
     cy, cz, ky, kz = constants
     square = 1.0 - ky * y * y - kz * z * z
-    w = np.sqrt(np.where(square > 0.0, square, 1.0))
+    inside = square > 0.0
+    w = np.sqrt(inside * square + (1.0 - inside))  # 1 outside; numba takes a second to compile `np.where`
     d = 1.0 / (1.0 + w)
     x = -(cy * y * y + cz * z * z) * d
     wy, wz = -ky * y / w, -kz * z / w

@@ -210,9 +210,10 @@ def _splines(t):  # type: ignore[no-untyped-def]
 @compiled("i8[::1], f8[:,:,::1], f8[::1], f8[::1], f8[::1], f8[:,:,::1]")
 def jets(kinds: Ints, numbers: Floats, table: Floats, y: Floats, z: Floats, out: Floats) -> None:
     """Write `jet` of every surface of the first eye at positions (k,) to `out` (surfaces, 6, k)."""
+    eye = np.int64(0)  # numba would compile everything once more for a literal 0
     for s in range(len(kinds)):
         for k in range(len(y)):
-            found = jet(kinds, numbers, table, 0, s, y[k], z[k])
+            found = jet(kinds, numbers, table, eye, s, y[k], z[k])
             for d in range(6):
                 out[s, d, k] = found[d]
 
@@ -220,6 +221,7 @@ def jets(kinds: Ints, numbers: Floats, table: Floats, y: Floats, z: Floats, out:
 @compiled("i8[::1], f8[:,:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1]")
 def heights(kinds: Ints, numbers: Floats, table: Floats, y: Floats, z: Floats, out: Floats) -> None:
     """Write the height of every surface of the first eye at positions (k,) to `out` (surfaces, k)."""
+    eye = np.int64(0)  # see `jets`
     for s in range(len(kinds)):
         for k in range(len(y)):
-            out[s, k] = jet(kinds, numbers, table, 0, s, y[k], z[k])[0]
+            out[s, k] = jet(kinds, numbers, table, eye, s, y[k], z[k])[0]

@@ -23,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Floats, Ints, Statuses
-from ..geometry.graph_kernels import APEX, AXIS, LEAN, ORIGIN, SMOOTH, inlined, measured_jet, merged, smooth_jet
+from ..geometry.graph_kernels import APEX, AXIS, LEAN, ORIGIN, SMOOTH, helper, inlined, measured_jet, merged, smooth_jet
 from ..jit import compiled
 from ..status import Status
 
@@ -88,6 +88,17 @@ def load(numbers, ladder, viewpoint, target, first, count, columns, nodes):  # t
                     nodes[j, COPY + c, lane] = numbers[min(i, len(numbers) - 1), j - 1, c]
 
 
+@helper
+def blend_measured(kind, numbers, table, j, first, count, columns, w):  # type: ignore[no-untyped-def]
+    """Blend the measured surface of a node w (ROWS, LANES) into its outer biconic, which was evaluated before."""
+    for lane in range(LANES):
+        i = min(min(first + lane, count - 1) // columns, len(numbers) - 1)
+        outer = (w[X, lane], w[SLOPE_Y, lane], w[SLOPE_Z, lane], w[YY, lane], w[YZ, lane], w[ZZ, lane])
+        found = measured_jet(kind, numbers, table, i, j - 1, w[Y, lane], w[Z, lane], outer)
+        w[X, lane], w[SLOPE_Y, lane], w[SLOPE_Z, lane] = found[0], found[1], found[2]
+        w[YY, lane], w[YZ, lane], w[ZZ, lane] = found[3], found[4], found[5]
+
+
 @inlined
 def evaluate(kinds, numbers, table, j, first, count, columns, nodes):  # type: ignore[no-untyped-def]
     """Compute height, slopes and second derivatives at the (y, z) of node j."""
@@ -96,14 +107,8 @@ def evaluate(kinds, numbers, table, j, first, count, columns, nodes):  # type: i
         found = smooth_jet(w[COPY:, lane], w[Y, lane], w[Z, lane])
         w[X, lane], w[SLOPE_Y, lane], w[SLOPE_Z, lane] = found[0], found[1], found[2]
         w[YY, lane], w[YZ, lane], w[ZZ, lane] = found[3], found[4], found[5]
-    kind = kinds[j - 1]
-    if kind != SMOOTH:
-        for lane in range(LANES):
-            i = min(min(first + lane, count - 1) // columns, len(numbers) - 1)
-            outer = (w[X, lane], w[SLOPE_Y, lane], w[SLOPE_Z, lane], w[YY, lane], w[YZ, lane], w[ZZ, lane])
-            found = measured_jet(kind, numbers, table, i, j - 1, w[Y, lane], w[Z, lane], outer)
-            w[X, lane], w[SLOPE_Y, lane], w[SLOPE_Z, lane] = found[0], found[1], found[2]
-            w[YY, lane], w[YZ, lane], w[ZZ, lane] = found[3], found[4], found[5]
+    if kinds[j - 1] != SMOOTH:
+        blend_measured(kinds[j - 1], numbers, table, j, first, count, columns, w)
 
 
 @merged

@@ -36,7 +36,6 @@ from eyerender.extraction.pupil.covariance import GROUPS, SHAPE, distance_slopes
 from eyerender.extraction.pupil.edge_model import EdgeModel, longest_gap
 from eyerender.extraction.pupil.edges import WEAK
 from eyerender.extraction.pupil.least_squares import FIXED, KURTOSIS_LIMITS
-from eyerender.extraction.pupil.occlusion import FARTHEST, LINEAR, OUTLIER
 from eyerender.extraction.pupil.outline import DARK, SHADED
 from eyerender.extraction.pupil.places import SECTORS
 from eyerender.extraction.statistics import median, quantile
@@ -642,62 +641,24 @@ def _band(
     return x, y, linear[row, column].astype(np.float64)
 
 
-def _visible(
-    bins: Indices, found: tuple[Floats, ...], use: Bools, seen: Bools, sectors: Bools, noise_dn: float, uneven_px: float
-) -> tuple[Bools, Bools, float, Floats]:
-    """Compute the parts of `Visible`, but the sectors of the pixels, from what `_displacements` found."""
-    residual, whole, weight = found
-    told = seen & (weight > 0.1 * float(weight.max(initial=0.0)))
-    by_noise = noise_dn**2 / np.maximum(weight, 1e-9)
-    uneven2 = 0.0
-    if told.any():
-        uneven2 = max((1.4826 * median(np.abs(whole[told]))) ** 2 - 1.3 * median(by_noise[told]), 0.0)
-    scale = max(1.4826 * median(np.abs(residual[use & seen[bins]])), noise_dn, 1e-3)
-    new_use = np.abs(residual) < OUTLIER * scale
-    total = np.maximum(np.bincount(bins, minlength=SECTORS), 1)
-    capped = np.minimum((residual / scale) ** 2, OUTLIER**2)
-    mean_square = np.bincount(bins, weights=capped, minlength=SECTORS) / total
-    outliers = np.bincount(bins, weights=~new_use, minlength=SECTORS) / total
-    usual = max(median(mean_square[seen]), 1.0)
-    explained = (mean_square < np.where(sectors, 5.0, 2.5) * usual) & (outliers < np.where(sectors, 0.25, 0.1))
-    likely2 = np.where(sectors, max(uneven2, uneven_px**2), uneven2) + by_noise
-    explained &= np.abs(whole) < FARTHEST * np.sqrt(likely2)
-    likely = np.where(explained, whole * uneven2 / (uneven2 + by_noise), 0.0)
-    return new_use, explained, math.sqrt(uneven2), likely
-
-
-def _look(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
-    """Sector of each pixel (n,), and its distance, curvature, inner level, step and slopes (6, n)."""
+def boundary_terms(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
+    """Sector of each pixel (n,); distance, curvature, cos u, sin u, inner level, step and slopes (8, n)."""
     model = EdgeModel.of(numbers)
     place = Place.of(model.ellipse, x, y, steps=3)
     inner = inner_level(model, place)
     step = model.outer @ harmonics(place.cos_u, place.sin_u, (model.outer.size - 1) // 2) - inner
     within, beyond = _slopes(model, place)
-    return sector_of(place), np.stack([place.distance, place.curvature, inner, step, within, beyond - within])
+    about = (place.distance, place.curvature, place.cos_u, place.sin_u)
+    return sector_of(place), np.stack([*about, inner, step, within, beyond - within])
 
 
-def _displacements(
-    bins: Indices, look: Floats, level: Floats, use: Bools, numbers: Floats, displaced: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Find the displacement of every sector that its pixels show, from what `_look` returns.
-
-    Returns:
-        The residual of each pixel (n,), the displacements (SECTORS,) and their weights (SECTORS,).
-    """
-    model, (distance, curvature, inner, step, within, bend), whole = EdgeModel.of(numbers), look, displaced
-    for _ in range(2):  # the levels are not linear in a displacement as large as the blur
-        at = distance + whole[bins]
-        profile = Profile.of(at, curvature, model.sigma_px, model.kurtosis)
-        residual = level - (inner + step * profile.edge + within * at + bend * profile.ramp)
-        slope = step * profile.edge_by_distance + within + bend * profile.ramp_by_distance
-        counted = slope * use
-        weight = np.bincount(bins, weights=counted * slope, minlength=SECTORS).astype(np.float64)
-        further = np.bincount(bins, weights=counted * residual, minlength=SECTORS) / np.maximum(weight, 1e-9)
-        further = np.where(weight > 1e-9, np.minimum(np.maximum(further, -model.sigma_px), model.sigma_px), 0.0)
-        whole = whole + further
-        if float(np.abs(further).max()) < LINEAR * model.sigma_px:
-            break
-    return residual - slope * further[bins], whole, weight
+def levels_and_slopes(terms: Floats, displaced: Floats, numbers: Floats) -> tuple[Floats, Floats]:
+    """Levels (n,) and their derivatives by the distance (n,), from the result of `boundary_terms`."""
+    distance, curvature, _, _, inner, step, within, bend = terms
+    at = distance + displaced
+    profile = Profile.of(at, curvature, numbers[5], numbers[8])
+    level = inner + step * profile.edge + within * at + bend * profile.ramp
+    return level, step * profile.edge_by_distance + within + bend * profile.ramp_by_distance
 
 
 def _sampled(smooth: Image, xy: Floats, x: Floats, y: Floats) -> Singles:

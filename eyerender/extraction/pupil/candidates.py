@@ -275,7 +275,7 @@ def _ring_levels(small: Image, blobs: Floats, noise: float) -> Floats:
     within, step = np.empty((2, ANGLES)), np.empty(ANGLES)
     for k in range(blobs.shape[0]):
         ellipse = (blobs[k, 0], blobs[k, 1], blobs[k, 2], blobs[k, 3], blobs[k, 4])
-        _levels_along(small, ellipse, 1.5, 0, within, step)
+        _levels_along(small, ellipse, 1.5, np.int64(0), within, step)
         typical = quantile_of(step, 0.5)
         out[k, 0], out[k, 1], out[k, 3] = quantile_of(within.ravel(), 0.5), typical, quantile_of(within[0], 0.5)
         out[k, 2], out[k, 4] = _share_above(step, max(0.35 * typical, 2.0 * noise)), _deviation(within.ravel())
@@ -305,12 +305,12 @@ def _deviation(values: Floats) -> float:
 
 @inlined
 def _levels_along(
-    image: Image, ellipse: tuple[float, ...], away: float, box: int, within: Floats, step: Floats
+    image: Image, ellipse: tuple[float, ...], away: float, box: np.int64, within: Floats, step: Floats
 ) -> None:
     """Write levels along .65 and .4 of an ellipse (2, ANGLES), and steps from .65 to a ring outside (ANGLES,).
 
     Levels are means of the pixels nearest to a point, up to `box` to each side. The ring is `away` px outside 1.15 of
-    the ellipse (cx, cy, a, b, angle).
+    the ellipse (cx, cy, a, b, angle). `box` is an np.int64: numba would compile this once more for each literal.
     """
     x, y, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
@@ -325,7 +325,7 @@ def _levels_along(
 
 
 @inlined
-def _mean_about(image: Image, x: float, y: float, box: int) -> float:
+def _mean_about(image: Image, x: float, y: float, box: np.int64) -> float:
     """Average the pixels up to `box` to each side of the nearest one; beyond the frame, its border is repeated."""
     column, row, total = int(np.rint(x)), int(np.rint(y)), 0.0
     for j in range(row - box, row + box + 1):
@@ -348,7 +348,7 @@ def _levels_about(linear: Image, ellipse: tuple[float, ...]) -> tuple[float, flo
     They are medians of the means of 3 x 3 pixels along ellipses.
     """
     within, step = np.empty((2, ANGLES)), np.empty(ANGLES)
-    _levels_along(linear, ellipse, 3.0, 1, within, step)
+    _levels_along(linear, ellipse, 3.0, np.int64(1), within, step)
     return quantile_of(within.ravel(), 0.5), quantile_of(step, 0.5)
 
 

@@ -23,10 +23,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Bools, Floats
+from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse
 from ...jit import compiled, inlined
-from .places import BLOCK, COS_U, CURVATURE, SIN_U, places
+from .places import BLOCK, COS_U, CURVATURE, SIN_U, places, sector_at
 
 # Columns of a block of profiles, all by the distance d: the edge E (first), its derivatives by the distance, sigma and
 # the kurtosis, the blurred ramp max(d, 0), and its derivatives by the distance and sigma.
@@ -171,27 +171,59 @@ def local_levels(place: Floats, count: int, numbers: Floats, basis: Floats, out:
                 out[BEND + i] += part * plane
 
 
-@compiled("f8[::1], f8[::1], f8[::1], f8[::1]")
-def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
-    """Compute levels (n,) of the model with these parameters; `displaced` is empty for an exact ellipse."""
+@compiled("f8[::1], f8[::1], f8[::1]")
+def boundary_terms(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
+    """Compute what the level at pixels (n,) depends on, except the displacement of the boundary.
+
+    Returns:
+        Sectors (n,); distance, curvature, cos u, sin u and the four `local_levels` as rows (8, n).
+    """
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
-    place, edge, basis = np.empty(8 * BLOCK), np.empty(7 * BLOCK), np.empty(2 * BLOCK)
-    out, local, n = np.empty(x.size), np.empty(4 * BLOCK), displaced.size
+    bins, out = np.empty(x.size, dtype=np.int64), np.empty((8, x.size))
+    place, basis, local = np.empty(8 * BLOCK), np.empty(2 * BLOCK), np.empty(4 * BLOCK)
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
         places(ellipse, x, y, start, count, place)
-        if n:
-            for i in range(count):
-                at = (math.atan2(place[SIN_U + i], place[COS_U + i]) / (2.0 * math.pi) + 0.5) * n - 0.5
-                low = math.floor(at)
-                first = displaced[int(low) % n]
-                place[i] += first + (at - low) * (displaced[int(low + 1.0) % n] - first)
-        profiles(place, count, numbers[5], numbers[8], edge)
         local_levels(place, count, numbers, basis, local)
         for i in range(count):
-            flat = local[i] + local[WITHIN + i] * place[i]
-            out[start + i] = flat + local[STEP + i] * edge[i] + local[BEND + i] * edge[RAMP + i]
-    return out
+            bins[start + i] = sector_at(place[COS_U + i], place[SIN_U + i])
+            out[0, start + i], out[1, start + i] = place[i], place[CURVATURE + i]
+            out[2, start + i], out[3, start + i] = place[COS_U + i], place[SIN_U + i]
+            for k in range(4):
+                out[4 + k, start + i] = local[k * BLOCK + i]
+    return bins, out
+
+
+@compiled("f8[:,::1], f8[::1], f8[::1]")
+def levels_and_slopes(terms: Floats, displaced: Floats, numbers: Floats) -> tuple[Floats, Floats]:
+    """Compute levels (n,) and their derivatives by the distance (n,), from the terms (8, n) of `boundary_terms`.
+
+    The boundary at each pixel is `displaced` (n,) px into the ellipse.
+    """
+    n = displaced.size
+    level, slope, place, edge = np.empty(n), np.empty(n), np.empty(8 * BLOCK), np.empty(7 * BLOCK)
+    for start in range(0, n, BLOCK):
+        count = min(BLOCK, n - start)
+        for i in range(count):
+            place[i], place[CURVATURE + i] = terms[0, start + i] + displaced[start + i], terms[1, start + i]
+        profiles(place, count, numbers[5], numbers[8], edge)
+        for i in range(count):
+            k = start + i
+            inner, step, within, bend = terms[4, k], terms[5, k], terms[6, k], terms[7, k]
+            level[k] = inner + step * edge[i] + within * place[i] + bend * edge[RAMP + i]
+            slope[k] = step * edge[BY_DISTANCE + i] + within + bend * edge[RAMP_BY_DISTANCE + i]
+    return level, slope
+
+
+def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
+    """Compute levels (n,) of the model with these parameters; `displaced` is empty for an exact ellipse."""
+    terms, between = boundary_terms(x, y, numbers)[1], np.zeros(x.size)
+    if displaced.size:
+        at = (np.arctan2(terms[3], terms[2]) / (2.0 * np.pi) + 0.5) * displaced.size - 0.5
+        low = np.floor(at).astype(np.intp)
+        first, second = displaced[low % displaced.size], displaced[(low + 1) % displaced.size]
+        between = first + (at - low) * (second - first)
+    return levels_and_slopes(terms, between, numbers)[0]
 
 
 def longest_gap(held: Bools) -> float:

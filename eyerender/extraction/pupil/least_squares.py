@@ -44,12 +44,6 @@ KURTOSIS_LIMITS = (-1.5, 3.0)  # outside these limits the edge would not be mono
 STILL_PX = 1.5e-2  # a fit ends with a step smaller than this
 
 
-_Sums = tuple[Floats, float, Floats, Floats, Floats, Floats]  # the parts of `Sums`
-_Normal = tuple[Floats, Floats, float, Floats, Floats]  # parts of `Normal`, except `across`
-_SUMS = "Tuple((f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[::1], f8[::1]))"  # type for `compiled`
-_NORMAL = "Tuple((f8[:,::1], f8[::1], f8, f8[::1], f8[::1]))"
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
     """Pixels near the boundary: positions x (n,) and y (n,), px, levels (n,), DN, and sectors (n,)."""
@@ -279,34 +273,20 @@ class Normal:
     @staticmethod
     def of(sums: Sums, displaced: Floats, prior: Prior) -> Normal:
         """Eliminate the displacements (k,) from the sums."""
-        parts = (sums.matrix, sums.cost, sums.pull, sums.across, sums.along, sums.square)
-        matrix, vector, cost, along, inverse = _eliminated(parts, displaced, prior.displacement)
-        return Normal(matrix=matrix, vector=vector, cost=cost, across=sums.across, along=along, inverse=inverse)
-
-
-@compiled(f"{_SUMS}, f8[::1], f8")
-def _eliminated(sums: _Sums, displaced: Floats, displacement: float) -> _Normal:
-    """Compute the parts of `Normal`, except `across`, from those of `Sums` and the prior's weight (see `Prior`)."""
-    matrix, cost, pull, across, along, square = sums
-    size, sectors = across.shape
-    vector, products = np.zeros(size), np.zeros((size, size))
-    rest, inverse, root = np.zeros(sectors), np.zeros(sectors), np.zeros((size, sectors))
-    if not math.isinf(displacement):
-        for k in range(sectors):
-            inverse[k] = 1.0 / (square[k] + displacement)
-            rest[k] = along[k] - displacement * displaced[k]
-            cost += displacement * displaced[k] ** 2
-            for j in range(size):
-                root[j, k] = across[j, k] * math.sqrt(inverse[k])
-    add_products(root, 0, sectors, products)
-    reduced = matrix.copy()
-    for j in range(size):
-        for k in range(sectors):
-            vector[j] += pull[j, k] - across[j, k] * inverse[k] * rest[k]
-        for m in range(j + 1):
-            reduced[j, m] -= products[j, m]
-            reduced[m, j] = reduced[j, m]
-    return reduced, vector, cost, rest, inverse
+        cost, rest, inverse = sums.cost, np.zeros(displaced.size), np.zeros(displaced.size)
+        if not math.isinf(prior.displacement):
+            inverse = 1.0 / (sums.square + prior.displacement)
+            rest = sums.along - prior.displacement * displaced
+            cost += prior.displacement * float(displaced @ displaced)
+        root = sums.across * np.sqrt(inverse)
+        return Normal(
+            matrix=sums.matrix - root @ root.T,
+            vector=sums.pull.sum(axis=1) - sums.across @ (inverse * rest),
+            cost=cost,
+            across=sums.across,
+            along=rest,
+            inverse=inverse,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -326,18 +306,19 @@ def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, st
     numbers = model.numbers()
     held, damping = prior.of_all(numbers.size), 1e-4
     about = (pixels.x, pixels.y, pixels.level, pixels.index)
-    sums = _pixel_sums(*about, numbers, displaced)
-    normal = _eliminated(sums, displaced, prior.displacement)
-    cost = normal[2] + float(held @ numbers**2)
+    sums = Sums(*_pixel_sums(*about, numbers, displaced))
+    normal = Normal.of(sums, displaced, prior)
+    cost = normal.cost + float(held @ numbers**2)
     for _ in range(steps):
-        trial, trial_displaced, largest, widened = _trial(normal, sums[3], held, numbers, displaced, damping)
+        parts = (normal.matrix, normal.vector, normal.across, normal.along, normal.inverse)
+        trial, trial_displaced, largest, widened = _trial(parts, held, numbers, displaced, damping)
         if largest < STILL_PX and widened < 10.0 * STILL_PX and damping < 1e-3:
             # Another step would be several times smaller, and a step this small hardly changes the sums.
             numbers, displaced = trial, trial_displaced
             break
-        trial_sums = _pixel_sums(*about, trial, trial_displaced)
-        trial_normal = _eliminated(trial_sums, trial_displaced, prior.displacement)
-        trial_cost = trial_normal[2] + float(held @ trial**2)
+        trial_sums = Sums(*_pixel_sums(*about, trial, trial_displaced))
+        trial_normal = Normal.of(trial_sums, trial_displaced, prior)
+        trial_cost = trial_normal.cost + float(held @ trial**2)
         if trial_cost <= cost:
             gained, cost = cost - trial_cost, trial_cost
             numbers, displaced, sums, normal = trial, trial_displaced, trial_sums, trial_normal
@@ -346,7 +327,7 @@ def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, st
                 break
         else:
             damping = min(max(damping * 30.0, 1e-3), 1e6)
-    return Solution(EdgeModel.of(numbers), displaced, Sums(*sums))
+    return Solution(EdgeModel.of(numbers), displaced, sums)
 
 
 @inlined
@@ -383,15 +364,14 @@ def _moved(numbers: Floats, step: Floats) -> Floats:
     return out
 
 
-@compiled(f"{_NORMAL}, f8[:,::1], f8[::1], f8[::1], f8[::1], f8")
+@compiled("Tuple((f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[::1])), f8[::1], f8[::1], f8[::1], f8")
 def _trial(
-    normal: _Normal, across: Floats, held: Floats, numbers: Floats, displaced: Floats, damping: float
+    normal: tuple[Floats, ...], held: Floats, numbers: Floats, displaced: Floats, damping: float
 ) -> tuple[Floats, Floats, float, float]:
     """Take one damped step of at most 3 px.
 
     Args:
-        normal: result of `_eliminated`.
-        across: as in `Sums`.
+        normal: matrix, vector, across, along and inverse of `Normal`.
         held: (p,) weights of the priors.
         numbers: (p,) the model (see `EdgeModel.numbers`).
         displaced: (k,) displacements of the sectors.
@@ -400,7 +380,7 @@ def _trial(
     Returns:
         The new parameters and displacements, and the step's largest change of the shape and of sigma, px.
     """
-    matrix, vector, _, along, inverse = normal
+    matrix, vector, across, along, inverse = normal
     step = _step(matrix, vector, held, numbers, damping)
     largest = largest_size(step[:SHAPE])
     if largest > 3.0:
