@@ -9,11 +9,11 @@ import drjit as dr
 import mitsuba as mi
 
 from ..hits.eyeshape import EyeShape
-from ..hits.interaction import SurfaceInteraction, outer_albedo
+from ..hits.interaction import SurfaceInteraction, outer_albedo, tear_film
 from ..hits.meniscus import View, through_water, water_hit
 from ..hits.primary import TriangleHit, behind, region_interaction
 from ..materials.albedo import sclera_albedo
-from ..materials.gloss import film_normal, glossy_normal
+from ..materials.gloss import glossy_normal
 from ..records.frame import Frame, Lamp
 from ..records.recording import syntax
 from ..transport.directlight import direct_light, irradiance_through_cornea, lamp_blocked, on_relief
@@ -137,9 +137,9 @@ def _globe_radiance(frame: Frame, group: PixelGroup, view: View, j: mi.UInt32) -
     albedo = outer_albedo(frame, si)
     received = frame.caches.radiosity.at_globe(frame.point_to_scene(si.point))
     radiance = indirect(frame, si, view.d, albedo, inner, received)
-    lit = _LitPoint(
-        si=si, normal=film_normal(si.normal), to_camera=-frame.vector_to_eye(view.d), spot=group.spot(j)
-    )  # fmt: skip
+    normal, gloss = tear_film(frame, si)
+    si = replace(si, gloss=gloss)
+    lit = _LitPoint(si=si, normal=normal, to_camera=-frame.vector_to_eye(view.d), spot=group.spot(j))
     if frame.structure.scattering:
         return radiance + _highlights_of_globe(frame, lit, albedo), failures
     return radiance + _lamps_on_globe(frame, group, lit, albedo, j), failures
