@@ -86,6 +86,12 @@ def _vessels(rng: np.random.Generator, size: int) -> Singles:
     return np.asarray(fft.irfft2(blurred, s=(size, size)))
 
 
+def film_ripples(seed: int) -> float:
+    """Draw the slope of the ripples of the tear film on the sclera; two people in three have none (chosen)."""
+    share, slope = np.random.default_rng((0xF11A, seed)).random(2)
+    return float(0.09 + 0.08 * slope) if share < 1 / 3 else 0.0
+
+
 @lru_cache(maxsize=4)
 def skin_texture(seed: int, size: int = 768) -> Singles:
     """Compute the relative albedo (size, size) of a periodic tile of skin: slow variation, furrows and pores."""

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from eyerender.imaging.capture import render_job
+from eyerender.region.texture import film_ripples
 from eyerender.scene.shipped import load_scene
 
 pytestmark = pytest.mark.render
@@ -41,3 +43,42 @@ def test_masks_mark_where_mirrored_light_exceeds_half_of_the_scattered(renderer,
 def test_a_bare_eye_has_no_highlights(renderer):
     job = render_job(load_scene("blignaut2014").with_({"image.window_px": [64, 48]}).frames(), 0)
     assert not renderer.render(replace(job, highlights=True), spp=1).highlights.any()
+
+
+def test_film_with_ripples_is_smooth_up_close_and_rough_from_afar():
+    import mitsuba as mi
+
+    from eyerender.rendering.materials.gloss import rippled_film
+
+    rng = np.random.default_rng(3)
+    n = np.stack([np.full(4000, 0.9), *rng.uniform(-0.4, 0.4, (2, 4000))])
+    n /= np.linalg.norm(n, axis=0)
+    found = [rippled_film(mi.Vector3f(*(mi.Float(c) for c in n)), mi.Float(0.1), mi.Float(mm)) for mm in (0.02, 0.3, 9)]
+    tilted, gloss = found[0][0].numpy(), [float(g.numpy()[0]) for _, g in found]
+    assert np.linalg.norm(tilted, axis=0) == pytest.approx(1.0, abs=1e-5)
+    assert 0.05 < np.sqrt(np.mean(np.sum((tilted - n) ** 2, axis=0))) < 0.15
+    assert gloss[0] > gloss[1] > gloss[2] == pytest.approx(0.93, abs=1e-3)  # that of the film without ripples
+
+
+def test_ripples_mirror_lamps_as_small_points_on_the_sclera(renderer, monkeypatch):
+    from eyerender.rendering.records import job as jobs
+
+    def picture(slope):
+        monkeypatch.setattr(jobs, "film_ripples", lambda _: slope)
+        given = load_scene("headset").with_({"image.interreflection": False})
+        job = render_job(given.frames(), 0)
+        return renderer.radiance(job, spp=16), renderer.labels(job).part
+
+    (even, part), (rippled, _) = picture(0.0), picture(0.13)
+    more = (rippled - even) / np.median(even[part == 1])
+    points, count = ndimage.label((more > 0.5) & (part == 1))
+    radius = np.sqrt(np.sum(part >= 2) / np.pi)
+    assert count >= 5
+    assert np.bincount(points.ravel())[1:].max() < 0.02 * radius**2
+    assert np.abs(more[(part != 1) & ~ndimage.binary_dilation(part == 1, iterations=2)]).max() < 1e-3
+
+
+def test_one_person_in_three_has_ripples():
+    slopes = np.array([film_ripples(seed) for seed in range(2000)])
+    assert np.mean(slopes > 0) == pytest.approx(1 / 3, abs=0.04)
+    assert np.all((slopes[slopes > 0] >= 0.09) & (slopes[slopes > 0] <= 0.17))

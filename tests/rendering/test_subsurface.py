@@ -159,3 +159,35 @@ def test_shut_lids_transmit_light(renderer):
     # The lids are 2 to 3.5 mm thick there.
     k = diffusion.transmitted(BARE.skin.albedo, 2.04)
     assert 0.5 * np.exp(-3.5 * k) < inside / outside < np.exp(-2.0 * k)
+
+
+@pytest.mark.parametrize("name", ["remote", "head"])
+def test_light_goes_on_from_the_globe_into_the_conjunctiva(renderer, name):
+    """Where the conjunctiva rises from the globe in the inner corner, both have the same light; below is no shadow."""
+    import mitsuba as mi
+
+    shown, place = renderer.bind(job(name, region=BARE))
+    frame, light = shown.frame, shown.frame.caches.diffusion
+    column = np.linspace(-24, 24, 25) % COLUMNS  # the columns begin in the inner corner
+
+    def both(row):
+        x, _ = place.skin.sheet_point(mi.Float(np.full(25, row)), mi.Float(column))
+        v = np.full(25, sheet_v(row / (ROWS - 1)))
+        on_skin = light.at_skin(mi.Float(column / COLUMNS), mi.Float(v)).numpy()
+        return on_skin, light.at_globe(frame, frame.point_to_eye(x)).numpy()
+
+    skin, globe = both(0.3)
+    assert skin == pytest.approx(globe, rel=0.03)
+    assert np.all(both(2.0)[1] > 0.7 * globe)
+
+
+def test_even_light_stays_even_where_tissues_join(renderer):
+    import mitsuba as mi
+
+    from eyerender.rendering.transport.diffusion import join_tissues
+
+    bound = job(region=BARE)
+    (sheet, _), at, _, on_globe = grids(renderer, bound)
+    frame = renderer.bind(bound)[0].frame
+    out = join_tissues(frame, sheet, mi.Float(np.ones(at.shape[:2]).ravel()), mi.Float(np.ones(len(on_globe))))
+    assert out.numpy() == pytest.approx(1.0, abs=1e-6)

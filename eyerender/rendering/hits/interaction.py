@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..materials.albedo import sclera_albedo
+from ..materials.gloss import glossy_normal, rippled_film
 from ..records.frame import Frame
 from ..records.recording import syntax
 from ..records.surfaces import Bundle
@@ -125,6 +126,13 @@ class SurfaceInteraction:
         (w, a, b), (_, p, q) = at
         both = dr.dot(w, dr.cross(p, b)) + dr.dot(w, dr.cross(a, q))
         return 0.5 * both / dr.dot(w, dr.cross(a, b))
+
+
+def tear_film(frame: Frame, si: SurfaceInteraction) -> tuple[mi.Vector3f, mi.Float]:
+    """Return normal (eye frame) and gloss of the film that mirrors lamps; on some people's sclera it has ripples."""
+    on = si.sclera & ~si.other & (frame.sclera.ripples > 0)
+    normal, gloss = rippled_film(si.normal, frame.sclera.ripples, si.distance / frame.camera.focal[0])
+    return dr.select(on, normal, glossy_normal(si.normal, si.gloss)), dr.select(on, gloss, si.gloss)
 
 
 @syntax

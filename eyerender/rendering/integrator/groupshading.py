@@ -9,10 +9,11 @@ import drjit as dr
 import mitsuba as mi
 
 from ..hits.eyeshape import EyeShape
-from ..hits.interaction import SurfaceInteraction, outer_albedo
+from ..hits.interaction import SurfaceInteraction, outer_albedo, tear_film
 from ..hits.meniscus import View, through_water, water_hit
 from ..hits.primary import TriangleHit, behind, region_interaction
-from ..materials.gloss import film_normal, glossy_normal
+from ..materials.albedo import sclera_albedo
+from ..materials.gloss import glossy_normal
 from ..records.frame import Frame, Lamp
 from ..records.recording import syntax
 from ..transport.directlight import direct_light, irradiance_through_cornea, lamp_blocked, on_relief
@@ -136,9 +137,9 @@ def _globe_radiance(frame: Frame, group: PixelGroup, view: View, j: mi.UInt32) -
     albedo = outer_albedo(frame, si)
     received = frame.caches.radiosity.at_globe(frame.point_to_scene(si.point))
     radiance = indirect(frame, si, view.d, albedo, inner, received)
-    lit = _LitPoint(
-        si=si, normal=film_normal(si.normal), to_camera=-frame.vector_to_eye(view.d), spot=group.spot(j)
-    )  # fmt: skip
+    normal, gloss = tear_film(frame, si)
+    si = replace(si, gloss=gloss)
+    lit = _LitPoint(si=si, normal=normal, to_camera=-frame.vector_to_eye(view.d), spot=group.spot(j))
     if frame.structure.scattering:
         return radiance + _highlights_of_globe(frame, lit, albedo), failures
     return radiance + _lamps_on_globe(frame, group, lit, albedo, j), failures
@@ -220,15 +221,29 @@ def _add_region(frame: Frame, group: PixelGroup, point: RegionSample, total: mi.
     """Add light from other surfaces and from the lamps that the group uses."""
     _, d, _ = group.ray(frame, point.j)
     si = region_interaction(frame, point.face, point.uv, d, point.weight > 0)
+    on_map = frame.region.map_place(point.face, point.uv, point.weight > 0)
+    if on_sheet and frame.structure.scattering:
+        si = _over_globe(frame, si, frame.region.own_share(on_map[1]))
     radiance = off_eye(frame, si, d, si.albedo, si.received)
     lit = _LitPoint(
         si=si, normal=glossy_normal(si.normal, si.gloss), to_camera=-frame.vector_to_eye(d), spot=group.shared_spot
     )  # fmt: skip
     if not (on_sheet and frame.structure.scattering):
         return _lamps_on_region(frame, group, point, lit, total + radiance * point.weight, on_sheet)
-    tissues, on_map = frame.caches.diffusion, frame.region.map_place(point.face, point.uv, point.weight > 0)
+    tissues = frame.caches.diffusion
     radiance += direct(si, si.albedo, tissues.at_skin(*on_map), mi.Float(0))
     return _highlights_of_skin(group, point, lit, total + radiance * point.weight, tissues.lamps_at_skin(*on_map))
+
+
+@syntax
+def _over_globe(frame: Frame, si: SurfaceInteraction, own: mi.Float) -> SurfaceInteraction:
+    """Blend albedo and received light of thin conjunctiva with those of the globe below it."""
+    albedo, received = mi.Float(si.albedo), mi.Vector4f(si.received)
+    if dr.hint(own < 1, exclude=[frame, si, own]):
+        white, below = sclera_albedo(frame, si.point), frame.caches.radiosity.at_globe(frame.point_to_scene(si.point))
+        albedo = white + own * (albedo - white)
+        received = below + own * (received - below)
+    return replace(si, albedo=albedo, received=received)
 
 
 @syntax

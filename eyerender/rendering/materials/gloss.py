@@ -11,6 +11,7 @@ _ROUGH_OIL, _THINNER = 0.13, 0.35  # roughness of a film of oil at a gloss of 0.
 # roughness grows by `_BARER` per gloss below that of standing water.
 _ROUGH_WET, _STANDING, _BARER, _ROUGHEST = 0.02, 0.97, 3.2, 0.15
 _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
+_RIPPLE_MM, _GLOBE_MM, _ROUGH_RIPPLES = 0.6, 12.0, 0.035  # of a rippled film: waves, the globe's radius, roughness
 _RIPPLES = ((0.05, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
 
 
@@ -53,6 +54,26 @@ def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
         p, q = wave * (71 * normal.y + 23 * normal.z), wave * (67 * normal.z - 29 * normal.y)
         tilted = tilted + slope * mi.Vector3f(0, dr.sin(p + 1.7 * dr.sin(q)), dr.sin(q + 1.7 * dr.sin(p)))
     return dr.normalize(tilted)
+
+
+def rippled_film(normal: mi.Vector3f, slope: mi.Float, pixel_mm: mi.Float) -> tuple[mi.Vector3f, mi.Float]:
+    """Compute normal (eye frame) and gloss of a smooth tear film on a globe with ripples of this slope.
+
+    Each ripple mirrors a lamp once, so the picture shows rows of points. Within a pixel of `pixel_mm`, the ripples only
+    add to the roughness.
+    """
+    wave = 2 * dr.pi / _RIPPLE_MM
+    tilt = mi.Vector2f(0)
+    for part, shorter in ((1.0, 1.0), (0.7, 1.7)):
+        # Slow waves bend the rows and move the points of each against those of the next.
+        p, q = (shorter * wave * _GLOBE_MM * (a * normal.y + b * normal.z) for a, b in ((0.35, 0.94), (0.64, -0.29)))
+        along = dr.sin(q + 1.3 * dr.sin(0.61 * p) + 2 * dr.sin(0.23 * p))
+        across = dr.sin(p + 1.7 * dr.sin(0.53 * q) + 2 * dr.sin(0.19 * q))
+        tilt += part * mi.Vector2f(along, across)
+    blur = slope * wave * pixel_mm * 0.29  # standard deviation over a pixel is its width / sqrt(12)
+    rough = dr.minimum(dr.sqrt(_ROUGH_RIPPLES * _ROUGH_RIPPLES + blur * blur), _ROUGHEST)
+    gloss = _STANDING - (rough - _ROUGH_WET) * (1 / _BARER)
+    return dr.normalize(normal + slope * mi.Vector3f(0, tilt.x, tilt.y)), gloss
 
 
 def film_reflectance(cosine: mi.Float, gloss: mi.Float) -> mi.Float:

@@ -13,12 +13,11 @@ from ...arrays import ArrayValue, Bools, Bytes, frozen, sealed
 from ...folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ...rig.camera import Window
 from ..hits.eyeshape import EyeShape
-from ..hits.interaction import SurfaceInteraction, outer_albedo
+from ..hits.interaction import SurfaceInteraction, outer_albedo, tear_film
 from ..hits.meniscus import on_water
 from ..hits.primary import first_hit, hidden
 from ..integrator.request import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
-from ..materials.gloss import glossy_normal
 from ..records.frame import Frame
 from ..records.recording import recorded, syntax
 from ..transport.directlight import direct_light, lamp_blocked
@@ -102,7 +101,8 @@ def _lamps_at(frame: Frame, window: Window, right: float, down: float) -> tuple[
     si = first_hit(frame, o, d, mi.Bool(True))
     albedo = outer_albedo(frame, si)  # albedo of the surface below the water
     si = on_water(frame, si, o, d)
-    shine, irradiance = _shine(frame, si, (glossy_normal(si.normal, si.gloss), -frame.vector_to_eye(d)))
+    normal, gloss = tear_film(frame, si)
+    shine, irradiance = _shine(frame, replace(si, gloss=gloss), (normal, -frame.vector_to_eye(d)))
     there = si.other | si.sclera
     values = (shine, albedo * irradiance * dr.inv_pi, mi.Float(1 / _ACROSS**2))
     shine, matte, share = (dr.select(there, x, 0) for x in values)

@@ -22,6 +22,7 @@ from ...region.anatomy import Region
 from ...region.globe import Globe
 from ...region.limbus import upwards
 from ...region.look import Look
+from ...region.texture import film_ripples
 from ...rig.camera import PinholeCamera, Window
 from ...rig.imaging import Ambient, Lens
 from ...rig.light import Lamp
@@ -182,7 +183,13 @@ def parameters_of(job: RenderJob) -> Parameters:
             bulge=still.bulge,
             bulge_radius=still.bulge_radius,
         ),
-        sclera=ScleraParameters(sclera.centre_mm, sclera.radius_mm, look.sclera_albedo, look.sclera_contrast),
+        sclera=ScleraParameters(
+            centre=sclera.centre_mm,
+            radius=sclera.radius_mm,
+            albedo=look.sclera_albedo,
+            contrast=look.sclera_contrast,
+            ripples=film_ripples(look.iris_seed),
+        ),
         image=still.image,
         pose=PoseParameters((job.M[:, 0], job.M[:, 1], job.M[:, 2]), job.t - anchor),
         camera=CameraParameters(

@@ -93,14 +93,15 @@ class LimbusParameters:
     bulge_radius: Number
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ScleraParameters:
-    """The sclera: centre (3,) and radius of the sphere (mm), mean albedo and contrast of the texture."""
+    """The sclera: centre (3,) and radius (mm), mean albedo, contrast of the texture, slope of the film's ripples."""
 
     centre: Vector
     radius: Number
     albedo: Number
     contrast: Number
+    ripples: Number
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,11 +23,12 @@ from ...region.head import file_states
 from ...region.lids import FINE, ROWS
 from ...region.mapcache import kept
 from ...region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_ends
-from ...region.skin import SHEET_ROWS, skin_texels
+from ...region.skin import SHEET_ROWS, sheet_v, skin_texels
 from ..records.frame import aligned_copy
 from .background import clear_between, rays_between
 from .diffusiongrids import GRID_COLUMNS, GRID_ROWS
 
+_THIN_ROWS = 6.0  # rows of the sheet over which the conjunctiva reaches its full thickness
 SHEET_COLUMNS = COLUMNS + 1  # columns of the sheet's grid; the first column is repeated
 
 
@@ -81,7 +82,8 @@ class RegionScene:
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         mirror = -1.0 if globe.mirrored else 1.0
         inner = self._inner()
-        self.skin = SkinGeometry.of(look, posed.layout, mirror, inner, self._water)
+        thin = 0.0 if spec.skin.map == "off" else float(sheet_v(np.array(_THIN_ROWS / (ROWS - 1))))
+        self.skin = SkinGeometry.of(look, posed.layout, mirror, thin, inner, self._water)
         self.relief = {} if inner is None else _mean_slopes(pixels)
         self.sheet_faces = int(posed.layout.face_ends[0])
         self._records = np.zeros((len(posed.layout.uv), 8), np.float32)
@@ -222,6 +224,7 @@ class SkinGeometry:
         sheet: number of triangles of the sheet, which come first.
         film: number of the first triangle of the menisci.
         mirror: -1 for a left eye, else 1.
+        thin: coordinate v of the map at which the conjunctiva has its full thickness; 0 without a map.
     """
 
     map: Any
@@ -233,10 +236,17 @@ class SkinGeometry:
     sheet: mi.UInt32
     film: mi.UInt32
     mirror: mi.Float
+    thin: mi.Float
 
     @classmethod
     def of(
-        cls, look: mi.Texture2f, layout: RegionLayout, mirror: float, inner: Bools | None, water: mi.Scene | None
+        cls,
+        look: mi.Texture2f,
+        layout: RegionLayout,
+        mirror: float,
+        thin: float,
+        inner: Bools | None,
+        water: mi.Scene | None,
     ) -> SkinGeometry:
         """Copy the triangles of a region to the device.
 
@@ -244,6 +254,7 @@ class SkinGeometry:
             look: the map.
             layout: the triangles.
             mirror: -1 for a left eye, else 1.
+            thin: as the attribute.
             inner: which triangles of the sheet are away from its ends; None if it may not be a single surface.
             water: the menisci.
         """
@@ -254,6 +265,7 @@ class SkinGeometry:
         return cls(
             map=look, water=water, is_sheet=inner is not None, faces=mi.UInt32(aligned_copy(faces.ravel())),
             vertices=mi.Float(0), received=mi.Float(0), sheet=sheet, film=film, mirror=dr.opaque(mi.Float, mirror),
+            thin=dr.opaque(mi.Float, thin),
         )  # fmt: skip
 
     def corners(self, face: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f, mi.Bool]:
@@ -287,6 +299,14 @@ class SkinGeometry:
             u += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i, active).w
             v += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active).w
         return u, v
+
+    def own_share(self, v: mi.Float) -> mi.Float:
+        """Compute how much of the tissue at coordinates v of the map is the sheet's own, as opposed to the globe's.
+
+        Beside the globe, the conjunctiva begins as a clear film on the white of the eye.
+        """
+        s = dr.minimum(v / dr.maximum(self.thin, 1e-6), 1)
+        return s * s * (3 - 2 * s)
 
     def tilted(self, normal: mi.Vector3f, slope_y: mi.Float, slope_z: mi.Float) -> mi.Vector3f:
         """Tilt normals by a relief: n - (g - n (n . g)) for the slope g over the tangent plane of the normal n."""

@@ -23,7 +23,7 @@ from ..records.frame import Frame, aligned_copy, quotient
 from ..records.job import LampTable, RenderJob
 from ..records.recording import recorded, syntax
 from ..scene.diffusiongrids import SIDE, WIDTH, DiffusionGrids
-from ..scene.region import RegionScene, SkinGeometry
+from ..scene.region import SHEET_COLUMNS, RegionScene, SkinGeometry
 from .pyramid import Pyramid, level_of
 from .tissuegrids import GlobeGrid, SheetGrid, SheetMetric, SheetSize, globe_cells, globe_direction, globe_place
 from .tissuelight import TissueScene, light_on_globe, light_on_skin
@@ -118,12 +118,13 @@ def _diffused_light(
     frame = scene.frame
     lit, skin_seen = light_on_skin(scene, sheet)
     skin = spread_in_skin(sheet, frame.region, lit, thick)
-    lit, globe_seen = light_on_globe(scene, globe, sheet.size, skin)
+    lit, globe_seen = light_on_globe(scene, globe, sheet.size, lit, skin)
+    on_globe = spread_in_globe(globe, frame.sclera.radius, lit, thin)
     return DiffusedLight(
         size=sheet.size,
-        skin=skin,
+        skin=join_tissues(frame, sheet, skin, on_globe),
         skin_seen=skin_seen,
-        globe=spread_in_globe(globe, frame.sclera.radius, lit, thin),
+        globe=on_globe,
         globe_seen=globe_seen,
         lamps=dr.maximum(frame.lights.count, 1),
     )
@@ -201,6 +202,18 @@ def spread_in_globe(grid: GlobeGrid, radius_mm: mi.Float, irradiance: mi.Float, 
     lit = Pyramid.build(irradiance, side, side, closed=False)
     dr.scatter(light, _gather_on_globe(lit, grid.between, radius_mm, points), grid.between)
     return light
+
+
+def join_tissues(frame: Frame, grid: SheetGrid, skin: mi.Float, globe: mi.Float) -> mi.Float:
+    """Blend the light of the conjunctiva with that of the globe below it where it is thin; return that of the sheet."""
+    index, columns = grid.cells[0], grid.size.columns
+    row, column = index // columns, index % columns
+    across = (mi.Float(column) + 0.5) * ((SHEET_COLUMNS - 1) / mi.Float(columns))
+    x, _ = frame.region.sheet_point(grid.vertex_row(row, mi.Float(0.5)), across)
+    below = globe_cells(*globe_place(x - frame.point_to_scene(frame.sclera.centre))).interpolate(mi.Float, globe)
+    share = frame.region.own_share(grid.size.coordinate(mi.Float(row)))
+    dr.scatter(skin, below + share * (dr.gather(mi.Float, skin, index) - below), index)
+    return skin
 
 
 @syntax

@@ -27,7 +27,8 @@ from .radiosityfield import RadiosityField
 
 START_MM = 0.02  # above a surface, where rays begin
 SHUFFLED = 0x9E3779B1
-_TOUCHING_MM = 0.3  # a patch most of whose rays are stopped this near is covered
+# A patch is covered if most of its rays are stopped this near, or by the inner side of the skin above it.
+_TOUCHING_MM, _UNDER_MM = 0.3, 4.0
 
 
 @dataclass(kw_only=True)
@@ -184,9 +185,9 @@ def _meet(
     at = dr.select(view.met, frame.point_to_scene(view.point), 0)
     if frame.region is None:
         other, matte = _patch_on_background(frame, field, tables, view, at, s, t)
-        on_skin = mi.Bool(False)
+        on_skin = inner = mi.Bool(False)
     else:
-        other, matte, on_skin = _patch_on_skin(frame, tables, view, hit, d, s)
+        other, matte, on_skin, inner = _patch_on_skin(frame, tables, view, hit, d, s)
     column, row = field.globe_place(at)
     i, j = mi.UInt32(dr.clip(column + t, 0, field.columns - 1)), mi.UInt32(dr.clip(row + s, 0, field.rows - 1))
     through = view.cornea & (view.opacity < 0.5)
@@ -197,23 +198,25 @@ def _meet(
     back = dr.select(through, inside, dr.select(view.other & ~matte, 0, outer_albedo(frame, view)))
     back = dr.select(view.met, back, 0)
     dark = mi.Float(0) * o.x
+    near = dr.select(view.met, view.distance, 1e9) < dr.select(inner, _UNDER_MM, _TOUCHING_MM)
     return RayHits(
         target=dr.select(back > 0, target, 0), weight=back,
-        near=mi.Float(dr.select(view.met, view.distance, 1e9) < _TOUCHING_MM), open=active & ~view.met, sky=dark,
+        near=mi.Float(near), open=active & ~view.met, sky=dark,
         free=dark, on_skin=on_skin, point=view.point, normal=view.normal,
     )  # fmt: skip
 
 
 def _patch_on_skin(
     frame: Frame, tables: PatchTables, view: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f, s: mi.Float
-) -> tuple[mi.UInt32, mi.Bool, mi.Bool]:
-    """Return the hit patch of a region, whether it sends light back, and whether it is the sheet's outer side."""
+) -> tuple[mi.UInt32, mi.Bool, mi.Bool, mi.Bool]:
+    """Return the hit patch of a region, if it sends light back, and if it is the sheet's outer or inner side."""
     face = frame.region.face(hit)
     inner = frame.region.from_behind(face, hit.prim_uv, d, view.other)
     corner = frame.region.corner(face, hit.prim_uv, s, view.other)
     which = dr.gather(mi.Int32, tables.stands_for, 2 * corner + dr.select(inner, 1, 0), view.other)
     matte = view.other & (~inner | (which >= mi.Int32(tables.on_skin)))
-    return tables.on_globe + mi.UInt32(which), matte, view.other & ~inner & frame.region.on_sheet(face)
+    sheet = view.other & frame.region.on_sheet(face)
+    return tables.on_globe + mi.UInt32(which), matte, sheet & ~inner, sheet & inner
 
 
 def _patch_on_background(

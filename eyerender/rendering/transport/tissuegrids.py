@@ -65,6 +65,10 @@ class SheetSize:
         rows, columns = (mi.Float(n) for n in (self.rows, self.columns))
         return v * ((SHEET_ROWS + BANDS) / SHEET_ROWS) * rows - 0.5, u * columns - 0.5
 
+    def coordinate(self, row: mi.Float) -> mi.Float:
+        """Return the coordinate v of the map at rows; the inverse of `place`."""
+        return (row + 0.5) / mi.Float(self.rows) * (SHEET_ROWS / (SHEET_ROWS + BANDS))
+
     def cells(self, row: mi.Float, column: mi.Float, level: int) -> Bilinear:
         """Return cells of the grid reduced by 2^level, around positions in units of its finest cells."""
         rows, columns, scale = self.rows >> level, self.columns >> level, 1 / (1 << level)

@@ -148,23 +148,42 @@ def _lamp_on_skin(scene: TissueScene, grid: SheetGrid, cells: _Cells, i: mi.UInt
     return flux * share, free * share
 
 
-def light_on_globe(scene: TissueScene, grid: GlobeGrid, size: SheetSize, skin: mi.Float) -> tuple[mi.Float, mi.Float]:
+def light_on_globe(
+    scene: TissueScene, grid: GlobeGrid, size: SheetSize, lit: mi.Float, skin: mi.Float
+) -> tuple[mi.Float, mi.Float]:
     """Compute the irradiance of the globe's grid, and the share of each lamp that cells see.
+
+    Cells under the conjunctiva receive the light that falls on it, as if it were a part of the globe.
 
     Args:
         scene: the scene.
         grid: the grid.
         size: size of the grid over the skin.
-        skin: irradiance of that grid after diffusion in the skin.
+        lit: irradiance of that grid.
+        skin: the same after diffusion in the skin.
     """
     # Light through a lid varies slowly, so it is computed for two by two cells.
     coarse = dr.zeros(mi.Float, SIDE * SIDE // 4)
     dr.scatter(coarse, _through_lids(scene, grid.coarse, size, skin), grid.coarse)
     cells = dr.zeros(mi.Float, SIDE * SIDE)
     dr.scatter(cells, dr.gather(mi.Float, coarse, grid.over), grid.under)
-    lit, seen = _lamps_on_globe(scene, grid.between)
-    dr.scatter(cells, dr.gather(mi.Float, cells, grid.between) + lit, grid.between)
+    direct, seen = _lamps_on_globe(scene, grid.between)
+    covered, above = _on_sheet_above(scene, grid.between, size, lit)
+    total = dr.gather(mi.Float, cells, grid.between) + dr.select(covered, above, direct)
+    dr.scatter(cells, total, grid.between)
     return cells, seen
+
+
+def _on_sheet_above(scene: TissueScene, index: mi.UInt32, size: SheetSize, lit: mi.Float) -> tuple[mi.Bool, mi.Float]:
+    """Return which cells of the globe the sheet covers, and its irradiance `lit` above them."""
+    frame, skin = scene.frame, scene.frame.region
+    n = globe_direction(mi.Float(index // SIDE), mi.Float(index % SIDE))
+    start = frame.point_to_scene(_globe_surface(frame, n)[0])
+    hit = _next_surface(frame, start, n, mi.Float(0), mi.Bool(True))
+    face = skin.face(hit)
+    covered = hit.is_valid() & skin.on_sheet(face)
+    u, v = skin.map_place(face, hit.prim_uv, covered)
+    return covered, size.cells(*size.place(u, v), 0).interpolate(mi.Float, lit)
 
 
 @syntax
