@@ -55,6 +55,7 @@ class Condition:
     bit_depth: int = 8
     jpeg: tuple[int, int] | None = None  # range of the quality with which the image is compressed
     log_size: bool = False  # the semi-axis is drawn evenly in its logarithm
+    iris: tuple[float, float] | None = None  # radius over that of the pupil; None: 2.4
 
 
 CONDITIONS: dict[str, Condition] = {
@@ -168,7 +169,7 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
     iris_level = pupil_level + step
     sclera_level = min(2.0 * max(iris_level, 40.0), 200.0)
     a = float(np.exp(rng.uniform(*np.log(c.semi_axis)))) if c.log_size else pick(c.semi_axis)
-    reach = min(2.4 * a, 0.42 * height)
+    reach = min((2.4 if c.iris is None else pick(c.iris)) * a, 0.42 * height)
     spread = 0.12 * np.array([width, height])
     pupil = _Conic(
         np.array([(width - 1) / 2, (height - 1) / 2]) + rng.uniform(-spread, spread),
@@ -221,7 +222,7 @@ def draw(condition: str | Condition, seed: int) -> Drawing:
     parameters = {
         "condition": name, "seed": seed, "noise_dn": noise, "blur_px": blur, "step_dn": step, "texture_dn": texture,
         "pupil_level_dn": pupil_level, "lid": lid is not None, "visible_fraction": _visible(pupil, lid),
-        "bit_depth": c.bit_depth,
+        "bit_depth": c.bit_depth, "iris_px": float(iris.semi[1]),
         "pupil_contrast_to_noise": abs(step) / max(noise, 1e-9), "polarity": "bright" if c.bright_pupil else "dark",
     }  # fmt: skip
     return Drawing(stored, record, parameters)

@@ -1,9 +1,9 @@
 """Classification of fitted spots: which are glints, and why other reflections are not.
 
 A spot's features (background, distance from the pupil, shape and height) give a first logit of the probability that it
-is a glint of the cornea. The others are then compared with the likeliest one: reflections of one rig's lamps are about
-equally high and wide. The weights of both steps are maximum a-posteriori estimates (logistic regression) from
-development images, made by `scripts/fit_glints.py`.
+is a glint of the cornea. The others are then compared with the brightest likely one: reflections of one rig's
+lamps are about equally high and wide, and those in the tear menisci are smaller. The weights of both steps are maximum
+a-posteriori estimates (logistic regression) from development images, made by `scripts/fit_glints.py`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ BRIGHTEST = 1.4
 ROUND = math.log(2.0)  # elongation that LEDs have; it counts twice, so this is an oval of 1.4 : 1
 # A spot is accepted if it is a glint with at least these odds.
 LEAST_ODDS = 2.0
+WIDER = 0.5  # largest difference of the logarithms of widths that counts; bright glints are clipped far out
 LIKELIEST = 12.0  # largest logit that counts
 # Glints of one rig are alike: largest differences of the logarithms of light, width and form; how many of them count.
 ALIKE, MOST_ALIKE = (1.0, 0.3, 0.3), 3.0
@@ -41,14 +42,14 @@ GROUNDS = (
     "too faint for a glint",
     "dimmer than reflections of lamps are",
     "much fainter than the brightest glint, as highlights of skin and lid margins are",
-    "not as wide as the likeliest glint",
+    "not as wide as the brightest glint",
 )
 # Features of an unambiguous glint, in the order of the reasons.
 USUAL = (0.0, 0.0, 0.0, 0.0, math.log(10.0), 1.0)
 
 # Made by scripts/fit_glints.py: weights of the features and 1, and of the comparison.
-FIRST = np.array([-1.75, -2.86, 0.952, -6.06, 1.91, 2.83, 3.82, -3.34])
-SECOND = np.array([0.897, 0.769, 3.1, -2.2, 0.367, 0.996])
+FIRST = np.array([-2.98, -1.97, 0.254, -4.07, 1.63, 2.17, 3.73, -2.95])
+SECOND = np.array([0.778, 0.687, 2.67, -3.11, 0.536, 1.07])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,12 +139,13 @@ def features(fit: SpotFit, eye: Eye) -> Floats:
     return np.stack(columns, axis=1)
 
 
-def compared(fit: SpotFit, logit: Floats, top_dn: float) -> Floats:
+def compared(fit: SpotFit, logit: Floats, odds: Floats, top_dn: float) -> Floats:
     """Compute the features (n, 6) of spots for the second logit.
 
-    They are the first logit; whether the spot is not the likeliest one, and if so, the logarithms of its visible light
-    (height times width) over that of the brightest glint and of its visible width over the likeliest one's; the
-    expected number of glints among other similar spots; and 1.
+    They are the first logit; whether the spot is not the reference, and if so, the logarithms of its visible light
+    (height times width) and of its visible width over those of the reference; the expected number of glints among
+    other similar spots; and 1. The reference is the brightest of the spots that are rather glints than not: it is
+    brighter than ghosts of the lens and the lamps' images in the tear menisci.
 
     The flanks of a clipped spot determine its height badly, so only the visible part counts: the height up to `top_dn`,
     and the width from the area above half of it, 2 pi sigma^2 ln(A / (h / 2)) for a Gaussian.
@@ -151,23 +153,23 @@ def compared(fit: SpotFit, logit: Floats, top_dn: float) -> Floats:
     Args:
         fit: the n spots.
         logit: (n,) the first logit.
+        odds: (n,) logit by which similar spots count; the first one at first, then the second.
         top_dn: level at which the sensor clips.
     """
-    best = int(np.argmax(logit))
     visible = np.minimum(fit.amplitude_dn, np.maximum(top_dn - fit.background_dn, 1.0))
     wide2 = (fit.sigma_px**2 + PIXEL).prod(axis=1) ** 0.5 * (1.0 + np.log2(fit.amplitude_dn / visible))
     light, width = np.log(np.maximum(visible * np.sqrt(wide2), 1e-3)), 0.5 * np.log(wide2)
     form = 0.5 * np.log((fit.sigma_px[:, 0] ** 2 + PIXEL) / (fit.sigma_px[:, 1] ** 2 + PIXEL))
     near = (np.abs(one[:, None] - one) < most for one, most in zip((light, width, form), ALIKE, strict=True))
     alike = np.logical_and.reduce(list(near)) & ~np.eye(logit.size, dtype=bool)
-    top = light[logit > 0.0].max(initial=float(light[best]))
+    best = int(np.argmax(np.where(logit >= min(0.0, logit.max()), light, -np.inf)))
     other = (np.arange(logit.size) != best) / (1.0 + math.exp(-float(np.clip(logit[best], -30.0, 30.0))))
     columns = (
         np.clip(logit, -LIKELIEST, LIKELIEST),
         other,
-        other * np.clip(light - top, -4.0, 0.0),
-        other * np.minimum(np.abs(width - width[best]), 1.0),
-        np.minimum(alike @ (1.0 / (1.0 + np.exp(-np.clip(logit, -30.0, 30.0)))), MOST_ALIKE),
+        other * np.clip(light - light[best], -4.0, 0.0),
+        other * np.minimum(np.abs(width - width[best]), WIDER),
+        np.minimum(alike @ (1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0)))), MOST_ALIKE),
         np.ones(logit.size),
     )
     return np.stack(columns, axis=1)
@@ -182,7 +184,8 @@ def _objections(fit: SpotFit, eye: Eye) -> list[str | None]:
     fit = fit.taken(index)
     first = features(fit, eye)
     logit = first @ FIRST
-    second = compared(fit, logit, eye.clip_dn)
+    second = compared(fit, logit, logit, eye.clip_dn)
+    second = compared(fit, logit, second @ SECOND, eye.clip_dn)
     glint = second @ SECOND > math.log(LEAST_ODDS)
     against = np.concatenate([(first[:, :6] - USUAL) * FIRST[:6] * SECOND[0], second[:, 2:4] * SECOND[2:4]], axis=1)
     sharp = fit.sigma_px.max(axis=1) < 0.5 * optics_sigma(eye.blur_px)

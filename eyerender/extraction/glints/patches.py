@@ -27,6 +27,7 @@ BRIGHT = ((0.6, 2, 5, 8), (0.92, 1, 2, 24))
 LONGEST = 2.0  # longest side of a patch in semi-axes b of the pupil, its smear included
 HEAD = 0.8  # of the radius of the largest disc in a patch; smear along rows or columns of the sensor is narrower
 OUTLINE = (0.5, 0.75)  # shares of the height that outline a patch; the second parts patches that touch
+SOLID = 0.85  # least area of an outline over that of its convex hull, unless patches touch
 USUAL_PX = 2  # half the side of a spot whose fit failed
 POOR = 0.1  # residual, as a share of the visible height, with which a Gaussian does not describe a clipped spot
 _AREA = 2.0 * math.pi * math.log(2.0)  # area of a Gaussian above half its height, in sigma^2
@@ -91,8 +92,11 @@ def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -
     seed = y + top - rows.start, x + left - columns.start
     ground = median(np.concatenate([window[0], window[-1], window[:, 0], window[:, -1]]))
     height = float(window[seed]) - ground
-    outlined = (_outlined(window, ground + share * height, seed) for share in OUTLINE)
-    core = next((one for one in outlined if one is not None), None)
+    core, solid = None, False
+    for share in OUTLINE:
+        if not solid and (one := _outlined(window, ground + share * height, seed)) is not None:
+            solid = _solid(one)
+            core = one if solid or core is None else core
     if core is None or height <= 0.0 or known[seed]:
         return None
     known[cv2.dilate(core, np.ones((3, 3), np.uint8)) > 0] = number
@@ -128,6 +132,12 @@ def _outlined(window: Image, level: float, seed: tuple[int, int]) -> Bytes | Non
         return None
     outline, _ = cv2.findContours(core, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return np.asarray(cv2.drawContours(core, outline, -1, 1, cv2.FILLED))
+
+
+def _solid(core: Bytes) -> bool:
+    """Return whether the outline of a mask (h, w) is nearly convex; that of two patches that touch is not."""
+    outline = cv2.findContours(core, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0][0]
+    return cv2.contourArea(outline) >= SOLID * cv2.contourArea(cv2.convexHull(outline))
 
 
 def _head(core: Bytes) -> Bytes:
