@@ -102,7 +102,7 @@ class RayEngine:
                 try:
                     kind, *message = ours.recv()
                 except (EOFError, OSError):
-                    wait([process.sentinel], timeout=10)
+                    process.join(10)
                     raise EyerenderError(end_of(process.exitcode, "Ray's driver")) from None
                 if kind == "end":
                     return dict(message[0])

@@ -117,8 +117,9 @@ def test_sigterm_ends_a_run_on_ray_like_an_interrupt(started, tiny):
     assert err.splitlines()[-1] == "interrupted"
     assert all(line.startswith(("generating: ", "interrupted")) or "are finished" in line for line in err.splitlines())
     assert processes(3, driver) == []
-    assert not list(folder.glob(".partial-*"))
+    # A slow actor may have stored a checkpoint of its shard.
     assert make(folder, plan())["complete"]
+    assert not list(folder.glob(".partial-*"))
     assert tree(folder) == tree(tiny)
 
 
