@@ -27,7 +27,8 @@ def test_the_grid_gives_the_light_of_exact_paths(renderer, model, name):
     shown, _ = renderer.bind(job)
     grid = shown.frame.caches.iris
     places = mi.Vector3f(*x.astype(np.float32).T)
-    found, left = (k.numpy() for k in grid.at(shown.frame, places, behind(shown.frame.surfaces[-1], places)))
+    middle, reached = (mi.Float(0), mi.Float(0), mi.Float(1)), behind(shown.frame.surfaces[-1], places)
+    found, left = (k.numpy() for k in grid.at(shown.frame, places, middle, reached))
     lacked = left[left != ALL, None] >> np.arange(len(job.lights)) & 1
     assert np.mean(left == ALL) < 0.05  # before the back of the cornea
     assert np.mean(lacked) < 0.02  # where lamps set

@@ -47,7 +47,7 @@ class IrradianceGrid:
     @syntax
     def build(
         cls, side: int, nodes: mi.Float, lamps: mi.UInt32, *, more: mi.Float | None = None, held: Held | None = None
-    ) -> tuple[IrradianceGrid, mi.UInt32]:
+    ) -> tuple[IrradianceGrid, mi.UInt32, mi.UInt32]:
         """Build a grid from the irradiance of its nodes.
 
         Args:
@@ -56,10 +56,11 @@ class IrradianceGrid:
             lamps: number of lamps, on the device.
             more: additional, slowly varying light at the nodes, which does not decide what a cell holds; evaluated.
             held: called with a lamp, a cell and the allowed third difference where cubic interpolation is too
-                inaccurate; returns whether the caller holds this lamp's light in another way.
+                inaccurate or a node unknown; returns whether the caller holds this lamp's light in another way.
 
         Returns:
-            The grid, and a bit mask per cell of the lamps that the caller holds.
+            The grid, a bit mask per cell of the lamps that the caller holds, and one of those that are known at all
+            nodes around the cell.
         """
         cell = dr.arange(mi.UInt32, side * side)
         row = cell // side
@@ -69,7 +70,8 @@ class IrradianceGrid:
         usual = _sum_of_lamps(nodes, lamps, cell, side) / mi.Float(lamps)
         # Separate arrays for each, because Dr.Jit writes the results of the loop into them.
         none, dark = mi.UInt32(0) * cell, mi.Float(0) * mi.Float(cell)
-        k, left, elsewhere, sums = mi.UInt32(0), mi.UInt32(none), mi.UInt32(none), [mi.Float(dark) for _ in around]
+        k, left, elsewhere, known = mi.UInt32(0), *(mi.UInt32(none) for _ in range(3))
+        sums = [mi.Float(dark) for _ in around]
         while dr.hint(k < lamps, label="cells", exclude=[cls, side, nodes, around, more, held]):
             values = [dr.gather(mi.Float, nodes, k * side**2 + node) for node in around]
             bent, least, most = unevenness(values)
@@ -79,18 +81,19 @@ class IrradianceGrid:
             bit = mi.UInt32(1) << k
             left |= dr.select(good | kept, 0, dr.select(many, ALL, bit))
             elsewhere |= dr.select(kept, bit, 0)
+            known |= dr.select(least >= 0, bit, 0)
             sums = _sum(sums, [dr.select(good, value, 0) for value in values])
             k += 1
         left = dr.select(within, left, ALL)
         if dr.hint(more is not None, mode="scalar"):
             sums = _sum(sums, [dr.gather(mi.Float, more, node) for node in around])
         sums = [dr.select(within & ~(many & (left != 0)), total, 0) for total in sums]
-        dr.eval(sums, left, elsewhere)
+        dr.eval(sums, left, elsewhere, known)
         cells = dr.zeros(mi.Float, 16 * side**2)
         for n in range(4):
             dr.scatter(cells, mi.Vector4f(*sums[4 * n : 4 * n + 4]), 4 * cell + n)
         dr.eval(cells)
-        return cls(side=side, cells=cells, left=left), elsewhere
+        return cls(side=side, cells=cells, left=left), elsewhere, known
 
     def place(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> Place:
         """Return the grid places of points given in units of the node spacing."""

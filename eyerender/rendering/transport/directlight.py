@@ -175,9 +175,11 @@ def irradiance_through_cornea(
     """
     wanted = inside & behind((surfaces or frame.surfaces)[-1], inner)
     cached, count = frame.caches.iris, frame.lights.count
-    total, left = (mi.Float(0), mi.UInt32(ALL)) if cached is None else cached.at(frame, inner, wanted)
     many = count > BITS
     sine, cosine = dr.sincos(v * (2 * dr.pi))
+    total, left = mi.Float(0), mi.UInt32(ALL)
+    if dr.hint(cached is not None, mode="scalar"):
+        total, left = cached.at(frame, inner, (u, sine, cosine), wanted)
     # Of the lamps whose light is unknown, the next one is at the lowest set bit; without bits the number is too high.
     i = dr.select(left == 0, count, dr.select(many, 0, dr.tzcnt(left)))
     failures = mi.UInt32(0)
@@ -227,6 +229,14 @@ def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
     return met & (t < away + ahead_mm)
 
 
+def image_of(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
+    """Return the Gaussian images of points behind the cornea, near the stop, as seen from outside (eye frame).
+
+    A straight line from a lamp must aim there to be refracted to the point.
+    """
+    return mi.Vector3f(x.x + frame.image.shift, x.y * frame.image.scale, x.z * frame.image.scale)
+
+
 def on_relief(frame: Frame, view: SurfaceInteraction) -> SurfaceInteraction:
     """Return the view with the points where the rays meet the iris relief, as their feet in its plane."""
     if frame.caches.relief is None:
@@ -273,10 +283,7 @@ class LampPath:
 
         `ahead_mm` is as for `connect`.
         """
-        # This is the point's Gaussian image: a straight line from a lamp must aim there to be refracted to the point.
-        scale, shift = frame.image.scale, frame.image.shift
-        aim = mi.Vector3f(inner.x + shift, inner.y * scale, inner.z * scale)
-        target = Target(inner, frame.stop.normal if normal is None else normal, aim)
+        target = Target(inner, frame.stop.normal if normal is None else normal, image_of(frame, inner))
         path = connect(surfaces or frame.surfaces, source, target, frame.limbus.radius, active, ahead_mm=ahead_mm)
         out = limbal_radius(frame, frame.surfaces[0].point_in(path.entry))
         clear = 1 - opacity(frame, out)

@@ -70,8 +70,8 @@ class GlobeIrradiance:
         on_plane = _from_lamps(frame, points, seen, normal, sphere=yes, cornea=yes)
         dr.eval(on_globe, more, on_plane)
         one = dr.opaque(mi.UInt32, 1)  # the sum over the lamps stands for a single one
-        globe, _ = IrradianceGrid.build(_SIDE, on_globe, one, more=more)
-        plane, _ = IrradianceGrid.build(_SIDE, on_plane, one)
+        globe, *_ = IrradianceGrid.build(_SIDE, on_globe, one, more=more)
+        plane, *_ = IrradianceGrid.build(_SIDE, on_plane, one)
         return cls(globe=globe, plane=plane, reach=reach)
 
     @syntax

@@ -1,11 +1,10 @@
 """Lamp light on the iris, on a grid in its plane that is filled once per frame (see `irradiancegrid`).
 
-A cell lacks a lamp if anything blocks it at one of the surrounding nodes. With an eye region, the nodes must also be
-far from all hairs and lids as seen from the lamp (`shadowmaps`), so that no occluder falls between them.
-
-The rim of the cornea turns opaque within a millimetre. Where light passes the rim, a cell holds the irradiance behind a
-clear rim and the radius at which the light enters; both vary slowly. Every sample then applies the transmittance of the
-rim.
+Two things make the light of a lamp uneven. Behind the rim of the cornea, which turns opaque within a millimetre, and in
+shadows, a cell holds the path of the light instead: the irradiance if nothing blocked it, and where it enters the
+cornea. Both vary slowly. Every sample then applies the transmittance of the rim, and asks one ray whether its path is
+free. It asks in cells where something may hide the lamp from a surrounding node; with an eye region, also where hairs
+or lids are near the paths as seen from the lamp (`shadowmaps`), so that no occluder falls between nodes.
 
 A small lamp is represented by its middle, a larger one by four points whose mean is exact to third order in its radius.
 For large and near lamps there is no grid.
@@ -18,16 +17,18 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..materials.albedo import STEEPEST, opacity
-from ..records.frame import BITS, Frame
-from ..records.irradiancegrid import BENT, IrradianceGrid, unevenness
+from ..materials.albedo import STEEPEST, limbal_radius, opacity
+from ..records.frame import BITS, Frame, Lamp
+from ..records.irradiancegrid import BENT, IrradianceGrid, Place, unevenness
 from ..records.recording import syntax
-from .directlight import LampPath, behind
+from .directlight import LampPath, behind, image_of, lamp_blocked
 
 _SIDE = 68
 _NODES = _SIDE * _SIDE
+_NUMBERS = 3  # that describe a path
 _SPARE_MM = 0.45  # margin beyond the root of the iris: two cells
-_STEADY = 0.02  # like BENT, of the light that enters: without shadow edges, the error of cubics is a hundredth of it
+_STEADY = 0.06  # like BENT, of the light that enters: without shadow edges, the error of cubics is a hundredth of it
+_SAME = 0.004  # largest difference between the light of several paths and that of their mean path, over the light
 _AHEAD_MM = 1.0  # distance in front of the back of the cornea, within which nodes continue the light behind it
 
 
@@ -36,14 +37,15 @@ class IrisIrradiance:
     """Irradiance of the lamps in the plane of the iris.
 
     Attributes:
-        grid: irradiance of the lamps that the rim does not attenuate.
-        behind_rim: bit mask per cell of lamps whose light passes the rim of the cornea.
-        paths: for these lamps, the irradiance behind a clear rim at four nodes in a row, and the radii (mm) where the
-            light enters.
+        grid: irradiance of the lamps that neither the rim nor anything else attenuates.
+        by_path: bit mask per cell of the other lamps whose paths are known.
+        clear: bit mask per cell of lamps that nothing hides.
+        paths: `_Path` of each lamp at four nodes in a row, number by number.
     """
 
     grid: IrradianceGrid
-    behind_rim: mi.UInt32
+    by_path: mi.UInt32
+    clear: mi.UInt32
     paths: mi.Float
 
     @classmethod
@@ -56,44 +58,78 @@ class IrisIrradiance:
             points: number of points that represent a lamp.
         """
         if not lamps:
-            none = dr.zeros(mi.UInt32, _NODES)
-            dr.make_opaque(none)
-            return cls(grid=IrradianceGrid.unknown(_SIDE), behind_rim=none, paths=dr.zeros(mi.Float, 8))
+            none, clear = dr.zeros(mi.UInt32, _NODES), dr.zeros(mi.UInt32, _NODES)
+            dr.make_opaque(none, clear)
+            unknown = IrradianceGrid.unknown(_SIDE)
+            return cls(grid=unknown, by_path=none, clear=clear, paths=dr.zeros(mi.Float, 4 * _NUMBERS))
         index = dr.arange(mi.UInt32, _NODES * lamps)
         lamp = index // _NODES
-        lit, *paths = _at_nodes(frame, points, lamp, index - lamp * _NODES)
-        dr.eval(lit, paths)
-        rows = _four_in_a_row(paths, min(lamps, BITS), frame.lights.count)
+        lit, *path = _at_nodes(frame, points, lamp, index - lamp * _NODES)
+        dr.eval(lit, path)
+        rows = _four_in_a_row(path, min(lamps, BITS), frame.lights.count)
 
-        def steady_behind_rim(k: mi.UInt32, cell: mi.UInt32, allowed: mi.Float) -> mi.Bool:
+        def steady(k: mi.UInt32, cell: mi.UInt32, allowed: mi.Float) -> mi.Bool:
             four = [_rows(rows, k * _NODES + cell + n * _SIDE - _SIDE) for n in range(4)]
-            whole, out = ([value for row in four for value in row[m]] for m in (0, 1))
+            whole, *entry = ([value for row in four for value in row[m]] for m in range(_NUMBERS))
             bent, least, most = unevenness(whole)
-            steep = unevenness(out)[0] * most * STEEPEST * frame.limbus.gain
-            return (least > 0) & (bent + steep <= _STEADY / BENT * allowed)
+            steep = sum(unevenness(values)[0] for values in entry) * most * STEEPEST * frame.limbus.gain
+            return (least >= 0) & (bent + steep <= _STEADY * dr.maximum(most, allowed / BENT))
 
-        grid, behind_rim = IrradianceGrid.build(_SIDE, lit, frame.lights.count, held=steady_behind_rim)
-        return cls(grid=grid, behind_rim=behind_rim, paths=rows)
+        grid, by_path, clear = IrradianceGrid.build(_SIDE, lit, frame.lights.count, held=steady)
+        return cls(grid=grid, by_path=by_path, clear=clear, paths=rows)
 
     @syntax
-    def at(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32]:
-        """Interpolate the irradiance (mW/mm^2) at points of the iris plane (eye frame); also return missing lamps."""
+    def at(
+        self, frame: Frame, x: mi.Vector3f, spot: tuple[mi.Float, mi.Float, mi.Float], active: mi.Bool
+    ) -> tuple[mi.Float, mi.UInt32]:
+        """Interpolate the irradiance (mW/mm^2) at points of the iris plane (eye frame); also return missing lamps.
+
+        `spot` is the position on each lamp's disc as for `Lamp.point`.
+        """
         q = x - frame.stop.centre
         scale = 0.5 * (_SIDE - 1) / _half(frame)
         u, v = (dr.dot(q, axis) * scale + 0.5 * (_SIDE - 1) for axis in (frame.stop.u, frame.stop.v))
         place = self.grid.place(u, v, active)
         total, left = self.grid.at(place)
-        lamps = dr.gather(mi.UInt32, self.behind_rim, place.cell, place.inside)
-        while dr.hint(lamps != 0, label="behind the rim", exclude=[self, frame, place]):
-            whole, out = mi.Float(0), mi.Float(0)
-            first = dr.tzcnt(lamps) * _NODES + place.cell
-            for k in range(4):
-                a, b = _rows(self.paths, first + k * _SIDE - _SIDE)
-                whole += place.down[k] * dr.dot(place.across, a)
-                out += place.down[k] * dr.dot(place.across, b)
+        lamps = dr.gather(mi.UInt32, self.by_path, place.cell, place.inside)
+        clear = dr.gather(mi.UInt32, self.clear, place.cell, place.inside)
+        while dr.hint(lamps != 0, label="by path", exclude=[self, frame, x, spot, place, clear]):
+            number = dr.tzcnt(lamps)
+            lit, entry = self._path(frame, number, place)
+            shaded = ((clear >> number) & 1) == 0
+            blocked = _blocked(frame, frame.lights[number], x, entry, spot, shaded & (lit > 0))
+            total += dr.select(blocked, 0, lit)
             lamps &= lamps - 1
-            total += whole * (1 - opacity(frame, out))
         return total, left
+
+    def _path(self, frame: Frame, lamp: mi.UInt32, place: Place) -> tuple[mi.Float, mi.Vector3f]:
+        """Interpolate the irradiance of a lamp if nothing but the rim attenuates it, and where its light enters."""
+        first, numbers = lamp * _NODES + place.cell, [mi.Float(0) for _ in range(_NUMBERS)]
+        for k in range(4):
+            rows = _rows(self.paths, first + k * _SIDE - _SIDE)
+            numbers = [n + place.down[k] * dr.dot(place.across, row) for n, row in zip(numbers, rows, strict=True)]
+        whole, y, z = numbers
+        local, front = mi.Vector3f(0, y, z), frame.surfaces[0]
+        lit = whole * (1 - opacity(frame, limbal_radius(frame, local)))
+        return lit, front.on_surface(front.vector_out(local) + front.origin)[0]
+
+
+@syntax
+def _blocked(
+    frame: Frame, lamp: Lamp, x: mi.Vector3f, entry: mi.Vector3f, spot: tuple[mi.Float, mi.Float, mi.Float],
+    asked: mi.Bool,
+) -> mi.Bool:  # fmt: skip
+    """Return whether anything blocks the path from a spot of a lamp to points x, where `asked`.
+
+    The path from the lamp's middle enters the cornea at `entry`. Paths from other spots meet it at the image of x.
+    """
+    blocked = mi.Bool(False)
+    if dr.hint(asked, exclude=[frame, lamp, x, entry, spot]):
+        source = lamp.point(*spot)
+        behind_entry, before = dr.norm(image_of(frame, x) - entry), dr.norm(lamp.position - entry)
+        start = entry + (source - lamp.position) * (behind_entry / (behind_entry + before))
+        blocked = lamp_blocked(frame, start, source, True, False, True)
+    return blocked
 
 
 def _half(frame: Frame) -> mi.Float:
@@ -101,52 +137,57 @@ def _half(frame: Frame) -> mi.Float:
     return frame.iris.root_radius + _SPARE_MM
 
 
-def _four_in_a_row(paths: list[mi.Float], lamps: int, count: mi.UInt32) -> mi.Float:
-    """Arrange irradiances behind a clear rim, and radii of entry, for each node and the next three."""
+def _four_in_a_row(path: list[mi.Float], lamps: int, count: mi.UInt32) -> mi.Float:
+    """Arrange the numbers of paths for each node and the next three."""
     index = dr.arange(mi.UInt32, _NODES * lamps)
-    rows = dr.zeros(mi.Float, 8 * _NODES * lamps)
+    rows = dr.zeros(mi.Float, 4 * _NUMBERS * _NODES * lamps)
     last = mi.Int32(dr.minimum(count, BITS) * _NODES) - 1
-    for n, path in enumerate(paths):
-        four = (dr.gather(mi.Float, path, mi.UInt32(dr.clip(mi.Int32(index) + k, 0, last))) for k in range(-1, 3))
-        dr.scatter(rows, mi.Vector4f(*four), 2 * index + n)
+    for n, number in enumerate(path):
+        four = (dr.gather(mi.Float, number, mi.UInt32(dr.clip(mi.Int32(index) + k, 0, last))) for k in range(-1, 3))
+        dr.scatter(rows, mi.Vector4f(*four), _NUMBERS * index + n)
     dr.eval(rows)
     return rows
 
 
-def _rows(paths: mi.Float, node: mi.UInt32) -> tuple[mi.Vector4f, mi.Vector4f]:
-    """Read irradiances behind a clear rim at nodes and the next three, and the radii of entry."""
-    return dr.gather(mi.Vector4f, paths, 2 * node), dr.gather(mi.Vector4f, paths, 2 * node + 1)
+def _rows(paths: mi.Float, node: mi.UInt32) -> list[mi.Vector4f]:
+    """Read each number of the paths at nodes and the next three."""
+    return [dr.gather(mi.Vector4f, paths, _NUMBERS * node + n) for n in range(_NUMBERS)]
 
 
 @syntax
-def _at_nodes(frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Compute the irradiance of lamps i at nodes, that behind a clear rim, and the radius (mm) of entry.
+def _at_nodes(
+    frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+    """Compute the irradiance of lamps i at nodes, and their paths.
 
-    Irradiances are negative where anything may hide the lamps, or a path was not found; behind a clear rim also for
-    lamps with several points.
+    The irradiance is negative where anything may hide the lamp, or a path was not found. Three numbers describe a path:
+    the irradiance if nothing blocked it, negative where it is unknown, and (y, z) where it enters the front surface, in
+    its frame. The paths of several points are replaced by their mean, unless the rim attenuates that otherwise.
     """
-    half, lamp = _half(frame), frame.lights[i]
+    half, lamp, front = _half(frame), frame.lights[i], frame.surfaces[0]
     row = node // _SIDE
     column = node - row * _SIDE
     a, b = (half * (mi.Float(k) * (2 / (_SIDE - 1)) - 1) for k in (column, row))
     x = frame.stop.centre + a * frame.stop.u + b * frame.stop.v
     within = (a * a + b * b < dr.square(half)) & behind(frame.surfaces[-1], x, _AHEAD_MM)
-    k, total, whole, out, hidden = mi.UInt32(0), mi.Float(0), mi.Float(-1), mi.Float(0), mi.Bool(False)
-    while dr.hint(within & (k < points), label="grid of the iris", exclude=[frame, lamp]):
+    k, total, gain, whole, entry, hidden = mi.UInt32(0), *(mi.Float(0) for _ in range(3)), mi.Vector3f(0), ~within
+    unknown = mi.Bool(hidden)
+    while dr.hint(within & (k < points), label="grid of the iris", exclude=[frame, lamp, front]):
         path = LampPath.find(frame, lamp, lamp.node(k, points), x, within, ahead_mm=_AHEAD_MM)
-        shadow, usable = _shadow(frame, i, path)
+        hidden |= path.failed | (path.enters & (path.blocked | ~_free(frame, i, path)))
+        unknown |= path.failed
         total += dr.select(path.blocked, 0, path.gain)
-        whole = dr.select(usable & (points == 1), path.whole, -1)
-        out = mi.Float(path.out)
-        hidden |= shadow
+        gain += path.gain
+        whole += path.whole
+        entry += front.point_in(path.entry)
         k += 1
-    hidden |= ~within
-    return dr.select(hidden, -1, total / mi.Float(points)), dr.select(hidden, -1, whole), out
+    each = dr.rcp(mi.Float(points))
+    entry *= each
+    unknown |= dr.abs(whole * (1 - opacity(frame, limbal_radius(frame, entry))) - gain) > _SAME * whole
+    return dr.select(hidden, -1, total * each), dr.select(unknown, -1, whole * each), entry.y, entry.z
 
 
-def _shadow(frame: Frame, lamp: mi.UInt32, path: LampPath) -> tuple[mi.Bool, mi.Bool]:
-    """Return whether a path is in, near or possibly in a shadow, and whether a clear rim would let it pass."""
-    if frame.caches.shadow_maps is None:
-        return path.failed, ~path.blocked
-    free = frame.caches.shadow_maps.at(lamp, frame.point_to_scene(path.entry), path.whole > 0)
-    return path.failed | (path.enters & (path.blocked | ~free)), ~path.blocked & free
+def _free(frame: Frame, lamp: mi.UInt32, path: LampPath) -> mi.Bool:
+    """Return whether the shadow maps, if there are any, exclude anything near a path in front of the eye."""
+    maps = frame.caches.shadow_maps
+    return mi.Bool(True) if maps is None else maps.at(lamp, frame.point_to_scene(path.entry), path.whole > 0)

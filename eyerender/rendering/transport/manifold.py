@@ -23,6 +23,7 @@ from ..records.recording import syntax
 from ..records.surfaces import Bundle, Surface
 
 MAX_STEPS = 48
+_DARK_STEPS = 20  # the same for paths that have crossed the horizon; of those found at all, one of 20,000 takes over 16
 TOLERANCE_MM = 1e-4  # changes the irradiance by less than 1e-4 of itself; float32 reaches about 1e-6 mm
 _STANDOFF_MM = 15.0
 _STEP_MM = 2.5
@@ -107,7 +108,7 @@ def connect(
         local = front.point_in(y)
         out = local.y * local.y + local.z * local.z > dr.square(reach + 1)
         dark |= on & (over | out)
-        on &= ~done & (steps < MAX_STEPS)
+        on &= ~done & (steps < dr.select(dark, _DARK_STEPS, MAX_STEPS))
         last = dr.select(on & ~over, y, last)
         y = dr.select(on, after, y)
     found = mi.Bool(active) & (transfer > 0)
