@@ -53,17 +53,17 @@ class _Next:
 
 @recorded
 def _grids_behind_cornea(
-    frame: Frame, shape: ReliefShape | None, side: mi.UInt32, points: mi.UInt32, factors: mi.Float | None,
-    lamps: int | None, relief: tuple[int, int],
+    frame: Frame, shape: ReliefShape | None, side: mi.UInt32, points: tuple[mi.UInt32, mi.UInt32],
+    factors: mi.Float | None, lamps: int | None, relief: tuple[int, int],
 ) -> tuple[IrisIrradiance | None, IrisRelief, FundusIrradiance]:  # fmt: skip
     """Fill the irradiance grids behind the cornea: on the iris, on its relief, and on the fundus.
 
     The grid on the iris holds the light of `lamps` lamps; None: there is none. The numbers of `relief` are those of its
-    nodes, and of the points on all lamps that light it.
+    nodes, and of the points on all lamps that light it. A lamp has `points` on the iris and on the relief.
     """
     pupil = FundusIrradiance.build(frame, factors)
-    on_iris = None if lamps is None else IrisIrradiance.build(frame, lamps, points)
-    return on_iris, IrisRelief.build(frame, shape, side, points, relief), pupil
+    on_iris = None if lamps is None else IrisIrradiance.build(frame, lamps, points[0])
+    return on_iris, IrisRelief.build(frame, shape, side, points[1], relief), pupil
 
 
 class FrameBuilder:
@@ -180,12 +180,13 @@ class FrameBuilder:
         iris_px = 2 * float(job.eye.iris_root_radius_mm) * float(job.camera.scale_at(job.t))
         worthwhile = lamps.gridded and iris_px > _FEWEST_PX
         on_grid = (len(lamps) if worthwhile else 0) if gridded else None
-        relief = size.side**2, lamps.points * max(len(lamps), 1)
+        relief = size.side**2, lamps.points_on_relief * max(len(lamps), 1)
         factors = host.returned.factors
         sent_factors = upload_array(factors) if len(lamps) and factors.any() else None
         caches = frame.caches
+        points = dr.opaque(mi.UInt32, lamps.points), dr.opaque(mi.UInt32, lamps.points_on_relief)
         caches.iris, caches.relief, caches.fundus = _grids_behind_cornea(
-            frame, shape, side, dr.opaque(mi.UInt32, lamps.points), sent_factors, on_grid, relief
+            frame, shape, side, points, sent_factors, on_grid, relief
         )
 
     def _host_data(self, job: RenderJob) -> tuple[HostData, Background | RegionScene]:

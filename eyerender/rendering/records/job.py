@@ -43,7 +43,7 @@ from .parameters import (
 
 _SENSOR, _LOOK, _LENS, _AMBIENT = Sensor(), Look(), Lens(), Ambient()
 _SUN_MM = 1e6
-_POINT_LIKE, _LARGE = 0.015, 0.25  # radius of a lamp over its distance
+_POINT_LIKE, _NARROW, _LARGE = 0.015, 0.05, 0.25  # radius of a lamp over its distance
 _PANEL_PARTS = 4  # parts of a panel along each side
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
@@ -354,6 +354,11 @@ class LampTable(ArrayValue):
     def points(self) -> int:
         """Number of points that represent each lamp at grid nodes: its middle, or four around it."""
         return 1 if self.widest < _POINT_LIKE and not np.any(self.rows[:, 9] > 0) else 4
+
+    @property
+    def points_on_relief(self) -> int:
+        """The same for the relief of the iris, whose own shadows are softer than those of all but wide lamps."""
+        return 1 if self.widest < _NARROW else 4
 
     @property
     def gridded(self) -> bool:
