@@ -44,7 +44,7 @@ def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, spots
         spots: the spots.
         fit: their fits.
     """
-    columns, rows = around(ellipse, reach_px, prepared.linear.shape)
+    columns, rows = around(ellipse.centre_px, reach_px, prepared.linear.shape)
     crop, corner = prepared.linear[rows, columns], np.array([columns.start, rows.start])
     fit = replace(fit, xy_px=np.where(fit.converged[:, None], fit.xy_px, spots.xy_px))
     poor = ~fit.converged | ((fit.residual_dn > POOR * np.minimum(fit.amplitude_dn, DN)) & (fit.clipped > 0))
@@ -95,8 +95,8 @@ def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -
     core, solid = None, False
     for share in OUTLINE:
         if not solid and (one := _outlined(window, ground + share * height, seed)) is not None:
-            solid = _solid(one)
-            core = one if solid or core is None else core
+            solid = one[1]
+            core = one[0] if solid or core is None else core
     if core is None or height <= 0.0 or known[seed]:
         return None
     known[cv2.dilate(core, np.ones((3, 3), np.uint8)) > 0] = number
@@ -124,20 +124,20 @@ def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -
     )
 
 
-def _outlined(window: Image, level: float, seed: tuple[int, int]) -> Bytes | None:
-    """Compute the mask (h, w) of pixels above a level around a seed, holes filled; None if it reaches the border."""
+def _outlined(window: Image, level: float, seed: tuple[int, int]) -> tuple[Bytes, bool] | None:
+    """Outline the patch above a level around a seed; None if it reaches the border.
+
+    Returns:
+        The mask (h, w) of its pixels, holes filled, and whether the outline is nearly convex. That of two patches that
+        touch is not.
+    """
     labels = cv2.connectedComponents((window >= level).view(np.uint8), connectivity=8)[1]
     core = (labels == labels[seed]).view(np.uint8)
     if core[0].any() or core[-1].any() or core[:, 0].any() or core[:, -1].any():
         return None
     outline, _ = cv2.findContours(core, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return np.asarray(cv2.drawContours(core, outline, -1, 1, cv2.FILLED))
-
-
-def _solid(core: Bytes) -> bool:
-    """Return whether the outline of a mask (h, w) is nearly convex; that of two patches that touch is not."""
-    outline = cv2.findContours(core, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0][0]
-    return cv2.contourArea(outline) >= SOLID * cv2.contourArea(cv2.convexHull(outline))
+    solid = cv2.contourArea(outline[0]) >= SOLID * cv2.contourArea(cv2.convexHull(outline[0]))
+    return np.asarray(cv2.drawContours(core, outline, -1, 1, cv2.FILLED)), solid
 
 
 def _head(core: Bytes) -> Bytes:
