@@ -166,12 +166,8 @@ def _surroundings(fit: SpotFit, beyond: Floats, eye: Eye) -> tuple[Floats, Float
 
     A glint lies before iris and pupil. Lashes beside a spot are darker than these, and between the pupil and a spot on
     a lid, its margin and its lashes change the level. The fourth lowest of 24 levels on a circle around the spot
-    counts, and the standard deviation of 16 levels between the edge of the pupil and that circle.
-
-    Args:
-        fit: the n spots.
-        beyond: (n,) their distances from the edge of the pupil, px.
-        eye: the eye.
+    counts, and the standard deviation of 16 levels between the edge of the pupil and that circle. `beyond` (n,) is the
+    distance of the spots from that edge, px.
     """
     radius = 2.2 * fit.sigma_px.max(axis=1) + 1.5 * eye.blur_px + 3.0
     circle = fit.xy_px[:, None] + radius[:, None, None] * _CIRCLE
