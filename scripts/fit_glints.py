@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 COUNTS = {
     "noise2": 6, "noise8": 8, "noise16": 8, "noise2-13px": 6, "blur4": 8, "texture6": 8, "edge-glint": 8,
     "eight-glints": 10, "lid": 6, "remote": 12, "bright-pupil": 6, "jpeg": 16, "grey-pupil": 16, "any-size": 8,
-    "ring-light": 16, "head-mounted": 8, "mixed": 80, "led": 160,
+    "ring-light": 16, "head-mounted": 8, "mixed": 80, "led": 200,
 }  # fmt: skip
 # How much an image counts. Drawn glints before a drawn sclera may be as faint as highlights of skin. A webcam's single
 # lamp is often hidden, and its few pixels are the hardest to judge.
@@ -51,8 +51,8 @@ FALSE_WEIGHT = 2.0  # how much more a false glint counts than a lost one
 PRIOR_SD = 4.0  # of a weight times the largest value of its feature
 SHIFT_SD = 1.5  # the same for the difference to the weights that rendered images gave
 RENDERED = (
-    np.array([-4.46, -2.03, -6.81, -4.0, 3.95, -3.75, 4.88, -4.44]),
-    np.array([0.91, -0.676, 1.13, -6.8, 1.06, 1.06]),
+    np.array([-6.06, -2.51, 2.75, -3.73, 3.63, -1.07, -9.99, -0.149, 3.92, 3.73]),
+    np.array([1.02, -0.23, 0.619, -11.2, 1.1, 0.762]),
 )
 ROUNDS = 4  # the comparison counts similar spots by what it said itself
 FOLDS = 10
@@ -145,20 +145,20 @@ def fitted(observed: list[Observed], before: tuple[Array, Array] | None) -> tupl
     each = [np.full(one.known.sum(), WEIGHTS.get(one.row, _usual_weight(one.row))) for one in observed]
     weight, means = np.concatenate(each) * np.where(true > 0.5, 1.0, FALSE_WEIGHT), before or (None, None)
     first = logistic(np.concatenate([one.features[one.known] for one in observed]), true, weight, means[0])
-    odds = [one.features @ first for one in observed]
-    for _ in range(ROUNDS):
-        rows = [compared(one.fit, one.features @ first, o, one.clip_dn) for one, o in zip(observed, odds, strict=True)]
-        known = np.concatenate([row[one.known] for one, row in zip(observed, rows, strict=True)])
-        second = logistic(known, true, weight, means[1])
-        odds = [compared(one.fit, one.features @ first, one.features @ first, one.clip_dn) @ second for one in observed]
+
+    def refitted(second: Array | None) -> Array:
+        rows = [compared(one.fit, one.features @ first, one.clip_dn, second)[one.known] for one in observed]
+        return logistic(np.concatenate(rows), true, weight, means[1])
+
+    second = refitted(None)
+    for _ in range(ROUNDS - 1):
+        second = refitted(second)
     return first, second
 
 
 def judged(one: Observed, first: Array, second: Array) -> NDArray[np.bool_]:
     """Which spots are glints, as classification.py decides it."""
-    logit = one.features @ first
-    odds = compared(one.fit, logit, logit, one.clip_dn) @ second
-    return np.asarray(compared(one.fit, logit, odds, one.clip_dn) @ second > np.log(LEAST_ODDS))
+    return np.asarray(compared(one.fit, one.features @ first, one.clip_dn, second) @ second > np.log(LEAST_ODDS))
 
 
 def _usual_weight(row: str) -> float:

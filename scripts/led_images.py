@@ -2,11 +2,11 @@
 
 Every image is a pure function of its seed; seeds below 10,000 are for development. An eye of `make_ideal_images.py`
 gets two lids of bright, textured skin with highlights, wet margins with chains of highlights, a dark line of lashes,
-and the glints: one lamp, two, an arc or a ring of eight. A glint is a uniform ellipse of any slant, blurred by the
-optics, often many times as bright as the sensor can show, in one rig up to four times as bright as another; some have a
-streak, up to almost as wide as the glint, or a star. Three kinds of spots are no glints: the same lamps mirrored in the
-tear menisci along the lid margins, wet roots of lashes, and faint sharp ghosts inside the pupil (reflections off the
-lens). The camera clips at 225 to 255 DN, and some sharpen or compress the image.
+and the glints: one lamp, two, an arc or a ring of eight, as far as the cornea reaches. A glint is a uniform ellipse of
+any slant, blurred by the optics, often many times as bright as the sensor can show, in one rig up to four times as
+bright as another; some have a streak, up to almost as wide as the glint, or a star. Three kinds of spots are no glints:
+the same lamps mirrored in the tear menisci along the lid margins, wet roots of lashes, and faint sharp ghosts inside
+the pupil (reflections off the lens). The camera clips at 225 to 255 DN, and some sharpen or compress the image.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ def draw(seed: int) -> ideal.Drawing:
     open_eye, margins = _add_lids(image, centre, size, about["pupil_level_dn"] + about["step_dn"], rng)
     blur = about["blur_px"] * rng.uniform(0.7, 1.2)
     lamps = _glints(centre, size, blur, rng)
-    spots = [spot for spot in lamps if _inside(open_eye, spot["xy_px"], spot["radius_px"])]
+    # Beyond the limbus the sclera scatters the lamps' light. A glint at a lid's margin spills over it.
+    cornea = [spot for spot in lamps if np.hypot(*(spot["xy_px"] - centre)) < about["iris_px"]]
+    spots = [spot for spot in cornea if _inside(open_eye, spot["xy_px"], 0.5 * spot["radius_px"])]
     light = np.zeros_like(image)
     wet = [one for one in _wet_spots(lamps, margins, size, rng) if 0.0 <= one["xy_px"][1] < image.shape[0]]
     for spot in spots + [one for one in wet if _apart(one, spots)]:

@@ -102,10 +102,15 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
     if not pupil.ok:
         return _nothing(pupil, noise, size)
     iris, step = _iris_level(prepared, found, model), model.step_dn
-    inside = iris + step if found.image.inverted else iris - step
-    support = found.boundary.support
-    levels = {"pupil_dn": inside, "iris_dn": iris, "clip_dn": prepared.clip_dn}
-    eye = Eye(ellipse=model.ellipse, blur_px=model.sigma_px, support=support, **levels)
+    eye = Eye(
+        ellipse=model.ellipse,
+        blur_px=model.sigma_px,
+        pupil_dn=iris + step if found.image.inverted else iris - step,
+        iris_dn=iris,
+        support=found.boundary.support,
+        clip_dn=prepared.clip_dn,
+        linear=prepared.linear,
+    )
     measured = measure_patches(prepared, model.ellipse, search_reach(model.ellipse, settings), spots, fit)
     accepted, rejected = classify_spots(measured, spots.patches_px, eye, settings)
     return Extraction(pupil=pupil, glints=accepted, rejected=rejected, noise=noise, shape=size)

@@ -37,7 +37,6 @@ COMPARED = [
     (consensus, "_support"),
     (consensus, "_settled"),
     (covariance, "_edge_sums"),
-    (covariance, "_along_outline"),
     (outline, "_along"),
     (edge_model, "_levels"),
     (least_squares, "_pixel_sums"),

@@ -309,13 +309,6 @@ def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats
     return slopes @ slopes.T, sums(slopes * place.distance), sums(slopes), np.bincount(group, minlength=GROUPS)
 
 
-def _along_outline(ellipse: tuple[float, ...], covariance: Floats) -> float:
-    """Root mean square of the boundary's standard deviation, by the covariance (5, 5) of centre and shape matrix."""
-    about = Ellipse.of(ellipse)
-    slopes = distance_slopes(about, Place.middles(about, 32))
-    return math.sqrt(max(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1], 0.0))
-
-
 def _ridges(
     gx: Image, gy: Image, magnitude: Image, covered: Bytes, ellipse: tuple[float, ...], half_band: float, floor: float
 ) -> tuple[Floats, Floats, Floats, Indices, Indices]:

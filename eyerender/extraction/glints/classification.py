@@ -1,7 +1,7 @@
 """Classification of fitted spots: which are glints, and why other reflections are not.
 
-A spot's features (background, distance from the pupil, shape and height) give a first logit of the probability that it
-is a glint of the cornea. The others are then compared with the brightest likely one: reflections of one rig's
+A spot's features (its surroundings, distance from the pupil, shape and height) give a first logit of the probability
+that it is a glint of the cornea. The others are then compared with the brightest likely one: reflections of one rig's
 lamps are about equally high and wide, and those in the tear menisci are smaller. The weights of both steps are maximum
 a-posteriori estimates (logistic regression) from development images, made by `scripts/fit_glints.py`.
 """
@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...arrays import Floats, frozen
-from ...geometry.ellipse import Ellipse
+from ...geometry.ellipse import Ellipse, signed_distance
 from ...status import Status
-from ..preprocessing import DN
+from ..preprocessing import DN, Image
 from ..result import GlintResult
 from ..settings import ExtractionSettings
 from .detection import optics_sigma
@@ -26,6 +26,7 @@ from .prescreening import PIXEL
 # Largest counted steps by which the background is brighter than the iris; more is not worse, because the sclera is as
 # bright.
 BRIGHTEST = 1.4
+SIZES = -4.0, -2.0  # logarithms of the width over the pupil's semi-axis b between which wider is likelier
 ROUND = math.log(2.0)  # elongation that LEDs have; it counts twice, so this is an oval of 1.4 : 1
 # A spot is accepted if it is a glint with at least these odds.
 LEAST_ODDS = 2.0
@@ -37,19 +38,23 @@ ALIKE, MOST_ALIKE = (1.0, 0.3, 0.3), 3.0
 GROUNDS = (
     "before something brighter than the iris, as highlights of skin are",
     "far from the pupil, as highlights of skin are",
-    "not as wide as the optics' image of a lamp",
+    "smaller than images of lamps in this eye are",
     "elongated, as reflections off the sclera and wet lid margins are",
     "too faint for a glint",
     "dimmer than reflections of lamps are",
+    "beside something darker than the iris, as spots between lashes are",
+    "behind a lid or lashes, seen from the pupil",
     "much fainter than the brightest glint, as highlights of skin and lid margins are",
     "not as wide as the brightest glint",
 )
 # Features of an unambiguous glint, in the order of the reasons.
-USUAL = (0.0, 0.0, 0.0, 0.0, math.log(10.0), 1.0)
+USUAL = (0.0, 0.0, SIZES[1], 0.0, math.log(10.0), 1.0, 0.0, 0.0)
+_TURN = np.arange(24) * (np.pi / 12.0)
+_CIRCLE, _LINE = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1), np.linspace(0.0, 1.0, 16)
 
 # Made by scripts/fit_glints.py: weights of the features and 1, and of the comparison.
-FIRST = np.array([-2.99, -1.97, 0.254, -4.07, 1.63, 2.17, 3.73, -2.95])
-SECOND = np.array([0.778, 0.687, 2.67, -3.11, 0.536, 1.07])
+FIRST = np.array([-3.49, -2.39, 1.73, -4.45, 1.92, 1.54, -3.03, -1.9, 3.86, 2.95])
+SECOND = np.array([0.77, 0.381, 2.56, -1.42, 0.455, 0.906])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +68,7 @@ class Eye:
         iris_dn: level just outside the pupil.
         support: visible share of its boundary.
         clip_dn: level at which the sensor clips.
+        linear: the image.
     """
 
     ellipse: Ellipse
@@ -71,6 +77,22 @@ class Eye:
     iris_dn: float
     support: float
     clip_dn: float
+    linear: Image
+
+    @property
+    def step_dn(self) -> float:
+        """Step between pupil and iris."""
+        return abs(self.iris_dn - self.pupil_dn)
+
+    def expected_dn(self, depth: Floats) -> Floats:
+        """Compute the level (...) expected at a depth: 0 in the iris, 1 in the pupil."""
+        return self.iris_dn + (self.pupil_dn - self.iris_dn) * np.clip(depth, 0.0, 1.0)
+
+    def levels_dn(self, places_px: Floats) -> Floats:
+        """Return the levels (...) of the pixels nearest to places (..., 2), the border's outside the image."""
+        column, row = np.rint(places_px).astype(np.intp).T
+        height, width = self.linear.shape
+        return self.linear[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].T.astype(np.float64)
 
 
 def classify_spots(
@@ -109,37 +131,57 @@ def classify_spots(
 
 
 def features(fit: SpotFit, eye: Eye) -> Floats:
-    """Compute the features (n, 8) of spots for the first logit.
+    """Compute the features (n, 10) of spots for the first logit.
 
     They are: how much the background is brighter than the pupil or iris expected there, in steps from pupil to iris;
-    the distance outside the pupil in semi-axes a; the logarithms of the width over the blur, of the elongation (of the
-    fit and of the bright patch) beyond ROUND and of the height in steps; the fourth power of the peak's level over the
-    clip level, which hardly anything but lamps reaches; the visible share of the pupil boundary; and 1.
+    the distance outside the pupil in semi-axes a; the logarithms of the width over the semi-axis b, of the elongation
+    (of the fit and of the bright patch) beyond ROUND and of the height in steps; the fourth power of the peak's level
+    over the clip level, which hardly anything but lamps reaches; how much darker than expected the darkest surroundings
+    are and how much the level varies between pupil and spot, in steps; the visible share of the pupil boundary; and 1.
     """
-    step, wide2 = abs(eye.iris_dn - eye.pupil_dn), fit.sigma_px**2 + PIXEL
+    wide2 = fit.sigma_px**2 + PIXEL
     width = wide2.prod(axis=1) ** 0.25
     (xx, xy), (_, yy) = fit.moments_px2.transpose(1, 2, 0)
     mean, apart = 0.5 * (xx + yy) + PIXEL, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
     stretch = (mean + apart) / np.maximum(mean - apart, 1e-3) * wide2.max(axis=1) / wide2.min(axis=1)
-    offset = fit.xy_px - eye.ellipse.centre_px
-    cos, sin = math.cos(eye.ellipse.angle_rad), math.sin(eye.ellipse.angle_rad)
-    scaled = (offset @ np.array([[cos, -sin], [sin, cos]])) / eye.ellipse.semi_axes_px
-    beyond = np.hypot(*offset.T) * (1.0 - 1.0 / np.maximum(np.hypot(*scaled.T), 1e-6))
-    expected = eye.iris_dn + (eye.pupil_dn - eye.iris_dn) * np.clip(-beyond / (2.0 * width + 1.0), 0.0, 1.0)
+    beyond, (a, b) = signed_distance(eye.ellipse, fit.xy_px), eye.ellipse.semi_axes_px
+    darker, uneven = _surroundings(fit, beyond, eye)
     columns = (
-        np.clip((fit.background_dn - expected) / step, 0.0, BRIGHTEST),
-        np.clip(beyond / eye.ellipse.semi_axes_px[0], 0.0, 4.0),
-        np.minimum(np.abs(np.log(width / eye.blur_px)), 1.5),
+        np.clip((fit.background_dn - eye.expected_dn(-beyond / (2.0 * width + 1.0))) / eye.step_dn, 0.0, BRIGHTEST),
+        np.clip(beyond / a, 0.0, 4.0),
+        np.clip(np.log(width / b), *SIZES),
         np.clip(0.5 * np.log(stretch) - ROUND, 0.0, 2.0),
-        np.log(np.clip(fit.amplitude_dn / step, 0.2, 60.0)),
+        np.log(np.clip(fit.amplitude_dn / eye.step_dn, 0.2, 60.0)),
         np.clip((fit.background_dn + fit.amplitude_dn) / min(eye.clip_dn, DN), 0.0, 1.0) ** 4,
+        np.clip(darker / eye.step_dn, 0.0, 1.2),
+        np.minimum(uneven / eye.step_dn, 0.8),
         np.full(width.size, eye.support),
         np.ones(width.size),
     )
     return np.stack(columns, axis=1)
 
 
-def compared(fit: SpotFit, logit: Floats, odds: Floats, top_dn: float) -> Floats:
+def _surroundings(fit: SpotFit, beyond: Floats, eye: Eye) -> tuple[Floats, Floats]:
+    """Compute how much darker than expected it is beside spots, and how much the level varies towards them, DN (n,).
+
+    A glint lies before iris and pupil. Lashes beside a spot are darker than these, and between the pupil and a spot on
+    a lid, its margin and its lashes change the level. The fourth lowest of 24 levels on a circle around the spot
+    counts, and the standard deviation of 16 levels between the edge of the pupil and that circle. `beyond` (n,) is the
+    distance of the spots from that edge, px.
+    """
+    radius = 2.2 * fit.sigma_px.max(axis=1) + 1.5 * eye.blur_px + 3.0
+    circle = fit.xy_px[:, None] + radius[:, None, None] * _CIRCLE
+    depth = 0.5 - signed_distance(eye.ellipse, circle) / (3.0 * eye.blur_px)
+    darker = np.sort(eye.expected_dn(depth) - eye.levels_dn(circle), axis=1)[:, -4]
+    offset = fit.xy_px - eye.ellipse.centre_px
+    distance = np.maximum(np.hypot(*offset.T), 1e-6)
+    first, last = 1.0 - (beyond - 2.0 * eye.blur_px - 1.0) / distance, 1.0 - radius / distance
+    along = first[:, None] + (last - first)[:, None] * _LINE
+    levels = eye.levels_dn(eye.ellipse.centre_px + along[..., None] * offset[:, None])
+    return darker, np.where(first < last, levels.std(axis=1), 0.0)
+
+
+def compared(fit: SpotFit, logit: Floats, top_dn: float, second: Floats | None = None) -> Floats:
     """Compute the features (n, 6) of spots for the second logit.
 
     They are the first logit; whether the spot is not the reference, and if so, the logarithms of its visible light
@@ -152,9 +194,9 @@ def compared(fit: SpotFit, logit: Floats, odds: Floats, top_dn: float) -> Floats
 
     Args:
         fit: the n spots.
-        logit: (n,) the first logit.
-        odds: (n,) logit by which similar spots count; the first one at first, then the second.
+        logit: (n,) the first logit, by which similar spots count.
         top_dn: level at which the sensor clips.
+        second: (6,) weights of the features; given, similar spots are counted again, by the second logit.
     """
     visible = np.minimum(fit.amplitude_dn, np.maximum(top_dn - fit.background_dn, 1.0))
     wide2 = (fit.sigma_px**2 + PIXEL).prod(axis=1) ** 0.5 * (1.0 + np.log2(fit.amplitude_dn / visible))
@@ -163,16 +205,23 @@ def compared(fit: SpotFit, logit: Floats, odds: Floats, top_dn: float) -> Floats
     near = (np.abs(one[:, None] - one) < most for one, most in zip((light, width, form), ALIKE, strict=True))
     alike = np.logical_and.reduce(list(near)) & ~np.eye(logit.size, dtype=bool)
     best = int(np.argmax(np.where(logit >= min(0.0, logit.max()), light, -np.inf)))
-    other = (np.arange(logit.size) != best) / (1.0 + math.exp(-float(np.clip(logit[best], -30.0, 30.0))))
+    other = (np.arange(logit.size) != best) * _probability(logit[best])
     columns = (
         np.clip(logit, -LIKELIEST, LIKELIEST),
         other,
         other * np.clip(light - light[best], -4.0, 0.0),
         other * np.minimum(np.abs(width - width[best]), WIDER),
-        np.minimum(alike @ (1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0)))), MOST_ALIKE),
+        np.minimum(alike @ _probability(logit), MOST_ALIKE),
         np.ones(logit.size),
     )
-    return np.stack(columns, axis=1)
+    out = np.stack(columns, axis=1)
+    if second is not None:
+        out[:, 4] = np.minimum(alike @ _probability(out @ second), MOST_ALIKE)
+    return out
+
+
+def _probability(logit: Floats) -> Floats:
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(logit, -30.0, 30.0))))
 
 
 def _objections(fit: SpotFit, eye: Eye) -> list[str | None]:
@@ -184,10 +233,9 @@ def _objections(fit: SpotFit, eye: Eye) -> list[str | None]:
     fit = fit.taken(index)
     first = features(fit, eye)
     logit = first @ FIRST
-    second = compared(fit, logit, logit, eye.clip_dn)
-    second = compared(fit, logit, second @ SECOND, eye.clip_dn)
+    second = compared(fit, logit, eye.clip_dn, SECOND)
     glint = second @ SECOND > math.log(LEAST_ODDS)
-    against = np.concatenate([(first[:, :6] - USUAL) * FIRST[:6] * SECOND[0], second[:, 2:4] * SECOND[2:4]], axis=1)
+    against = np.concatenate([(first[:, :8] - USUAL) * FIRST[:8] * SECOND[0], second[:, 2:4] * SECOND[2:4]], axis=1)
     sharp = fit.sigma_px.max(axis=1) < 0.5 * optics_sigma(eye.blur_px)
     for k, i in enumerate(index.tolist()):
         reasons[i] = None if glint[k] else GROUNDS[int(np.argmin(against[k]))]

@@ -65,7 +65,7 @@ def detect_spots(
     """
     linear = prepared.linear
     reach = search_reach(ellipse, settings)
-    (cx, cy), (columns, rows) = ellipse.centre_px, around(ellipse, reach, linear.shape)
+    (cx, cy), (columns, rows) = ellipse.centre_px, around(ellipse.centre_px, reach, linear.shape)
     x0, y0, crop = columns.start, rows.start, linear[rows, columns]
     crop = crop[: crop.shape[0] // 2 * 2, : crop.shape[1] // 2 * 2]  # whole blocks of the opening
     if crop.shape[0] < 6 or crop.shape[1] < 6:

@@ -67,8 +67,8 @@ def fit_spots(
     """
     noise = limits.noise_dn
     pixels = cut(linear, known, start_px, width_px, limits.clip_dn)
-    apart, radius = _distance(start_px), window_radius(width_px)
-    touching = apart < 1.35 * (radius[:, None] + radius)
+    apart, radius = np.hypot(*(start_px[:, None] - start_px).transpose(2, 0, 1)), window_radius(width_px)
+    touching = (apart < 1.35 * (radius[:, None] + radius)) & ~np.eye(radius.size, dtype=bool)
     theta = _start(pixels, start_px, width_px, height_dn, touching)
     pairs = shining_pairs(pixels, theta, touching, noise)
     rest = pixels.data - pixels.known
@@ -100,14 +100,6 @@ def fit_spots(
             break
     ended = Descent(theta=theta, gram=gram, used=used, settled=settled & ~gone, moved=moved, falling=falling)
     return FittedSpots(report(pixels, ended, rest - light, limits), pixels, theta, rest - light)
-
-
-def _distance(start: Floats) -> Floats:
-    """Compute distances (n, n) between spots; infinite on the diagonal."""
-    gap = start[:, None] - start
-    out: Floats = np.sqrt((gap * gap).sum(axis=-1))
-    np.fill_diagonal(out, np.inf)
-    return out
 
 
 def _start(pixels: SpotPixels, start: Floats, width: Floats, height: Floats, touching: Bools) -> Floats:

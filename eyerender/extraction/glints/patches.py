@@ -30,6 +30,7 @@ OUTLINE = (0.5, 0.75)  # shares of the height that outline a patch; the second p
 SOLID = 0.85  # least area of an outline over that of its convex hull, unless patches touch
 USUAL_PX = 2  # half the side of a spot whose fit failed
 POOR = 0.1  # residual, as a share of the visible height, with which a Gaussian does not describe a clipped spot
+_SQUARE = np.ones((3, 3), np.uint8)
 _AREA = 2.0 * math.pi * math.log(2.0)  # area of a Gaussian above half its height, in sigma^2
 Box = tuple[int, int, int, int]  # first and last column, first and last row
 
@@ -44,7 +45,7 @@ def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, spots
         spots: the spots.
         fit: their fits.
     """
-    columns, rows = around(ellipse, reach_px, prepared.linear.shape)
+    columns, rows = around(ellipse.centre_px, reach_px, prepared.linear.shape)
     crop, corner = prepared.linear[rows, columns], np.array([columns.start, rows.start])
     fit = replace(fit, xy_px=np.where(fit.converged[:, None], fit.xy_px, spots.xy_px))
     poor = ~fit.converged | ((fit.residual_dn > POOR * np.minimum(fit.amplitude_dn, DN)) & (fit.clipped > 0))
@@ -72,7 +73,7 @@ def _bright_boxes(crop: Image, clip_dn: float, middle: Floats) -> list[Box]:
     levels = [min(clip_dn, share * float(crop.max(initial=0.0))) for share, _, _, _ in BRIGHT if crop.size]
     for level, (_, step, least, most) in zip(levels, BRIGHT, strict=False):
         part = crop[::step, ::step]
-        closed = cv2.morphologyEx((part >= level).view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        closed = cv2.morphologyEx((part >= level).view(np.uint8), cv2.MORPH_CLOSE, _SQUARE)
         labels, stats = cv2.connectedComponentsWithStats(closed, connectivity=8)[1:3]
         white = np.bincount(labels[part >= levels[-1]], minlength=len(stats))
         chosen = (stats[:, 4] >= least) & ((white < 0.5 * stats[:, 4]) | (level == levels[-1]))
@@ -90,21 +91,25 @@ def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -
     window, known = crop[rows, columns], owner[rows, columns]
     y, x = divmod(int(crop[top : bottom + 1, left : right + 1].argmax()), right - left + 1)
     seed = y + top - rows.start, x + left - columns.start
+    if known[seed]:
+        return None
     ground = median(np.concatenate([window[0], window[-1], window[:, 0], window[:, -1]]))
     height = float(window[seed]) - ground
     core, solid = None, False
     for share in OUTLINE:
         if not solid and (one := _outlined(window, ground + share * height, seed)) is not None:
-            solid = _solid(one)
-            core = one if solid or core is None else core
-    if core is None or height <= 0.0 or known[seed]:
+            solid = one[1]
+            core = one[0] if solid or core is None else core
+    if core is None or height <= 0.0:
         return None
-    known[cv2.dilate(core, np.ones((3, 3), np.uint8)) > 0] = number
-    core = _head(core) if window[seed] >= clip_dn else core
-    near = cv2.dilate(core, np.ones((3, 3), np.uint8)).astype(bool)
-    light = np.where(core > 0, height, np.clip(window - ground, 0.0, height))
+    near = cv2.dilate(core, _SQUARE).view(bool)
+    known[near] = number
+    if window[seed] >= clip_dn:
+        core = _head(core)
+        near = cv2.dilate(core, _SQUARE).view(bool)
     ys, xs = np.nonzero(near)
-    weight = light[ys, xs] / light[ys, xs].sum()
+    weight = np.where(core[ys, xs] > 0, height, np.clip(window[ys, xs] - ground, 0.0, height))
+    weight /= weight.sum()
     centre = np.array([weight @ xs, weight @ ys])
     offset = np.stack([xs, ys]) - centre[:, None]
     moments = (offset * weight) @ offset.T + np.eye(2) / 12.0
@@ -124,20 +129,19 @@ def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -
     )
 
 
-def _outlined(window: Image, level: float, seed: tuple[int, int]) -> Bytes | None:
-    """Compute the mask (h, w) of pixels above a level around a seed, holes filled; None if it reaches the border."""
-    labels = cv2.connectedComponents((window >= level).view(np.uint8), connectivity=8)[1]
-    core = (labels == labels[seed]).view(np.uint8)
-    if core[0].any() or core[-1].any() or core[:, 0].any() or core[:, -1].any():
+def _outlined(window: Image, level: float, seed: tuple[int, int]) -> tuple[Bytes, bool] | None:
+    """Compute the mask (h, w) of pixels above a level around a seed, holes filled; None if it reaches the border.
+
+    Also returns whether the outline is nearly convex; that of two patches that touch is not.
+    """
+    labels, stats = cv2.connectedComponentsWithStats((window >= level).view(np.uint8), connectivity=8)[1:3]
+    x, y, w, h, _ = stats[labels[seed]].tolist()
+    if x == 0 or y == 0 or x + w == window.shape[1] or y + h == window.shape[0]:
         return None
+    core = (labels == labels[seed]).view(np.uint8)
     outline, _ = cv2.findContours(core, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return np.asarray(cv2.drawContours(core, outline, -1, 1, cv2.FILLED))
-
-
-def _solid(core: Bytes) -> bool:
-    """Return whether the outline of a mask (h, w) is nearly convex; that of two patches that touch is not."""
-    outline = cv2.findContours(core, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0][0]
-    return cv2.contourArea(outline) >= SOLID * cv2.contourArea(cv2.convexHull(outline))
+    solid = cv2.contourArea(outline[0]) >= SOLID * cv2.contourArea(cv2.convexHull(outline[0]))
+    return np.asarray(cv2.drawContours(core, outline, -1, 1, cv2.FILLED)), solid
 
 
 def _head(core: Bytes) -> Bytes:

@@ -28,7 +28,8 @@ def well_fitted(prepared: Prepared, fit: SpotFit) -> Bools:
 
 def part_about(linear: Image, ellipse: Ellipse) -> Part:
     """Cut out the part that pixel model and boundary spots need, for boundaries up to 1.4 times as large."""
-    columns, rows = around(ellipse, 1.4 * float(ellipse.semi_axes_px[0]) + LARGEST_PX + SPARE_PX, linear.shape)
+    reach = 1.4 * float(ellipse.semi_axes_px[0]) + LARGEST_PX + SPARE_PX
+    columns, rows = around(ellipse.centre_px, reach, linear.shape)
     return Part(np.ascontiguousarray(linear[rows, columns]), (columns.start, rows.start))
 
 
@@ -47,9 +48,9 @@ def affected_pixels(prepared: Prepared, part: Part, spots: Spots, which: Bools |
 def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools:
     """Compute the mask (h, w) of clipped pixels and of pixels within a radius (n,) of positions (n, 2)."""
     mask = linear >= clip_dn
-    for (x, y), far in zip(xy.tolist(), radius.tolist(), strict=True):
-        rows, columns = _window(x, y, far, mask.shape)
-        dx, dy = np.arange(columns.start, columns.stop) - x, np.arange(rows.start, rows.stop) - y
+    for centre, far in zip(xy, radius.tolist(), strict=True):
+        columns, rows = around(centre, far, mask.shape)
+        dx, dy = np.arange(columns.start, columns.stop) - centre[0], np.arange(rows.start, rows.stop) - centre[1]
         mask[rows, columns] |= dx[None, :] ** 2 + dy[:, None] ** 2 < far**2
     return np.asarray(mask)
 
@@ -107,10 +108,3 @@ def _subtracted(linear: Image, spots: Floats, radius: Floats, limit: float) -> t
 def _reach(sigma: Floats, peak: Floats, noise_dn: float) -> Floats:
     """Compute the distance (n,) from the peak at which a spot falls to FAINT standard deviations of the noise."""
     return np.asarray(sigma * np.sqrt(2.0 * np.log(np.maximum(peak / (FAINT * noise_dn), math.e))))
-
-
-def _window(x: float, y: float, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Return slices of rows and columns of an image within `radius` of a point, along each axis."""
-    columns = slice(max(0, math.floor(x - radius)), min(shape[1], math.ceil(x + radius) + 1))
-    rows = slice(max(0, math.floor(y - radius)), min(shape[0], math.ceil(y + radius) + 1))
-    return slice(rows.start, max(rows.stop, rows.start)), slice(columns.start, max(columns.stop, columns.start))

@@ -381,7 +381,7 @@ def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noi
     that glints covered do not count. Medians and quartiles are used because of fainter reflections.
     """
     a, b = ellipse.semi_axes_px.tolist()
-    columns, rows = around(ellipse, a, inpainted.linear.shape)
+    columns, rows = around(ellipse.centre_px, a, inpainted.linear.shape)
     crop, hidden = inpainted.cut(columns, rows)
     (cx, cy) = ellipse.centre_px.tolist()
     end = min(0.85, 1.0 - 2.5 * blur_px / b)
@@ -438,7 +438,7 @@ def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float
 def find_inside(prepared: Prepared, inpainted: Inpainted, ellipse: Ellipse, shape: Shape) -> list[Candidate]:
     """Return candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
     a, b = ellipse.semi_axes_px.tolist()
-    columns, rows = around(ellipse, a, inpainted.linear.shape)
+    columns, rows = around(ellipse.centre_px, a, inpainted.linear.shape)
     crop, _ = inpainted.cut(columns, rows)
     sigma = float(np.clip(0.08 * b, 1.0, 4.0))
     smooth = as_image(cv2.GaussianBlur(cv2.medianBlur(crop, 5), (0, 0), sigma))

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Indices
 from ...geometry.ellipse import Ellipse
-from ...jit import compiled, inlined
+from ...jit import compiled
 from .places import BLOCK, COS_T, COS_U, NX, NY, SECTORS, SIN_T, SIN_U, Place, places, sector_at
 
 SHAPE = 5  # number of parameters
@@ -72,13 +72,6 @@ class EdgeSums:
         return EdgeSums(*_edge_sums(ellipse.numbers(), points[:, 0].copy(), points[:, 1].copy()))
 
 
-@inlined
-def slopes_at(cos: float, sin: float, c: float, s: float, nx: float, ny: float, row: Floats) -> None:
-    """Write `distance_slopes` at one position into row (5,); cos and sin are those of the ellipse's angle."""
-    row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos
-    row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
-
-
 @compiled("UniTuple(f8, 5), f8[::1], f8[::1]")
 def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Indices]:
     """Compute the sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle) and points (x, y)."""
@@ -89,7 +82,9 @@ def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats
         count = min(BLOCK, x.size - start)
         places(ellipse, x, y, start, count, place)
         for i in range(count):
-            slopes_at(cos, sin, place[COS_T + i], place[SIN_T + i], place[NX + i], place[NY + i], row)
+            c, s, nx, ny = place[COS_T + i], place[SIN_T + i], place[NX + i], place[NY + i]
+            row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos  # as in `distance_slopes`
+            row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
             k = sector_at(place[COS_U + i], place[SIN_U + i]) * GROUPS // SECTORS
             number[k] += 1
             for j in range(SHAPE):
@@ -174,7 +169,7 @@ def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
     outline is uncertain.
     """
     moved = _inverse(sums.matrix) @ sums.slopes
-    return max(_along_outline(ellipse.numbers(), moved @ moved.T), 1e-3)
+    return max(_along_outline(ellipse, moved @ moved.T), 1e-3)
 
 
 def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
@@ -182,23 +177,13 @@ def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
     # Use the off-diagonal term of the shape matrix in place of the angle: d ab = (a - b) d angle.
     scale = np.ones(SHAPE)
     scale[4] = ellipse.semi_axes_px[0] - ellipse.semi_axes_px[1]
-    return _along_outline(ellipse.numbers(), covariance * (scale[:, None] * scale))
+    return _along_outline(ellipse, covariance * (scale[:, None] * scale))
 
 
-@compiled("UniTuple(f8, 5), f8[:,::1]")
-def _along_outline(ellipse: tuple[float, ...], covariance: Floats) -> float:
+def _along_outline(ellipse: Ellipse, covariance: Floats) -> float:
     """Compute the rms of the boundary's standard deviation, given the covariance (5, 5) of centre and shape matrix."""
-    _, _, a, b, angle = ellipse
-    cos, sin, total, row, count = math.cos(angle), math.sin(angle), 0.0, np.empty(SHAPE), 32
-    for k in range(count):
-        t = 2.0 * math.pi * ((k + 0.5) / count - 0.5) - angle
-        c, s = math.cos(t), math.sin(t)
-        height = math.hypot(b * c, a * s)
-        slopes_at(cos, sin, c, s, b * c / height, a * s / height, row)
-        for j in range(SHAPE):
-            for m in range(SHAPE):
-                total += row[j] * covariance[j, m] * row[m]
-    return math.sqrt(max(total / count, 0.0))
+    slopes = distance_slopes(ellipse, Place.middles(ellipse, 32))
+    return math.sqrt(max(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1], 0.0))
 
 
 def _inverse(matrix: Floats) -> Floats:

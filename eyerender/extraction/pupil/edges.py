@@ -81,7 +81,8 @@ def find_edges(
     """
     ellipse = candidate.ellipse
     b = float(ellipse.semi_axes_px[1])
-    columns, rows = around(ellipse, float(ellipse.semi_axes_px[0]) * (1.0 + band) + 8.0, inpainted.linear.shape)
+    reach = float(ellipse.semi_axes_px[0]) * (1.0 + band) + 8.0
+    columns, rows = around(ellipse.centre_px, reach, inpainted.linear.shape)
     x0, y0 = columns.start, rows.start
     crop, hidden = inpainted.cut(columns, rows)
     sigma = filter_px

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ...arrays import Bools
+from ...arrays import Bools, Floats
 from ...geometry.ellipse import Ellipse
-from ...jit import compiled, inlined
+from ...jit import compiled
 from ..preprocessing import Image, as_image
 from ..statistics import quantile
 from .places import SECTORS
@@ -76,25 +76,6 @@ class Inpainted:
         return Inpainted(linear, (x, y), patch, mask)
 
 
-@inlined
-def _beside(
-    ellipse: tuple[float, ...], k: int, away: float, linear: Image, corner: tuple[int, int], patch: Image
-) -> float:
-    """Return the level at the pixel `away` outside an ellipse, in the middle of sector k."""
-    cx, cy, a, b, angle = ellipse
-    cos, sin, t = math.cos(angle), math.sin(angle), 2.0 * math.pi * ((k + 0.5) / SECTORS - 0.5) - angle
-    c, s = math.cos(t), math.sin(t)
-    nx, ny = b * c, a * s
-    height = math.sqrt(nx * nx + ny * ny)
-    p, q = a * c + away * nx / height, b * s + away * ny / height
-    column = min(max(int(np.rint(cx + p * cos - q * sin)), 0), linear.shape[1] - 1)
-    row = min(max(int(np.rint(cy + p * sin + q * cos)), 0), linear.shape[0] - 1)
-    i, j = row - corner[1], column - corner[0]
-    if 0 <= i < patch.shape[0] and 0 <= j < patch.shape[1]:
-        return patch[i, j]
-    return linear[row, column]
-
-
 @compiled("UniTuple(f8, 5), f8, f4[:,::1], UniTuple(i8, 2), f4[:,::1]")
 def levels_beside(
     ellipse: tuple[float, ...], away_px: float, linear: Image, corner: tuple[int, int], patch: Image
@@ -104,15 +85,25 @@ def levels_beside(
     Outside the frame its border is repeated. The part of the image from `corner` on is replaced by `patch`, unless that
     is empty.
     """
-    out = np.empty(SECTORS, dtype=np.float32)
+    cx, cy, a, b, angle = ellipse
+    cos, sin, out = math.cos(angle), math.sin(angle), np.empty(SECTORS, dtype=np.float32)
     for k in range(SECTORS):
-        out[k] = _beside(ellipse, k, away_px, linear, corner, patch)
+        t = 2.0 * math.pi * ((k + 0.5) / SECTORS - 0.5) - angle
+        c, s = math.cos(t), math.sin(t)
+        nx, ny = b * c, a * s
+        height = math.sqrt(nx * nx + ny * ny)
+        p, q = a * c + away_px * nx / height, b * s + away_px * ny / height
+        column = min(max(int(np.rint(cx + p * cos - q * sin)), 0), linear.shape[1] - 1)
+        row = min(max(int(np.rint(cy + p * sin + q * cos)), 0), linear.shape[0] - 1)
+        i, j = row - corner[1], column - corner[0]
+        replaced = 0 <= i < patch.shape[0] and 0 <= j < patch.shape[1]
+        out[k] = patch[i, j] if replaced else linear[row, column]
     return out
 
 
-def around(ellipse: Ellipse, reach: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Return slices of columns and rows of an image (h, w) up to `reach` px from an ellipse's centre."""
-    (cx, cy), (height, width) = ellipse.centre_px.tolist(), shape
+def around(centre: Floats, reach: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Return slices of columns and rows of an image (h, w) up to `reach` px from a point (2,)."""
+    (cx, cy), (height, width) = centre.tolist(), shape
     x0, x1 = max(0, math.floor(cx - reach)), min(width, math.ceil(cx + reach) + 1)
     y0, y1 = max(0, math.floor(cy - reach)), min(height, math.ceil(cy + reach) + 1)
     return slice(x0, max(x0, x1)), slice(y0, max(y0, y1))
@@ -129,7 +120,7 @@ def inpaint_glints(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: f
         noise_dn: standard deviation of a pixel's noise.
     """
     a, b = ellipse.semi_axes_px.tolist()
-    columns, rows = around(ellipse, 1.4 * a + 8.0, linear.shape)
+    columns, rows = around(ellipse.centre_px, 1.4 * a + 8.0, linear.shape)
     crop = np.ascontiguousarray(linear[rows, columns])
     beside = levels_beside(ellipse.numbers(), BESIDE_PX, linear, (0, 0), NO_PATCH)
     upper = quantile(beside, 0.75)

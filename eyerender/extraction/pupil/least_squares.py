@@ -31,7 +31,7 @@ from .edge_model import (
     profiles,
     turn_harmonics,
 )
-from .places import BLOCK, COS_T, COS_U, NX, NY, SECTORS, SIN_T, SIN_U, places
+from .places import BLOCK, COS_T, COS_U, NX, NY, SIN_T, SIN_U, places
 
 # Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
 FIXED = SHAPE + 7
@@ -75,31 +75,10 @@ class Pixels:
     @staticmethod
     def of(band: Band, use: Bools, seen: Bools) -> Pixels:
         """Select the pixels (n,) in `use` whose sector is one of those `seen` (SECTORS,)."""
-        return Pixels(*_grouped(band.x, band.y, band.level, band.sector, use, seen))
-
-
-@compiled("f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], b1[::1]")
-def _grouped(
-    x: Floats, y: Floats, level: Floats, bins: Indices, use: Bools, seen: Bools
-) -> tuple[Floats, Floats, Floats, Indices, Indices]:
-    """Compute the parts of `Pixels`."""
-    count, first = np.zeros(SECTORS, dtype=np.int64), np.empty(SECTORS, dtype=np.int64)
-    for i in range(x.size):
-        count[bins[i]] += use[i] and seen[bins[i]]
-    sector, rank, n, k = np.empty(SECTORS, dtype=np.int64), np.empty(SECTORS, dtype=np.int64), 0, 0
-    for s in range(SECTORS):
-        first[s], n = n, n + count[s]
-        if count[s]:
-            sector[k], rank[s] = s, k
-            k += 1
-    out, index = np.empty((3, n)), np.empty(n, dtype=np.int64)
-    for i in range(x.size):
-        s = bins[i]
-        if use[i] and seen[s]:
-            at = first[s]
-            out[0, at], out[1, at], out[2, at], index[at] = x[i], y[i], level[i], rank[s]
-            first[s] += 1
-    return out[0], out[1], out[2], index, sector[:k].copy()
+        chosen = np.flatnonzero(use & seen[band.sector])
+        chosen = chosen[np.argsort(band.sector[chosen], kind="stable")]
+        sector, index = np.unique(band.sector[chosen], return_inverse=True)
+        return Pixels(band.x[chosen], band.y[chosen], band.level[chosen], index, sector)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

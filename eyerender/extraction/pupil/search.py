@@ -190,7 +190,7 @@ def _near(work: Prepared, shape: Shape, prior: Ellipse) -> Iterator[PupilCandida
     if candidate is not None:
         yield find_boundary(work, candidate, shape)
     a, b = prior.semi_axes_px.tolist()
-    columns, rows = around(prior, MOVED * a + 8.0, work.linear.shape)
+    columns, rows = around(prior.centre_px, MOVED * a + 8.0, work.linear.shape)
     crop = replace(work, linear=np.ascontiguousarray(work.linear[rows, columns]))
     if min(crop.linear.shape) < 16:
         return
