@@ -84,10 +84,10 @@ class Lashes(Spec):
     )
     lower_count: Annotated[int, Field(ge=0, le=110)] = Field(default=46, description="number on the lower lid (chosen)")
     upper_length_mm: float = _number(8.5, 5.0, 12.0, "longest lash of the upper lid (textbooks)")
-    lower_length_mm: float = _number(5.0, 3.0, 8.0, "longest lash of the lower lid (chosen)")
+    lower_length_mm: float = _number(4.6, 3.0, 8.0, "longest lash of the lower lid (chosen)")
     diameter_mm: float = _number(0.085, 0.05, 0.12, "diameter at the root (chosen)")
     upper_curl_deg: float = _number(80.0, 20.0, 120.0, "turn of an upper lash from root to tip (chosen)")
-    lower_curl_deg: float = _number(45.0, 10.0, 80.0, "turn of a lower lash from root to tip (chosen)")
+    lower_curl_deg: float = _number(100.0, 10.0, 140.0, "turn of a lower lash from root to tip (chosen)")
     upper_droop_deg: float = _number(
         38.0, 22.0, 60.0, "angle of upper lashes at the root below the lid's normal (chosen)"
     )

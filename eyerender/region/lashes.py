@@ -66,7 +66,10 @@ def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
     # The margins have no lashes between the lacrimal puncta and the nose.
     low, high = (-0.955, 0.62) if upper else (-0.93, 0.58)
     tuft = _tufts(rng, count)
-    place = (np.arange(count) + 0.5 + rng.uniform(-0.45, 0.45, count)) / max(count, 1)
+    if upper:
+        place = (np.arange(count) + 0.5 + rng.uniform(-0.45, 0.45, count)) / max(count, 1)
+    else:
+        place = np.sort(rng.uniform(0, 1, count))  # they stand irregularly
     # The roots of a tuft stand closer, with gaps between tufts.
     place += 0.55 * spec.clumping * (_means(place, tuft) - place)
     # Lashes are denser towards the temple.
@@ -87,10 +90,16 @@ def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
         return common * _shared(rng.normal(0, 1, count), tuft) + own * rng.normal(0, 1, count)
 
     # A few lashes cross all others.
-    stray = np.where(rng.uniform(size=count) < 0.12, 2.2, 1.0) * (1.0 if upper else 1.4) * spread
-    fan = np.radians(42.0) * np.sin(1.3 * (a + 0.04)) + stray * both(0.8, 0.65)
-    sway = stray * both(0.9, 0.9)
-    droop = np.radians(spec.upper_droop_deg if upper else -8.0)
+    stray = np.where(rng.uniform(size=count) < 0.12, 2.2, 1.0) * spread
+    fan = np.radians(42.0) * np.sin(1.3 * (a + 0.04))
+    if upper:
+        fan += stray * both(0.8, 0.65)
+        sway = stray * both(1.4, 1.1)
+    else:
+        # Lower lashes leave the margin to the sides and arch down, so they look like hooks.
+        root, tip = 0.6 * fan + stray * both(1.9, 1.3), 0.5 * fan + stray * both(1.2, 1.0)
+        fan, sway = 2 * root, tip - 2.4 * root
+    droop = np.radians(spec.upper_droop_deg if upper else 22.0)
     start = -droop + spread * both(0.6, 0.4)
     curl = np.radians(spec.upper_curl_deg if upper else spec.lower_curl_deg)
     curl = curl * np.clip(1 + both(0.16, 0.12), 0.4, 1.5)
@@ -103,7 +112,7 @@ def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
     fan += 0.5 * lean
     sway += 0.8 * lean
     angle = np.arccos(np.clip(a, -1, 1)) if upper else 2 * np.pi - np.arccos(np.clip(a, -1, 1))
-    stout = (1.0 if upper else 0.7) * np.clip(0.5 + 0.55 * length / most, 0.0, 1.0) * rng.uniform(0.75, 1.1, count)
+    stout = (1.0 if upper else 0.75) * np.clip(0.5 + 0.55 * length / most, 0.0, 1.0) * rng.uniform(0.75, 1.1, count)
     return angle, across, length, fan, start, curl, stout, sway
 
 

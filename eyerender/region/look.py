@@ -96,6 +96,11 @@ class Look(Spec):
         "reflects 0.34 to 0.44; one of 0.6 mm 0.25 to 0.33)",
     )
     sclera_contrast: Contrast = Field(default=1.0, description="contrast of vessels and unevenness (chosen)")
+    film_ripples: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
+        default=None,
+        description="slope of the ripples of the tear film on the sclera, which mirror lamps as rows of points; 0 for "
+        "none; default: one person in three has ripples of 0.08 to 0.14, drawn from `iris_seed` (chosen)",
+    )
     limbus_albedo: Albedo = Field(
         default=0.35,
         description="albedo of the tissue where the cornea merges into the sclera (chosen so that the limbus has no "

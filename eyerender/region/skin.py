@@ -380,8 +380,9 @@ class _Strip:
     def look(self, spots: Singles) -> tuple[Singles, Singles, Singles]:
         """Compute albedo, gloss and height (mm) of the relief; `spots` is the share of light left by freckles."""
         spec = self.spec
-        cells, creases, pores, wet = self.cells(), self.creases(), self.pores(), self.wet()
-        height = self.relief(cells) - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases
+        cells, creases, pores, wet, bumps = self.cells(), self.creases(), self.pores(), self.wet(), self.bumps()
+        height = self.relief(cells) + 0.7 * spec.skin.relief_mm * bumps
+        height = height - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases
         # Water fills the furrows.
         dry = self.lid * (1 - np.minimum(wet * (1 / 0.7), 1))
         height = height * dry + spec.tears.unevenness * self.lumps()
@@ -390,10 +391,11 @@ class _Strip:
             low = 0.075 + 0.25 * spec.tears.unevenness
             height = height + self.flesh * (low * self.field(6, (10, 36), (10, 36)) + 0.05 * self.nodules)
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
-        open_ = 1 + 0.10 * (cells - 0.5) - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
-        # Oil stands in a thin film on the plateaus, more of it near the glands of the lash roots.
-        film = (0.9 * self.slowly("film") + 0.2 * self.roots) * (0.3 + 0.7 * cells) * (1 - pores) * (1 - 0.7 * creases)
-        sheen = spec.skin.sheen * np.clip(film, 0.04, 0.9)
+        open_ = 1 + 0.10 * (cells - 0.5) + 0.02 * bumps - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
+        # Oil stands on the tops of the bumps, more of it near the glands of the lash roots.
+        film = (0.9 * self.slowly("film") + 0.2 * self.roots) * (0.25 + 5 * np.clip(bumps - 0.5, 0, 1))
+        film = film * (0.3 + 0.7 * cells) * (1 - pores) * (1 - 0.7 * creases)
+        sheen = spec.skin.sheen * np.clip(film, 0.04, 2.0)
         gloss = np.where(wet > 0, wet, np.minimum(sheen, 0.49) * self.lid)
         return self.albedo(open_, spots), gloss, height
 
@@ -434,6 +436,11 @@ class _Strip:
             narrow = Places(_TILE, y[some], self.level[some] + self.slowly("sway")[some], 0.8 * _TILE_MM)
             cells[some] += self.lids[some] * (narrow.sample(tiles.drawn) - cells[some])
         return np.asarray(1 - (0.2 + 0.8 * self.slowly("patch")) * (1 - cells))
+
+    def bumps(self) -> Singles:
+        """Sample the finest relief (mean 0, deviation about 0.8): bumps a quarter of a millimetre wide, in patches."""
+        places = Places(_TILE, self.y, self.level, _TILE_MM)
+        return self.tiles.at(17, places, (10, 40), (28, 68)) * (0.4 + 0.8 * self.slowly("patch"))
 
     def relief(self, cells: Singles) -> Singles:
         """Compute the height (mm) of the relief: cells separated by furrows, swellings, and lines.
@@ -523,7 +530,8 @@ class _Strip:
         if np.any(near):
             lashes, along = self.spec.lashes, np.cos(self.turn).astype(np.float32)
             count = np.where(self.upper > 0, lashes.upper_count, lashes.lower_count)
-            loss = _ROOTS_LOSS * count * lashes.diameter_mm / _MANY + 0.45 * lashes.mascara
+            liner = np.where(self.upper > 0, 0.45, 0.1) * lashes.mascara
+            loss = _ROOTS_LOSS * count * lashes.diameter_mm / _MANY + liner
             loss = loss * step(along, -1.0, -0.85) * (1 - step(along, 0.55, 0.75))
             uneven = 1 + 0.4 * self.tiles.at(45, _places(self.y[near], self.out_mm[near]), (12, 90), (12, 60))
             out[near] = (loss * _bell(self.out_mm, *_ROOTS_MM))[near] * uneven
@@ -534,7 +542,7 @@ class _Strip:
         skin, rows, upper = self.spec.skin, self.rows, self.upper
         # Finer mottling than half a millimetre would show the lattice of the map as a weave.
         slow, blotch, fine = ((c, c) for c in ((0, 4), (3, 22), (25, 85)))
-        mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.03, 22, *blotch), (0.05, 23, *fine))
+        mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.02, 22, *blotch), (0.012, 23, *fine))
         tone = (1 + skin.mottling * mottled) * open_
         tone *= 1 - skin.veins * self.veins()
         tone *= self.slowly("shade")

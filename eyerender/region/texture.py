@@ -89,7 +89,7 @@ def _vessels(rng: np.random.Generator, size: int) -> Singles:
 def film_ripples(seed: int) -> float:
     """Draw the slope of the ripples of the tear film on the sclera; two people in three have none (chosen)."""
     share, slope = np.random.default_rng((0xF11A, seed)).random(2)
-    return float(0.09 + 0.08 * slope) if share < 1 / 3 else 0.0
+    return float(0.08 + 0.06 * slope) if share < 1 / 3 else 0.0
 
 
 @lru_cache(maxsize=4)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from eyerender.errors import InputError
 from eyerender.imaging.capture import render_job
 from eyerender.region.texture import film_ripples
+from eyerender.rendering.records.job import parameters_of
 from eyerender.scene.shipped import load_scene
 
 pytestmark = pytest.mark.render
@@ -54,18 +56,18 @@ def test_film_with_ripples_is_smooth_up_close_and_rough_from_afar():
     n = np.stack([np.full(4000, 0.9), *rng.uniform(-0.4, 0.4, (2, 4000))])
     n /= np.linalg.norm(n, axis=0)
     found = [rippled_film(mi.Vector3f(*(mi.Float(c) for c in n)), mi.Float(0.1), mi.Float(mm)) for mm in (0.02, 0.3, 9)]
-    tilted, gloss = found[0][0].numpy(), [float(g.numpy()[0]) for _, g in found]
+    tilted, near = found[0][0].numpy(), found[0][1].numpy()
+    gloss = [float(g.numpy().max()) for _, g in found]
     assert np.linalg.norm(tilted, axis=0) == pytest.approx(1.0, abs=1e-5)
     assert 0.05 < np.sqrt(np.mean(np.sum((tilted - n) ** 2, axis=0))) < 0.15
     assert gloss[0] > gloss[1] > gloss[2] == pytest.approx(0.93, abs=1e-3)  # that of the film without ripples
+    assert 0.1 < np.mean(near > 0.95) < 0.4  # it is smooth in patches only
+    assert np.mean(near < 0.94) > 0.5
 
 
-def test_ripples_mirror_lamps_as_small_points_on_the_sclera(renderer, monkeypatch):
-    from eyerender.rendering.records import job as jobs
-
+def test_ripples_mirror_lamps_as_small_points_on_the_sclera(renderer):
     def picture(slope):
-        monkeypatch.setattr(jobs, "film_ripples", lambda _: slope)
-        given = load_scene("headset").with_({"image.interreflection": False})
+        given = load_scene("headset").with_({"image.interreflection": False, "look.film_ripples": slope})
         job = render_job(given.frames(), 0)
         return renderer.radiance(job, spp=16), renderer.labels(job).part
 
@@ -81,4 +83,16 @@ def test_ripples_mirror_lamps_as_small_points_on_the_sclera(renderer, monkeypatc
 def test_one_person_in_three_has_ripples():
     slopes = np.array([film_ripples(seed) for seed in range(2000)])
     assert np.mean(slopes > 0) == pytest.approx(1 / 3, abs=0.04)
-    assert np.all((slopes[slopes > 0] >= 0.09) & (slopes[slopes > 0] <= 0.17))
+    assert np.all((slopes[slopes > 0] >= 0.08) & (slopes[slopes > 0] <= 0.14))
+
+
+def test_a_look_states_its_ripples_or_leaves_them_to_the_seed():
+    def ripples(**look):
+        return parameters_of(render_job(load_scene("headset").with_({"look": look}).frames(), 0)).sclera.ripples
+
+    with_ripples = next(seed for seed in range(100) if film_ripples(seed) > 0)
+    assert ripples(iris_seed=with_ripples) == film_ripples(with_ripples)
+    assert ripples(iris_seed=with_ripples, film_ripples=0.0) == 0
+    assert ripples(film_ripples=0.2) == pytest.approx(0.2)
+    with pytest.raises(InputError, match="film_ripples"):
+        ripples(film_ripples=0.4)

@@ -59,19 +59,22 @@ def film_normal(normal: mi.Vector3f) -> mi.Vector3f:
 def rippled_film(normal: mi.Vector3f, slope: mi.Float, pixel_mm: mi.Float) -> tuple[mi.Vector3f, mi.Float]:
     """Compute normal (eye frame) and gloss of a smooth tear film on a globe with ripples of this slope.
 
-    Each ripple mirrors a lamp once, so the picture shows rows of points. Within a pixel of `pixel_mm`, the ripples only
-    add to the roughness.
+    Each ripple mirrors a lamp once, so the picture shows rows of points. The film is smooth in patches, and as rough as
+    the tissue between them. Within a pixel of `pixel_mm`, the ripples only add to the roughness.
     """
     wave = 2 * dr.pi / _RIPPLE_MM
+    p0, q0 = (wave * _GLOBE_MM * (a * normal.y + b * normal.z) for a, b in ((0.35, 0.94), (0.64, -0.29)))
     tilt = mi.Vector2f(0)
     for part, shorter in ((1.0, 1.0), (0.7, 1.7)):
         # Slow waves bend the rows and move the points of each against those of the next.
-        p, q = (shorter * wave * _GLOBE_MM * (a * normal.y + b * normal.z) for a, b in ((0.35, 0.94), (0.64, -0.29)))
+        p, q = shorter * p0, shorter * q0
         along = dr.sin(q + 1.3 * dr.sin(0.61 * p) + 2 * dr.sin(0.23 * p))
         across = dr.sin(p + 1.7 * dr.sin(0.53 * q) + 2 * dr.sin(0.19 * q))
         tilt += part * mi.Vector2f(along, across)
     blur = slope * wave * pixel_mm * 0.29  # standard deviation over a pixel is its width / sqrt(12)
-    rough = dr.minimum(dr.sqrt(_ROUGH_RIPPLES * _ROUGH_RIPPLES + blur * blur), _ROUGHEST)
+    smooth = dr.minimum(dr.sqrt(_ROUGH_RIPPLES * _ROUGH_RIPPLES + blur * blur), _ROUGHEST)
+    patch = dr.sin(0.53 * p0 + 2 * dr.sin(0.29 * q0)) * dr.sin(0.46 * q0 + 2 * dr.sin(0.36 * p0))
+    rough = dr.lerp(_ROUGHEST, smooth, dr.clip(6 * patch - 1, 0, 1))
     gloss = _STANDING - (rough - _ROUGH_WET) * (1 / _BARER)
     return dr.normalize(normal + slope * mi.Vector3f(0, tilt.x, tilt.y)), gloss
 

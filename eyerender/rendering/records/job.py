@@ -188,7 +188,7 @@ def parameters_of(job: RenderJob) -> Parameters:
             radius=sclera.radius_mm,
             albedo=look.sclera_albedo,
             contrast=look.sclera_contrast,
-            ripples=film_ripples(look.iris_seed),
+            ripples=film_ripples(look.iris_seed) if look.film_ripples is None else look.film_ripples,
         ),
         image=still.image,
         pose=PoseParameters((job.M[:, 0], job.M[:, 1], job.M[:, 2]), job.t - anchor),
