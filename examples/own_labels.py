@@ -3,9 +3,9 @@
 Do rendered eyes teach more than drawn blobs?
 =============================================
 
-This script trains the small U-Net of ``train_segmentation.py`` twice, with the same number of pictures and steps: on
-datasets of people, and on eyes drawn as plain ellipses, which know nothing of light. It tests both on pictures that you
-have labelled::
+This script trains the small U-Net of ``train_segmentation.py`` three times, with the same number of steps: on datasets
+of people, on as many eyes drawn as plain ellipses, which know nothing of light, and on both. It tests the networks on
+pictures that you have labelled::
 
     eyerender generate people_iris_camera --count 96 --subjects 32 --size 320x240 -o out/iris
     eyerender generate people_openeds --count 40 --subjects 20 --size 200x320 -o out/openeds
@@ -183,7 +183,7 @@ def overlap(network: UNet, picture: np.ndarray, label: Label) -> float:
 
 
 def main() -> int:
-    """Train both networks and print how well each finds the labelled parts."""
+    """Train the networks and print how well each finds the labelled parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", help="datasets with masks")
     parser.add_argument("--test", type=Path, required=True, help="the folder of your pictures")
@@ -192,7 +192,8 @@ def main() -> int:
     options = parser.parse_args()
     table = labels(options.ellipses)
     items, rng = rendered(options.folders), np.random.default_rng(1)
-    arms = {"rendered": items, "blobs": [blob(rng) for _ in items]}
+    blobs = [blob(rng) for _ in items]
+    arms = {"rendered": items, "blobs": blobs, "both": items + blobs}
     networks = {name: trained(arm, options.steps) for name, arm in arms.items()}
     found: dict[tuple[str, str], list[list[float]]] = defaultdict(list)
     for label in table:
@@ -202,7 +203,7 @@ def main() -> int:
             continue
         source = label.file.split("__")[0] if "__" in label.file else "all"
         found[source, label.part].append([overlap(network, picture, label) for network in networks.values()])
-    print(f"{len(items)} pictures for each network\n{'pictures':16s} part      n  " + "  ".join(networks))
+    print(f"{len(items)} pictures rendered, as many blobs\n{'pictures':16s} part      n  " + "  ".join(networks))
     for (source, part), scores in sorted(found.items()):
         means = "  ".join(f"{m:8.3f}" for m in np.mean(scores, axis=0))
         print(f"{source:16s} {part:6s} {len(scores):4d}  {means}")
