@@ -40,42 +40,84 @@ def levelled(image: torch.Tensor) -> torch.Tensor:
     return (0.35 + 0.4 * (image - low) / (high - low + 1e-3)).clamp(0.2, 1.4)
 
 
-def placed(picture: torch.Tensor, turn: float, zoom: float, shift: torch.Tensor, mode: str) -> torch.Tensor:
-    """Put a picture (1, h, w) on a canvas, turned (rad), zoomed and moved; what lies beside it is 0."""
-    h, w = picture.shape[-2:]
-    scale = zoom * min(WIDTH / w, HEIGHT / h)
+def placed(
+    picture: torch.Tensor, scale: float, turn: float, shift: torch.Tensor, mode: str, canvas: tuple[int, int]
+) -> torch.Tensor:
+    """Put a picture (1, h, w) on a canvas (height, width), scaled, turned (rad) and moved; what lies beside it is 0."""
+    (h, w), (height, width) = picture.shape[-2:], canvas
     if scale < 1 and mode == "bilinear":  # no finer detail than the canvas shows
         size = (round(h * scale), round(w * scale))
         picture = F.interpolate(picture[None], size, mode="bilinear", antialias=True, align_corners=False)[0]
         h, w, scale = *size, 1.0
     cos, sin = np.cos(turn) / scale, np.sin(turn) / scale
-    matrix = torch.tensor([[cos * WIDTH / w, -sin * HEIGHT / w, 0], [sin * WIDTH / h, cos * HEIGHT / h, 0]])
+    matrix = torch.tensor([[cos * width / w, -sin * height / w, 0], [sin * width / h, cos * height / h, 0]])
     matrix[:, 2] = shift
-    grid = F.affine_grid(matrix[None].float(), [1, 1, HEIGHT, WIDTH], align_corners=False)
+    grid = F.affine_grid(matrix[None].float(), [1, 1, height, width], align_corners=False)
     return F.grid_sample(picture[None], grid, mode=mode, align_corners=False)[0]
 
 
+def fit(picture: torch.Tensor) -> tuple[float, tuple[int, int]]:
+    """Compute the scale at which a canvas shows a whole picture (1, h, w); the canvas is upright if the picture is."""
+    h, w = picture.shape[-2:]
+    canvas = (WIDTH, HEIGHT) if h > w else (HEIGHT, WIDTH)
+    return min(canvas[0] / h, canvas[1] / w), canvas
+
+
+def blurred(image: torch.Tensor, sigma: float) -> torch.Tensor:
+    """Blur an image (1, h, w) with a Gaussian of a standard deviation in px."""
+    k = torch.exp(-0.5 * (torch.arange(-6, 7) / sigma) ** 2)
+    return F.conv2d(image[None], torch.outer(k, k)[None, None] / k.sum() ** 2, padding=6)[0]
+
+
+def between(low: float, high: float) -> float:
+    """Draw an even random number."""
+    return float(torch.empty(()).uniform_(low, high))
+
+
+def exposed(image: torch.Tensor) -> torch.Tensor:
+    """Change brightness, contrast, sharpness and noise of an image (1, h, w) at random, as cameras differ in them."""
+    image = (image ** between(0.35, 1.1) * between(0.6, 2.6)).clamp(0, 1)
+    which = between(0, 1)
+    if which < 0.4:
+        image = blurred(image, between(0.5, 1.7))
+    elif which < 0.7:  # an unsharp mask
+        image = (image + between(0, 3) * (image - blurred(image, between(0.6, 1.5)))).clamp(0, 1)
+    image = levelled(image + between(0, 0.04) * torch.randn_like(image))
+    return image * between(0.85, 1.15) + between(-0.08, 0.08)
+
+
+def covered(image: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Cover one side of an image (1, h, w) with an even grey, like the edge of a holder."""
+    angle, away = between(-np.pi, np.pi), between(0.45, 1.0)
+    y, x = (torch.linspace(-1, 1, n) for n in mask.shape)
+    behind = x[None] * np.cos(angle) + y[:, None] * np.sin(angle) > away
+    return torch.where(behind, between(0, 1), image), mask.masked_fill(behind, 0)
+
+
 def varied(item: dict[str, Any]) -> dict[str, Any]:
-    """Change the place, the scale, the brightness, the contrast, the blur and the noise of an image at random."""
-    turn, zoom = 0.17 * float(torch.randn(())), float(torch.exp(torch.empty(()).uniform_(-0.5, 0.5)))
-    shift = torch.empty(2).uniform_(-0.4, 0.4)
-    image = placed(item["image"], turn, zoom, shift, "bilinear")
-    mask = placed(item["mask"][None].float(), turn, zoom, shift, "nearest")[0].long()
-    if torch.rand(()) < 0.5:
+    """Change the place, the scale and the exposure of an image at random, and cover a part of some images."""
+    (h, w), canvas = item["mask"].shape, (HEIGHT, WIDTH)
+    scale = between(0.55, 1.65) * float(np.sqrt(HEIGHT * WIDTH / (h * w)))
+    place = scale, 0.17 * float(torch.randn(())), torch.empty(2).uniform_(-0.4, 0.4)
+    image = placed(item["image"], *place, "bilinear", canvas)
+    mask = placed(item["mask"][None].float(), *place, "nearest", canvas)[0].long()
+    if between(0, 1) < 0.5:
         image, mask = image.flip(-1), mask.flip(-1)
-    gamma, gain, sigma, noise = (torch.empty(4).uniform_(0, 1) * torch.tensor([0.5, 2, 2, 0.04])).tolist()
-    image = (image ** (0.3 + gamma) * (0.6 + gain)).clamp(0, 1)
-    if sigma > 1:
-        k = torch.exp(-0.5 * (torch.arange(-6, 7) / (sigma - 0.5)) ** 2)
-        image = F.conv2d(image[None], torch.outer(k, k)[None, None] / k.sum() ** 2, padding=6)[0]
-    return {"image": levelled(image + noise * torch.randn_like(image)), "mask": mask}
+    if between(0, 1) < 0.3:
+        image, mask = covered(image, mask)
+    return {"image": exposed(image), "mask": mask}
 
 
 def shrunk(item: dict[str, Any]) -> dict[str, Any]:
-    """Bring an image and its mask to 1.5 times the width of the canvas."""
-    size = (round(item["mask"].shape[0] * 1.5 * WIDTH / item["mask"].shape[1]), round(1.5 * WIDTH))
+    """Bring an image and its mask to 1.5 times the width and height of a canvas of the same area."""
+    h, w = item["mask"].shape
+    factor = 1.5 * float(np.sqrt(WIDTH * HEIGHT / (h * w)))
+    size = (round(factor * h), round(factor * w))
     image = F.interpolate(item["image"][None], size, mode="bilinear", antialias=True, align_corners=False)[0]
-    return {"image": image, "mask": F.interpolate(item["mask"][None, None].float(), size)[0, 0].to(torch.uint8)}
+    return {
+        "image": image,
+        "mask": F.interpolate(item["mask"][None, None].float(), size, mode="nearest-exact")[0, 0].to(torch.uint8),
+    }
 
 
 def trained(folders: list[Path], epochs: int) -> UNet:
@@ -96,7 +138,8 @@ def trained(folders: list[Path], epochs: int) -> UNet:
 def outlined(network: UNet, recorded: np.ndarray) -> np.ndarray:
     """Draw the outlines of the parts that a network finds into a grey picture (h, w) of 8 bits."""
     picture = torch.from_numpy(recorded).float()[None] / 255
-    canvas = placed(picture, 0.0, 1.0, torch.zeros(2), "bilinear")
+    scale, size = fit(picture)
+    canvas = placed(picture, scale, 0.0, torch.zeros(2), "bilinear", size)
     with torch.inference_mode():
         found = network(levelled(canvas)[None])[0].argmax(0).numpy()
     shown = cv2.cvtColor((canvas[0].numpy() * 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)

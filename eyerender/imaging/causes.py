@@ -114,7 +114,7 @@ def ideal_scene(scene: Scene) -> Scene:
     spec, own = scene.spec, scene.spec.sensor
     sensor = own.model_copy(
         update={
-            "noise": False, "bit_depth": 16, "gamma": 1.0, "jpeg_quality": None, "blooming": 0.0,
+            "noise": False, "bit_depth": 16, "gamma": 1.0, "jpeg_quality": None, "blooming": 0.0, "sharpening": 0.0,
             "border_px": (0, 0, 0, 0), "border_dn": 0.0,
             "black_level_dn": None, "gain_dn_per_e": None,
         }

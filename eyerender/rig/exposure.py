@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import ndimage, special
 
 from ..arrays import Floats, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
@@ -73,7 +73,8 @@ def expose_again(
 ) -> NDArray[np.uint16]:
     """Add noise to an image that was stored without noise.
 
-    The codes determine each pixel's mean charge, except at full scale, where pixels stay saturated.
+    The codes determine each pixel's mean charge, except at full scale, where pixels stay saturated. The noise of a
+    camera that sharpens is not sharpened.
 
     Args:
         sensor: the sensor; its switch `noise` is ignored.
@@ -147,11 +148,21 @@ def _codes(sensor: Sensor, mean: Singles, noise: _Noise | None) -> Reals:
 def recorded(
     sensor: Sensor, camera: PinholeCamera, window: Window, irradiance: Reals, wavelength_nm: float, seed: int
 ) -> NDArray[np.uint16]:
-    """Compute the stored codes (h, w) of a window of a camera's sensor, including the sensor's border; see `expose`."""
-    codes = expose(sensor, irradiance, wavelength_nm, seed, window[:2])
+    """Compute the stored codes (h, w) of a window of a camera's sensor, sharpened and with its border; see `expose`."""
+    codes = sharpened(sensor, expose(sensor, irradiance, wavelength_nm, seed, window[:2]))
     if any(sensor.border_px):
         codes[border(sensor, camera, window)] = round(sensor.border_dn)
     return codes
+
+
+def sharpened(sensor: Sensor, codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Apply the unsharp mask of the camera's firmware to codes (h, w); beyond the window, its border repeats."""
+    if sensor.sharpening == 0:
+        return codes
+    plain = codes.astype(np.float32)
+    detail = plain - ndimage.gaussian_filter(plain, sensor.sharpening_px, mode="nearest")
+    sharp = np.clip(plain + np.float32(sensor.sharpening) * detail, 0, sensor.full_scale_dn)
+    return np.asarray(np.rint(sharp).astype(np.uint16))
 
 
 @lru_cache(maxsize=8)

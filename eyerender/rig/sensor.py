@@ -6,7 +6,7 @@
 
 D is the area on the sensor per area without lens distortion. mu_e of a pixel varies by its photo-response
 non-uniformity, and its read-out has a fixed offset of its own. A pixel beyond the full well may spill into its
-neighbours. With a gamma g, codes are full scale (DN / full scale)^(1/g).
+neighbours. With a gamma g, codes are full scale (DN / full scale)^(1/g). Sharpening works on these codes.
 `exposure_ms` and the gain K belong to the scene; images are never normalised one by one.
 Source: EMVA Standard 1288 (release 4.0, 2021), linear model, equations 3-8.
 """
@@ -42,8 +42,10 @@ class Sensor(Spec):
     gain_dn_per_e: Positive | None = Field(
         default=None, description="system gain K; default: full scale at 98 % of the full well"
     )
-    black_level_dn: NonNegative | None = Field(
-        default=None, description="code of no light; default: 1/256 of full scale (an OV9281 has 16/256)"
+    black_level_dn: Annotated[float, Field(ge=-16384)] | None = Field(
+        default=None,
+        description="code of no light; default: 1/256 of full scale (an OV9281 has 16/256). Below 0, dark parts of the "
+        "picture are clipped to black",
     )
     bit_depth: Literal[8, 10, 12, 16] = Field(default=16, description="bits of the stored numbers")
     psf_sigma_px: Annotated[float, Field(ge=0, le=20)] = Field(
@@ -75,6 +77,13 @@ class Sensor(Spec):
     blooming_along: Literal["columns", "rows"] = Field(default="columns", description="where that charge spills")
     gamma: Annotated[float, Field(ge=1, le=4)] = Field(
         default=1.0, description="codes store the linear number^(1 / gamma); 1 is linear"
+    )
+    sharpening: Annotated[float, Field(ge=0, le=10)] = Field(
+        default=0.0,
+        description="amount k of the camera's sharpening (unsharp mask): codes c become c + k (c - blurred c), clipped",
+    )
+    sharpening_px: Annotated[float, Field(gt=0, le=20)] = Field(
+        default=1.5, description="standard deviation of the blur that sharpening subtracts"
     )
     jpeg_quality: Annotated[int, Field(ge=5, le=100)] | None = Field(
         default=None, description="quality of the JPEG compression that 8-bit codes pass through; default: none"

@@ -211,6 +211,33 @@ def test_codes_with_a_gamma(gamma):
     assert expose(encoded, ramp * 4, 850.0, 0).max() >= encoded.saturation_dn
 
 
+def test_sharpening_overshoots_at_edges_and_keeps_even_areas():
+    """An unsharp mask of amount k and width s takes the codes at a step of height h by up to k h / 2 beyond it."""
+    camera = Camera.looking_at([0, 0, 0], position_mm=[40, 0, 0], size_px=(100, 60), focal_length_px=90.0).build()
+    plain = quiet(noise=False, full_well_e=15000, gain_dn_per_e=4.0)
+    sharp = plain.model_copy(update={"sharpening": 0.5, "sharpening_px": 2.0})
+    step = bright(plain, 4000.0, (60, 100))
+    step[:, 50:] *= 2.0
+    flat, edged = (recorded(s, camera, (0, 0, 100, 60), step, 850.0, 0).astype(float) for s in (plain, sharp))
+    height = flat[0, 99] - flat[0, 0]
+    assert np.abs(edged - flat)[:, [*range(40), *range(60, 100)]].max() <= 1.0
+    share = special.ndtr(-0.25)  # of the blurred step, half a pixel before it
+    assert edged[30, 49] - flat[30, 49] == pytest.approx(-0.5 * share * height, rel=0.02)
+    assert edged[30, 50] - flat[30, 50] == pytest.approx(0.5 * share * height, rel=0.02)
+    assert np.abs(edged.mean() - flat.mean()) < 1.0
+    assert (recorded(sharp, camera, (0, 0, 100, 60), 3 * step, 850.0, 0) <= sharp.full_scale_dn).all()
+    with pytest.raises(InputError, match="sharpening: "):
+        Sensor.from_mapping({"sharpening": -1.0})
+    with pytest.raises(InputError, match="sharpening_px: "):
+        Sensor.from_mapping({"sharpening_px": 0.0})
+
+
+def test_a_black_level_below_zero_clips_the_dark():
+    sensor = quiet(bit_depth=8, noise=False, black_level_dn=-20.0, gain_dn_per_e=0.01)
+    codes = expose(sensor, np.array([[0.0, 1.0, 2.0]]) * bright(sensor, 4000.0, (1, 3)), 850.0, 0)
+    assert codes.tolist() == [[0, 20, 60]]
+
+
 def test_borders_hold_their_code_and_jpeg_needs_eight_bits():
     camera = Camera.looking_at([0, 0, 0], position_mm=[40, 0, 0], size_px=(100, 80), focal_length_px=90.0).build()
     sensor = quiet(border_px=(4, 0, 0, 6), border_dn=17.0)

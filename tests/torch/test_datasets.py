@@ -286,7 +286,7 @@ def test_the_example_for_recorded_images_outlines_them(folder, tmp_path):
     assert [f.name for f in (tmp_path / "out").iterdir()] == ["eye.png"]
 
 
-def test_the_example_with_own_labels_compares_both_networks(folder, tmp_path):
+def test_the_example_with_own_labels_compares_the_networks(folder, tmp_path):
     source = next((folder / "images").rglob("*.png"))
     (tmp_path / "one__eye.png").write_bytes(source.read_bytes())
     header, eye = "file,x_px,y_px,a_px,b_px,angle_deg", ",20,20,5,4,30"
@@ -298,7 +298,7 @@ def test_the_example_with_own_labels_compares_both_networks(folder, tmp_path):
     name, part, count, *scores = done.stdout.splitlines()[-1].split()
     assert (name, part, count) == ("one", "pupil", "1")
     assert all(0 <= float(score) <= 1 for score in scores)
-    assert len(scores) == 2
+    assert len(scores) == 3
     table.write_text("file,x_px\nno,1\n")
     failed = subprocess.run([*script, "--ellipses", table], capture_output=True, text=True, check=False)
     assert failed.returncode == 2
