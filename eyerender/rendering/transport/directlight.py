@@ -252,7 +252,6 @@ class LampPath:
     Attributes:
         gain: irradiance (mW/mm^2) if nothing blocks the path.
         whole: the same if the whole cornea were clear.
-        out: `limbal_radius` where the path enters, mm.
         entry: where the path enters the front surface (eye frame).
         enters: whether there is a path, through the clear part of the cornea.
         blocked: whether anything blocks the path.
@@ -261,7 +260,6 @@ class LampPath:
 
     gain: mi.Float
     whole: mi.Float
-    out: mi.Float
     entry: mi.Vector3f
     enters: mi.Bool
     blocked: mi.Bool
@@ -285,13 +283,12 @@ class LampPath:
         """
         target = Target(inner, frame.stop.normal if normal is None else normal, image_of(frame, inner))
         path = connect(surfaces or frame.surfaces, source, target, frame.limbus.radius, active, ahead_mm=ahead_mm)
-        out = limbal_radius(frame, frame.surfaces[0].point_in(path.entry))
-        clear = 1 - opacity(frame, out)
+        clear = 1 - opacity(frame, limbal_radius(frame, frame.surfaces[0].point_in(path.entry)))
         enters = path.found & (clear > 0)
         blocked = lamp_blocked(frame, path.entry, source, True, False, enters)
         whole = dr.select(path.found, lamp.radiant_intensity(path.leaving) * path.transfer, 0)
         return cls(
             # Without a path, its entry may not be a number.
-            gain=dr.select(enters, whole * clear, 0), whole=whole, out=out, entry=path.entry, enters=enters,
+            gain=dr.select(enters, whole * clear, 0), whole=whole, entry=path.entry, enters=enters,
             blocked=blocked, failed=path.failed,
         )  # fmt: skip

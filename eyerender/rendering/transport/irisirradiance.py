@@ -1,10 +1,10 @@
 """Lamp light on the iris, on a grid in its plane that is filled once per frame (see `irradiancegrid`).
 
-Two things make the light of a lamp uneven. Behind the rim of the cornea, which turns opaque within a millimetre, and in
-shadows, a cell holds the path of the light instead: the irradiance if nothing blocked it, and where it enters the
-cornea. Both vary slowly. Every sample then applies the transmittance of the rim, and asks one ray whether its path is
-free. It asks in cells where something may hide the lamp from a surrounding node; with an eye region, also where hairs
-or lids are near the paths as seen from the lamp (`shadowmaps`), so that no occluder falls between nodes.
+The light of a lamp is uneven in shadows, and behind the rim of the cornea, which turns opaque within a millimetre.
+There a cell holds the path of the light instead: the irradiance if nothing blocked it, and where it enters the cornea.
+Both vary slowly. Every sample applies the transmittance of the rim. Where something may hide the lamp from a
+surrounding node, it also sends a shadow ray. With an eye region, this includes cells whose paths pass near hairs or
+lids as seen from the lamp (`shadowmaps`), so that no occluder falls between nodes.
 
 A small lamp is represented by its middle, a larger one by four points whose mean is exact to third order in its radius.
 For large and near lamps there is no grid.
@@ -40,7 +40,7 @@ class IrisIrradiance:
         grid: irradiance of the lamps that neither the rim nor anything else attenuates.
         by_path: bit mask per cell of the other lamps whose paths are known.
         clear: bit mask per cell of lamps that nothing hides.
-        paths: `_Path` of each lamp at four nodes in a row, number by number.
+        paths: the numbers of each lamp's path (see `_at_nodes`), each at four nodes in a row.
     """
 
     grid: IrradianceGrid
@@ -160,9 +160,9 @@ def _at_nodes(
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
     """Compute the irradiance of lamps i at nodes, and their paths.
 
-    The irradiance is negative where anything may hide the lamp, or a path was not found. Three numbers describe a path:
-    the irradiance if nothing blocked it, negative where it is unknown, and (y, z) where it enters the front surface, in
-    its frame. The paths of several points are replaced by their mean, unless the rim attenuates that otherwise.
+    The irradiance is negative where anything may hide the lamp, or the search failed. Three numbers describe a path:
+    the irradiance if nothing blocked it, negative where there is no path, and (y, z) where it enters the front surface,
+    in its frame. The paths of several points are replaced by their mean, unless the rim attenuates that otherwise.
     """
     half, lamp, front = _half(frame), frame.lights[i], frame.surfaces[0]
     row = node // _SIDE
@@ -175,7 +175,7 @@ def _at_nodes(
     while dr.hint(within & (k < points), label="grid of the iris", exclude=[frame, lamp, front]):
         path = LampPath.find(frame, lamp, lamp.node(k, points), x, within, ahead_mm=_AHEAD_MM)
         hidden |= path.failed | (path.enters & (path.blocked | ~_free(frame, i, path)))
-        unknown |= path.failed
+        unknown |= path.whole <= 0
         total += dr.select(path.blocked, 0, path.gain)
         gain += path.gain
         whole += path.whole
