@@ -42,6 +42,11 @@ _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STEEPEST = 2.0  # slope of the map, over the region's frame; margins are seen from their edges
 _STRIP = 32  # number of map rows computed together, so that they stay in the processor's cache
 _HAIR_GLOSS = 0.2
+_WET_END_MM, _GLANDS_END_MM, _CREASES_END_MM = (
+    4.0,
+    10.0,
+    21.0,
+)  # distances from the lash line beyond which there are none
 _MASCARA = 0.03  # albedo of lashes with mascara (chosen)
 # Roots of lashes darken the skin over them: follicles are 1.8 mm deep in the upper lid and 0.9 mm in the lower one
 # (Elder 1997, Ophthal Plast Reconstr Surg 13, 21), and light of 850 nm gets that deep. The strip is as wide as the
@@ -303,9 +308,16 @@ class _Slow:
             for name, field in fields.items()
         }
 
+    def reaches(self, name: str, rows: slice, level: float) -> bool:
+        """Return whether a field exceeds a level anywhere in some rows of the map."""
+        return bool(np.any(self._known(name, rows) > level))
+
+    def _known(self, name: str, rows: slice) -> Singles:
+        return self._fields[name][rows.start // _SLOW : rows.stop // _SLOW + 1]
+
     def at(self, name: str, rows: slice) -> Singles:
         """Return a field in some rows of the map; start and end are multiples of `_SLOW`."""
-        known = self._fields[name][rows.start // _SLOW : rows.stop // _SLOW + 1]
+        known = self._known(name, rows)
         part = (np.arange(_SLOW, dtype=np.float32) / _SLOW)[:, None]
         down = (known[:-1, None] + part * np.diff(known, axis=0)[:, None]).reshape(-1, known.shape[1])
         left, steps = down[:, :-1], np.diff(down, axis=1)
@@ -357,8 +369,8 @@ class _Strip:
         self.within = 1 - step(rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
         # The plica darkens the conjunctiva little by little towards the caruncle.
         self.flesh = step(np.cos(self.turn).astype(np.float32), 0.55, 0.95) * self.within * step(rows, 0.0, 6.0)
-        self.lids = _hill(y, z, 19.0, 13.0) * self.near
-        self.roots = _bell(self.out_mm, 0.9, 2.4)  # roots of the lashes
+        self.lids = _hill(y, z, 19.0, 13.0) * self.near if np.any(self.near) else np.zeros_like(y)
+        self.patch = self.slowly("patch")
 
     def field(self, number: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
         """Sample a band of noise at the positions of the strip."""
@@ -383,9 +395,10 @@ class _Strip:
         cells, creases, pores, wet, bumps = self.cells(), self.creases(), self.pores(), self.wet(), self.bumps()
         height = self.relief(cells) + 0.7 * spec.skin.relief_mm * bumps
         height = height - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases
-        # Water fills the furrows.
-        dry = self.lid * (1 - np.minimum(wet * (1 / 0.7), 1))
-        height = height * dry + spec.tears.unevenness * self.lumps()
+        height *= self.lid
+        if np.min(self.out_mm) < _WET_END_MM:
+            # Water fills the furrows.
+            height = height * (1 - np.minimum(wet * (1 / 0.7), 1)) + spec.tears.unevenness * self.lumps()
         if np.any(self.flesh):
             # The plica is nearly smooth, and the caruncle a cluster of nodules.
             low = 0.075 + 0.25 * spec.tears.unevenness
@@ -393,7 +406,10 @@ class _Strip:
         # Less light leaves pores, creases and furrows: a part of it meets the opposite wall.
         open_ = 1 + 0.10 * (cells - 0.5) + 0.02 * bumps - 0.16 * pores - 0.20 * spec.skin.wrinkles * creases
         # Oil stands on the tops of the bumps, more of it near the glands of the lash roots.
-        film = (0.9 * self.slowly("film") + 0.2 * self.roots) * (0.25 + 5 * np.clip(bumps - 0.5, 0, 1))
+        film = 0.9 * self.slowly("film")
+        if np.min(self.out_mm) < _GLANDS_END_MM:
+            film += 0.2 * _bell(self.out_mm, 0.9, 2.4)
+        film *= 0.25 + 5 * np.clip(bumps - 0.5, 0, 1)
         film = film * (0.3 + 0.7 * cells) * (1 - pores) * (1 - 0.7 * creases)
         sheen = spec.skin.sheen * np.clip(film, 0.04, 2.0)
         gloss = np.where(wet > 0, wet, np.minimum(sheen, 0.49) * self.lid)
@@ -405,9 +421,9 @@ class _Strip:
         Values above `_WET` mean oil on the film.
         """
         out: Singles = np.zeros_like(self.y)
-        if np.min(self.out_mm) < 4:
+        if np.min(self.out_mm) < _WET_END_MM:
             tongues = self.tiles.at(43, _places(self.y, self.out_mm / 3), (10, 60), (10, 60))
-            reach = np.where(self.upper > 0, 0.5, 0.25)  # the upper lashes hold more water
+            reach = np.where(self.upper > 0, np.float32(0.5), np.float32(0.25))  # the upper lashes hold more water
             film = 1 - step(self.out_mm - reach - 0.35 * tongues, -0.15, 0.15)
             out = film * np.clip(0.95 - 0.03 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
         return out
@@ -415,7 +431,7 @@ class _Strip:
     def lumps(self) -> Singles:
         """Compute the height (mm) of the lumps of the wet margins: mouths of glands, and water between the lashes."""
         at = step(self.rows, CONJUNCTIVA - 1.0, CONJUNCTIVA + 1.0)
-        at = at * (1 - step(self.out_mm - np.where(self.upper > 0, 0.5, 0.0), 1.0, 2.5))
+        at = at * (1 - step(self.out_mm - np.where(self.upper > 0, np.float32(0.5), np.float32(0)), 1.0, 2.5))
         out: Singles = np.zeros_like(self.y)
         if np.any(at > 0):
             places = _places(self.y, self.out_mm)
@@ -435,12 +451,12 @@ class _Strip:
         if np.any(some):
             narrow = Places(_TILE, y[some], self.level[some] + self.slowly("sway")[some], 0.8 * _TILE_MM)
             cells[some] += self.lids[some] * (narrow.sample(tiles.drawn) - cells[some])
-        return np.asarray(1 - (0.2 + 0.8 * self.slowly("patch")) * (1 - cells))
+        return np.asarray(1 - (0.2 + 0.8 * self.patch) * (1 - cells))
 
     def bumps(self) -> Singles:
         """Sample the finest relief (mean 0, deviation about 0.8): bumps a quarter of a millimetre wide, in patches."""
         places = Places(_TILE, self.y, self.level, _TILE_MM)
-        return self.tiles.at(17, places, (10, 40), (28, 68)) * (0.4 + 0.8 * self.slowly("patch"))
+        return self.tiles.at(17, places, (10, 40), (28, 68)) * (0.4 + 0.8 * self.patch)
 
     def relief(self, cells: Singles) -> Singles:
         """Compute the height (mm) of the relief: cells separated by furrows, swellings, and lines.
@@ -448,12 +464,14 @@ class _Strip:
         The lines run along the lids and, at the temple, away from the canthus.
         """
         skin, y = self.spec.skin, self.y
-        grain = self.field(3, (30, 90), (30, 90))
+        grain, swell = ((c, c) for c in ((30, 90), (7, 20)))
+        even = self.tiles.mixed(self.places, (0.03, 3, *grain), (1.3, 13, *swell))
         along = self.tiles.mixed(self.along, (1.6, 14, (5, 15), (12, 34)), (0.5, 15, (12, 36), (24, 60)))
-        swell = self.field(13, (7, 20), (7, 20))
-        lines = self.tiles.at(11, _places(y, self.level + self.slowly("sway")), (0, 6), (22, 60))
-        height = skin.relief_mm * (cells + 0.03 * grain + 1.3 * swell + along)
-        return np.asarray(height - self.slowly("lines") * np.abs(lines))
+        height = skin.relief_mm * (cells + even + along)
+        if self.slow.reaches("lines", self.strip, 1e-6):
+            lines = self.tiles.at(11, _places(y, self.level + self.slowly("sway")), (0, 6), (22, 60))
+            height -= self.slowly("lines") * np.abs(lines)
+        return np.asarray(height)
 
     def creases(self) -> Singles:
         """Compute the depth, 0 to about 1, of the creases in the thin skin of the lids.
@@ -462,12 +480,12 @@ class _Strip:
         folds.
         """
         y, out_mm, tiles = self.y, self.out_mm, self.tiles
+        depth = np.zeros_like(y)
+        if np.min(out_mm) > _CREASES_END_MM:
+            return depth
         reach = step(out_mm, 0.4, 2.0) * np.exp(-np.square(np.maximum(out_mm - 7.0, 0) * 0.2))
         far = np.square(y * (1 / 21.0))
         reach = reach * step(np.abs(self.upper), 0.05, 0.5) * np.exp(-far * far * far)
-        depth = np.zeros_like(y)
-        if not np.any(reach > 1e-3):
-            return depth
         sway, some, less = (self.slowly(name) for name in ("bent", "wide", "fine"))
         for side in (0, 1):
             mine = (reach > 1e-3) & ((self.upper > 0) == (side == 0))
@@ -491,6 +509,8 @@ class _Strip:
         low, width = self.tiles.brow
         out = np.zeros_like(self.y)
         inside = (self.z > np.min(low - width)) & (self.z < np.max(low + 2 * width))
+        if not np.any(inside):
+            return out
         y, z = self.y[inside], self.z[inside]
         along = (21.0 - y) / 46.0
         start, end = _BROW_ENDS
@@ -510,11 +530,11 @@ class _Strip:
 
     def veins(self) -> Singles:
         """Compute the loss of light, 0 to about 0.2, over veins in the skin of the lids: broad and blurred."""
-        tiles, where = self.tiles, self.slowly("veins")
         out: Singles = np.zeros_like(self.y)
-        some = where > 1e-3
-        if not np.any(some):
+        if not self.slow.reaches("veins", self.strip, 1e-3):
             return out
+        tiles, where = self.tiles, self.slowly("veins")
+        some = where > 1e-3
         y, z = self.y[some], self.z[some]
         way = z + self.slowly("way")[some]
         bent = _places(y + 0.6 * way, 1.3 * way)
@@ -527,14 +547,15 @@ class _Strip:
         """Compute the loss of light over the roots of lashes, which make-up fills; beside the nose there are none."""
         out: Singles = np.zeros_like(self.y)
         near = np.abs(self.out_mm) < 2
-        if np.any(near):
-            lashes, along = self.spec.lashes, np.cos(self.turn).astype(np.float32)
-            count = np.where(self.upper > 0, lashes.upper_count, lashes.lower_count)
-            liner = np.where(self.upper > 0, 0.45, 0.1) * lashes.mascara
-            loss = _ROOTS_LOSS * count * lashes.diameter_mm / _MANY + liner
-            loss = loss * step(along, -1.0, -0.85) * (1 - step(along, 0.55, 0.75))
-            uneven = 1 + 0.4 * self.tiles.at(45, _places(self.y[near], self.out_mm[near]), (12, 90), (12, 60))
-            out[near] = (loss * _bell(self.out_mm, *_ROOTS_MM))[near] * uneven
+        if not np.any(near):
+            return out
+        lashes, along = self.spec.lashes, np.cos(self.turn).astype(np.float32)
+        count = np.where(self.upper > 0, lashes.upper_count, lashes.lower_count)
+        liner = np.where(self.upper > 0, 0.45, 0.1) * lashes.mascara
+        loss = _ROOTS_LOSS * count * lashes.diameter_mm / _MANY + liner
+        loss = loss * step(along, -1.0, -0.85) * (1 - step(along, 0.55, 0.75))
+        uneven = 1 + 0.4 * self.tiles.at(45, _places(self.y[near], self.out_mm[near]), (12, 90), (12, 60))
+        out[near] = (loss * _bell(self.out_mm, *_ROOTS_MM))[near] * uneven
         return np.clip(out, 0, 0.9)
 
     def albedo(self, open_: Singles, spots: Singles) -> Singles:
@@ -552,11 +573,13 @@ class _Strip:
         # In the crease, skin lies against skin.
         tone *= 1 - 0.12 * _bell(rows, CONJUNCTIVA + MARGIN + LID - 0.7, 0.9) * step(upper, 0.12, 0.75)
         outer = skin.albedo * tone * spots
+        s = _keratinised(rows)
+        if np.all(s == 1):
+            return np.asarray(np.clip(outer, 0.02, 0.95))
         # Where the conjunctiva lies on the globe, it is as white as the adjacent sclera.
         white = Look().sclera_albedo
         moist = white + step(rows, 1.0, CONJUNCTIVA - 1.0) * (skin.wet_albedo - white)
         moist = moist * (1 - self.flesh * (0.3 - 0.08 * self.nodules)) * (1 + 0.25 * mottled)
-        s = _keratinised(rows)
         return np.asarray(np.clip(moist + s * (outer - moist), 0.02, 0.95))
 
 
