@@ -253,8 +253,15 @@ def _covariance(first: str, second: str, roots: Mapping[str, Distribution], tabl
 def _hermite(found: Distribution) -> Floats:
     """Compute E[F(z) He_k(z)] for k >= 1 of the map F of a marginal."""
     assert not isinstance(found, Regression)
+    z, weighted = _quadrature()
+    return np.asarray(found.at(z) @ weighted)
+
+
+@cache
+def _quadrature() -> tuple[Floats, Floats]:
+    """Return nodes z (n,) of Gauss and Hermite, and He_k(z) for k >= 1, times the nodes' weights (n, k)."""
     z, weight = hermegauss(_NODES)
-    return np.asarray((weight / weight.sum() * found.at(z)) @ hermevander(z, _ORDERS - 1)[:, 1:])
+    return z, hermevander(z, _ORDERS - 1)[:, 1:] * (weight / weight.sum())[:, None]
 
 
 def _mean(found: Regression, roots: Mapping[str, Distribution]) -> float:
