@@ -222,9 +222,8 @@ class _Polar:
         # The cells bend like the fibres beside them.
         x = (self.turn + 0.0025 * self.warp[some]) * around
         y = np.broadcast_to(self.s[some] * along, x.shape) + 0.02 * np.roll(self.warp[some], 97, axis=1)
-        distances, cells = nearest_two(copies, x, y)
-        first, second = distances[:, : len(rows)]
-        return second - first, np.tile(np.arange(count), 3)[cells[:, : len(rows)]], count
+        lead, cells = nearest_two(copies, x, y)
+        return lead[: len(rows)], np.tile(np.arange(count), 3)[cells[:, : len(rows)]], count
 
     def empty(self) -> Singles:
         """Zeros over the map."""

@@ -76,14 +76,15 @@ def furrows(seed: int, size: int, cells: int, stretch: float = 1.0) -> Singles:
     x = turn + wobble * band(seed + 1, size, (0, 40), (0, 40))
     y = turn[:, None] * stretch + wobble * stretch * band(seed + 2, size, (0, 40), (0, 40))
     copies = [seeds + extent * np.array([i, j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    (first, second), _ = nearest_two(np.concatenate(copies), x, y)
-    second -= first
-    second /= np.float32(0.45 * np.sqrt(stretch / cells))
-    return np.asarray(np.minimum(second, 1, out=second))
+    around = np.concatenate(copies)
+    around = around[np.all(np.abs(around / extent - 0.5) < 0.75, axis=1)]  # others are nowhere among the nearest
+    lead, _ = nearest_two(around, x, y)
+    lead /= np.float32(0.45 * np.sqrt(stretch / cells))
+    return np.asarray(np.minimum(lead, 1, out=lead))
 
 
 def nearest_two(seeds: Floats, x: Floats, y: Floats) -> tuple[Singles, NDArray[np.int32]]:
-    """Compute distances (2, h, w) of points to the nearest and second nearest seed (n, 2), and numbers of these seeds.
+    """Compute how much farther (h, w) the second nearest seed (n, 2) is than the nearest, and their numbers (2, h, w).
 
     The sides must be multiples of 8. Neighbouring points share a short list of candidates, which is much faster than a
     search for each of them.
@@ -92,10 +93,10 @@ def nearest_two(seeds: Floats, x: Floats, y: Floats) -> tuple[Singles, NDArray[n
     rows = [v.reshape(-1, side, w).mean(axis=1) for v in (x, y)]
     middle = np.stack([v.reshape(h // side, -1, side).mean(axis=2) for v in rows], axis=-1)
     _, near = cKDTree(seeds, compact_nodes=False, balanced_tree=False).query(middle, k=_CANDIDATES)
-    distances, numbers = np.empty((2, h, w), np.float32), np.empty((2, h, w), np.int32)
+    lead, numbers = np.empty((h, w), np.float32), np.empty((2, h, w), np.int32)
     x, y = (np.ascontiguousarray(v, dtype=float) for v in (x, y))
-    kernels.nearest_two(seeds, near, x, y, distances, numbers)
-    return distances, numbers
+    kernels.nearest_two(seeds, near, x, y, lead, numbers)
+    return lead, numbers
 
 
 def padded(tile: Singles) -> Singles:

@@ -54,9 +54,7 @@ def shift(field: Singles, aside: Singles, out: Singles) -> None:
 
 
 @compiled()
-def nearest_two(
-    seeds: Floats, near: Ints, x: Floats, y: Floats, distances: Singles, numbers: NDArray[np.int32]
-) -> None:
+def nearest_two(seeds: Floats, near: Ints, x: Floats, y: Floats, lead: Singles, numbers: NDArray[np.int32]) -> None:
     """Find the two nearest of the nearby seeds for every point.
 
     Args:
@@ -64,7 +62,7 @@ def nearest_two(
         near: (h / BLOCK, w / BLOCK, c) numbers of the seeds near each block of points.
         x: (h, w) coordinates of the points.
         y: (h, w).
-        distances: (2, h, w) distances to the nearest and the second nearest seed.
+        lead: (h, w) how much farther the second nearest seed is than the nearest.
         numbers: (2, h, w) numbers of these seeds.
     """
     # A seed is compared with all points of a block in vector instructions, which one array of one type allows.
@@ -87,8 +85,5 @@ def nearest_two(
                     block[_ONE, k] = number if square < first else one
             for k in range(BLOCK * BLOCK):
                 row, column = BLOCK * i + k // BLOCK, BLOCK * j + k % BLOCK
-                distances[0, row, column], distances[1, row, column] = (
-                    np.sqrt(block[_FIRST, k]),
-                    np.sqrt(block[_SECOND, k]),
-                )
+                lead[row, column] = np.float32(np.sqrt(block[_SECOND, k])) - np.float32(np.sqrt(block[_FIRST, k]))
                 numbers[0, row, column], numbers[1, row, column] = block[_ONE, k], block[_TWO, k]
