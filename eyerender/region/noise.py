@@ -109,8 +109,10 @@ class Places:
 
     def __init__(self, size: int, x: NDArray[Any], y: NDArray[Any], period_mm: float) -> None:
         self.size = size
-        turns = (c * np.float32(1 / period_mm) for c in (x, y))
-        self._u, self._v = ((c - np.floor(c)) * np.float32(size) for c in turns)
+        self._u, self._v = (np.asarray(c * np.float32(1 / period_mm)) for c in (x, y))
+        for turns in (self._u, self._v):
+            turns -= np.floor(turns)
+            turns *= np.float32(size)
 
     def sample(self, tile: Singles) -> Singles:
         """Return the values of a `padded` tile at the positions."""

@@ -53,12 +53,12 @@ def _vessels(rng: np.random.Generator, size: int) -> Singles:
     tips = np.stack([x, y, np.cos(heading), np.sin(heading), weight, steps, steps, level], axis=1)
     layers = np.zeros((3, size, size))
     while len(tips):
-        tips = tips[: kernels.prune(tips, limbus * (1.05 + 0.65 * rng.random(len(tips))), size)]
-        kernels.grow(tips, 0.16 * rng.standard_normal(len(tips)), layers)
+        tips = tips[: kernels.prune(tips, rng.random(len(tips)), limbus, size)]
+        kernels.grow(tips, rng.standard_normal(len(tips)), layers)
         branches = tips[(rng.random(len(tips)) < 0.012) & (tips[:, kernels.LEVEL] < 3)]
-        n = len(branches)
-        if n:
-            kernels.fork(branches, (2 * rng.integers(0, 2, n) - 1) * rng.uniform(0.3, 0.8, n))
+        if len(branches):
+            sides = np.array([2 * rng.integers(0, 2) - 1 for _ in branches])
+            kernels.fork(branches, sides * rng.uniform(0.3, 0.8, len(branches)))
             tips = np.concatenate([tips, branches])
     return _blurred(layers)
 

@@ -12,19 +12,21 @@ X, Y, COSINE, SINE, WEIGHT, LEFT, STEPS, LEVEL, COLUMNS = range(9)
 
 
 @compiled()
-def prune(tips: Floats, ends: Floats, size: int) -> int:
+def prune(tips: Floats, draws: Floats, limbus: float, size: int) -> int:
     """Move the tips (n, COLUMNS) that still grow to the front, in their order, and return their number.
 
     Args:
         tips: the tips.
-        ends: (n,) distance from the middle of the map at which each ends.
-        size: side of the map.
+        draws: (n,) random numbers from 0 to 1.
+        limbus: radius of the limbus, pixels.
+        size: side of the map, with the limbus in its middle.
     """
     count, half = 0, size / 2
     for k in range(len(tips)):
         x, y = tips[k, X], tips[k, Y]
         inside = min(x, y) > 1 and max(x, y) < size - 2
-        if inside and tips[k, LEFT] > 0 and np.sqrt((x - half) ** 2 + (y - half) ** 2) >= ends[k]:
+        away, end = np.sqrt((x - half) ** 2 + (y - half) ** 2), limbus * (1.05 + 0.65 * draws[k])
+        if inside and away >= end and tips[k, LEFT] > 0:
             for column in range(COLUMNS):
                 tips[count, column] = tips[k, column]
             count += 1
@@ -32,12 +34,12 @@ def prune(tips: Floats, ends: Floats, size: int) -> int:
 
 
 @compiled()
-def grow(tips: Floats, bends: Floats, layers: Floats) -> None:
+def grow(tips: Floats, draws: Floats, layers: Floats) -> None:
     """Move tips (n, COLUMNS) by a step, and add their weights to the layers (3, size, size) of their levels.
 
     Args:
         tips: the tips.
-        bends: (n,) random changes of direction, rad.
+        draws: (n,) random numbers of variance 1.
         layers: maps of the vessels, the widest first.
     """
     half = layers.shape[1] / 2
@@ -45,7 +47,7 @@ def grow(tips: Floats, bends: Floats, layers: Floats) -> None:
         tip = tips[k]
         x, y = half - tip[X], half - tip[Y]
         # Vessels turn slowly towards the middle.
-        _turn(tip, bends[k] + 0.02 * (y * tip[COSINE] - x * tip[SINE]) / np.sqrt(x * x + y * y))
+        _turn(tip, 0.16 * draws[k] + 0.02 * (y * tip[COSINE] - x * tip[SINE]) / np.sqrt(x * x + y * y))
         tip[X] += 0.8 * tip[COSINE]
         tip[Y] += 0.8 * tip[SINE]
         layers[min(int(tip[LEVEL]), 2), int(tip[Y]), int(tip[X])] += tip[WEIGHT]
