@@ -39,15 +39,14 @@ def band_noise(
     kept = min(w // 2 + 1, int(_NEGLIGIBLE * across[1]) + 2)
     f = np.abs(fft.fftfreq(h) * h)
     some = np.flatnonzero(f <= _NEGLIGIBLE * up[1])
-    waves = rng.standard_normal((len(some), 2 * kept), np.float32).view(np.complex64)
-    k, f = np.arange(kept, dtype=float), f[some, None]
-    left = gain(f, 0, up[1]) * gain(k, 0, across[1])
-    if across[0] > 0 or up[0] > 0:
-        below = [np.exp(-((v / low) ** 2)) if low > 0 else 1.0 for v, low in ((f, up[0]), (k, across[0]))]
-        left *= 1 - below[0] * below[1]
-    waves *= left.astype(np.float32)
+    waves = rng.standard_normal((len(some), 2 * kept), np.float32)
+    f, k, banded = f[some], np.arange(kept, dtype=float), float(up[0] > 0 or across[0] > 0)
+    below = (
+        np.exp(-((v / low) ** 2)) if low > 0 else np.full(len(v), banded) for v, low in ((f, up[0]), (k, across[0]))
+    )
+    kernels.weigh(waves, gain(f, 0, up[1]), gain(k, 0, across[1]), *below)
     spectrum = np.zeros((h, kept), np.complex64)
-    spectrum[some] = waves
+    spectrum[some] = waves.view(np.complex64)
     spectrum[0, 0] = 0
     # Columns stand for two frequencies, +k and -k, except the first and, for even widths, the last of all.
     single = [0, w // 2] if kept == w // 2 + 1 and w % 2 == 0 else [0]

@@ -15,6 +15,24 @@ _X, _Y, _FIRST, _SECOND, _ONE, _TWO = range(
 
 
 @compiled()
+def weigh(waves: Singles, up: Floats, across: Floats, below_up: Floats, below_across: Floats) -> None:
+    """Multiply waves by the gain up * across * (1 - below_up * below_across).
+
+    Args:
+        waves: (h, 2 w) real and imaginary parts in turn.
+        up: (h,) factors of the rows.
+        across: (w,) factors of the columns.
+        below_up: (h,).
+        below_across: (w,).
+    """
+    for row in range(len(up)):
+        for column in range(len(across)):
+            gain = np.float32(up[row] * across[column] * (1 - below_up[row] * below_across[column]))
+            waves[row, 2 * column] *= gain
+            waves[row, 2 * column + 1] *= gain
+
+
+@compiled()
 def sample(tile: Singles, u: Singles, v: Singles, out: Singles) -> None:
     """Interpolate a tile linearly at positions in texels.
 
