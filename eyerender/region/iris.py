@@ -86,7 +86,9 @@ def _noise(
     if periodic_rows:
         return band_noise(rng, shape, columns, rows)
     field = band_noise(rng, (2 * h, w), columns, (2 * rows[0], 2 * rows[1]), h)
-    return np.asarray(field / field.std(dtype=float).astype(np.float32))
+    wide = field.ravel().astype(float)
+    field /= np.float32(np.sqrt(wide @ wide / wide.size - wide.mean() ** 2))
+    return field
 
 
 def iris_maps(iris: DrawnPattern) -> Singles:

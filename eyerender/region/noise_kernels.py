@@ -59,15 +59,20 @@ def shift(field: Singles, aside: Singles, out: Singles) -> None:
 
     Args:
         field: (h, w) values.
-        aside: (h, w) distances to the right, columns.
+        aside: (h, w) distances to the right, columns; less than w.
         out: (h, w) interpolated values.
     """
+    width = field.shape[1]
     for row in range(field.shape[0]):
-        for column in range(field.shape[1]):
+        for column in range(width):
             place = np.float32(column) + aside[row, column]
             before = np.floor(place)
-            left = int(before) % field.shape[1]
-            right = left + 1 if left + 1 < field.shape[1] else 0
+            left = int(before)
+            if left < 0:
+                left += width
+            elif left >= width:
+                left -= width
+            right = left + 1 if left + 1 < width else 0
             out[row, column] = field[row, left] + (place - before) * (field[row, right] - field[row, left])
 
 
