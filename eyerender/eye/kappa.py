@@ -64,10 +64,13 @@ def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
     _, axis = pupillary_axis(eye)
     nasal, up = angles_of(eye, axis) + np.radians(wanted_deg)
     way = field_direction(np.array([_handed(eye) * nasal, up]))
-    point = np.zeros(3)
+    viewpoint = _FAR_MM * way
     for _ in range(2):  # the second ray leaves the cornea along `way`
-        point = _through_stop(eye, point + _FAR_MM * way, 1.0, reason).exit_points_mm
-    traced = trace(path_to_retina(eye), 1.0, point + _START_MM * way, -way)
+        found = _through_stop(eye, viewpoint, 1.0, reason)
+        viewpoint = found.exit_points_mm + _FAR_MM * way
+    outwards, indoors = found.inner_directions, path_to_retina(eye)[len(eye.front) :]
+    start = eye.stop.centre_mm + _START_MM * outwards
+    traced = trace(indoors, float(eye.front_indices[-1]), start, -outwards)
     if traced.status != Status.OK:
         raise InputError(reason, path="kappa_deg")
     return np.asarray(traced.points_mm[-1])
