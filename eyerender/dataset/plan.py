@@ -27,7 +27,7 @@ from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
 from ..eye.topography import topography_files
 from ..observation import EYES
-from ..population.people import PersonChoice, choice_of
+from ..population.people import PersonChoice, choice_of, chosen_person
 from ..references import is_reference
 from ..scene import Scene
 from ..scene.spec import SceneSpec
@@ -415,7 +415,7 @@ class Plan:
             try:
                 if self.spec.population is not None:
                     # The distance between the eyes needs both of them.
-                    _ = self.person_of(subject, attempt).chosen().apex_distance_mm
+                    _ = chosen_person(self.person_of(subject, attempt).to_mapping()).apex_distance_mm
                 else:
                     eye, _, modified = self._eye_of(tree, turn)
                     if modified:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..errors import InputError, Refuse
-from ..geometry.graphs import express
+from ..geometry.graphs import graphs_of
 from ..geometry.surfaces import Surface, components
 from ..geometry.surfaces_measured import Measured
 from .corneas import WINDOW, grid_surface, misfit_mm, zernike_surface
@@ -128,7 +128,7 @@ def _check_inside(spec: EyeParts, refuse: Refuse, stop: Stop, pupil_radius_mm: f
 
 def _depth(surface: Surface, grid: Floats) -> Floats:
     """Depth x (mm, eye frame) of the surface over points (y, z), (m, 2) -> (m,); NaN where the line misses it."""
-    graphs = express(surface)
+    graphs = graphs_of(surface)
     if graphs is not None and graphs.plain:
         return np.asarray(graphs.heights(*grid.T)[0])
     start = np.column_stack([np.full(len(grid), _FAR_MM), grid])

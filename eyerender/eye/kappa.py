@@ -8,14 +8,13 @@ axis instead.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.transforms import normalize
-from ..optics.trace import outward_path, trace
+from ..optics.solve import ApparentPoints, apparent_points
+from ..optics.trace import trace
 from ..status import Status
 from .landmarks import field_direction, fovea_by_nodal_ray, incident_node, path_to_retina
 from .model import EyeModel
@@ -25,8 +24,8 @@ from .spec import EyeSpec
 _START_MM = 20.0
 _STEP_RAD = 1e-4
 _STEPS = 8
-_SETTLED_MM, _SETTLED_RAD = 1e-9, 1e-13
-_ASIDE = np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+_SETTLED_MM = 1e-9
+_FAR_MM, _NO_INDEX = 1e9, 1e-14
 
 
 def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
@@ -35,7 +34,9 @@ def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
     Raises:
         InputError: the cornea has no such axis.
     """
-    return _through_stop(eye, lambda point: np.asarray(eye.front[0].normal(point)), "the cornea has no pupillary axis")
+    # Whatever its direction in a medium of index 0, light enters along the normal.
+    found = _through_stop(eye, np.array([_FAR_MM, 0.0, 0.0]), _NO_INDEX, "the cornea has no pupillary axis")
+    return found.exit_points_mm, np.asarray(eye.front[0].normal(found.exit_points_mm))
 
 
 def kappa_deg(eye: EyeModel) -> tuple[float, float]:
@@ -63,8 +64,13 @@ def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
     _, axis = pupillary_axis(eye)
     nasal, up = angles_of(eye, axis) + np.radians(wanted_deg)
     way = field_direction(np.array([_handed(eye) * nasal, up]))
-    point, _ = _through_stop(eye, lambda _: way, reason)
-    traced = trace(path_to_retina(eye), 1.0, point + _START_MM * way, -way)
+    viewpoint = _FAR_MM * way
+    for _ in range(2):  # the second ray leaves the cornea along `way`
+        found = _through_stop(eye, viewpoint, 1.0, reason)
+        viewpoint = found.exit_points_mm + _FAR_MM * way
+    outwards, indoors = found.inner_directions, path_to_retina(eye)[len(eye.front) :]
+    start = eye.stop.centre_mm + _START_MM * outwards
+    traced = trace(indoors, float(eye.front_indices[-1]), start, -outwards)
     if traced.status != Status.OK:
         raise InputError(reason, path="kappa_deg")
     return np.asarray(traced.points_mm[-1])
@@ -115,33 +121,17 @@ def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: flo
     raise InputError("no nodal ray ends there", path="fovea")
 
 
-def _through_stop(eye: EyeModel, way: Callable[[Floats], Floats], reason: str) -> tuple[Floats, Floats]:
-    """Find the ray from the centre of the stop that leaves the cornea in a wanted direction, by Newton's method.
-
-    Args:
-        eye: the eye.
-        way: returns the wanted unit directions (3,) or (k, 3) of rays that leave the cornea at points (k, 3).
-        reason: message of the error.
-
-    Returns:
-        The point (3,) where the ray leaves the cornea, and its direction (3,) there.
+def _through_stop(eye: EyeModel, viewpoint_mm: Floats, n_outside: float, reason: str) -> ApparentPoints:
+    """Find the ray from the centre of the stop to a viewpoint (3,) in a medium of index `n_outside`.
 
     Raises:
         InputError: there is no such ray.
     """
-    path = outward_path(eye.front, eye.front_indices)
-    start = np.broadcast_to(eye.stop.centre_mm, (3, 3))
-    inside = np.array([1.0, 0.0, 0.0])
-    for _ in range(_STEPS):
-        traced = trace(path, float(eye.front_indices[-1]), start, normalize(inside + _STEP_RAD * _ASIDE))
-        if not (traced.status == Status.OK).all():
-            break
-        error = (traced.directions[-1] - way(traced.points_mm[-1]))[:, 1:]
-        if np.abs(error[0]).max() < _SETTLED_RAD:
-            return traced.points_mm[-1, 0], traced.directions[-1, 0]
-        slope = (error[1:] - error[0]).T / _STEP_RAD
-        inside = normalize(inside - [0.0, *np.linalg.solve(slope, error[0])])
-    raise InputError(reason, path="stop.position_mm")
+    centre = eye.stop.centre_mm
+    found = apparent_points(eye.front, eye.front_indices, centre, viewpoint_mm, n_outside=n_outside)
+    if found.status != Status.OK:
+        raise InputError(reason, path="stop.position_mm")
+    return found
 
 
 def angles_of(eye: EyeModel, way: Floats) -> Floats:

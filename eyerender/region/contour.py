@@ -66,7 +66,10 @@ def step(x: NDArray[Any] | float, low: float, high: float) -> NDArray[Any]:
     """Compute a smooth step from 0 at `low` to 1 at `high`, in the precision of `x`."""
     s = np.asarray((np.asarray(x) - low) / (high - low))
     np.minimum(np.maximum(s, 0, out=s), 1, out=s)  # `np.clip` is slower
-    return np.asarray(s * s * (3 - 2 * s))
+    out = np.asarray(3 - 2 * s)
+    s *= s  # in place, because new arrays take longer than the arithmetic
+    out *= s
+    return out
 
 
 def unit(v: Floats) -> Floats:

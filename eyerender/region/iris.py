@@ -20,6 +20,7 @@ from scipy import ndimage
 
 from ..arrays import Ints, Singles
 from ..spec import Spec
+from . import noise_kernels as kernels
 from .contour import step
 from .noise import band_noise, nearest_two
 
@@ -84,8 +85,10 @@ def _noise(
     h, w = shape
     if periodic_rows:
         return band_noise(rng, shape, columns, rows)
-    field = band_noise(rng, (2 * h, w), columns, (2 * rows[0], 2 * rows[1]))[:h]
-    return np.asarray(field / field.std(dtype=float).astype(np.float32))
+    field = band_noise(rng, (2 * h, w), columns, (2 * rows[0], 2 * rows[1]), h)
+    wide = field.ravel().astype(float)
+    field /= np.float32(np.sqrt(wide @ wide / wide.size - wide.mean() ** 2))
+    return field
 
 
 def iris_maps(iris: DrawnPattern) -> Singles:
@@ -147,11 +150,9 @@ def _fibres(rng: np.random.Generator, warp: Singles, ciliary: Singles, strength:
     shape = (RADIAL, ANGULAR)
 
     def bent(field: Singles, share: float) -> Singles:
-        place = np.arange(ANGULAR, dtype=np.float32) + np.float32(share) * warp
-        left = np.floor(place)
-        column, part = left.astype(np.intp) % ANGULAR, place - left
-        low = np.take_along_axis(field, column, axis=1)
-        return np.asarray(low + part * (np.take_along_axis(field, (column + 1) % ANGULAR, axis=1) - low))
+        out = np.empty_like(field)
+        kernels.shift(field, np.float32(share) * warp, out)
+        return out
 
     fine_by, long_by = rng.uniform(0.6, 1.35), rng.uniform(1.0, 3.0)
     coarse = bent(_noise(rng, shape, (0, 1.6), (22 * fine_by, 60 * fine_by)), 1.0)
@@ -180,8 +181,12 @@ def _furrows(rng: np.random.Generator, s: NDArray[Any], turn: NDArray[Any]) -> S
         uneven = np.clip(0.7 + 0.4 * _noise(rng, (1, ANGULAR), (0, 1), (3, 24), True), 0, 1.4)
         along = np.mod(turn - start, 1.0)
         mask = step(along, 0.0, 0.08) * (1 - step(along, span - 0.08, span)) * uneven
-        d = (s - place - wave) / rng.uniform(0.008, 0.022)
-        out += mask * rng.uniform(0.3, 1.0) * (np.exp(-(d**2)) - 0.4 * np.exp(-((d - 1.8) ** 2)))
+        width = rng.uniform(0.008, 0.022)
+        # The depth is less than 1e-15 in other rows.
+        ends = place + wave.min() - 6 * width, place + wave.max() + 8 * width
+        near = slice(*np.searchsorted(s[:, 0], ends))
+        d = (s[near] - place - wave) / width
+        out[near] += mask * rng.uniform(0.3, 1.0) * (np.exp(-(d**2)) - 0.4 * np.exp(-((d - 1.8) ** 2)))
     return out
 
 
@@ -219,9 +224,8 @@ class _Polar:
         # The cells bend like the fibres beside them.
         x = (self.turn + 0.0025 * self.warp[some]) * around
         y = np.broadcast_to(self.s[some] * along, x.shape) + 0.02 * np.roll(self.warp[some], 97, axis=1)
-        distances, cells = nearest_two(copies, x, y)
-        first, second = distances[:, : len(rows)]
-        return second - first, cells[:, : len(rows)] % count, count
+        lead, cells = nearest_two(copies, x, y)
+        return lead[: len(rows)], np.tile(np.arange(count), 3)[cells[:, : len(rows)]], count
 
     def empty(self) -> Singles:
         """Zeros over the map."""

@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -32,7 +33,7 @@ from .iris import DrawnPattern
 LIMIT = "EYERENDER_MAP_CACHE_MB"
 """Environment variable: size of the map cache in megabytes; 0 disables it."""
 DEFAULT_MB = 1000
-SCHEMA = "eyerender/map/1"
+SCHEMA = "eyerender/map/2"
 _ENDING = ".map"
 _DTYPES = ("float16", "float32")
 _LARGEST_HEADER, _ALIGNMENT = 4096, 64
@@ -106,14 +107,10 @@ def _code() -> list[str]:
     return [__version__, digest.hexdigest(), np.__version__, scipy.__version__]
 
 
-def _checksum(data: memoryview | bytes) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
-
-
 def _write(file: Path, values: NDArray[Any]) -> None:
     """Write a map: a header, one line of JSON, and the bytes of the array."""
     data = np.ascontiguousarray(values)
-    header = {"schema": SCHEMA, "dtype": str(data.dtype), "shape": data.shape, "blake2b": _checksum(data.data)}
+    header = {"schema": SCHEMA, "dtype": str(data.dtype), "shape": data.shape, "crc32": zlib.crc32(data.data)}
     file.parent.mkdir(parents=True, exist_ok=True)
     with written(file, sync=False) as out:  # the checksum detects the damage of a power cut
         line = json.dumps(header).encode()
@@ -142,7 +139,7 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
         dtype, shape = header["dtype"], tuple(header["shape"])
         sound = header["schema"] == SCHEMA and dtype in _DTYPES and all(type(n) is int and n >= 0 for n in shape)
         body = memoryview(data)[len(line) + 1 :]
-        if sound and len(body) == np.prod(shape) * np.dtype(dtype).itemsize and header["blake2b"] == _checksum(body):
+        if sound and len(body) == np.prod(shape) * np.dtype(dtype).itemsize and header["crc32"] == zlib.crc32(body):
             return np.frombuffer(body, dtype).reshape(shape)
     except (InputError, ValueError, KeyError, TypeError, OverflowError):
         pass

@@ -3,11 +3,33 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Floats, Ints, Singles
 from ..jit import compiled
 
 BLOCK = 8  # texels along the side of a block that shares a list of nearby cells
+_X, _Y, _FIRST, _SECOND, _ONE, _TWO = range(
+    6
+)  # rows of a block: places, squares of the distances, numbers of the cells
+
+
+@compiled()
+def weigh(waves: Singles, up: Floats, across: Floats, below_up: Floats, below_across: Floats) -> None:
+    """Multiply waves by the gain up * across * (1 - below_up * below_across).
+
+    Args:
+        waves: (h, 2 w) real and imaginary parts in turn.
+        up: (h,) factors of the rows.
+        across: (w,) factors of the columns.
+        below_up: (h,).
+        below_across: (w,).
+    """
+    for row in range(len(up)):
+        for column in range(len(across)):
+            gain = np.float32(up[row] * across[column] * (1 - below_up[row] * below_across[column]))
+            waves[row, 2 * column] *= gain
+            waves[row, 2 * column + 1] *= gain
 
 
 @compiled()
@@ -32,7 +54,30 @@ def sample(tile: Singles, u: Singles, v: Singles, out: Singles) -> None:
 
 
 @compiled()
-def nearest_two(seeds: Floats, near: Ints, x: Floats, y: Floats, distances: Singles, numbers: Ints) -> None:
+def shift(field: Singles, aside: Singles, out: Singles) -> None:
+    """Sample the rows of a field linearly beside every place; the columns are periodic.
+
+    Args:
+        field: (h, w) values.
+        aside: (h, w) distances to the right, columns; less than w.
+        out: (h, w) interpolated values.
+    """
+    width = field.shape[1]
+    for row in range(field.shape[0]):
+        for column in range(width):
+            place = np.float32(column) + aside[row, column]
+            before = np.floor(place)
+            left = int(before)
+            if left < 0:
+                left += width
+            elif left >= width:
+                left -= width
+            right = left + 1 if left + 1 < width else 0
+            out[row, column] = field[row, left] + (place - before) * (field[row, right] - field[row, left])
+
+
+@compiled()
+def nearest_two(seeds: Floats, near: Ints, x: Floats, y: Floats, lead: Singles, numbers: NDArray[np.int32]) -> None:
     """Find the two nearest of the nearby seeds for every point.
 
     Args:
@@ -40,18 +85,28 @@ def nearest_two(seeds: Floats, near: Ints, x: Floats, y: Floats, distances: Sing
         near: (h / BLOCK, w / BLOCK, c) numbers of the seeds near each block of points.
         x: (h, w) coordinates of the points.
         y: (h, w).
-        distances: (2, h, w) distances to the nearest and the second nearest seed.
+        lead: (h, w) how much farther the second nearest seed is than the nearest.
         numbers: (2, h, w) numbers of these seeds.
     """
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            first, second, one, two = np.inf, np.inf, 0, 0
-            for seed in near[row // BLOCK, column // BLOCK]:
-                dx, dy = x[row, column] - seeds[seed, 0], y[row, column] - seeds[seed, 1]
-                square = dx * dx + dy * dy
-                if square < first:
-                    first, second, one, two = square, first, seed, one
-                elif square < second:
-                    second, two = square, seed
-            distances[0, row, column], distances[1, row, column] = np.sqrt(first), np.sqrt(second)
-            numbers[0, row, column], numbers[1, row, column] = one, two
+    # A seed is compared with all points of a block in vector instructions, which one array of one type allows.
+    block = np.empty((6, BLOCK * BLOCK))
+    for i in range(near.shape[0]):
+        for j in range(near.shape[1]):
+            for k in range(BLOCK * BLOCK):
+                row, column = BLOCK * i + k // BLOCK, BLOCK * j + k % BLOCK
+                block[_X, k], block[_Y, k] = x[row, column], y[row, column]
+                block[_FIRST, k], block[_SECOND, k] = np.inf, np.inf
+            for seed in near[i, j]:
+                seed_x, seed_y, number = seeds[seed, 0], seeds[seed, 1], float(seed)
+                for k in range(BLOCK * BLOCK):
+                    dx, dy = block[_X, k] - seed_x, block[_Y, k] - seed_y
+                    square = dx * dx + dy * dy
+                    first, second, one, two = block[_FIRST, k], block[_SECOND, k], block[_ONE, k], block[_TWO, k]
+                    block[_SECOND, k] = first if square < first else (square if square < second else second)
+                    block[_TWO, k] = one if square < first else (number if square < second else two)
+                    block[_FIRST, k] = square if square < first else first
+                    block[_ONE, k] = number if square < first else one
+            for k in range(BLOCK * BLOCK):
+                row, column = BLOCK * i + k // BLOCK, BLOCK * j + k % BLOCK
+                lead[row, column] = np.float32(np.sqrt(block[_SECOND, k])) - np.float32(np.sqrt(block[_FIRST, k]))
+                numbers[0, row, column], numbers[1, row, column] = block[_ONE, k], block[_TWO, k]

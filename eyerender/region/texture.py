@@ -8,6 +8,7 @@ import numpy as np
 from scipy import fft
 
 from ..arrays import Floats, Singles, sealed
+from . import texture_kernels as kernels
 from .noise import band_noise, gain
 
 
@@ -35,7 +36,8 @@ def sclera_texture(seed: int, size: int = 768) -> Singles:
     )
     vessels = _vessels(rng, size)
     texture = shade * (1 - np.clip(vessels, 0, 0.3))
-    return sealed((texture / texture.mean(dtype=float)).astype(np.float32))
+    texture /= texture.mean(dtype=float)
+    return sealed(texture)
 
 
 def _vessels(rng: np.random.Generator, size: int) -> Singles:
@@ -43,47 +45,37 @@ def _vessels(rng: np.random.Generator, size: int) -> Singles:
     limbus = 0.29 / 0.6 / 2 * size / np.pi * 1.02  # 29 degrees of polar angle, in pixels of the map
     half, count = size / 2, 70
     start, away = rng.uniform(0, 2 * np.pi, count), size * rng.uniform(0.36, 0.48, count)
+    x, y = half + away * np.cos(start), half + away * np.sin(start)
     steps = rng.integers(120, 420, count)
-    # Each column is the tip of a vessel. All of them grow together, and a branch joins them.
-    tips = np.stack(
-        [
-            half + away * np.cos(start), half + away * np.sin(start), start + np.pi + rng.normal(0, 0.5, count),
-            rng.uniform(0.3, 1, count), steps, steps, rng.integers(0, 3, count),
-        ]
-    )  # fmt: skip
-    grown: list[tuple[Floats, Floats, Floats]] = [(np.zeros(0),) * 3]
-    while tips.size:
-        x, y, heading, weight, left, steps, level = tips
-        ends = limbus * (1.05 + 0.65 * rng.random(x.size))
-        inside = (np.minimum(x, y) > 1) & (np.maximum(x, y) < size - 2)
-        tips = tips[:, (np.hypot(x - half, y - half) >= ends) & inside & (left > 0)]
-        x, y, heading, weight, left, steps, level = tips
-        inward = np.arctan2(half - y, half - x)
-        heading += 0.16 * rng.standard_normal(x.size) + 0.02 * np.sin(inward - heading)
-        x += 0.8 * np.cos(heading)
-        y += 0.8 * np.sin(heading)
-        grown.append((np.minimum(level, 2), y.astype(int) * size + x.astype(int), weight.copy()))
-        weight *= 0.9985
-        left -= 1
-        branches = tips[:, (level < 3) & (rng.random(x.size) < 0.012)]
-        if branches.size:
-            n = branches.shape[1]
-            branches[2] += rng.choice([-1, 1], n) * rng.uniform(0.3, 0.8, n)
-            branches[3] *= 0.7
-            branches[5] = branches[5] // 2
-            branches[4], branches[6] = branches[5], branches[6] + 1
-            tips = np.concatenate([tips, branches], axis=1)
-    layers, places, weights = (np.concatenate(v) for v in zip(*grown, strict=True))
-    f2 = np.square(fft.fftfreq(size))[:, None] + np.square(fft.rfftfreq(size))
-    blurred = np.zeros(f2.shape, np.complex64)
-    for k, width in enumerate((2.2, 1.4, 0.9)):
-        some = layers == k
-        layer = np.bincount(places[some].astype(int), weights[some], minlength=size * size)
-        share = 0.16 * width * np.exp(-2 * (np.pi * width) ** 2 * f2)
-        if width > 1:  # wider vessels have a soft halo
-            share += 0.25 * np.exp(-2 * (np.pi * 5.0) ** 2 * f2)
-        blurred += share.astype(np.float32) * fft.rfft2(layer.reshape(size, size).astype(np.float32))
-    return np.asarray(fft.irfft2(blurred, s=(size, size)))
+    heading = start + np.pi + rng.normal(0, 0.5, count)
+    weight, level = rng.uniform(0.3, 1, count), rng.integers(0, 3, count)
+    # All tips grow together, and a branch joins them.
+    tips = np.stack([x, y, np.cos(heading), np.sin(heading), weight, steps, steps, level], axis=1)
+    layers = np.zeros((3, size, size))
+    while len(tips):
+        tips = tips[: kernels.prune(tips, rng.random(len(tips)), limbus, size)]
+        kernels.grow(tips, rng.standard_normal(len(tips)), layers)
+        branches = tips[(rng.random(len(tips)) < 0.012) & (tips[:, kernels.LEVEL] < 3)]
+        if len(branches):
+            sides = np.array([2 * rng.integers(0, 2) - 1 for _ in branches])
+            kernels.fork(branches, sides * rng.uniform(0.3, 0.8, len(branches)))
+            tips = np.concatenate([tips, branches])
+    return _blurred(layers)
+
+
+def _blurred(layers: Floats) -> Singles:
+    """Add layers (3, size, size) of vessels, blurred to their widths."""
+    size = layers.shape[1]
+
+    def blur(weight: float, deviation: float) -> Floats:
+        up, across = (np.exp(-2 * (np.pi * deviation * f) ** 2) for f in (fft.fftfreq(size), fft.rfftfreq(size)))
+        return np.asarray((weight * up)[:, None] * across)
+
+    halo = blur(0.25, 5.0)  # of wider vessels
+    waves = fft.rfft2(layers.astype(np.float32))
+    for wave, width in zip(waves, (2.2, 1.4, 0.9), strict=True):
+        wave *= (blur(0.16 * width, width) + (halo if width > 1 else 0)).astype(np.float32)
+    return np.asarray(fft.irfft2(waves.sum(axis=0), s=(size, size)))
 
 
 def film_ripples(seed: int) -> float:

@@ -11,6 +11,7 @@ from ...arrays import Floats
 from ...errors import InputError
 from ...region.anatomy import Region
 from ...region.globe import Globe
+from ...region.halves import to_halves
 from ...region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
 from ...region.headspec import Head
 from ...region.mesh import RegionMesh
@@ -52,7 +53,7 @@ class HeadScene(RegionScene):
 
     @staticmethod
     def _look(spec: Region) -> NDArray[np.float16]:
-        return head_map(spec, load_head(_head(spec))).astype(np.float16)
+        return to_halves(head_map(spec, load_head(_head(spec))))
 
     def _inner(self) -> None:
         return None
