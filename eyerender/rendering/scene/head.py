@@ -11,7 +11,6 @@ from ...arrays import Floats
 from ...errors import InputError
 from ...region.anatomy import Region
 from ...region.globe import Globe
-from ...region.halves import to_halves
 from ...region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
 from ...region.headspec import Head
 from ...region.mesh import RegionMesh
@@ -53,7 +52,7 @@ class HeadScene(RegionScene):
 
     @staticmethod
     def _look(spec: Region) -> NDArray[np.float16]:
-        return to_halves(head_map(spec, load_head(_head(spec))))
+        return head_map(spec, load_head(_head(spec))).astype(np.float16)
 
     def _inner(self) -> None:
         return None
