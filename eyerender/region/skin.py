@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from typing import Any
 
 import numpy as np
@@ -230,7 +230,7 @@ class _Tiles:
         key = places.size, *parts
         if key not in self._made:
             bands = [factor * band(self.spec.seed + number, places.size, *ends) for factor, number, *ends in parts]
-            self._made[key] = padded(np.sum(bands, axis=0, dtype=np.float32))
+            self._made[key] = padded(reduce(np.add, bands))
         return places.sample(self._made[key])
 
     @cached_property
