@@ -1,4 +1,4 @@
-"""Compiled heights x = h(y, z) of surfaces over one plane, with first and second derivatives.
+"""Compiled heights x = h(y, z) of surfaces over one plane, with first and second derivatives, and their hits by rays.
 
 The surfaces of an eye are rows of numbers, `numbers` (eyes, surfaces, `COLUMNS`), one row for all eyes or one per eye;
 `kinds` holds the kind of each surface, and `table` the coefficients of measured surfaces one after the other.
