@@ -8,6 +8,14 @@ import numpy as np
 
 from ..arrays import Bools, FloatLike, Floats
 
+STEPS = 12
+SETTLED_MM = 1e-7
+"""Where a ray meets such a height: Newton converges quadratically, so that an error of 1e-7 before the last step leaves
+less than 1e-14 after it.
+"""
+SEARCHED_MM, SAMPLES, HALVINGS = 4.0, 41, 30
+"""Where Newton fails, a change of sign is searched at samples on both sides of the start, and bisected."""
+
 
 class Jet(NamedTuple):
     """Height h over (y, z), its slopes and its second derivatives."""

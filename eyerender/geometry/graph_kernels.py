@@ -1,4 +1,4 @@
-"""Compiled heights x = h(y, z) of surfaces over one plane, with first and second derivatives.
+"""Compiled heights x = h(y, z) of surfaces over one plane, with first and second derivatives, and their hits by rays.
 
 The surfaces of an eye are rows of numbers, `numbers` (eyes, surfaces, `COLUMNS`), one row for all eyes or one per eye;
 `kinds` holds the kind of each surface, and `table` the coefficients of measured surfaces one after the other.
@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..jit import HELPER, compiled, njit
-from .biconic_kernels import biconic_jet
+from .biconic_kernels import HALVINGS, SAMPLES, SEARCHED_MM, SETTLED_MM, STEPS, biconic_jet
 
 SMOOTH, ZERNIKE, GRID = range(3)
 """Kinds of surfaces: quadrics and biconics, and the two kinds of measured surfaces."""
@@ -32,6 +32,9 @@ COLUMNS = SHAPE + 7
 
 helper = njit(**HELPER)
 inlined = njit(forceinline=True, **HELPER)  # calls would pass every field of every array
+# Numba counts the references to arrays, which takes longer than a small function; only functions that create arrays
+# need it.
+uncounted = njit(forceinline=True, _nrt=False, **HELPER)
 merged = njit(inline="always", **HELPER)  # numba types and optimizes a large function with its caller only, not twice
 _biconic_jet = inlined(biconic_jet)
 
@@ -225,3 +228,115 @@ def heights(kinds: Ints, numbers: Floats, table: Floats, y: Floats, z: Floats, o
     for s in range(len(kinds)):
         for k in range(len(y)):
             out[s, k] = jet(kinds, numbers, table, eye, s, y[k], z[k])[0]
+
+
+@uncounted
+def to_conic(curvature, shape, p, w, sign):  # type: ignore[no-untyped-def]
+    """Compute the distance to the conic c (y^2 + z^2) + 2 x + c p x^2 = 0, NaN where it is missed."""
+    gx = 1.0 + curvature * shape * p[0]
+    a = curvature * (1.0 + (shape - 1.0) * (w[0] * w[0]))
+    b = gx * w[0] + curvature * (p[1] * w[1] + p[2] * w[2])
+    value = (gx + 1.0) * p[0] + curvature * (p[1] * p[1] + p[2] * p[2])
+    return value / (sign * np.sqrt(b * b - a * value) - b)
+
+
+@uncounted
+def above(kinds, numbers, table, p, w, t):  # type: ignore[no-untyped-def]
+    """Compute how far the point at a distance along a ray is above the first surface, along x, and the derivative.
+
+    Also return whether the surface reaches there. Beyond its end it is continued with u = 1 (see `X0`).
+    """
+    c, y, z = numbers[0, 0], p[1] + t * w[1], p[2] + t * w[2]
+    r_y, r_z = c[11] + c[13] * y + c[14] * z, c[12] + c[15] * z
+    n_y, n_z = c[2] + c[4] * y + c[5] * z, c[3] + c[6] * z
+    r = c[10] + r_y * y + r_z * z
+    inside = r > 0.0
+    u = np.sqrt(r) if inside else 1.0
+    half = 0.5 / u
+    d = -1.0 / (c[7] + c[8] * y + c[9] * z + u)
+    x = d * (c[1] + n_y * y + n_z * z)
+    slope_y = c[16] + d * (n_y + c[4] * y + x * (c[8] + half * (r_y + c[13] * y)))
+    slope_z = c[17] + d * (n_z + c[5] * y + c[6] * z + x * (c[9] + half * (r_z + c[14] * y + c[15] * z)))
+    x += c[0] + c[16] * y + c[17] * z
+    if kinds[0] != SMOOTH:
+        outer, eye = (x, slope_y, slope_z, 0.0, 0.0, 0.0), np.int64(0)  # see `jets`
+        x, slope_y, slope_z, _, _, _ = measured_jet(kinds[0], numbers, table, eye, eye, y, z, outer)
+    return p[0] + t * w[0] - x, w[0] - slope_y * w[1] - slope_z * w[2], inside
+
+
+@uncounted
+def misses(kinds, numbers, table, p, w, sign, guess, far):  # type: ignore[no-untyped-def]
+    """Return whether a ray surely does not cross the first surface before `far`, because that surface is convex.
+
+    Going in, it must not start upwards, nor still go down above the surface at its end; going out, it must have come
+    out at its end.
+    """
+    if sign > 0.0 and guess < SEARCHED_MM and above(kinds, numbers, table, p, w, 0.0)[1] > 0.0:
+        return True
+    if far == np.inf:
+        return False
+    value, rate, inside = above(kinds, numbers, table, p, w, far)
+    return inside and sign * value > 0.0 and (rate < 0.0 or sign < 0.0)
+
+
+@uncounted
+def bracket(kinds, numbers, table, p, w, sign, guess, far):  # type: ignore[no-untyped-def]
+    """Bisect the first change of sign near a guess and before `far`; return the distance, NaN if there is none."""
+    low, high, front = guess - SEARCHED_MM, np.nan, False
+    for k in range(SAMPLES + HALVINGS):
+        searching = not high < np.inf
+        if searching and (k == SAMPLES or low > far):
+            break
+        after = guess - SEARCHED_MM + 2.0 * SEARCHED_MM * k / (SAMPLES - 1) if searching else 0.5 * (low + high)
+        value, _, inside = above(kinds, numbers, table, p, w, after)
+        if inside and sign * value <= 0.0 and (front or not searching):
+            high = after
+        else:
+            low, front = after, inside and sign * value > 0.0
+    return 0.5 * (low + high)
+
+
+@compiled("i8[::1], f8[:,:,::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1], b1, f8[::1]")
+def crossings(
+    kinds: Ints,
+    numbers: Floats,
+    table: Floats,
+    conic: Floats,
+    points: Floats,
+    ways: Floats,
+    inward: bool,
+    distance: Floats,
+) -> None:
+    """Intersect rays with the first surface by the method of `GraphSurface.hit`.
+
+    Args:
+        kinds: kind of the surface.
+        numbers: numbers of the surface.
+        table: table of the surface.
+        conic: (2,) its `likeness`.
+        points: (n, 3) origins of the rays in its frame, mm.
+        ways: (n, 3) their unit directions.
+        inward: whether they go in or out.
+        distance: (n,) how far the rays reach, mm; overwritten by the distances of the crossings, infinite for none.
+    """
+    sign = 1.0 if inward else -1.0
+    for i in range(len(points)):
+        p, w, far = (points[i, 0], points[i, 1], points[i, 2]), (ways[i, 0], ways[i, 1], ways[i, 2]), distance[i]
+        distance[i] = np.inf
+        guess, error = to_conic(conic[0], conic[1], p, w, sign), np.inf
+        if not guess - SEARCHED_MM < far or misses(kinds, numbers, table, p, w, sign, guess, far):
+            continue
+        t = guess
+        for searches in range(2):
+            if searches:
+                t = bracket(kinds, numbers, table, p, w, sign, guess, far)
+            for _ in range(STEPS):
+                error, rate, _ = above(kinds, numbers, table, p, w, t)
+                t -= error / rate
+                if not abs(error) > SETTLED_MM:
+                    break
+            if abs(error) < SETTLED_MM:
+                break
+        _, rate, inside = above(kinds, numbers, table, p, w, t)
+        if inside and abs(error) < SETTLED_MM and sign * rate < 0.0 and t > 0.0:
+            distance[i] = t

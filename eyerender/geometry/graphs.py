@@ -24,6 +24,7 @@ from .graph_kernels import (
     TURN,
     X0,
     ZERNIKE,
+    crossings,
     heights,
     jets,
 )
@@ -120,6 +121,33 @@ def express(*surfaces: Surface) -> Graphs | None:
     return Graphs(
         kinds=np.array(kinds, dtype=np.int64), numbers=numbers, table=whole, origin_mm=origin, rotation=rotation
     )
+
+
+def distances(surface: GraphSurface, points: Floats, ways: Floats, far: Floats, inward: bool) -> Floats:
+    """Intersect rays with a surface as `GraphSurface.hit` does, but compiled.
+
+    Args:
+        surface: one surface, convex towards its local +x.
+        points: (n, 3) origins of the rays, which are on the side from which they cross.
+        ways: (n, 3) their unit directions.
+        far: (n,) distances (mm) from which on hits do not matter.
+        inward: whether the rays go in (d.g < 0) or out.
+
+    Returns:
+        Distances (n,) of the hits, infinite for none and perhaps for those beyond `far`.
+    """
+    graphs, conic = _in_own_frame(surface)
+    start, out = (points - surface.origin_mm) @ surface.rotation, np.array(far, dtype=float)
+    crossings(graphs.kinds, graphs.numbers, graphs.table, conic, start, ways @ surface.rotation, inward, out)
+    return out
+
+
+@remembered
+def _in_own_frame(surface: GraphSurface) -> tuple[Graphs, Floats]:
+    """Express one surface in its own frame, which is always possible, and return its `likeness`."""
+    graphs = express(surface.placed(np.zeros(3), np.eye(3)))
+    assert graphs is not None
+    return graphs, np.array(surface.likeness())
 
 
 def _turned_about_x(rotation: Floats) -> bool:

@@ -8,16 +8,10 @@ from typing import Self
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from .biconic_kernels import Jet, Slopes
+from .biconic_kernels import HALVINGS, SAMPLES, SEARCHED_MM, SETTLED_MM, STEPS, Jet, Slopes
 from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit, shift, turn, turn_back
 
-STEPS = 12
-SETTLED_MM = 1e-7
-"""Newton converges quadratically: an error of 1e-7 before the last step leaves less than 1e-14 after it."""
 _TOGETHER = 5  # Newton steps of all rays; almost all that meet the surface have settled by then
-_SEARCHED_MM = 4.0
-_SAMPLES = 41
-_HALVINGS = 30
 
 
 class GraphSurface(Surface):
@@ -128,7 +122,7 @@ class GraphSurface(Surface):
         if crosses.any():
             rows, low, high = tuple(row[crosses] for row in rows), low[crosses], high[crosses]
             few, own, ways = self._rays(rows, shape, start, way)
-            for _ in range(_HALVINGS):
+            for _ in range(HALVINGS):
                 middle = 0.5 * (low + high)
                 behind = few._side(own, ways, middle, inward) <= 0.0
                 low, high = np.where(behind, low, middle), np.where(behind, middle, high)
@@ -136,11 +130,11 @@ class GraphSurface(Surface):
         return t.reshape(lost.shape), error.reshape(lost.shape)
 
     def _bracketed(self, start: Xyz, way: Xyz, near: Floats, inward: bool) -> tuple[Floats, Floats]:
-        """Find distances before and behind the first crossing within `_SEARCHED_MM` of a guess, else NaN."""
+        """Find distances before and behind the first crossing within `SEARCHED_MM` of a guess, else NaN."""
         low, high = np.full(near.shape, np.nan), np.full(near.shape, np.nan)
-        before, value = near - _SEARCHED_MM, self._side(start, way, near - _SEARCHED_MM, inward)
-        for k in range(1, _SAMPLES):
-            after = near - _SEARCHED_MM + 2.0 * _SEARCHED_MM * k / (_SAMPLES - 1)
+        before, value = near - SEARCHED_MM, self._side(start, way, near - SEARCHED_MM, inward)
+        for k in range(1, SAMPLES):
+            after = near - SEARCHED_MM + 2.0 * SEARCHED_MM * k / (SAMPLES - 1)
             there = self._side(start, way, after, inward)
             found = np.isnan(low) & (value > 0.0) & (there <= 0.0)
             low, high = np.where(found, before, low), np.where(found, after, high)

@@ -10,9 +10,10 @@ from scipy.optimize import brentq
 
 from eyerender.eye.parts import PlacedSpec
 from eyerender.eye.surfaces import surface_of
-from eyerender.geometry.graphs import graphs_of
+from eyerender.geometry.graphs import distances, graphs_of
 from eyerender.geometry.surfaces import components, join
 from eyerender.geometry.surfaces_biconic import Biconic
+from eyerender.geometry.surfaces_graph import GraphSurface
 from eyerender.geometry.surfaces_quadric import Quadric
 from eyerender.geometry.transforms import flip_y, tilt_rotation
 from tests.support.corneas import measured_shapes
@@ -190,6 +191,31 @@ def test_the_graph_is_the_surface_with_its_derivatives(surface):
     assert np.allclose((plus.z - minus.z) / (2 * h), jet.yz, atol=1e-7)
     plus, minus = jet_at(y, z + h), jet_at(y, z - h)
     assert np.allclose((plus.z - minus.z) / (2 * h), jet.zz, atol=1e-7)
+
+
+CORNEAS = {name: s for name, s in SURFACES.items() if isinstance(s, GraphSurface) and "back" not in name}
+
+
+@pytest.mark.parametrize("surface", CORNEAS.values(), ids=CORNEAS.keys())
+@pytest.mark.parametrize("inward", [True, False])
+def test_compiled_intersections_are_those_of_the_surface(surface, inward):
+    rng = np.random.default_rng(5)
+    points = points_on(surface, 4000, reach=5.0)
+    way = rng.normal(size=points.shape)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    # Many are oblique, and some miss the surface; others start behind it and are left out.
+    start = points - rng.uniform(0.01, 5.0, (4000, 1)) * way + rng.normal(scale=0.05, size=points.shape)
+    before = (surface.implicit(start) > 0.0) == inward
+    start, way = start[before], way[before]
+    hit = surface.hit(components(start), components(way), inward)
+    expected = np.where(hit.ok & (hit.distance > 0.0), hit.distance, np.inf)
+    assert 0.1 < np.isfinite(expected).mean() < 1.0
+    found = distances(surface, start, way, np.full(len(start), np.inf), inward)
+    np.testing.assert_allclose(found, expected, atol=1e-11)
+    far = rng.uniform(0.1, 8.0, len(start))
+    near = expected < far
+    np.testing.assert_array_equal(np.minimum(distances(surface, start, way, far, inward), far)[near], found[near])
+    assert not (distances(surface, start, way, far, inward) < far)[~near].any()
 
 
 def test_a_biconic_of_equal_meridians_is_a_conic():

@@ -156,11 +156,14 @@ def _through_limbus(chamber: Chamber, front: Surface, limbus: float, width: floa
     at = np.asarray(front.origin_mm) + np.stack([front.sag(y, z), y, z], axis=-1) @ rotation.T
     normal = front.normal(at.reshape(-1, 3)).reshape(at.shape)
     area = opaque / np.abs(normal @ rotation[:, 0])
-    way = at - chamber.points[:, None, None]
-    r2 = np.sum(way * way, axis=-1)
-    here = np.einsum("ijkl,il->ijk", way, chamber.normals)
-    there = np.einsum("ijkl,jkl->ijk", way, normal)
-    seen = np.maximum(here, 0) * np.maximum(there, 0) / (np.pi * r2 * r2) * area
+    # One array per coordinate: NumPy would loop over the three numbers of each vector.
+    wx, wy, wz = (at[..., k] - chamber.points[:, k, None, None] for k in range(3))
+    r2 = wx * wx + wy * wy + wz * wz
+    here, there = (
+        np.maximum(wx * n[..., 0] + wy * n[..., 1] + wz * n[..., 2], 0)
+        for n in (chamber.normals[:, None, None], normal)
+    )
+    seen = here * there / (np.pi * r2 * r2) * area
     sectors = seen.reshape(PATCHES, len(y), TURNS, _FINE).sum(axis=(1, 3))
     return frozen(wall + np.where(chamber.valid[:, None], sectors, 0))
 

@@ -9,7 +9,10 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...eye.meshes import chamber_rim
+from ...geometry.graphs import distances
 from ...geometry.surfaces import Surface, components
+from ...geometry.surfaces_graph import GraphSurface
+from ...geometry.vectors import dots, lengths
 from ...optics.interface import fresnel
 
 _WEAK, _FEW = 0.25, 4  # one in _FEW is traced for all of the rays that the cornea mirrors less than _WEAK
@@ -121,73 +124,92 @@ class Arrivals:
 
 @dataclass(slots=True, kw_only=True)
 class _Rays:
-    """Rays in flight: numbers, weights, points, directions, and medium (surfaces in front of it)."""
+    """Rays in flight in one medium: numbers, weights, points and directions."""
 
     number: Ints
     weight: Floats
     o: Floats
     d: Floats
-    layer: Ints
 
     def only(self, some: Bools) -> _Rays:
-        return _Rays(**{f.name: getattr(self, f.name)[some] for f in fields(self)})
+        rows = np.flatnonzero(some)
+        return _Rays(**{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)})
 
-    def join(self, other: _Rays) -> _Rays:
-        return _Rays(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
+    @staticmethod
+    def join(parts: list[_Rays]) -> _Rays:
+        return _Rays(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(_Rays)})
 
 
 def trace_inside(walls: Walls, o: Floats, d: Floats, layer: Ints) -> Arrivals:
     """Trace rays until they arrive at the plane or the wall; record those that leave through the front first.
 
-    The back of the cornea refracts them and mirrors only by total reflection.
+    The back of the cornea refracts them and mirrors only by total reflection. `layer` is the number of surfaces in
+    front of the medium in which each starts.
     """
-    rays = _Rays(number=np.arange(len(o)), weight=np.ones(len(o)), o=o, d=d, layer=layer)
+    whole, media = _Rays(number=np.arange(len(o)), weight=np.ones(len(o)), o=o, d=d), range(1, len(walls.front) + 1)
+    rays = {k: whole.only(layer == k) for k in media}
     first = np.ones(len(o), dtype=bool)
     ends, left = [], []
     for _ in range(_STEPS):
-        if not len(rays.number):
+        further: dict[int, list[_Rays]] = {k: [] for k in media}
+        for k, some in rays.items():
+            at_outer, at_inner, end = _advance(walls, some, k)
+            ends.append(end)
+            if k == 1:
+                mirrored, gone = _mirror_at_front(walls, at_outer, first)
+                further[1].append(mirrored)
+                left.append(gone)
+            else:
+                passed, mirrored = _cross(walls, at_outer, k - 1, outwards=True)
+                further[k - 1].append(passed)
+                further[k].append(mirrored)
+            if k < len(walls.front):
+                passed, mirrored = _cross(walls, at_inner, k, outwards=False)
+                further[k + 1].append(passed)
+                further[k].append(mirrored)
+        rays = {k: _Rays.join(parts) for k, parts in further.items()}
+        if not any(len(some.number) for some in rays.values()):
             break
-        outer, inner = _surface_distances(walls, rays)
-        plane = np.where(rays.layer == len(walls.front), walls.to_plane(rays.o, rays.d), np.inf)
-        wall = np.where(rays.layer == walls.layer, walls.to_wall(rays.o, rays.d), np.inf)
-        nearest = np.minimum(np.minimum(plane, wall), np.minimum(outer, inner))
-        known = np.isfinite(nearest)
-        # Where the rim of a tilted cornea is above the wall's edge, rays pass between them: they meet the wall there.
-        arrives = ~known | (nearest == np.minimum(plane, wall))
-        at = rays.o + np.where(known, nearest, 0)[:, None] * rays.d
-        ends.append((rays.number[arrives], rays.weight[arrives], at[arrives], (~known | (wall < plane))[arrives]))
-        rays.o = at
-        known &= ~arrives
-        outwards = nearest == outer
-        at_front = rays.only(known & outwards & (rays.layer == 1))
-        at_front, gone = _mirror_at_front(walls, at_front, first)
-        left.append(gone)
-        further = [at_front]
-        for k in range(1, len(walls.front)):
-            further.append(_cross(walls, rays.only(known & outwards & (rays.layer == k + 1)), k, outwards=True))
-            further.append(_cross(walls, rays.only(known & ~outwards & (rays.layer == k)), k, outwards=False))
-        rays = further[0]
-        for more in further[1:]:
-            rays = rays.join(more)
     columns = [np.concatenate(column) for part in (left, ends) for column in zip(*part, strict=True)]
     return Arrivals(**dict(zip((f.name for f in fields(Arrivals)), columns, strict=True)))
 
 
-def _surface_distances(walls: Walls, rays: _Rays) -> tuple[Floats, Floats]:
-    """Compute distances (n,) to the surfaces in front of and behind the rays' medium; infinite if missed."""
-    outer, inner = np.full(len(rays.number), np.inf), np.full(len(rays.number), np.inf)
-    for k, surface in enumerate(walls.front):
-        here = rays.layer == k + 1
-        t = _distance_outwards(surface, rays.o[here], rays.d[here])
-        if k == 0:
-            hit = rays.o[here] + np.where(np.isfinite(t), t, 0)[:, None] * rays.d[here]
-            local = surface.to_local(hit)
-            t[(np.hypot(local[:, 1], local[:, 2]) > walls.limbus) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
-        outer[here] = t
-        here = rays.layer == k
-        hit = surface.hit(components(rays.o[here] + _AHEAD_MM * rays.d[here]), components(rays.d[here]), True)
-        inner[here] = np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
-    return outer, inner
+def _advance(walls: Walls, rays: _Rays, k: int) -> tuple[_Rays, _Rays, tuple[Ints, Floats, Floats, Bools]]:
+    """Move rays in medium k to what they meet first.
+
+    Returns:
+        The rays at the surface in front of the medium, those at the surface behind it, and as in `Arrivals` those that
+        arrive at the plane or the wall.
+    """
+    none = np.full(len(rays.number), np.inf)
+    plane = walls.to_plane(rays.o, rays.d) if k == len(walls.front) else none
+    wall = walls.to_wall(rays.o, rays.d) if k == walls.layer else none
+    end = np.minimum(plane, wall)
+    outer = _distance(walls.front[k - 1], rays, end, inward=False)
+    if k == 1:
+        hit = rays.o + np.where(np.isfinite(outer), outer, 0)[:, None] * rays.d
+        local = walls.front[0].to_local(hit)
+        outer[(np.hypot(local[:, 1], local[:, 2]) > walls.limbus) | (hit[:, 0] < walls.top - 1e-6)] = np.inf
+    nearest = np.minimum(end, outer)
+    inner = _distance(walls.front[k], rays, nearest, inward=True) if k < len(walls.front) else none
+    nearest = np.minimum(nearest, inner)
+    known = np.isfinite(nearest)
+    # Where the rim of a tilted cornea is above the wall's edge, rays pass between them: they meet the wall there.
+    arrives = ~known | (nearest == end)
+    rays.o = rays.o + np.where(known, nearest, 0)[:, None] * rays.d
+    at = rays.only(arrives)
+    outwards = nearest == outer
+    ended = (at.number, at.weight, at.o, (~known | (wall < plane))[arrives])
+    return rays.only(~arrives & outwards), rays.only(~arrives & ~outwards), ended
+
+
+def _distance(surface: Surface, rays: _Rays, far: Floats, *, inward: bool) -> Floats:
+    """Compute the distance (n,) to a surface; infinite where it is missed, and perhaps where it is beyond `far`."""
+    start = rays.o + _AHEAD_MM * rays.d
+    if isinstance(surface, GraphSurface):
+        return distances(surface, start, rays.d, far - _AHEAD_MM, inward) + _AHEAD_MM
+    hit = surface.hit(components(start), components(rays.d), inward)
+    return np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
 
 
 def _mirror_at_front(walls: Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tuple[Ints, Floats, Floats, Floats]]:
@@ -196,43 +218,44 @@ def _mirror_at_front(walls: Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tu
     `first` marks the rays that have not left yet.
     """
     n, w = walls.front[0].normal(rays.o), rays.d
-    cosine = np.sum(n * w, axis=1)
+    cosine = dots(n, w)
     mirrored = fresnel(cosine, walls.indices[0], 1.0, walls.film).unpolarized
     go = first[rays.number] & (mirrored < 1)
     full = rays.weight * walls.indices[0] ** 2 * (1 - mirrored)
     gone = rays.number[go], rays.o[go], _refract(w[go], -n[go], walls.indices[0]), full[go]
     first[rays.number[go]] = False
-    rays.d = w - 2 * cosine[:, None] * n
     weak = mirrored < _WEAK
     rays.weight = rays.weight * np.where(weak, _FEW * mirrored, mirrored)
-    return rays.only((rays.weight > 1e-3) & (~weak | (rays.number % _FEW == 0))), gone
+    on = (rays.weight > 1e-3) & (~weak | (rays.number % _FEW == 0))
+    rays = rays.only(on)
+    rays.d = rays.d - 2 * cosine[on, None] * n[on]
+    return rays, gone
 
 
-def _cross(walls: Walls, rays: _Rays, k: int, *, outwards: bool) -> _Rays:
-    """Refract rays at surface k behind the front, with the change of radiance between media, or mirror them."""
+def _cross(walls: Walls, rays: _Rays, k: int, *, outwards: bool) -> tuple[_Rays, _Rays]:
+    """Refract rays at surface k behind the front, with the change of radiance between media, or mirror them.
+
+    Returns:
+        Refracted rays and mirrored ones.
+    """
     n = walls.front[k].normal(rays.o)
     before, after = walls.indices[k - 1], walls.indices[k]
     if outwards:
         n, before, after = -n, after, before
     eta = before / after
-    cosine = -np.sum(n * rays.d, axis=1)
+    cosine = -dots(n, rays.d)
     passes = 1 - eta * eta * (1 - cosine * cosine) > 0
-    mirrored = rays.d + 2 * cosine[:, None] * n
-    rays.d = np.where(passes[:, None], _refract(rays.d, n, eta), mirrored)
-    rays.weight = rays.weight * np.where(passes, eta * eta, 1.0)
-    rays.layer = rays.layer + np.where(passes, -1 if outwards else 1, 0)
-    return rays
-
-
-def _distance_outwards(surface: Surface, o: Floats, d: Floats) -> Floats:
-    """Compute the distance (n,) to a surface from inside; infinite where it is missed."""
-    hit = surface.hit(components(o + _AHEAD_MM * d), components(d), False)
-    return np.where(hit.ok & (hit.distance > 0), hit.distance + _AHEAD_MM, np.inf)
+    mirrored = rays.only(~passes)
+    mirrored.d = mirrored.d + 2 * cosine[~passes, None] * n[~passes]
+    passed = rays.only(passes)
+    passed.d = _refract(passed.d, n[passes], eta)
+    passed.weight = passed.weight * (eta * eta)
+    return passed, mirrored
 
 
 def _refract(d: Floats, n: Floats, eta: float) -> Floats:
     """Refract directions at normals that face them; beyond total reflection, return grazing directions."""
-    c = -np.sum(n * d, axis=1)
+    c = -dots(n, d)
     c2 = np.sqrt(np.maximum(1 - eta * eta * (1 - c * c), 0))
     w = eta * d + (eta * c - c2)[:, None] * n
-    return np.asarray(w / np.linalg.norm(w, axis=1, keepdims=True))
+    return np.asarray(w / lengths(w)[:, None])
