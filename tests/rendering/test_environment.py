@@ -279,6 +279,7 @@ def test_files_that_are_no_maps_are_refused(renderer, tmp_path):
     (tmp_path / "huge.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
     (tmp_path / "huge.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 400000 +X 800000\n")
     (tmp_path / "huge.pfm").write_bytes(b"Pf\n800000 400000\n-1.0\n")
+    (tmp_path / "empty.pfm").write_bytes(b"Pf\n0f\n0 4!\n-\n\0?\0\0")  # Mitsuba divides by its width
     window = struct.pack("<4i", 0, 0, 799_999, 399_999)
     (tmp_path / "huge.exr").write_bytes(b"v/1\x01\x02\0\0\0dataWindow\0box2i\0\x10\0\0\0" + window)
     os.mkfifo(tmp_path / "pipe.exr")
@@ -291,6 +292,7 @@ def test_files_that_are_no_maps_are_refused(renderer, tmp_path):
         ("none.exr", "no such file"),
         ("pair.npy", "not a readable map"),
         *((f"huge.{kind}", "has 320000000000 pixels; at most") for kind in ("npy", "hdr", "pfm", "exr")),
+        ("empty.pfm", "its header names no size"),
         ("pipe.exr", "is a pipe, not a file"),
         ("room.jpg", "must end with"),
     ):

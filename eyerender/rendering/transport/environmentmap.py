@@ -42,7 +42,7 @@ MAX_MAP_PIXELS = 2**27
 _HEADER_BYTES = 65536
 _SIDES = {
     ".hdr": rb"[-+][XY] *([0-9]{1,20}) *[-+][XY] *([0-9]{1,20})",
-    ".pfm": rb"^P[fF]\s+([0-9]{1,20})\s+([0-9]{1,20})",
+    ".pfm": rb"^P[fF]\s+([0-9]{1,20})\s+([0-9]{1,20})\s",
 }
 
 
@@ -79,6 +79,8 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
         raise InputError(f"must end with one of {', '.join(_FORMATS)}", source=source)
     with opened(path) as file:
         size = _size(path.suffix.lower(), file.read(_HEADER_BYTES))
+    if size == 0 or (size is None and path.suffix.lower() == ".pfm"):  # Mitsuba would divide by zero
+        raise InputError("is not a readable map (its header names no size)", source=source)
     if size is not None and size > MAX_MAP_PIXELS:
         raise InputError(f"has {size} pixels; at most {MAX_MAP_PIXELS}", source=source)
     try:
