@@ -125,12 +125,14 @@ def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: 
         core *= (1 - spread.halo_share) / (2 * np.pi * sigma**2)
         halo *= spread.halo_share / (2 * np.pi * spread.halo_rad**2)
         factors[k] = (core + halo) * weight
-    f, index = retinal_scale_mm(eye), float((eye.back_indices or eye.front_indices)[-1])
+    if np.any(factors):
+        factors /= retinal_scale_mm(eye) ** 2
+    index = float((eye.back_indices or eye.front_indices)[-1])
     rho = spread.reflectance * _relative_reflectance(eye, out_of_pupil, plane, theta_c, spread.disc_gain)
     # The retina is a sphere 1 mm, the thickness of the wall, inside the sclera's.
     area_mm2 = float(4 * np.pi * (float(eye.sclera.radius_mm) - 1.0) ** 2)
     even = len(nodes) * weight * spread.reflectance / (1 - spread.reflectance) / area_mm2
-    return FundusLight(rho * (factors / f**2 + even) / (np.pi * index**2))
+    return FundusLight(rho * (factors + even) / (np.pi * index**2))
 
 
 def _sums(seen: Floats, lit: Floats, sigma: float, fall: float) -> tuple[Floats, Floats]:
