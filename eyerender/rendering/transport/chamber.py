@@ -146,7 +146,7 @@ def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
     return rays[middle, :6], gain
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
 def _through_limbus(chamber: Chamber, front: Surface, limbus: float, width: float, aspect: float) -> Floats:
     wall = chamber.exchange[:, IRIS:].reshape(PATCHES, TURNS, LEVELS).sum(axis=2)
     if width == 0:
@@ -233,7 +233,7 @@ def _radius(ring: Floats, root: float, reach: float) -> Floats:
     return np.asarray(np.sqrt(root**2 * np.minimum(ring / ROOT_RINGS, 1) + (reach**2 - root**2) * beyond))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
 def _chamber(walls: Walls) -> Chamber:
     reach = walls.limbus + walls.slope * max(walls.top - walls.centre[0], 0)
     root = min(walls.root, 0.99 * reach)
