@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from .cluster import RayEngine
 
 LOG_S = 60.0  # the log is written at least so often while samples are made
-MEMORY_A_WORKER = 0.9e9  # bytes, measured resident size with head-room
+MEMORY_A_WORKER = 1.0e9  # bytes, resident size after fourteen subjects, with head-room
 
 
 def generate(
