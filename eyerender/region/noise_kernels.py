@@ -9,9 +9,8 @@ from ..arrays import Floats, Ints, Singles
 from ..jit import compiled
 
 BLOCK = 8  # texels along the side of a block that shares a list of nearby cells
-_X, _Y, _FIRST, _SECOND, _ONE, _TWO = range(
-    6
-)  # rows of a block: places, squares of the distances, numbers of the cells
+# Rows of a block: places, squares of the distances, and numbers of the cells.
+_X, _Y, _FIRST, _SECOND, _ONE, _TWO = range(6)
 
 
 @compiled()
