@@ -42,11 +42,8 @@ _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STEEPEST = 2.0  # slope of the map, over the region's frame; margins are seen from their edges
 _STRIP = 32  # number of map rows computed together, so that they stay in the processor's cache
 _HAIR_GLOSS = 0.2
-_WET_END_MM, _GLANDS_END_MM, _CREASES_END_MM = (
-    4.0,
-    10.0,
-    21.0,
-)  # distances from the lash line beyond which there are none
+# Distances from the lash line beyond which there are no tears, no oil of its glands, and no creases.
+_WET_END_MM, _GLANDS_END_MM, _CREASES_END_MM = 4.0, 10.0, 21.0
 _MASCARA = 0.03  # albedo of lashes with mascara (chosen)
 # Roots of lashes darken the skin over them: follicles are 1.8 mm deep in the upper lid and 0.9 mm in the lower one
 # (Elder 1997, Ophthal Plast Reconstr Surg 13, 21), and light of 850 nm gets that deep. The strip is as wide as the
