@@ -12,7 +12,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 import eyerender as er
-from eyerender.realism import measure_folder
+from eyerender.apps.realism import measure_folder
 
 SAMPLES = 8  # small: 1
 

@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import eyerender as er
-from eyerender.inspection import inspect
+from eyerender.apps.inspection import inspect
 
 COUNT = 40  # small: 12
 

@@ -4,11 +4,16 @@ from . import region as region
 from . import rig as rig
 from .analytic.observer import AnalyticObserver as AnalyticObserver
 from .analytic.observer import trace as trace
-from .applications.quickstart import compare_folder as compare_folder
-from .applications.quickstart import run_quickstart as run_quickstart
-from .benchmark.options import BenchOptions as BenchOptions
-from .benchmark.protocol import Extractor as Extractor
-from .benchmark.run import bench_extractors as bench_extractors
+from .apps.benchmark.options import BenchOptions as BenchOptions
+from .apps.benchmark.protocol import Extractor as Extractor
+from .apps.benchmark.run import bench_extractors as bench_extractors
+from .apps.quickstart import compare_folder as compare_folder
+from .apps.quickstart import run_quickstart as run_quickstart
+from .base.errors import BackendError as BackendError
+from .base.errors import EyerenderError as EyerenderError
+from .base.errors import InputError as InputError
+from .base.status import Status as Status
+from .base.versions import __version__ as __version__
 from .dataset.estimate import estimate as estimate
 from .dataset.export import export as export
 from .dataset.options import RunOptions as RunOptions
@@ -31,9 +36,6 @@ from .design.noise import sensor_noise as sensor_noise
 from .design.safety import Exposure as Exposure
 from .design.safety import eye_exposure as eye_exposure
 from .design.unknowns import Unknowns as Unknowns
-from .errors import BackendError as BackendError
-from .errors import EyerenderError as EyerenderError
-from .errors import InputError as InputError
 from .extraction import ExtractionSettings as ExtractionSettings
 from .extraction import extract as extract
 from .eye.catalogue import load_eye as load_eye
@@ -57,7 +59,6 @@ from .imaging.images import auto_exposed as auto_exposed
 from .imaging.images import export_scene as export_scene
 from .imaging.images import render as render
 from .imaging.images import render_folder as render_folder
-from .observation import Observations as Observations
 from .population.synteyes import SyntEye as SyntEye
 from .population.synteyes import SyntEyes as SyntEyes
 from .region.anatomy import Brow as Brow
@@ -95,6 +96,7 @@ from .scene import Frames as Frames
 from .scene import Scene as Scene
 from .scene import load_scene as load_scene
 from .scene import shipped_scenes as shipped_scenes
+from .scene.observation import Observations as Observations
 from .scene.observer import Observer as Observer
 from .scene.people import Population as Population
 from .scene.spec import Eye as Eye
@@ -103,7 +105,5 @@ from .scene.spec import Picture as Picture
 from .scene.spec import SceneSpec as SceneSpec
 from .scene.spec import Targets as Targets
 from .scene.subject import Subject as Subject
-from .status import Status as Status
-from .versions import __version__ as __version__
 
 __all__: list[str]

@@ -37,12 +37,12 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
 from .backends.choose import BackendChoice
+from .base.errors import InputError
+from .base.processes import usable_cpus
 from .dataset.plan import Plan
 from .dataset.realise import frames_of
 from .dataset.spec import DatasetSpec, GeometryKind
-from .errors import InputError
 from .folders.imagefolder import ImageFolder
-from .processes import usable_cpus
 from .region.mesh import LID_MARKS
 
 if TYPE_CHECKING:

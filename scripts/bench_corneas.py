@@ -31,7 +31,7 @@ from eyerender.eye.corneas import grid_surface, zernike_surface  # noqa: E402
 from eyerender.eye.model import EyeModel  # noqa: E402
 from eyerender.eye.pose import Poses  # noqa: E402
 from eyerender.eye.spec import EyeSpec  # noqa: E402
-from eyerender.geometry.surfaces_measured import GridSurface, ZernikeSurface  # noqa: E402
+from eyerender.optics.surfaces_measured import GridSurface, ZernikeSurface  # noqa: E402
 from tests.support.corneas import conic_depth, eye_with, grid_of, keratoconus, zernike_of  # noqa: E402
 
 COUNT = 1000

@@ -23,7 +23,7 @@ import numpy as np
 
 from _bench import Report, Row, options_of, row
 from eyerender.analytic.features import Features, features
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.fixation import fixations
 from eyerender.scene import load_scene

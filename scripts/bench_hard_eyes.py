@@ -26,7 +26,7 @@ import hard_eyes
 from _bench import Report, Row, options_of, row
 from extraction_tally import near
 from eyerender.extraction import FAST, REFINED, Extraction, extract
-from eyerender.geometry.ellipse import iou
+from eyerender.optics.ellipse import iou
 
 LEAST_VISIBLE = {"stress": 0.6, "webcam": 0.6}
 WITHOUT_LIDS = ("eight", "texture")

@@ -19,7 +19,7 @@ from _bench import Report, options_of, resident_mib, row
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from eyerender.inspection import inspect
+from eyerender.apps.inspection import inspect
 from tests.support.drawn_dataset import draw
 
 IMAGES, POOL, SIZE = 100_000, 2000, (200, 320)

@@ -26,8 +26,8 @@ from scipy.stats import spearmanr  # noqa: E402
 import eyerender as er  # noqa: E402
 from eyerender.gaze.estimate import ray_errors_deg  # noqa: E402
 from eyerender.imaging.capture import EyeImage, render_windows  # noqa: E402
-from eyerender.observation import Observations, concatenate  # noqa: E402
 from eyerender.rig.exposure import recorded  # noqa: E402
+from eyerender.scene.observation import Observations, concatenate  # noqa: E402
 
 LAYOUTS, REPEATS, SEED = 42, 24, 7
 FEW = (0, 2, 5, 7, 10)  # places of --quick

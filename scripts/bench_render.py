@@ -78,7 +78,7 @@ class Bench:
         import drjit as dr
         import mitsuba as mi
 
-        from eyerender.arrays import frozen
+        from eyerender.base.arrays import frozen
         from eyerender.rendering.hits.primary import first_hit
         from eyerender.rendering.integrator.sampling import Pixels, camera_ray
         from eyerender.rig.camera import Camera
@@ -152,7 +152,7 @@ class Bench:
 
     def iris_against_light_tracer(self) -> Iterable[Row]:
         """Irradiance of the iris of E4 and E5 by a point lamp, against flux counted by a forward tracer in float64."""
-        from eyerender.arrays import frozen
+        from eyerender.base.arrays import frozen
         from eyerender.rig.light import Lamp
         from tests.support.render_oracles import RINGS_MM, flux_on_rings, ring_points
 

@@ -21,8 +21,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from _bench import Report, Row, options_of, row
-from eyerender.study.literature import MODELS
-from eyerender.study.run import run_study
+from eyerender.apps.study.literature import MODELS
+from eyerender.apps.study.run import run_study
 
 
 def measure_images(quick: bool) -> Iterator[Row]:

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import kendalltau
 
-from eyerender.benchmark.checks import read_results
-from eyerender.errors import InputError
+from eyerender.apps.benchmark.checks import read_results
+from eyerender.base.errors import InputError
 
 RESAMPLES = 1000
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from eyerender.base.errors import EyerenderError
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import sample
-from eyerender.errors import EyerenderError
 
 
 def exposure(spec: Any) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 
 from eyerender import load_eye
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
 from eyerender.region.head import HEAD_PARTS, load_head

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from eyerender.arrays import Bools, Floats
+from eyerender.base.arrays import Bools, Floats
 from eyerender.extraction import Extraction
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.optics.ellipse import Ellipse, iou
 from make_ideal_images import Drawing
 
 MATCH_PX = 2.0  # a glint within this of a true one is that one

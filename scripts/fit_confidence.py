@@ -36,7 +36,7 @@ from eyerender.extraction.pupil.boundary import PupilCandidate
 from eyerender.extraction.pupil.refinement import PixelFit
 from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features, goodness_of
 from eyerender.extraction.settings import Shape
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.optics.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]
 METHODS: tuple[Literal["fast", "refined"], ...] = ("fast", "refined")

@@ -34,7 +34,7 @@ from eyerender.extraction import ExtractionSettings, extract, pipeline
 from eyerender.extraction.glints import classification
 from eyerender.extraction.glints.classification import LEAST_ODDS, classify_spots, compared, features
 from eyerender.extraction.glints.fits import SpotFit
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.optics.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]
 # Drawn images of each kind.

@@ -26,8 +26,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from eyerender.arrays import Floats
-from eyerender.geometry.ellipse import Ellipse
+from eyerender.base.arrays import Floats
+from eyerender.optics.ellipse import Ellipse
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 # row -> scene, range of pupil diameters in mm, range of blinks, largest turn of the eye in degrees

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from eyerender.backends.choose import choose_backend
-from eyerender.errors import BackendError
+from eyerender.base.errors import BackendError
 from tests.support.quick import Quick, Recorder, listed
 
 # A shell that starts the suite in the background ignores Ctrl-C for it, and the processes that tests interrupt would

@@ -16,28 +16,16 @@ import eyerender
 
 PACKAGE = Path(eyerender.__file__).resolve().parent
 
-# Lower floors know nothing of higher ones; rooms (folders) on one floor do not import each other.
+# Lower floors know nothing of higher ones; packages on one floor do not import each other.
 FLOORS = {
-    "errors": 0,
-    "arrays": 0,
-    "storage": 0,
-    "references": 0,
-    "jit": 0,
-    "progress": 0,
-    "processes": 0,
-    "status": 0,
-    "spec": 0,
-    "versions": 0,
+    "base": 0,
     "backends": 1,
-    "geometry": 1,
-    "optics": 2,
-    "eye": 3,
-    "region": 3,
-    "rig": 3,
-    "plausibility": 4,
-    "population": 4,
-    "scene": 4,
-    "observation": 4,
+    "optics": 1,
+    "eye": 2,
+    "region": 2,
+    "rig": 2,
+    "population": 3,
+    "scene": 3,
     "folders": 4,
     "analytic": 5,
     "rendering": 5,
@@ -47,35 +35,16 @@ FLOORS = {
     "imaging": 8,
     "report": 9,
     "dataset": 9,
-    "study": 10,
-    "benchmark": 10,
-    "applications": 10,
-    "inspection": 10,
-    "realism": 10,
     "torch": 10,
-    "live": 10,
+    "apps": 10,
     "cli": 11,
     "__init__": 12,
     "__main__": 12,
 }
-# The order of the rooms that share a floor and use each other: each may import those before it.
-ORDER = [
-    "errors",
-    "arrays",
-    "progress",
-    "processes",
-    "status",
-    "storage",
-    "jit",
-    "references",
-    "spec",
-    "versions",
-    "observation",
-    "folders",
-    "plausibility",
-    "population",
-    "scene",
-]
+# The order of the packages that share a floor and use each other: each may import those before it.
+ORDER = ["population", "scene"]
+# The modules of `base`: each may import those before it.
+BASE = ["errors", "arrays", "progress", "processes", "status", "storage", "jit", "references", "spec", "versions"]
 # The sub-packages of the renderer: each may import those before it, and `renderer` all of them.
 RENDERING = ["records", "scene", "materials", "hits", "transport", "glints", "integrator", "output", "renderer"]
 
@@ -187,15 +156,34 @@ def test_imports_point_down():
                 assert FLOORS[there] < FLOORS[here], f"{place}, which is above it"
 
 
-def test_sub_packages_of_the_renderer_have_one_direction():
+@pytest.mark.parametrize(("package", "order"), [("base", BASE), ("rendering", RENDERING)])
+def test_parts_of_a_package_have_one_direction(package, order):
     for path in modules():
         parts = path.relative_to(PACKAGE).with_suffix("").parts
-        if parts[0] != "rendering" or parts[1] == "__init__":
+        if parts[0] != package or parts[1] == "__init__":
             continue
         for name, line in facts(path).imports:
             there = name.split(".")
-            if there[:2] == ["eyerender", "rendering"] and there[2] != parts[1]:
-                assert RENDERING.index(there[2]) < RENDERING.index(parts[1]), f"{path}:{line}: {name}"
+            if there[:2] == ["eyerender", package] and there[2] != parts[1]:
+                assert order.index(there[2]) < order.index(parts[1]), f"{path}:{line}: {name}"
+
+
+def test_the_root_shows_the_architecture():
+    entries = {p.name for p in PACKAGE.iterdir() if p.suffix == ".py" or (p.is_dir() and (p / "__init__.py").is_file())}
+    assert len(entries - {"__init__.py", "__main__.py"}) <= 20
+
+
+def test_nothing_imports_a_product_and_products_are_apart():
+    """Only the command line, the public stub and entry points import `apps/`; its rooms do not import each other."""
+    for path in modules():
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        for name, line in facts(path).imports:
+            there = name.split(".")
+            if there[:2] != ["eyerender", "apps"]:
+                continue
+            place = f"{path}:{line}: {name}"
+            assert parts[0] in ("apps", "cli"), place
+            assert parts[0] == "cli" or there[2] == parts[1], f"{place}, another product"
 
 
 def circles(graph: dict[str, set[str]]) -> list[tuple[str, ...]]:
@@ -242,7 +230,7 @@ LARGE = {
     "optics.shooting._shoot": "one search with its cases",
     "population.synteyes.eye_file": "fields of an eye file",
     "gaze.table._observations": "columns of a table",
-    "study.findings.guestrin": "a list of findings",
+    "apps.study.findings.guestrin": "a list of findings",
 }
 # Records that are rebuilt from a tuple of their fields (batches of surfaces, results of compiled functions), or whose
 # first fields users give in order.
@@ -298,7 +286,7 @@ def test_observers_are_siblings(observer):
 def test_what_reproduces_a_papers_software_stays_in_the_studies():
     switches = "placed_by|tilt_order|index_rate|visual_axis|sum_of_errors|minimum_norm|E5-published"
     # The reader of old eye files knows the first three.
-    core = [p for p in modules() if room(p) not in ("study", "cli") and p.name != "format1.py"]
+    core = [p for p in modules() if room(p) != "cli" and "study" not in p.parts and p.name != "format1.py"]
     found = [p.name for p in core if re.search(rf"\b({switches})\b", p.read_text(encoding="utf-8"))]
     assert found == []
     own = {"E1", "E2", "E3", "E4", "E5", "keratoconus"}

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from eyerender.storage import cachefolder
-from eyerender.storage.cachefolder import cache_folder, private_folder
+from eyerender.base.storage import cachefolder
+from eyerender.base.storage.cachefolder import cache_folder, private_folder
 
 OTHER = 65534  # nobody
 as_root = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away")
@@ -58,7 +58,7 @@ def test_a_folder_that_others_can_write_is_refused_with_one_warning(tmp_path, ca
     assert said[0].startswith(f"warning: the cache folder {place} is not used, because other users can write to ")
     assert mode(place) != 0o700  # it is left as it was
     # Processes that this one starts know of the warning.
-    module = "eyerender.storage.cachefolder"
+    module = "eyerender.base.storage.cachefolder"
     code = f"from pathlib import Path; from {module} import private_folder as f; print(f(Path('{place}')))"
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (child.stdout.strip(), child.stderr) == ("None", "")
@@ -127,7 +127,7 @@ def test_links_in_a_circle_are_refused(tmp_path):
 def test_a_folder_of_root_that_others_only_read_is_good_for_a_user(tmp_path):
     place = Path("/usr/share")  # readable for everybody, of root
     code = (
-        "import os; from pathlib import Path; from eyerender.storage.cachefolder import private_folder\n"
+        "import os; from pathlib import Path; from eyerender.base.storage.cachefolder import private_folder\n"
         f"os.setuid({OTHER}); print(private_folder(Path({str(place)!r})))"
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -154,7 +154,7 @@ def test_a_planted_cache_is_not_used_by_any_of_its_users(tmp_path):
     code = (
         "import os, sys\n"
         "from eyerender.backends.libraries import runtime_store\n"
-        "from eyerender.benchmark.shipped import pupil_labs_python\n"
+        "from eyerender.apps.benchmark.shipped import pupil_labs_python\n"
         "from eyerender.backends.choose import _keep_kernels_private\n"
         "from eyerender.region import mapcache\n"
         "_keep_kernels_private(); kernels = os.environ['DRJIT_CACHE_DIR']\n"

@@ -11,7 +11,7 @@ import eyerender as er
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import realise
 from eyerender.dataset.spec import DatasetSpec
-from eyerender.observation import concatenate
+from eyerender.scene.observation import concatenate
 from tests.support.dataset_specs import mapping
 
 

@@ -8,8 +8,8 @@ import socket
 
 import pytest
 
-from eyerender.errors import EyerenderError, InputError
-from eyerender.storage.files import (
+from eyerender.base.errors import EyerenderError, InputError
+from eyerender.base.storage.files import (
     inside,
     is_plain,
     make_folder,

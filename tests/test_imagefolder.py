@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from eyerender.errors import EyerenderError, InputError
+from eyerender.base.errors import EyerenderError, InputError
 from eyerender.folders.imagefile import Writer, png_bytes, preview, read_image, write_png
 from eyerender.folders.imagefolder import FILE_KEYS, ImageFolder, same_run, write_dataset
 from eyerender.folders.outfolder import staged

@@ -17,7 +17,7 @@ from eyerender.dataset.spec import DatasetSpec
 from eyerender.folders.imagefile import write_png
 from eyerender.folders.imagefolder import write_dataset
 from eyerender.folders.outfolder import staged
-from eyerender.geometry.ellipse import Ellipse, signed_distance
+from eyerender.optics.ellipse import Ellipse, signed_distance
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 
@@ -180,7 +180,7 @@ report = validate({path!r}, quick=True)
 assert report["problem_count"] > {count}
 assert len(report["problems"]) == 50
 """
-COMPARE = """from eyerender.applications.quickstart import compare_folder
+COMPARE = """from eyerender.apps.quickstart import compare_folder
 
 result = compare_folder({path!r})
 assert len(result.truth) == {count}

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import eyerender as er
-from eyerender.spec import Spec
+from eyerender.base.spec import Spec
 
 ROOT = Path(__file__).parents[1]
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eyerender.errors import InputError
-from eyerender.observation import (
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
+from eyerender.scene.observation import (
     GlintFeatures,
     Index,
     Observations,
@@ -19,7 +20,6 @@ from eyerender.observation import (
     PupilFeatures,
     concatenate,
 )
-from eyerender.status import Status
 
 
 def observations(n: int = 4, seed: int = 0, points: int = 6, lights: int = 2) -> Observations:

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eyerender.apps.study import run as study
+from eyerender.base.errors import EyerenderError, InputError
+from eyerender.base.storage.lock import LOCK, run_lock, writer_lock
 from eyerender.dataset import assemble, croissant, done
-from eyerender.errors import EyerenderError, InputError
 from eyerender.folders.imagefile import write_png
 from eyerender.folders.imagefolder import DONE, LINES, LOG, SHARDS, write_dataset
 from eyerender.folders.outfolder import MARKER, clear, refuse_non_empty, staged
 from eyerender.imaging.images import render_folder
 from eyerender.scene import load_scene
-from eyerender.storage.lock import LOCK, run_lock, writer_lock
-from eyerender.study import run as study
 
 LINE = {"file_name": "images/a.png", "window_px": {"x0": 3, "y0": 4, "width": 5, "height": 6}, "records": []}
 

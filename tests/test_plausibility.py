@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import shipped_datasets
-from eyerender.errors import InputError
 from eyerender.imaging.images import render_folder
-from eyerender.plausibility import is_saturated
+from eyerender.rig.plausibility import is_saturated
 from eyerender.rig.sensor import Sensor
 from eyerender.scene import Scene, load_scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec

@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from eyerender.processes import mapper, process_pool
+from eyerender.base.processes import mapper, process_pool
 
 
 def test_results_come_in_the_order_of_the_arguments_in_this_process_and_in_a_pool():

@@ -1,6 +1,6 @@
 """Progress of long work."""
 
-from eyerender.progress import followed
+from eyerender.base.progress import followed
 
 
 def test_the_first_report_states_the_total():

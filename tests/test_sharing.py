@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from eyerender.base.storage.sharing import common, lists, merged, places, rest
 from eyerender.folders.packed import pack_lines, read_line, rounded
-from eyerender.storage.sharing import common, lists, merged, places, rest
 
 OBJECTS = [
     {"a": 1, "b": {"c": [1, 2.0], "d": None}, "e": [{"f": 1, "g": 2}, {"f": 3}], "h": {}, "i": []},

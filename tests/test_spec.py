@@ -9,15 +9,15 @@ import socket
 import pytest
 import yaml
 
+from eyerender.base.errors import InputError
+from eyerender.base.spec import file_digest, read_yaml
 from eyerender.cli.main import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
 from eyerender.dataset.spec import DatasetSpec, find_dataset, shipped_datasets
-from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene import load_scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
-from eyerender.spec import file_digest, read_yaml
 
 
 def quickstart():

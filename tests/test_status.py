@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from eyerender.status import Status, mark
+from eyerender.base.status import Status, mark
 
 
 def test_every_failure_has_a_reason_of_its_own():

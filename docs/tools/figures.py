@@ -13,7 +13,7 @@ from matplotlib.patches import Arc, Circle, Ellipse, Rectangle
 from numpy.typing import ArrayLike
 
 import eyerender as er
-from eyerender.arrays import Floats
+from eyerender.base.arrays import Floats
 
 INK, EYE, CAMERA, SCREEN = "#333333", "#1f6fb4", "#c2571a", "#4a8a3c"
 

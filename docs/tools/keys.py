@@ -16,11 +16,11 @@ from typing import Any
 
 from pydantic.fields import FieldInfo
 
+from eyerender.base.spec import LARGEST, Spec
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.eye.catalogue import catalogue_names, load_eye
 from eyerender.eye.spec import EyeSpec
 from eyerender.scene.spec import SceneSpec
-from eyerender.spec import LARGEST, Spec
 
 FILES: dict[str, type[Spec]] = {"scene": SceneSpec, "eye": EyeSpec, "dataset": DatasetSpec}
 

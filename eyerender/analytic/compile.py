@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from ..base.jit import RAYS, compile_share, ensure_compiled
 from ..eye import pose_kernels
-from ..geometry import ellipse_kernels, graph_kernels
-from ..jit import RAYS, compile_share, ensure_compiled
-from ..optics import fermat_kernels
+from ..optics import ellipse_kernels, fermat_kernels, graph_kernels
 from . import view_kernels
 
 MODULES = (graph_kernels, ellipse_kernels, fermat_kernels, pose_kernels, view_kernels)

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, Floats, Statuses
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Bools, Floats, Statuses
+from ..base.errors import InputError
+from ..base.status import Status
 from ..eye.batch import CHUNK_POINTS, chunks, groups, slices, take_eyes
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
-from ..geometry.ellipse import fit_ellipse_direct
-from ..geometry.surfaces import Xyz
-from ..observation import MAX_BOUNDARY_POINTS, MAX_POINTS
+from ..optics.ellipse import fit_ellipse_direct
+from ..optics.surfaces import Xyz
 from ..rig.camera import PinholeCamera
-from ..status import Status
+from ..scene.observation import MAX_BOUNDARY_POINTS, MAX_POINTS
 from .rays import glint_exits, pupil_exits
 from .view_kernels import project_all, see_all
 

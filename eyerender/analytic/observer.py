@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats
-from ..errors import InputError
+from ..base.arrays import Bools, Floats
+from ..base.errors import InputError
+from ..base.status import Status
 from ..eye.pose import Poses
-from ..geometry.ellipse import fit_ellipse_direct
-from ..observation import EYES, GlintFeatures, Observations, PupilFeatures
+from ..optics.ellipse import fit_ellipse_direct
 from ..rig.rig import RigLike
 from ..scene import Frames, Scene, as_frames
-from ..status import Status
+from ..scene.observation import EYES, GlintFeatures, Observations, PupilFeatures
 from .features import Features, features
 
 ARC_POINTS = 6

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Statuses
+from ..base.arrays import Bools, Floats, Statuses
+from ..base.status import Status, mark
 from ..eye.model import EyeModel
-from ..geometry.surfaces import Xyz, components, fit, join, shift, turn
 from ..optics.interface import dot
 from ..optics.purkinje import purkinje_points
 from ..optics.solve import mirrored_rays, refracted_rays
-from ..status import Status, mark
+from ..optics.surfaces import Xyz, components, fit, join, shift, turn
 
 _AHEAD_MM = 500.0
 _ASIDE = 0.1

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Floats, Statuses
-from ..jit import compiled
+from ..base.arrays import Floats, Statuses
+from ..base.jit import compiled
 
 
 @compiled("f8[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,::1], f8[:,::1]")

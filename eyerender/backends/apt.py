@@ -9,7 +9,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from ..errors import BackendError
+from ..base.errors import BackendError
 
 PAUSES_S = (3.0, 10.0)
 

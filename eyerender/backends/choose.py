@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ..errors import BackendError, InputError
-from ..storage.cachefolder import cache_folder, private_folder
-from ..versions import package_version
+from ..base.errors import BackendError, InputError
+from ..base.storage.cachefolder import cache_folder, private_folder
+from ..base.versions import package_version
 from .libraries import load_runtime
 from .llvm import ensure_llvm
 from .probe import Verdict, cpu_name, probe

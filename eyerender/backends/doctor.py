@@ -6,9 +6,9 @@ import platform
 import sys
 from dataclasses import dataclass
 
-from ..processes import usable_cpus
-from ..storage.cachefolder import cache_folder
-from ..versions import package_version
+from ..base.processes import usable_cpus
+from ..base.storage.cachefolder import cache_folder
+from ..base.versions import package_version
 from .choose import BackendName, BackendState, cuda_state
 from .llvm import examine
 from .probe import cpu_name

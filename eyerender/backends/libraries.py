@@ -7,7 +7,7 @@ import sys
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
-from ..storage.cachefolder import cache_folder
+from ..base.storage.cachefolder import cache_folder
 
 WHEEL = "karellen-llvm-core"
 # Libraries that Dr.Jit is linked with and a bare Linux lacks, with their packages on Debian and on Fedora.

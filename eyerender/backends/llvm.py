@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import BackendError
+from ..base.errors import BackendError
 from .libraries import load_llvm, wheel_libraries
 from .probe import Verdict, probe
 from .remedies import llvm_fix

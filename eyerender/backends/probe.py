@@ -24,10 +24,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..storage.cachefolder import cache_folder
-from ..storage.files import read_json
-from ..versions import package_version
+from ..base.errors import InputError
+from ..base.storage.cachefolder import cache_folder
+from ..base.storage.files import read_json
+from ..base.versions import package_version
 from .libraries import load_llvm, load_runtime
 
 TIMEOUT_S = 180.0

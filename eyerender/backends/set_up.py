@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import sys
 
-from ..errors import BackendError
-from ..progress import Say
+from ..base.errors import BackendError
+from ..base.progress import Say
 from .apt import fetch_library
 from .libraries import RUNTIME, load_runtime, runtime_store
 from .llvm import LibLlvm, examine

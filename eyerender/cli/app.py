@@ -5,7 +5,7 @@ from __future__ import annotations
 import cyclopts
 from cyclopts import App, Parameter
 
-from ..versions import __version__
+from ..base.versions import __version__
 
 
 def option_name(field: str) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from ..storage.files import read_json
+from ..base.storage.files import read_json
 from .app import app
 from .options import Overwrite, Result, at_least_one
 from .output import emit, progress, say
@@ -60,8 +60,8 @@ def bench_extractors(
         quick: Use a tenth of the images, with hard conditions in the same proportion.
         fresh: Ignore stored answers and run on every image again.
     """
-    from ..benchmark.options import BenchOptions
-    from ..benchmark.run import REPORT, TIMES, bench_extractors
+    from ..apps.benchmark.options import BenchOptions
+    from ..apps.benchmark.run import REPORT, TIMES, bench_extractors
 
     options = BenchOptions(
         jobs=jobs,

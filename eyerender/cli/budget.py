@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from ..errors import InputError
+from ..base.errors import InputError
 from .app import app
 from .options import AtLeastOne, Backend, EyeModel, Result, Strict, Threads
 from .output import Heed, emit, progress

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from ..base.errors import EyerenderError, InputError
 from ..dataset.options import PlanOptions, RunOptions
-from ..errors import EyerenderError, InputError
 from .app import app
 from .options import AtLeastOne, Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads
 from .output import Heed, emit, progress, say

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from ..errors import InputError
-from ..storage.files import written
+from ..base.errors import InputError
+from ..base.storage.files import written
 from .app import app
 from .options import Result, Strict
 from .output import Heed, emit

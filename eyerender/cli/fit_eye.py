@@ -47,13 +47,13 @@ def fit_eye(
         outline_px: Standard deviation of one pixel of outline, for records without covariance.
         glint_px: Standard deviation of a glint along each axis, for records without covariance.
     """
+    from ..base.spec import read_yaml
     from ..design.fit import fit_eye as fit
     from ..design.fitfolder import write_fits
     from ..design.noise import FeatureNoise
     from ..design.unknowns import Unknowns
     from ..eye.catalogue import load_eye
     from ..gaze.records import load_observations
-    from ..spec import read_yaml
 
     observations, built = load_observations(recording, rig=rig, columns=columns)
     given = None if unknowns is None else Unknowns.from_mapping(read_yaml(unknowns), source=str(unknowns))

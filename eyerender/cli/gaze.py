@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
-from ..errors import InputError
+from ..base.errors import InputError
 from .app import app
 from .options import Result, Strict
 from .output import Heed, emit
@@ -146,7 +146,7 @@ def predict(
     from ..gaze.predictions import predictions
     from ..gaze.records import load_observations
     from ..gaze.store import load_calibration
-    from ..plausibility import rig_warnings
+    from ..rig.plausibility import rig_warnings
 
     heed = Heed(strict)
     fitted, calibrated = load_calibration(calibration, estimator)

@@ -76,7 +76,7 @@ def quickstart(
     Args:
         output: The folder to write.
     """
-    from ..applications.quickstart import run_quickstart
+    from ..apps.quickstart import run_quickstart
 
     heed = Heed(strict)
     with progress("quickstart") as steps:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from ..errors import InputError
+from ..base.errors import InputError
 from .app import app
 from .options import AtLeastOne, Result
 from .output import emit, progress
@@ -36,7 +36,7 @@ def inspect(
         images: The largest number of images that are read of a dataset, spread evenly over it.
         workers: Number of processes that read them (default: all processors).
     """
-    from ..inspection import inspect as look
+    from ..apps.inspection import inspect as look
 
     if output is not None and output.suffix.lower() not in (".html", ".htm"):
         raise InputError("must end with .html", source="--output")

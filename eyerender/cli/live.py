@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from ..errors import InputError
+from ..base.errors import InputError
 from .app import app
 from .options import Backend, EyeModel, Strict, Threads
 from .output import Heed
@@ -34,7 +34,7 @@ def live(
     """
     if find_spec("nicegui") is None:
         raise InputError("needs NiceGUI (the extra 'live'); run: pip install nicegui", source="live")
-    from ..live.server import serve
+    from ..apps.live.server import serve
     from ..scene import load_scene
 
     loaded = load_scene(scene, eye=eye)

@@ -14,7 +14,7 @@ from typing import Any
 
 from cyclopts import CycloptsError, ValidationError
 
-from ..errors import MAX_MESSAGE, EyerenderError, InputError, UnfinishedRunWarning, one_line
+from ..base.errors import MAX_MESSAGE, EyerenderError, InputError, UnfinishedRunWarning, one_line
 
 # Importing them registers their commands.
 from . import (  # noqa: F401

@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from ..errors import InputError
-from ..observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
-from ..processes import usable_cpus
-from ..status import Status
+from ..base.errors import InputError
+from ..base.processes import usable_cpus
+from ..base.status import Status
+from ..scene.observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
 from .app import app
 from .options import AtLeastOne, EyeModel, Result, Strict
 from .output import Heed, emit, progress
@@ -96,12 +96,12 @@ def extract(
         processes: Number of images processed at the same time (default: one per processor).
         record: Version of the records in the JSON, 1 or 2.
     """
+    from ..base.storage.files import make_folder, refuse_special, written
     from ..extraction.settings import ExtractionSettings
     from ..extraction.video import is_video
     from ..imaging.imageobserver import ImageObserver, files_of
     from ..imaging.videoobserver import VideoOutput, observe_video
     from ..scene import load_scene
-    from ..storage.files import make_folder, refuse_special, written
 
     if not images:
         raise InputError("give at least one image", source="extract")
@@ -163,7 +163,7 @@ def compare(
         estimator: The gaze estimator: a name as in `gaze fit`, or module:Class, a class of your own.
         function: regression: the function, R1 to R12.
     """
-    from ..applications.quickstart import compare_folder
+    from ..apps.quickstart import compare_folder
     from ..gaze.determined import undetermined_to
     from ..gaze.store import choose_estimator
 

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from ..errors import InputWarning
-from ..progress import Progress
-from ..storage.files import write_json
+from ..base.errors import InputWarning
+from ..base.progress import Progress
+from ..base.storage.files import write_json
 
 
 def say(text: str) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from ..errors import InputError
+from ..base.errors import InputError
 from .app import app
 from .options import Backend, Overwrite, Result, Threads
 from .output import emit, progress
@@ -26,8 +26,8 @@ def read_population(given: str, argument: str) -> Population:
     Raises:
         InputError: there is no such preset, or the file does not fit.
     """
+    from ..base.spec import read_yaml
     from ..scene.people import Population
-    from ..spec import read_yaml
 
     if given.endswith((".yaml", ".yml")):
         data = read_yaml(given)
@@ -68,7 +68,7 @@ def population(
         spp: Samples per pixel of the faces.
         seed: The seed of the draw.
     """
-    from ..applications.survey import REPORT, SurveySize, run_survey
+    from ..apps.survey import REPORT, SurveySize, run_survey
 
     size = SurveySize(seed=seed, count=count, check=check, faces=faces, spp=spp)
     people = read_population(preset, "PRESET")

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from ..errors import InputError
+from ..base.errors import InputError
 from .app import app
 from .options import Result
 from .output import emit, progress
@@ -37,7 +37,7 @@ def realism(
             this package or an export states, else 1 (linear).
         limit: The largest number of images of a folder, chosen evenly.
     """
-    from ..realism import realism as measured
+    from ..apps.realism import realism as measured
 
     if output is not None and output.suffix.lower() not in (".html", ".htm"):
         raise InputError("must end with .html", source="--output")
@@ -51,7 +51,7 @@ def realism(
 
 def _table(data: dict[str, Any]) -> str:
     """Format one line per statistic: median and middle half of each folder's images, and the ratio of the medians."""
-    from ..realism.page import text
+    from ..apps.realism.page import text
 
     folders, ratios = data["folders"], data["ratios"]
     lines = []

@@ -55,10 +55,10 @@ def rig(
         elevation_deg: Half range of the directions of gaze, vertically.
         unknowns: A YAML file with the keys of `er.Unknowns` (default: priors of a population, 3 mm of slippage).
     """
-    from ..applications.rigs import REPORT, RigSize, run_rig
+    from ..apps.rigs import REPORT, RigSize, run_rig
+    from ..base.spec import read_yaml
     from ..design.unknowns import Unknowns
     from ..scene import load_scene
-    from ..spec import read_yaml
 
     size = RigSize(
         people=people,

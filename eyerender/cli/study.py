@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from ..errors import InputError
-from ..study.options import StudyOptions
+from ..apps.study.options import StudyOptions
+from ..base.errors import InputError
 from .app import app
 from .options import Result
 from .output import emit, progress, say
@@ -39,8 +39,8 @@ def study(
         eyes: Eye models separated by commas, as catalogue names or eye files (default: E1 to E5).
         people: rigs: Number of people (default: 100).
     """
-    from ..study.literature import MODELS
-    from ..study.run import REPORT, run_study
+    from ..apps.study.literature import MODELS
+    from ..apps.study.run import REPORT, run_study
 
     if name == "rigs":
         return _rigs(output, people, eyes, options, json)
@@ -55,7 +55,7 @@ def study(
 
 def _rigs(output: Path, people: int | None, eyes: str | None, options: StudyOptions, json: str | None) -> int:
     """Run the study of rigs."""
-    from ..study.rigs import run_rigs
+    from ..apps.study.rigs import run_rigs
 
     if people is not None and not 1 <= people <= 100_000:
         raise InputError(f"must be 1 to 100000, not {people}", source="--people")

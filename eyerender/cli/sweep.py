@@ -38,9 +38,9 @@ def sweep(
         shard: K/N: evaluate only every N-th layout, starting with the K-th (1 <= K <= N), for array jobs that write to
             one folder.
     """
-    from ..applications.sweeps import REPORT, SweepRun, run_sweep
-    from ..applications.sweepspec import SweepSpec
-    from ..errors import InputError
+    from ..apps.sweeps.run import REPORT, SweepRun, run_sweep
+    from ..apps.sweeps.spec import SweepSpec
+    from ..base.errors import InputError
 
     part = part_of(shard)
     if overwrite and shard is not None:
@@ -64,7 +64,7 @@ def sweep(
 def _text(found: dict[str, Any], report: Path) -> str:
     if not found["complete"]:
         return f"{found['missing']} of {found['layouts']} layouts are still missing"
-    from ..applications.sweeppage import leds_of
+    from ..apps.sweeps.page import leds_of
 
     best = [row for row in found["rows"] if row["pareto"]]
     lines = [f"{found['layouts']} layouts, {len(best)} of them on the Pareto front"]

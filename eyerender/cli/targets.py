@@ -9,8 +9,8 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..storage.files import parse_json, read_text, refuse_address, refuse_special
+from ..base.errors import InputError
+from ..base.storage.files import parse_json, read_text, refuse_address, refuse_special
 
 # Names of the parameters that say where a command writes; all other paths of a command are inputs.
 OUTPUTS = ("output", "overlay", "json")
@@ -113,7 +113,7 @@ def _with_named(paths: Iterable[Path]) -> Iterator[tuple[Path, os.stat_result]]:
 
 def _content(path: Path) -> Any:
     """Return the content of a YAML or JSON file; None for other files, and for unreadable ones."""
-    from ..spec import MAX_YAML_BYTES, parse_yaml
+    from ..base.spec import MAX_YAML_BYTES, parse_yaml
 
     kind = path.suffix.lower()
     if kind not in (".yaml", ".yml", ".json") or not _is_file(_state(path)):

@@ -16,7 +16,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import EyerenderError, InputError
+from ..base.errors import EyerenderError, InputError
+from ..base.storage.files import MAX_FILE_BYTES, read_json, remove_parts, write_json, write_text, written
 from ..folders.imagefolder import (
     CONVENTIONS,
     DATASET,
@@ -31,7 +32,6 @@ from ..folders.imagefolder import (
     shard_name,
 )
 from ..folders.packed import INDEX
-from ..storage.files import MAX_FILE_BYTES, read_json, remove_parts, write_json, write_text, written
 from .card import data_card
 from .columns import type_first
 from .croissant import CROISSANT, croissant

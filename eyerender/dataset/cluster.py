@@ -22,8 +22,8 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from ..errors import EyerenderError, InputError
-from ..processes import caller_hidden, signals_held
+from ..base.errors import EyerenderError, InputError
+from ..base.processes import caller_hidden, signals_held
 from .done import cpu_family
 from .pool import RECYCLE_IMAGES, TRIES, Events, end_of
 from .shard import Staged, write_shard

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.storage.files import MAX_FILE_BYTES, inside, read_json
+from ..base.versions import package_version
 from ..folders.imagefolder import ARRAY_KEYS, DONE, SHARDS, shard_name, versions
-from ..storage.files import MAX_FILE_BYTES, inside, read_json
-from ..versions import package_version
 
 SHARD_SCHEMA, PACKED_SHARD_SCHEMA = "eyerender/shard/1", "eyerender/shard/2"
 """Schemas of done.json of a shard whose pictures are files, and of a packed one."""

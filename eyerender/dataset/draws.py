@@ -20,8 +20,8 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.special import betaincinv, log_ndtr, ndtri, ndtri_exp
 
-from ..errors import InputError
-from ..spec import Positive, Spec
+from ..base.errors import InputError
+from ..base.spec import Positive, Spec
 
 Unit = Literal["sample", "subject"]
 MARK = "draw"

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import Warn
+from ..base.errors import Warn
 from ..folders.imagefile import picture_bytes
 from .maker import Maker
 from .options import RunOptions

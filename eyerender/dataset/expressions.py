@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 
-from ..errors import InputError
+from ..base.errors import InputError
 
 REFERENCE = "var"
 MAX_LENGTH = 200

@@ -11,9 +11,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.spec import file_digest
 from ..region.headspec import is_manifest, read_manifest
-from ..spec import file_digest
 from .template import possible
 
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..spec import read_yaml
-from ..storage.files import read_text
+from ..base.errors import InputError
+from ..base.spec import read_yaml
+from ..base.storage.files import read_text
 from .draws import MARK, is_draw
 
 MAX_ROWS = 10_000

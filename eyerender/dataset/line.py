@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from ..observation import EYES, RECORD
 from ..population.table import default_table
 from ..rig.camera import Window
 from ..scene import Scene
+from ..scene.observation import EYES, RECORD
 from .realise import Realised
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backends.choose import BackendChoice
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.progress import one_behind
 from ..imaging.capture import BegunImage, EyeImage, begin_each, make_renderer, noiseless
 from ..imaging.images import settled_exposure_ms
 from ..imaging.labels import image_labels
-from ..plausibility import is_saturated
-from ..progress import one_behind
+from ..rig.plausibility import is_saturated
 from .line import image_line
 from .plan import Plan
 from .realise import Realised, Rejection, realise

@@ -10,11 +10,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import EyerenderError, InputError
+from ..base.errors import EyerenderError, InputError
+from ..base.progress import Progress
+from ..base.storage.files import MAX_FILE_BYTES, make_folder, read_json, sync_folder, sync_tree
+from ..base.storage.lock import final_lock, run_lock
 from ..folders.imagefolder import DONE, RUN, SHARDS, STAGE, finished, shard_name
-from ..progress import Progress
-from ..storage.files import MAX_FILE_BYTES, make_folder, read_json, sync_folder, sync_tree
-from ..storage.lock import final_lock, run_lock
 from .assemble import assemble
 from .done import KINDS, read_done
 from .plan import Plan

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..backends.choose import BackendChoice
-from ..errors import InputError
+from ..base.errors import InputError
 
 if TYPE_CHECKING:
     from .spec import DatasetSpec

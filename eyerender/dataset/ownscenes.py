@@ -14,13 +14,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ..errors import EyerenderError, InputError
+from ..base.errors import EyerenderError, InputError
+from ..base.references import load_reference
+from ..base.spec import file_digest
+from ..base.storage.files import shown
 from ..eye.catalogue import catalogue_names, load_eye
-from ..references import load_reference
 from ..scene import Scene
 from ..scene.spec import SceneSpec
-from ..spec import file_digest
-from ..storage.files import shown
 from .template import Turn
 
 MORE = ("subject", "sequence", "attempt")

@@ -17,9 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..folders.imagefolder import DONE, LINES, SHARDS, shard_name
-from ..folders.packed import LINES_GZ, MEMBERS, TAR, pack_lines, read_line
-from ..storage.files import (
+from ..base.storage.files import (
     make_folder,
     parse_json,
     read_bytes,
@@ -30,6 +28,8 @@ from ..storage.files import (
     write_json,
     written,
 )
+from ..folders.imagefolder import DONE, LINES, SHARDS, shard_name
+from ..folders.packed import LINES_GZ, MEMBERS, TAR, pack_lines, read_line
 from .done import KINDS, PACKED_SHARD_SCHEMA, SHARD_SCHEMA, sum_of
 from .interleaving import scrambled
 

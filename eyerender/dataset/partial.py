@@ -23,10 +23,19 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.storage.files import (
+    inside,
+    make_folder,
+    opened,
+    parse_json,
+    remove_file,
+    sync_files,
+    sync_folder,
+    write_json,
+)
 from ..folders.imagefile import Writer
 from ..folders.imagefolder import DONE, IMAGE_SCHEMA, LINES, SHARDS, STAGE, shard_name
-from ..storage.files import inside, make_folder, opened, parse_json, remove_file, sync_files, sync_folder, write_json
 from .done import (
     KINDS,
     PACKED_SHARD_SCHEMA,

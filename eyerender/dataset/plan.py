@@ -22,16 +22,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, InputWarning
+from ..base.errors import InputError, InputWarning
+from ..base.references import is_reference
+from ..base.spec import read_yaml
 from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
 from ..eye.topography import topography_files
-from ..observation import EYES
 from ..population.people import PersonChoice, choice_of, chosen_person
-from ..references import is_reference
 from ..scene import Scene
+from ..scene.observation import EYES
 from ..scene.spec import SceneSpec
-from ..spec import read_yaml
 from .draws import Unit, is_draw, unit_number
 from .files import check_files, sum_of_file, sums_of_files
 from .gathering import aliased_draws

@@ -13,8 +13,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from ..errors import EyerenderError
-from ..processes import caller_hidden, environment, signals_held, threads_of_libraries
+from ..base.errors import EyerenderError
+from ..base.processes import caller_hidden, environment, signals_held, threads_of_libraries
 from .shard import Staged
 from .worker import FAILURES, Job, work
 

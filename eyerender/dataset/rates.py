@@ -15,10 +15,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ..errors import EyerenderError
-from ..spec import Positive, Spec
-from ..storage.cachefolder import cache_folder
-from ..storage.files import read_json, write_json
+from ..base.errors import EyerenderError
+from ..base.spec import Positive, Spec
+from ..base.storage.cachefolder import cache_folder
+from ..base.storage.files import read_json, write_json
 from .done import cpu_family
 from .plan import Plan
 

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from ..analytic.observer import trace
-from ..errors import EyerenderError, InputError, InputWarning
+from ..base.errors import EyerenderError, InputError, InputWarning
 from ..folders.outfolder import refuse_non_empty
 from ..imaging.capture import check_windows
-from ..observation import Observations
 from ..rig.camera import Window, in_window
 from ..scene import Frames, Scene
+from ..scene.observation import Observations
 from .plan import Plan, Sample, is_function
 from .spec import DatasetSpec
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import EyerenderError, InputError, Warn
+from ..base.errors import EyerenderError, InputError, Warn
+from ..base.processes import usable_cpus
+from ..base.progress import Progress, Say
+from ..base.storage.files import MAX_FILE_BYTES, make_folder, read_json, remove_file
+from ..base.storage.lock import LOCK, final_lock, run_lock
 from ..folders.imagefolder import DATASET, LOG, finished
 from ..folders.outfolder import clear, refuse_non_empty
-from ..plausibility import saturation_warnings
-from ..processes import usable_cpus
-from ..progress import Progress, Say
-from ..storage.files import MAX_FILE_BYTES, make_folder, read_json, remove_file
-from ..storage.lock import LOCK, final_lock, run_lock
+from ..rig.plausibility import saturation_warnings
 from .assemble import assemble, damage
 from .done import cpu_family, described, read_done, samples_of
 from .environment import environment, flags

@@ -9,13 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.progress import Say
+from ..base.storage.files import MAX_FILE_BYTES, PART, read_json, remove_file, remove_parts, write_json
+from ..base.storage.lock import LOCK
 from ..folders.imagefolder import DATASET, LOG, METADATA, PACKED_RUN_SCHEMA, RUN, RUN_SCHEMA, SHARDS, STAGE, finished
 from ..folders.outfolder import MARKER, clear
 from ..folders.packed import INDEX
-from ..progress import Say
-from ..storage.files import MAX_FILE_BYTES, PART, read_json, remove_file, remove_parts, write_json
-from ..storage.lock import LOCK
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
 from .done import KINDS, read_done, run_versions

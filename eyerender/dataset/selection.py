@@ -17,7 +17,7 @@ from typing import overload
 
 import numpy as np
 
-from ..arrays import Bools, Ints
+from ..base.arrays import Bools, Ints
 from .interleaving import MIXED, Interleaving
 
 _CHUNK = 2**20

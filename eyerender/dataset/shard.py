@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.storage.files import make_folder, remove_file, sync_folder
 from ..folders.imagefolder import DONE, LINES, SHARDS, shard_name
 from ..folders.packed import LINES_GZ
-from ..storage.files import make_folder, remove_file, sync_folder
 from .done import KINDS, PACKED_SHARD_SCHEMA, compare_sums, read_done
 from .maker import Maker
 from .partial import PartialShard, remove_stages, take_back

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from ..arrays import Bytes
 from ..backends.choose import BackendChoice
-from ..errors import InputError, Warn
+from ..base.arrays import Bytes
+from ..base.errors import InputError, Warn
+from ..base.progress import Progress, notify
+from ..base.storage.files import written
 from ..folders.imagefile import preview as eight_bit
 from ..imaging.capture import make_renderer, render_windows
-from ..plausibility import is_saturated, saturation_warnings
-from ..progress import Progress, notify
+from ..rig.plausibility import is_saturated, saturation_warnings
 from ..scene import Scene, is_dataset, load_scene, refuse_folder, shipped_files
-from ..storage.files import written
 from .maker import Maker
 from .plan import Plan, is_function
 from .realise import frames_of

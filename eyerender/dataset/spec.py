@@ -12,11 +12,11 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.spec import FileSpec, Positive, Spec
 from ..population.people import PopulationSpec
 from ..scene import is_shipped_dataset, refuse_folder, shipped_files
 from ..scene.spec import DATASET_KIND, NOT_A_DATASET, SceneSpec
-from ..spec import FileSpec, Positive, Spec
 from .expressions import FUNCTIONS
 from .gathering import extended, with_tables
 from .selection import Selection

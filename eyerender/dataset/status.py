@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.storage.files import MAX_FILE_BYTES, opened, parse_json, read_json
 from ..folders.imagefolder import DATASET, LOG, PACKED_RUN_SCHEMA, RUN, RUN_SCHEMA, finished
-from ..storage.files import MAX_FILE_BYTES, opened, parse_json, read_json
 from .partial import checkpoints
 from .selection import Selection
 

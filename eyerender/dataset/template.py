@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputError, Problems
+from ..base.arrays import Floats
+from ..base.errors import InputError, Problems
 from .draws import (
     MARK,
     ChoiceDraw,

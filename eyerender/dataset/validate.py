@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from ..backends.choose import BackendChoice
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.progress import Progress
 from ..folders.imagefolder import FILE_KEYS, Entries, ImageEntry, ImageFolder
-from ..progress import Progress
 from .validation.images import Tally, check_images
 from .validation.lines import Lines, check_records
 from .validation.problems import WRONG, Problems

@@ -13,8 +13,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ..errors import BackendError, EyerenderError, InputError
-from ..processes import die_with_parent
+from ..base.errors import BackendError, EyerenderError, InputError
+from ..base.processes import die_with_parent
 from .maker import Maker
 from .plan import Plan
 from .shard import write_shard

@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 
 from ..backends.choose import BackendChoice
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.processes import Endings
+from ..base.progress import Say
 from ..imaging.capture import EyeImage
-from ..processes import Endings
-from ..progress import Say
 from .maker import MadeSample, Maker
 from .options import RunOptions
 from .ownscenes import GivenScene, OwnScenes, given_scene

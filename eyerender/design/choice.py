@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats, Ints
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Floats, Ints
+from ..base.errors import InputError
 from ..rig.rig import RigLike
 from ..scene import Frames, Scene
 from .information import case_of, outline_normals

@@ -9,9 +9,9 @@ from itertools import repeat
 
 import numpy as np
 
-from ..arrays import Floats, finite_or_none
-from ..processes import mapper
-from ..progress import Progress, notify
+from ..base.arrays import Floats, finite_or_none
+from ..base.processes import mapper
+from ..base.progress import Progress, notify
 from .noise import FeatureNoise
 from .people import Figures, Survey, figures_of
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
+from ..base.arrays import Floats
 from ..eye.kappa import angles_of, pupillary_axis, with_kappa
 from ..eye.spec import EyeSpec
 from .unknowns import ASPHERICITY, CENTRE, DEPTH, ELLIPTICITY, KAPPA, LOCAL, POSITION, RADIUS, ROTATION, SHIFT, TORICITY

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Ints
-from ..observation import Observations
-from ..status import Status
+from ..base.arrays import ArrayValue, Bools, Floats, Ints
+from ..base.status import Status
+from ..scene.observation import Observations
 from .noise import FeatureNoise
 from .unknowns import COUNT
 from .varied import Images, Slopes

@@ -17,12 +17,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Ints, finite_or_none
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Bools, Floats, Ints, finite_or_none
+from ..base.errors import InputError
 from ..eye.catalogue import load_eye
 from ..eye.spec import EyeSpec
-from ..observation import EYES, Observations
 from ..rig.rig import RigGeometry, RigLike
+from ..scene.observation import EYES, Observations
 from .eyefile import changed_file
 from .features import Measured, Residuals, measured, residuals, sized
 from .information import EyeInformation, eye_information

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..base.storage.files import write_json, write_text
 from ..folders.outfolder import staged
-from ..storage.files import write_json, write_text
 from .fit import EyeFit
 
 SCHEMA = "eyerender/fit-eye/1"

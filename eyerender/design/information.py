@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Ints, finite_or_none
-from ..errors import InputError
-from ..observation import EYES
+from ..base.arrays import ArrayValue, Bools, Floats, Ints, finite_or_none
+from ..base.errors import InputError
 from ..rig.rig import RigLike
 from ..scene import Frames
+from ..scene.observation import EYES
 from .noise import FeatureNoise, sensor_noise
 from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, NAMES, PERSON, PUPIL, Unknowns
 from .varied import Slopes, Views, diameters_mm, gaze_slopes, lines_of_sight, slopes_of, stacked_eyes, target_slopes

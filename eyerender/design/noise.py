@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayValue, Floats, frozen
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Floats, frozen
+from ..base.errors import InputError
 from ..rig.camera import PinholeCamera
 from ..rig.exposure import electrons, radiance_to_irradiance
 from ..rig.light import Lamp

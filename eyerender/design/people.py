@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Indices, Ints
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Bools, Floats, Indices, Ints
+from ..base.errors import InputError
 from ..eye.batch import structure_of
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion

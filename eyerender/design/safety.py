@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayValue, Bools, Floats, frozen
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Bools, Floats, frozen
+from ..base.errors import InputError
 from ..rig.light import Lamp
 from ..rig.rig import RigLike
 

@@ -19,8 +19,8 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from ..arrays import Floats
-from ..spec import Spec
+from ..base.arrays import Floats
+from ..base.spec import Spec
 
 FRAME = ("azimuth", "elevation", "pupil", "slippage_x", "slippage_y", "slippage_z")
 PERSON = (

@@ -14,17 +14,17 @@ import numpy as np
 
 from ..analytic.features import View
 from ..analytic.rays import glint_exits, pupil_exits
-from ..arrays import Bools, Floats, Ints, Statuses
-from ..errors import InputError
+from ..base.arrays import Bools, Floats, Ints, Statuses
+from ..base.errors import InputError
+from ..base.status import Status
 from ..eye.batch import slices, stack_eyes, structure_of, take_eyes
 from ..eye.model import EyeModel, RotationCentres, Stop
 from ..eye.pose import Poses, rigid_motion
-from ..geometry.surfaces import Surface
-from ..geometry.surfaces_biconic import Biconic
-from ..geometry.surfaces_quadric import Quadric
-from ..geometry.transforms import normalize
+from ..optics.surfaces import Surface
+from ..optics.surfaces_biconic import Biconic
+from ..optics.surfaces_quadric import Quadric
+from ..optics.transforms import normalize
 from ..rig.rig import RigGeometry
-from ..status import Status
 from .unknowns import (
     ASPHERICITY,
     AZIMUTH,

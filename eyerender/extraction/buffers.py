@@ -12,7 +12,7 @@ import threading
 
 import numpy as np
 
-from ..arrays import Bytes, Singles
+from ..base.arrays import Bytes, Singles
 
 KEPT = 4  # buffers of a thread at most
 LEAST_BYTES = 100_000  # the C library caches less by itself

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import Bytes
-from ..jit import compile_share, functions
+from ..base.arrays import Bytes
+from ..base.jit import compile_share, functions
 from .pipeline import extract
 
 

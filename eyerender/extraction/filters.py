@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ..arrays import Bytes, Singles
+from ..base.arrays import Bytes, Singles
 
 
 def median_filtered(image: Bytes, size: int) -> Bytes:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bytes, Floats
+from ..base.arrays import Bytes, Floats
 from .result import Extraction
 
 _SHIFT = 4  # bits after the binary point of OpenCV's coordinates

@@ -9,9 +9,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from ..arrays import Bools, Floats
-from ..geometry.ellipse import signed_distance
-from ..jit import ensure_compiled
+from ..base.arrays import Bools, Floats
+from ..base.jit import ensure_compiled
+from ..optics.ellipse import signed_distance
 from .glints.classification import Eye, classify_spots
 from .glints.deblending import give_edges, split_blends
 from .glints.detection import Spots, detect_spots, search_reach, widest

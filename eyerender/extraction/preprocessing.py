@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Singles
-from ..errors import InputError
+from ..base.arrays import Singles
+from ..base.errors import InputError
 from .buffers import image_buffer
 from .statistics import median, quantile
 

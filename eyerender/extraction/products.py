@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from ..arrays import Bools, Floats
-from ..jit import inlined, summing
+from ..base.arrays import Bools, Floats
+from ..base.jit import inlined, summing
 
 
 @summing

@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import Floats, frozen
-from ..geometry.ellipse import Ellipse
-from ..status import Status
+from ..base.arrays import Floats, frozen
+from ..base.status import Status
+from ..optics.ellipse import Ellipse
 
 Stage = Literal["input", "coarse search", "edges", "fit", "refinement"]
 

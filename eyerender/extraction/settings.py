@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from ..spec import Positive, Spec
+from ..base.spec import Positive, Spec
 
 # A pupil of 3 px has a boundary of 19 px. A pupil is at most 8 mm x 1.2 wide; beyond 0.4 of the side, the iris around
 # it (12 mm) would not be in the image.

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats
-from ..jit import compiled, inlined
+from ..base.arrays import Floats
+from ..base.jit import compiled, inlined
 
 
 def median(values: NDArray[Any]) -> float:

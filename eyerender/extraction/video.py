@@ -17,9 +17,9 @@ from types import TracebackType
 import cv2
 import numpy as np
 
-from ..arrays import Bytes
-from ..errors import EyerenderError, InputError
-from ..storage.files import opened, written
+from ..base.arrays import Bytes
+from ..base.errors import EyerenderError, InputError
+from ..base.storage.files import opened, written
 from .pair import extract_eyes
 from .pipeline import extract
 from .preprocessing import MAX_PIXELS

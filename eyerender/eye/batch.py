@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Indices
-from ..geometry.transforms import read_only, stacked
+from ..base.arrays import Indices
+from ..optics.transforms import read_only, stacked
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
 
 Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str]

@@ -11,11 +11,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import FloatLike
-from ..errors import InputError
-from ..geometry.surfaces import Surface
-from ..geometry.transforms import read_only
+from ..base.arrays import FloatLike
+from ..base.errors import InputError
 from ..optics.gradient import GradientMedium
+from ..optics.surfaces import Surface
+from ..optics.transforms import read_only
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
 from .model import EyeModel, LineOfSight, RotationCentres, Stop
 from .parts import EyeParts, GradientLensSpec, Side, SurfaceLensSpec

@@ -7,11 +7,11 @@ from typing import NoReturn
 
 import numpy as np
 
-from ..arrays import Bools, Floats
-from ..errors import InputError, Refuse
-from ..geometry.graphs import graphs_of
-from ..geometry.surfaces import Surface, components
-from ..geometry.surfaces_measured import Measured
+from ..base.arrays import Bools, Floats
+from ..base.errors import InputError, Refuse
+from ..optics.graphs import graphs_of
+from ..optics.surfaces import Surface, components
+from ..optics.surfaces_measured import Measured
 from .corneas import WINDOW, grid_surface, misfit_mm, zernike_surface
 from .model import Stop
 from .parts import (

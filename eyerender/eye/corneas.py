@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import Floats
-from ..geometry.surfaces_measured import GridSurface, Measured, ZernikeSurface
-from ..geometry.topography import outer_biconic, spline_coefficients
-from ..geometry.zernike import order_of, terms
+from ..base.arrays import Floats
+from ..optics.surfaces_measured import GridSurface, Measured, ZernikeSurface
+from ..optics.topography import outer_biconic, spline_coefficients
+from ..optics.zernike import order_of, terms
 from .parts import GridSpec, ZernikeSpec
 
 WINDOW = (0.75, 1.15)

@@ -12,11 +12,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..arrays import Floats, frozen, remembered
-from ..errors import InputError
-from ..geometry.surfaces import Surface
+from ..base.arrays import Floats, frozen, remembered
+from ..base.errors import InputError
+from ..base.status import Status
 from ..optics.solve import apparent_points
-from ..status import Status
+from ..optics.surfaces import Surface
 from .model import EyeModel, Stop
 
 FAR_MM = 1e6

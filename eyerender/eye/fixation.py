@@ -22,14 +22,14 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, Floats, Statuses, frozen
-from ..errors import InputError
-from ..geometry.surfaces import Xyz, components, join
-from ..geometry.transforms import normalize
+from ..base.arrays import ArrayValue, Bools, Floats, Statuses, frozen
+from ..base.errors import InputError
+from ..base.status import Status
 from ..optics.interface import dot
 from ..optics.solve import apparent_points
+from ..optics.surfaces import Xyz, components, join
 from ..optics.trace import trace
-from ..status import Status
+from ..optics.transforms import normalize
 from .batch import CHUNK_POINTS, chunks, groups
 from .landmarks import path_to_retina
 from .model import EyeModel

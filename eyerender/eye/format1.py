@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputError
-from ..geometry.transforms import rotation_x, rotation_y, rotation_z, tilt_rotation
-from ..spec import LARGEST
-from ..storage.files import shown
+from ..base.arrays import Floats
+from ..base.errors import InputError
+from ..base.spec import LARGEST
+from ..base.storage.files import shown
+from ..optics.transforms import rotation_x, rotation_y, rotation_z, tilt_rotation
 
 
 def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:

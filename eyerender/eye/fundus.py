@@ -22,9 +22,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats, frozen, remembered
-from ..geometry.vectors import crosses
+from ..base.arrays import ArrayValue, Floats, frozen, remembered
 from ..optics.trace import trace
+from ..optics.vectors import crosses
 from .entrance import entrance_pupil
 from .landmarks import path_to_retina
 from .model import EyeModel

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputError
-from ..geometry.transforms import normalize
+from ..base.arrays import Floats
+from ..base.errors import InputError
+from ..base.status import Status
 from ..optics.solve import ApparentPoints, apparent_points
 from ..optics.trace import trace
-from ..status import Status
+from ..optics.transforms import normalize
 from .landmarks import field_direction, fovea_by_nodal_ray, incident_node, path_to_retina
 from .model import EyeModel
 from .parts import FoveaSpec

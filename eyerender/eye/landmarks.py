@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats, remembered, sealed
-from ..errors import InputError
-from ..geometry.surfaces import components, join
-from ..geometry.transforms import flip_y, normalize, read_only
+from ..base.arrays import Floats, remembered, sealed
+from ..base.errors import InputError
+from ..base.status import Status
 from ..optics.gradient import GradientMedium
 from ..optics.shooting import connect
+from ..optics.surfaces import components, join
 from ..optics.trace import Crossing, Traced, outward_path, trace
-from ..status import Status
+from ..optics.transforms import flip_y, normalize, read_only
 from .model import EyeModel, LineOfSight
 
 NODE_RING_DEG = 14.3

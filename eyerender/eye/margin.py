@@ -19,7 +19,7 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ..spec import Spec
+from ..base.spec import Spec
 from .parts import ContourSpec
 from .spec import EyeSpec
 

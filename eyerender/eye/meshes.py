@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints
-from ..geometry.surfaces import Surface
+from ..base.arrays import Floats, Ints
+from ..optics.surfaces import Surface
 from .model import EyeModel
 from .shells import shelled
 

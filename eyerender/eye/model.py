@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, FloatLike, Floats
-from ..geometry.surfaces import Surface, Xyz, components, fit, shift, turn_back
-from ..geometry.transforms import flip_y, mirror_rotation, read_only
+from ..base.arrays import ArrayValue, Bools, FloatLike, Floats
 from ..optics.gradient import GradientMedium
+from ..optics.surfaces import Surface, Xyz, components, fit, shift, turn_back
+from ..optics.transforms import flip_y, mirror_rotation, read_only
 from .parts import Side
 
 __all__ = ["EyeModel", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]

@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from ..spec import ByKind, FileSpec, Number, Positive, Spec, Vec2, Vec3
+from ..base.spec import ByKind, FileSpec, Number, Positive, Spec, Vec2, Vec3
 
 # This is the number of surfaces of the finest lens of shells.
 MAX_SURFACES = 400

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Floats
-from ..geometry.surfaces import Xyz
-from ..geometry.transforms import read_only
+from ..base.arrays import ArrayValue, Floats
+from ..optics.surfaces import Xyz
+from ..optics.transforms import read_only
 from .model import EyeModel
 from .pose_kernels import move_all
 

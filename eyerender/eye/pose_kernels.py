@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Floats
-from ..jit import HELPER, compiled, njit
+from ..base.arrays import Floats
+from ..base.jit import HELPER, compiled, njit
 
 inlined = njit(forceinline=True, **HELPER)
 SETTLED_MM, SETTLED_RAD = 1e-11, 1e-9

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import InputError
-from ..geometry.transforms import normalize
+from ..base.errors import InputError
+from ..base.status import Status
 from ..optics.trace import trace
-from ..status import Status
+from ..optics.transforms import normalize
 from .landmarks import path_to_retina
 from .model import EyeModel
 

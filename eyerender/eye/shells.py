@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatLike, Floats
-from ..geometry.surfaces import Surface
+from ..base.arrays import FloatLike, Floats
+from ..optics.surfaces import Surface
 from .model import EyeModel
 
 SHELLS = 21

@@ -8,8 +8,8 @@ from typing import Any, Self
 
 from pydantic import model_validator
 
-from ..errors import InputError
-from ..spec import KeyProblem
+from ..base.errors import InputError
+from ..base.spec import KeyProblem
 from .build import build_eye
 from .check import check_eye
 from .format1 import upgraded

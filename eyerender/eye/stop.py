@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..geometry.transforms import rotation_x, tilt_rotation
+from ..optics.transforms import rotation_x, tilt_rotation
 from .model import Stop
 from .parts import EyeParts
 

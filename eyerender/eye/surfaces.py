@@ -8,14 +8,14 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import brentq
 
-from ..arrays import FloatLike, Floats
-from ..errors import InputError
-from ..geometry.surfaces import Surface
-from ..geometry.surfaces_biconic import Biconic
-from ..geometry.surfaces_quadric import Quadric
-from ..geometry.transforms import read_only, tilt_rotation
+from ..base.arrays import FloatLike, Floats
+from ..base.errors import InputError
 from ..optics.gradient import GradientMedium
 from ..optics.media import CauchyMedium, ConstantMedium, Medium
+from ..optics.surfaces import Surface
+from ..optics.surfaces_biconic import Biconic
+from ..optics.surfaces_quadric import Quadric
+from ..optics.transforms import read_only, tilt_rotation
 from .corneas import grid_surface, zernike_surface
 from .model import Sphere
 from .parts import (

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputError
-from ..geometry.ply import plain_ply
-from ..geometry.topography import smooth_heights
-from ..spec import read_yaml
-from ..storage.files import read_bytes, read_text, shown
+from ..base.arrays import Floats
+from ..base.errors import InputError
+from ..base.spec import read_yaml
+from ..base.storage.files import read_bytes, read_text, shown
+from ..optics.ply import plain_ply
+from ..optics.topography import smooth_heights
 from .parts import MAX_NODES, GridSpec, TopographySpec
 
 MAX_FILE_BYTES, MAX_POINTS, MIN_POINTS = 64 * 2**20, 200_000, 50

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..storage.files import read_json
+from ..base.storage.files import read_json
 
 EXPORT = "export.json"
 

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..arrays import Bytes, Singles
-from ..errors import InputError
-from ..storage.files import opened, written
+from ..base.arrays import Bytes, Singles
+from ..base.errors import InputError
+from ..base.storage.files import opened, written
 
 ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")  # suffixes of images
 MAX_FILES = 1_000_000

@@ -19,13 +19,13 @@ from typing import Any, NoReturn, TypeGuard, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bytes, Ints, Singles
-from ..errors import InputError, Refuse, UnfinishedRunWarning
-from ..observation import EYES, Observations, concatenate, count_heads
+from ..base.arrays import Bytes, Ints, Singles
+from ..base.errors import InputError, Refuse, UnfinishedRunWarning
+from ..base.storage.files import MAX_FILE_BYTES, inside, is_plain, read_bytes, read_json, shown, write_bytes, write_json
+from ..base.storage.jsonlines import JsonLines, LineFiles
+from ..base.versions import package_version
 from ..rig.camera import Window
-from ..storage.files import MAX_FILE_BYTES, inside, is_plain, read_bytes, read_json, shown, write_bytes, write_json
-from ..storage.jsonlines import JsonLines, LineFiles
-from ..versions import package_version
+from ..scene.observation import EYES, Observations, concatenate, count_heads
 from .imagefile import MAX_IMAGE_BYTES, array_of, image_of
 from .packed import INDEX, INDEX_TYPE, MEMBERS, PackedLines, read_member
 

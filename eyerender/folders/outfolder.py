@@ -18,9 +18,18 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import EyerenderError, InputError
-from ..storage.files import is_plain, make_folder, read_json, remove_file, shown, sync_folder, sync_tree, write_json
-from ..storage.lock import LOCK, writer_lock
+from ..base.errors import EyerenderError, InputError
+from ..base.storage.files import (
+    is_plain,
+    make_folder,
+    read_json,
+    remove_file,
+    shown,
+    sync_folder,
+    sync_tree,
+    write_json,
+)
+from ..base.storage.lock import LOCK, writer_lock
 from .imagefolder import DATASET, RUN, STAGE
 
 FOLDER_SCHEMA = "eyerender/folder/1"

@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Ints
-from ..errors import InputError
-from ..storage.files import inside, opened, parse_json
-from ..storage.jsonlines import MAX_LINE_BYTES
-from ..storage.sharing import common, lists, merged, places, rest
+from ..base.arrays import Ints
+from ..base.errors import InputError
+from ..base.storage.files import inside, opened, parse_json
+from ..base.storage.jsonlines import MAX_LINE_BYTES
+from ..base.storage.sharing import common, lists, merged, places, rest
 from .imagefile import MAX_IMAGE_BYTES
 
 TAR, LINES_GZ, INDEX = "images.tar", "lines.jsonl.gz", "index.npy"

@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..errors import InputError
-from ..storage.cachefolder import cache_folder
+from ..base.errors import InputError
+from ..base.storage.cachefolder import cache_folder
 from .imagefile import write_png
 
 MAX_IMAGES = 100_000

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from ..arrays import Bools, Floats, Ints
-from ..errors import InputError
-from ..observation import EYES, Observations
+from ..base.arrays import Bools, Floats, Ints
+from ..base.errors import InputError
 from ..rig.rig import RigGeometry, RigLike
+from ..scene.observation import EYES, Observations
 from .estimate import GazeEstimator, GazePoints, RayEstimator, angular_error_deg, binocular_average
 
 ESTIMATOR = "estimator"

@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ..errors import Problems
-from ..observation import EYES
+from ..base.errors import Problems
+from ..base.spec import FileSpec, Positive, Spec, Vec2, Vec3
+from ..base.storage.files import shown
 from ..rig.light import MAX_LIGHTS
-from ..spec import FileSpec, Positive, Spec, Vec2, Vec3
-from ..storage.files import shown
+from ..scene.observation import EYES
 
 ColumnName = Annotated[str, Field(min_length=1, max_length=200)]
 ColumnPair = tuple[ColumnName, ColumnName]

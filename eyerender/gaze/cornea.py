@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, frozen
+from ..base.arrays import ArrayValue, Bools, Floats, frozen
 from .rays import unit
 
 # Starting distances of a cornea from its camera, in corneal radii: 30 mm to 10 m.

@@ -15,10 +15,10 @@ from typing import Self
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputError
-from ..observation import EYES, Observations
+from ..base.arrays import Floats
+from ..base.errors import InputError
 from ..rig.rig import RigGeometry, RigLike
+from ..scene.observation import EYES, Observations
 from .estimate import GazePoints
 from .homography import homography, transformed
 from .rays import chosen_lights, glints_of, screen_of

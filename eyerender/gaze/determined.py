@@ -14,8 +14,8 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputWarning, Warn
+from ..base.arrays import Floats
+from ..base.errors import InputWarning, Warn
 
 Terms = tuple[tuple[int, int], ...]  # exponents (i, j) of x^i y^j
 

@@ -14,10 +14,10 @@ from typing import Literal, Self
 
 import numpy as np
 
-from ..arrays import Floats, Objects
-from ..errors import InputError
-from ..observation import Observations
+from ..base.arrays import Floats, Objects
+from ..base.errors import InputError
 from ..rig.rig import RigLike
+from ..scene.observation import Observations
 from .determined import Terms
 from .estimate import GazePoints, GazeRays
 from .rays import camera_of, chosen_lights, glints_of, screen_of, target_directions

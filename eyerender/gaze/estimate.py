@@ -16,11 +16,11 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayValue, Bools, Floats, Objects, Statuses, frozen
-from ..observation import Observations
+from ..base.arrays import ArrayValue, Bools, Floats, Objects, Statuses, frozen
+from ..base.status import Status
 from ..rig.rig import RigLike
 from ..rig.screen import ScreenPlane
-from ..status import Status
+from ..scene.observation import Observations
 
 
 @dataclass(frozen=True, slots=True, eq=False)

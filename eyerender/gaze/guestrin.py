@@ -18,11 +18,11 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike
 
-from ..arrays import Bools, Floats, Ints, Objects
-from ..errors import InputError
-from ..observation import EYES, Observations
+from ..base.arrays import Bools, Floats, Ints, Objects
+from ..base.errors import InputError
 from ..rig.rig import RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
+from ..scene.observation import EYES, Observations
 from .cornea import CorneaCentres, from_all_glints, from_plane, optic_axis
 from .estimate import GazePoints, GazeRays
 from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds

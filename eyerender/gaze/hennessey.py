@@ -13,8 +13,8 @@ from typing import Self
 
 import numpy as np
 
-from ..observation import Observations
 from ..rig.rig import RigGeometry, RigLike
+from ..scene.observation import Observations
 from .estimate import GazeRays
 from .guestrin import GuestrinEizenman
 from .parameters import MEAN_EYE, EyeParameters

@@ -17,10 +17,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Bools, Floats, Objects
-from ..errors import InputError
-from ..observation import EYES, Observations
+from ..base.arrays import Bools, Floats, Objects
+from ..base.errors import InputError
 from ..rig.rig import RigGeometry, RigLike
+from ..scene.observation import EYES, Observations
 from .estimate import GazePoints
 from .rays import chosen_lights, glints_of, screen_of, targets_on_screen
 

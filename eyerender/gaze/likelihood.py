@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 
-from ..arrays import Floats, frozen
-from ..errors import InputError
-from ..observation import EYES, Observations
+from ..base.arrays import Floats, frozen
+from ..base.errors import InputError
 from ..rig.rig import RigLike
+from ..scene.observation import EYES, Observations
 from .estimate import GazePoints, GazeRays
 from .rays import screen_of
 

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-from ..errors import EyerenderError, InputError
-from ..observation import Observations
-from ..references import load_reference
+from ..base.errors import EyerenderError, InputError
+from ..base.references import load_reference
 from ..rig.rig import RigLike
+from ..scene.observation import Observations
 from .estimate import GazeEstimator, GazePoints, StoredEstimator
 
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Objects, finite_or_none
-from ..errors import InputError
-from ..observation import EYES, Observations
+from ..base.arrays import Bools, Floats, Objects, finite_or_none
+from ..base.errors import InputError
+from ..base.status import Status
 from ..rig.rig import RigGeometry
 from ..rig.screen import ScreenPlane
-from ..status import Status
+from ..scene.observation import EYES, Observations
 from .cornea import from_all_glints
 from .estimate import GazeEstimator, RayEstimator, angular_error_deg, binocular_average, ray_errors_deg
 from .parameters import MEAN_EYE

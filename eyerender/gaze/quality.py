@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayValue, Floats, frozen
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Floats, frozen
+from ..base.errors import InputError
 from .estimate import angular_error_deg
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats, Ints, Objects, frozen
-from ..errors import InputError
-from ..observation import Observations
+from ..base.arrays import ArrayValue, Floats, Ints, Objects, frozen
+from ..base.errors import InputError
 from ..rig.rig import RigGeometry
 from ..rig.screen import ScreenPlane
+from ..scene.observation import Observations
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

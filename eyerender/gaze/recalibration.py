@@ -16,10 +16,10 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputError
-from ..observation import EYES, Observations
+from ..base.arrays import Floats
+from ..base.errors import InputError
 from ..rig.rig import RigGeometry, RigLike
+from ..scene.observation import EYES, Observations
 from .determined import UndeterminedWarning, shortfall
 from .estimate import GazePoints, GazeRays
 from .rays import screen_of, targets_on_screen, unit

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, frozen
-from ..errors import InputError, Problems
-from ..observation import Observations
+from ..base.arrays import Floats, frozen
+from ..base.errors import InputError, Problems
+from ..base.spec import LARGEST, FileSpec, read_yaml
+from ..base.storage.files import parse_json, read_text
 from ..rig.camera import CameraCalibration, PinholeCamera
 from ..rig.light import MAX_LIGHTS, Lamp
 from ..rig.rig import MAX_CAMERAS, Rig, RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
 from ..scene import Scene, load_scene
-from ..spec import LARGEST, FileSpec, read_yaml
-from ..storage.files import parse_json, read_text
+from ..scene.observation import Observations
 from .columns import CsvColumns
 from .table import observations_from_csv
 

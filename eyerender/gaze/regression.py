@@ -15,10 +15,10 @@ from typing import Self
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, Objects
-from ..errors import InputError
-from ..observation import EYES, Observations
+from ..base.arrays import Bools, Floats, Ints, Objects
+from ..base.errors import InputError
 from ..rig.rig import RigLike
+from ..scene.observation import EYES, Observations
 from .determined import Terms, UndeterminedWarning, is_determined, monomials, shortfall
 from .estimate import GazePoints
 from .rays import glints_of, screen_of, targets_on_screen

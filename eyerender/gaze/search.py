@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from ..arrays import Bools, Floats
-from ..errors import InputError
+from ..base.arrays import Bools, Floats
+from ..base.errors import InputError
 from .parameters import NAMES, Calibration, EyeParameters, ParameterBounds
 
 # Typical change of each parameter for the trust region; differences use 1e-5 of it.

@@ -10,14 +10,14 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 from pydantic import Field
 
-from ..arrays import Floats, frozen
-from ..errors import InputError, Warn
-from ..observation import EYES, Observations
-from ..plausibility import target_warnings
-from ..references import is_reference
+from ..base.arrays import Floats, frozen
+from ..base.errors import InputError, Warn
+from ..base.references import is_reference
+from ..base.spec import Positive, Spec
+from ..base.storage.files import read_json, shown, write_json
+from ..rig.plausibility import target_warnings
 from ..rig.rig import RigGeometry, RigLike
-from ..spec import Positive, Spec
-from ..storage.files import read_json, shown, write_json
+from ..scene.observation import EYES, Observations
 from .crossratio import CrossRatio
 from .determined import undetermined_to
 from .directions import DirectionRegression, Feature

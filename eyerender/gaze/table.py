@@ -16,14 +16,23 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, Objects
-from ..errors import InputError, Problems
-from ..observation import EYES, MAX_GLINTS, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, count_heads
+from ..base.arrays import Bools, Floats, Ints, Objects
+from ..base.errors import InputError, Problems
+from ..base.status import Status
+from ..base.storage.files import read_bytes, shown
 from ..rig.light import MAX_LIGHTS
 from ..rig.rig import RigLike
 from ..rig.screen import ScreenPlane
-from ..status import Status
-from ..storage.files import read_bytes, shown
+from ..scene.observation import (
+    EYES,
+    MAX_GLINTS,
+    GlintFeatures,
+    Index,
+    Observations,
+    PoseTruth,
+    PupilFeatures,
+    count_heads,
+)
 from .columns import CsvColumns, EyeColumns, completed
 
 # A table in memory, as text and numbers, takes some 20 times its size in the file. A million rows are half an hour at

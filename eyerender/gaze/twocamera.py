@@ -13,10 +13,10 @@ from typing import Self
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, Objects
-from ..errors import InputError
-from ..observation import Observations
+from ..base.arrays import Bools, Floats, Ints, Objects
+from ..base.errors import InputError
 from ..rig.rig import RigGeometry, RigLike
+from ..scene.observation import Observations
 from .cornea import line_to_centre
 from .estimate import GazeRays
 from .rays import FeatureRays, feature_rays, unit

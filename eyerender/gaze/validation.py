@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Objects
-from ..errors import InputError, InputWarning
-from ..observation import Observations
+from ..base.arrays import ArrayValue, Bools, Floats, Objects
+from ..base.errors import InputError, InputWarning
 from ..rig.rig import RigLike
+from ..scene.observation import Observations
 from .determined import UndeterminedWarning, undetermined_to
 from .estimate import GazeEstimator, GazePoints, angular_error_deg, binocular_average
 

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bytes, Floats, Singles
 from ..backends.choose import BackendChoice, choose_backend
-from ..errors import InputError
+from ..base.arrays import Bytes, Floats, Singles
+from ..base.errors import InputError
+from ..base.progress import Progress, followed_by, one_behind
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
 from ..eye.refraction import at_cornea_d
 from ..folders.imagefile import MAX_PIXELS, compressed
-from ..observation import EYES
-from ..progress import Progress, followed_by, one_behind
 from ..rig.camera import Window
 from ..rig.stray import misses_light
 from ..scene import Frames, Scene, as_frames
+from ..scene.observation import EYES
 
 if TYPE_CHECKING:
     from ..rendering.records.job import RenderJob

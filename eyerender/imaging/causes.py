@@ -19,14 +19,14 @@ import numpy as np
 
 from ..analytic.observer import trace
 from ..backends.choose import BackendChoice
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.progress import Progress, notify
 from ..gaze.budget import ESTIMATOR
-from ..observation import Observations, concatenate
-from ..progress import Progress, notify
 from ..rig.exposure import recorded
 from ..rig.imaging import Ambient, Lens
 from ..rig.sensor import Sensor
 from ..scene import Frames, Scene
+from ..scene.observation import Observations, concatenate
 from .capture import EyeImage, make_renderer, render_windows, stored
 from .imageobserver import ImageObserver
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Bools, Floats, Ints, frozen
+from ..base.errors import InputError
 from ..gaze.estimate import GazeEstimator
 from ..gaze.regression import Regression
 from ..gaze.validation import GazeErrors, leave_one_target_out
-from ..observation import Observations
 from ..rig.rig import RigLike
+from ..scene.observation import Observations
 
 SCHEMA = "eyerender/compare/2"
 

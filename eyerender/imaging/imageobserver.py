@@ -13,9 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats, Ints
 from ..backends.choose import BackendChoice
-from ..errors import InputError, InputWarning, Warn
+from ..base.arrays import Floats, Ints
+from ..base.errors import InputError, InputWarning, Warn
+from ..base.processes import mapper
+from ..base.progress import Progress, followed, followed_by
+from ..base.storage.files import parse_json
 from ..extraction import Extraction, ExtractionSettings, extract
 from ..extraction.glints.matching import assign_lights, predict_glints
 from ..extraction.overlay import overlay
@@ -24,14 +27,11 @@ from ..extraction.preprocessing import single_threaded
 from ..eye.spec import EyeSpec
 from ..folders.imagefile import image_files, read_any_image, write_png
 from ..folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
-from ..observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
-from ..processes import mapper
-from ..progress import Progress, followed, followed_by
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigLike
 from ..scene import Frames, Scene
+from ..scene.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 from ..scene.spec import SceneSpec
-from ..storage.files import parse_json
 from .capture import EyeImage, render_windows
 
 # Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.

@@ -11,16 +11,16 @@ import numpy as np
 
 from ..analytic.observer import trace
 from ..backends.choose import BackendChoice
-from ..errors import InputError, Warn
+from ..base.errors import InputError, Warn
+from ..base.progress import Progress
 from ..folders.imagefile import Writer, png_bytes, preview
 from ..folders.imagefolder import FRAME, write_dataset
 from ..folders.outfolder import MARKER, refuse_non_empty, staged
-from ..observation import EYES
-from ..plausibility import is_saturated, saturation_warnings
-from ..progress import Progress
 from ..rig.exposure import electrons
+from ..rig.plausibility import is_saturated, saturation_warnings
 from ..rig.rig import RigLike
 from ..scene import Frame, Frames, Scene, as_frames
+from ..scene.observation import EYES
 from .capture import EyeImage, check_windows, make_renderer, render_job, render_windows
 from .labels import image_labels, seen_labels
 

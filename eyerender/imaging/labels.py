@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from ..arrays import Bools, Bytes, Floats, finite_or_none, remembered
-from ..errors import InputError
+from ..base.arrays import Bools, Bytes, Floats, finite_or_none, remembered
+from ..base.errors import InputError
+from ..base.status import Status
 from ..eye.entrance import entrance_pupil_mm
 from ..eye.fixation import fixations
 from ..eye.model import EyeModel
 from ..folders.imagefolder import IRIS, PUPIL
-from ..geometry.ellipse import fit_ellipse_direct
-from ..observation import EYES, Observations
+from ..optics.ellipse import fit_ellipse_direct
 from ..region.limbus import lower
 from ..rig.camera import PinholeCamera, Window, in_window
 from ..scene import Frames, Scene
-from ..status import Status
+from ..scene.observation import EYES, Observations
 from .capture import EyeImage, eye_motion
 
 _OUTLINE_POINTS = 60

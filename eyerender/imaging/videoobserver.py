@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import Warn
+from ..base.errors import Warn
+from ..base.progress import Progress, notify
+from ..base.storage.files import written
 from ..extraction import Extraction
 from ..extraction.overlay import overlay as drawn
 from ..extraction.video import VideoReader, VideoWriter, follow
-from ..observation import RECORD
-from ..progress import Progress, notify
 from ..scene import Scene
-from ..storage.files import written
+from ..scene.observation import RECORD
 from .imageobserver import ImageObserver, colour_warning
 
 

@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.optimize import brentq
 
-from ..arrays import Floats, frozen
+from ..base.arrays import Floats, frozen
 
 _TAIL = 60.0  # radius in units of d, beyond practically all light
 

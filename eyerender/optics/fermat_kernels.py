@@ -22,10 +22,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Floats, Ints, Statuses
-from ..geometry.graph_kernels import APEX, AXIS, LEAN, ORIGIN, SMOOTH, helper, inlined, measured_jet, merged, smooth_jet
-from ..jit import compiled
-from ..status import Status
+from ..base.arrays import Floats, Ints, Statuses
+from ..base.jit import compiled
+from ..base.status import Status
+from .graph_kernels import APEX, AXIS, LEAN, ORIGIN, SMOOTH, helper, inlined, measured_jet, merged, smooth_jet
 
 STEPS = 6
 SETTLED_MM = 2e-6

@@ -28,10 +28,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Floats, Indices
-from ..geometry.surfaces import Hit, Surface, Xyz, fit
-from ..geometry.surfaces_quadric import Quadric
-from ..geometry.transforms import MIRROR, flip_y, read_only
+from ..base.arrays import ArrayValue, Floats, Indices
+from .surfaces import Hit, Surface, Xyz, fit
+from .surfaces_quadric import Quadric
+from .transforms import MIRROR, flip_y, read_only
 
 STEPS = 32
 """Steps in each half. Twice as many change the direction behind a human lens by less than 1e-5 deg for any ray through

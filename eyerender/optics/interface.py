@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, FloatLike, Floats
-from ..geometry.surfaces import Xyz
+from ..base.arrays import Bools, FloatLike, Floats
+from .surfaces import Xyz
 
 
 def reflect(direction: Xyz, normal: Xyz) -> Xyz:

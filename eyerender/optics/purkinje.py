@@ -20,14 +20,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, FloatLike, Floats, Indices, Statuses
-from ..geometry.surfaces import Surface, components, join
-from ..geometry.transforms import normalize
-from ..status import Status
+from ..base.arrays import ArrayValue, Bools, FloatLike, Floats, Indices, Statuses
+from ..base.status import Status
 from .gradient import GradientMedium
 from .shooting import Corrected, correct, taken
 from .solve import apex_of
+from .surfaces import Surface, components, join
 from .trace import Crossing, trace
+from .transforms import normalize
 
 FIRST_STEP = 0.125
 SHORTEST_STEP = 2.0**-14

@@ -22,11 +22,11 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from ..arrays import Bools, FloatLike, Floats, Indices, Statuses
-from ..geometry.surfaces import Xyz, fit
-from ..status import Status, mark
+from ..base.arrays import Bools, FloatLike, Floats, Indices, Statuses
+from ..base.status import Status, mark
 from .fermat_kernels import FAR_MM, RESIDUAL_LIMIT_MM
 from .interface import dot, minus, moved, unit
+from .surfaces import Xyz, fit
 from .trace import BEHIND_MM, Crossing, inside_rim
 
 SETTLED_MM = 1e-12

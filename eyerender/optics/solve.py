@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
-from ..geometry.graphs import Graphs, graphs_of
-from ..geometry.surfaces import Surface, Xyz, components, join, shift, turn, turn_back
-from ..status import Status
+from ..base.arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
+from ..base.status import Status
 from .fermat_kernels import END, EXIT, GUESS, LOST, RESIDUAL, RESULTS, WAY, connect_all
+from .graphs import Graphs, graphs_of
 from .shooting import Connection, connect, taken
+from .surfaces import Surface, Xyz, components, join, shift, turn, turn_back
 from .trace import Crossing, outward_path, trace
 
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
-from ..geometry.surfaces import Surface, Xyz, components, fit, join
-from ..status import Status, mark
+from ..base.arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
+from ..base.status import Status, mark
 from .gradient import GradientMedium
 from .interface import dot, moved, reflect, refract, unit
+from .surfaces import Surface, Xyz, components, fit, join
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputError
+from ..base.arrays import Floats
+from ..base.errors import InputError
 
 SMALLEST = 1e-6
 """Smallest eigenvalue of the matrices used, which must be invertible for conditions."""

@@ -25,8 +25,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from ..arrays import Bools, Floats, Indices
-from ..errors import InputError
+from ..base.arrays import Bools, Floats, Indices
+from ..base.errors import InputError
 from .marginals import Share, Uniform, truncated
 from .model import Model
 from .table import ROOTS, Distribution, Regression

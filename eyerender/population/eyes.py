@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..base.errors import InputError
 from ..eye.build import bare_eye
 from ..eye.check import check_eye
 from ..eye.entrance import stop_for_entrance
@@ -20,7 +20,7 @@ from ..eye.parts import EyeParts
 from ..eye.spec import EyeSpec
 from ..eye.stop import stop_of
 from ..eye.surfaces import index_at, surface_of
-from ..geometry.surfaces import Surface
+from ..optics.surfaces import Surface
 from .pupil import ellipticity
 from .refraction import AQUEOUS, CORNEA, LENS, VITREOUS
 from .table import Table

@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
-from ..arrays import Floats
-from ..spec import ByKind, Number, Positive, Spec
+from ..base.arrays import Floats
+from ..base.spec import ByKind, Number, Positive, Spec
 
 FARTHEST = 8.0
 """Standard normal numbers are clipped here; one in 1e15 lies beyond."""

@@ -24,8 +24,8 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss, hermevander
 
-from ..arrays import Floats
-from ..errors import InputError
+from ..base.arrays import Floats
+from ..base.errors import InputError
 from ..eye.parts import Side
 from .correlation import completed, nearest_correlation
 from .table import ROOTS, Distribution, Pair, Quantity, Regression, Table, default_table

@@ -12,15 +12,15 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..arrays import Floats
-from ..errors import InputError
+from ..base.arrays import Floats
+from ..base.errors import InputError
+from ..base.spec import KeyProblem, Number, Spec
 from ..eye.fixation import far_sight_mm
 from ..eye.parts import Side
 from ..eye.refraction import at_cornea_d
 from ..eye.spec import EyeSpec
 from ..region.anatomy import Region
 from ..region.look import Look
-from ..spec import KeyProblem, Number, Spec
 from .draw import Conditions, latent_numbers
 from .eyes import amplitude_d, eye_file
 from .marginals import Fixed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import FloatLike, Floats
+from ..base.arrays import FloatLike, Floats
 
 OLDEST, YOUNGEST = 83.0, 20.0
 """Ages for which the formula holds; younger and older people have the pupil of these."""

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats
+from ..base.arrays import ArrayValue, Floats
 from ..optics.media import CauchyMedium
 
 # Navarro, Lopez-Gil and Palos 2014 and Atchison and Smith 2005, as in E5 of the catalogue: Cauchy's coefficients.

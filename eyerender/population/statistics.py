@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats, Ints
-from ..errors import InputError
-from ..progress import Progress, notify
+from ..base.arrays import Floats, Ints
+from ..base.errors import InputError
+from ..base.progress import Progress, notify
 from .model import SIDES, Model
 from .people import PopulationSpec
 

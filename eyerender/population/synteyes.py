@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Floats
+from ..base.errors import InputError
+from ..base.spec import LARGEST, SMALLEST
+from ..base.storage.files import read_bytes
 from ..eye.kappa import with_kappa
 from ..eye.spec import EyeSpec
-from ..geometry.transforms import read_only
-from ..spec import LARGEST, SMALLEST
-from ..storage.files import read_bytes
+from ..optics.transforms import read_only
 
 CORNEA_INDEX, AQUEOUS_INDEX, VITREOUS_INDEX = 1.376, 1.336, 1.336
 RETINA_THICKNESS_MM = 0.2

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..spec import ByKind, FileSpec, Number, Positive, Spec
+from ..base.spec import ByKind, FileSpec, Number, Positive, Spec
 from .marginals import Fixed, Lognormal, Marginal, Mixture, Normal, Share, Uniform
 
 FOLDER = Path(__file__).parent / "tables"

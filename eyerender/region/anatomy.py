@@ -28,7 +28,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ..spec import KeyProblem, Spec
+from ..base.spec import KeyProblem, Spec
 from .headspec import Head
 
 Share = Annotated[float, Field(ge=0, le=1)]

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import Floats, frozen
+from ..base.arrays import Floats, frozen
 from .anatomy import Region
 from .contour import step
 from .face import face_depth

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayValue, Floats, sealed
-from ..geometry.vectors import crosses, dots, lengths
+from ..base.arrays import ArrayValue, Floats, sealed
+from ..optics.vectors import crosses, dots, lengths
 from .anatomy import Region
 from .globe import Globe
 

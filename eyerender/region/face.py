@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
-from ..arrays import Floats
+from ..base.arrays import Floats
 from .anatomy import Face
 
 MIDDLE_MM = 31.5

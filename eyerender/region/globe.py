@@ -14,9 +14,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats, frozen, remembered, sealed
-from ..geometry.surfaces import Surface, components
-from ..geometry.vectors import lengths
+from ..base.arrays import ArrayValue, Floats, frozen, remembered, sealed
+from ..optics.surfaces import Surface, components
+from ..optics.vectors import lengths
 
 _POLAR, _TURNS = 241, 96
 _WIDEST = np.radians(40.0)

@@ -13,8 +13,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats, Ints, frozen
-from ..geometry.vectors import crosses, dots, lengths
+from ..base.arrays import ArrayValue, Floats, Ints, frozen
+from ..optics.vectors import crosses, dots, lengths
 from .contour import unit
 
 SEGMENTS = 6

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from ..arrays import ArrayValue, Floats, Ints, Singles, frozen
-from ..errors import InputError
-from ..geometry.ply import plain_ply
-from ..spec import file_digest
-from ..storage.files import opened, read_bytes, shown
+from ..base.arrays import ArrayValue, Floats, Ints, Singles, frozen
+from ..base.errors import InputError
+from ..base.spec import file_digest
+from ..base.storage.files import opened, read_bytes, shown
+from ..optics.ply import plain_ply
 from .anatomy import Region
 from .globe import Globe
 from .headspec import Head

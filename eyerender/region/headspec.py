@@ -13,9 +13,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from ..errors import InputError
-from ..spec import NonNegative, Spec, Vec3
-from ..storage.files import opened, read_json
+from ..base.errors import InputError
+from ..base.spec import NonNegative, Spec, Vec3
+from ..base.storage.files import opened, read_json
 
 SCHEMA = "eyerender/head/1"
 Name = Annotated[str, Field(min_length=1)]

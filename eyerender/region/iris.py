@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy import ndimage
 
-from ..arrays import Ints, Singles
-from ..spec import Spec
+from ..base.arrays import Ints, Singles
+from ..base.spec import Spec
 from . import noise_kernels as kernels
 from .contour import step
 from .noise import band_noise, nearest_two

@@ -17,8 +17,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..arrays import ArrayValue, Bools, Floats, Ints, frozen
-from ..geometry.vectors import dots, lengths
+from ..base.arrays import ArrayValue, Bools, Floats, Ints, frozen
+from ..optics.vectors import dots, lengths
 from .anatomy import Lashes, Region
 from .contour import step, unit
 from .globe import Globe

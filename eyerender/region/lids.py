@@ -21,8 +21,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import ArrayValue, Floats, frozen, sealed
-from ..geometry.vectors import crosses, dots, lengths
+from ..base.arrays import ArrayValue, Floats, frozen, sealed
+from ..optics.vectors import crosses, dots, lengths
 from .anatomy import Region
 from .contour import LATERAL, Contour, canthi, contour, step, unit
 from .face import face_depth

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Floats
-from ..geometry.surfaces import Surface
+from ..base.arrays import Floats
+from ..optics.surfaces import Surface
 
 
 def upwards(front: Surface) -> Floats:

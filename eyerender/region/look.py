@@ -14,7 +14,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from ..spec import KeyProblem, NonNegative, Spec
+from ..base.spec import KeyProblem, NonNegative, Spec
 from .iris import IrisPattern
 
 Albedo = Annotated[float, Field(ge=0, le=0.95)]

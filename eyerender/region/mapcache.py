@@ -23,10 +23,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..errors import EyerenderError, InputError
-from ..storage.cachefolder import cache_folder
-from ..storage.files import PART, parse_json, read_bytes, written
-from ..versions import __version__
+from ..base.errors import EyerenderError, InputError
+from ..base.storage.cachefolder import cache_folder
+from ..base.storage.files import PART, parse_json, read_bytes, written
+from ..base.versions import __version__
 from .anatomy import Region
 from .iris import DrawnPattern
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import ArrayValue, Bools, Floats, Ints, frozen, sealed
+from ..base.arrays import ArrayValue, Bools, Floats, Ints, frozen, sealed
 from .anatomy import Region
 from .brow import PLACES as BROW_PLACES
 from .brow import brow

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.spatial import cKDTree
 
-from ..arrays import Floats, Singles
+from ..base.arrays import Floats, Singles
 from . import noise_kernels as kernels
 
 _NEGLIGIBLE = 3.0  # times a band's upper end, where its gain is 1e-4

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats, Ints, Singles
-from ..jit import compiled
+from ..base.arrays import Floats, Ints, Singles
+from ..base.jit import compiled
 
 BLOCK = 8  # texels along the side of a block that shares a list of nearby cells
 # Rows of a block: places, squares of the distances, and numbers of the cells.

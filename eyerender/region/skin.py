@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..arrays import Bools, Floats, Singles, frozen
+from ..base.arrays import Bools, Floats, Singles, frozen
 from .anatomy import Region
 from .brow import brow_band
 from .contour import step

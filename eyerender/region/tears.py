@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import Floats, frozen
+from ..base.arrays import Floats, frozen
 from .anatomy import Region
 from .contour import step
 from .globe import Globe

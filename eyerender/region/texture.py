@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import fft
 
-from ..arrays import Floats, Singles, sealed
+from ..base.arrays import Floats, Singles, sealed
 from . import texture_kernels as kernels
 from .noise import band_noise, gain
 

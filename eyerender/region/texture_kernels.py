@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Floats
-from ..jit import compiled, inlined
+from ..base.arrays import Floats
+from ..base.jit import compiled, inlined
 
 X, Y, COSINE, SINE, WEIGHT, LEFT, STEPS, LEVEL, COLUMNS = range(9)
 """Columns of a vessel's tip: place (pixels), direction, weight, steps left and in total, and order of branching."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Singles
+from ..base.arrays import Bools, Floats, Singles
 from ..folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from .glints.splatting import MirrorImages, Shine
 from .integrator.coarsesensor import CoarseSensor

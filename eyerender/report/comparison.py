@@ -11,8 +11,8 @@ import numpy as np
 
 from ..folders.imagefolder import ImageEntry, versions
 from ..imaging.comparison import Comparison
-from ..observation import EYES
 from ..scene import Scene
+from ..scene.observation import EYES
 from .overlay import eye_picture
 from .page import write_template
 from .style import ANALYTIC, IMAGE, TARGET, figure, svg

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
+from ..base.arrays import Floats
 from ..eye.model import EyeModel
 from ..eye.shells import shelled
-from ..geometry.surfaces import Surface
+from ..optics.surfaces import Surface
 from .style import ANALYTIC, IMAGE, TARGET, figure
 
 _SCLERA, _CORNEA, _LENS, _RETINA, _IRIS = "#9a9a9a", ANALYTIC, "#009E73", IMAGE, "#8c564b"

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..arrays import Bytes, Floats
+from ..base.arrays import Bytes, Floats
 from ..folders.imagefile import preview
-from ..observation import Observations
+from ..scene.observation import Observations
 from .style import ANALYTIC_ON_DARK, IMAGE_ON_DARK
 
 

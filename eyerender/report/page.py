@@ -13,7 +13,7 @@ from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-from ..storage.files import write_text
+from ..base.storage.files import write_text
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..analytic.observer import trace
-from ..arrays import Floats
-from ..observation import EYES, Observations
+from ..base.arrays import Floats
 from ..rig.camera import PinholeCamera
 from ..scene import Scene
+from ..scene.observation import EYES, Observations
 from .style import ANALYTIC, IMAGE, TARGET, figure
 
 MAX_NOTES = 4

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from ..arrays import ArrayValue, Bools, Floats, frozen
-from ..errors import InputError
-from ..spec import Number, Positive, Spec, Vec2, Vec3
+from ..base.arrays import ArrayValue, Bools, Floats, frozen
+from ..base.errors import InputError
+from ..base.spec import Number, Positive, Spec, Vec2, Vec3
 from .opencv import read_opencv
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]

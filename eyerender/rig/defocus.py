@@ -26,8 +26,8 @@ from functools import lru_cache
 import numpy as np
 from scipy import fft, special
 
-from ..arrays import ArrayValue, Floats, Ints, Reals, Singles
-from ..errors import InputError
+from ..base.arrays import ArrayValue, Floats, Ints, Reals, Singles
+from ..base.errors import InputError
 from .camera import PinholeCamera, Window
 from .imaging import Lens
 from .sensor import Sensor

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Ints, Singles
-from ..jit import compiled
+from ..base.arrays import Ints, Singles
+from ..base.jit import compiled
 
 LANES = 8  # numbers added at once; rows of discs are padded with zeros to a multiple of it
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, special
 
-from ..arrays import Floats, Reals, Singles, frozen
+from ..base.arrays import Floats, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
 from .sensor import Sensor
 from .stray import border

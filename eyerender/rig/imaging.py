@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..arrays import Floats
-from ..spec import NonNegative, Positive, Spec, Vec2, Vec3
+from ..base.arrays import Floats
+from ..base.spec import NonNegative, Positive, Spec, Vec2, Vec3
 
 
 class Opening(Spec):

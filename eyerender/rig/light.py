@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from ..arrays import ArrayValue, Floats, frozen
-from ..spec import NonNegative, Number, Positive, Spec, Vec3
+from ..base.arrays import ArrayValue, Floats, frozen
+from ..base.spec import NonNegative, Number, Positive, Spec, Vec3
 from .camera import PinholeCamera
 
 # Largest number of LEDs of a rig, including each LED of a ring: each has a glint with a status and a reason in every

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from pydantic import Field
 
-from ..arrays import Floats, frozen
-from ..spec import Spec, Vec3
+from ..base.arrays import Floats, frozen
+from ..base.spec import Spec, Vec3
 from .camera import PinholeCamera
 from .light import Lamp
 

@@ -14,10 +14,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputError, Problems
-from ..spec import LARGEST, MAX_YAML_BYTES, parse_yaml
-from ..storage.files import parse_json, read_text, shown
+from ..base.arrays import Floats
+from ..base.errors import InputError, Problems
+from ..base.spec import LARGEST, MAX_YAML_BYTES, parse_yaml
+from ..base.storage.files import parse_json, read_text, shown
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 _SUPPORTED = 5

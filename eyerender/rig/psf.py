@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import fft, special
 
-from ..arrays import Floats, Reals, sealed
+from ..base.arrays import Floats, Reals, sealed
 from .camera import Window
 
 _AT_ONCE = 16  # rows or columns of a blurred picture

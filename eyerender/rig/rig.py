@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
-from ..arrays import ArrayValue
-from ..errors import InputError
-from ..spec import Spec
+from ..base.arrays import ArrayValue
+from ..base.errors import InputError
+from ..base.spec import Spec
 from .camera import Camera, PinholeCamera
 from .light import MAX_LIGHTS, Lamp, Led
 from .mount import Mount

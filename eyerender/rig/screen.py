@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from ..arrays import ArrayValue, Bools, Floats, frozen
-from ..spec import Positive, Spec, Vec3
+from ..base.arrays import ArrayValue, Bools, Floats, frozen
+from ..base.spec import Positive, Spec, Vec3
 
 
 class Screen(Spec):

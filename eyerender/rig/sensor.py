@@ -17,7 +17,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from ..spec import NonNegative, Positive, Spec
+from ..base.spec import NonNegative, Positive, Spec
 
 # Converters reach full scale slightly below the full well, so saturated pixels all read full scale instead of a noisy
 # level.

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy import fft, ndimage, special
 
-from ..arrays import Bools, Reals, Singles, frozen
+from ..base.arrays import Bools, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
 from .imaging import Lens, Opening, Star
 from .sensor import Sensor

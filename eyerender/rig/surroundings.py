@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
-from ..arrays import Floats
+from ..base.arrays import Floats
 
 _WALL, _CEILING, _FLOOR, _DESK, _SCREEN, _LAMP = 0.05, 0.06, 0.015, 0.03, 0.006, 0.12
 _OVERCAST, _GROUND, _INTERIOR = 1.5, 0.45, 0.012

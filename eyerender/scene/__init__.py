@@ -1,17 +1,8 @@
-"""Scenes (who looks where, and which rig and camera settings observe it) and their frames with poses."""
+"""Scenes (who looks where, and which rig and camera settings observe it), their frames with poses, and observations.
 
-from .scene import Frame, Frames, Scene, as_frames
-from .shipped import is_dataset, is_shipped_dataset, load_scene, refuse_folder, shipped_files, shipped_scenes
+The names in `__init__.pyi` load their modules on first use.
+"""
 
-__all__ = [
-    "Frame",
-    "Frames",
-    "Scene",
-    "as_frames",
-    "is_dataset",
-    "is_shipped_dataset",
-    "load_scene",
-    "refuse_folder",
-    "shipped_files",
-    "shipped_scenes",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from ..observation import Observations
 from ..rig.rig import RigLike
+from .observation import Observations
 from .scene import Frames
 
 

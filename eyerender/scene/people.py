@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from ..arrays import Floats, Ints
-from ..errors import InputError
+from ..base.arrays import Floats, Ints
+from ..base.errors import InputError
 from ..population.model import SIDES
 from ..population.people import Person, PopulationSpec
 from .subject import Subject

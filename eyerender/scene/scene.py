@@ -19,23 +19,16 @@ from typing import Any, Literal, Self, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayValue, Bools, Floats, Indices
-from ..errors import InputError, InputWarning
+from ..base.arrays import ArrayValue, Bools, Floats, Indices
+from ..base.errors import InputError, InputWarning
+from ..base.spec import Spec, file_digest
+from ..base.status import Status
 from ..eye.fixation import fixations
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.parts import Side
 from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
-from ..observation import EYES, Index, PoseTruth
-from ..plausibility import (
-    length_warnings,
-    mirror_warnings,
-    place_warnings,
-    pupil_warnings,
-    view_warnings,
-    wavelength_warnings,
-)
 from ..population.eyes import amplitude_d
 from ..population.people import Person
 from ..population.response import REFERENCE_AGE, responding
@@ -45,9 +38,16 @@ from ..region.face import face_depth
 from ..rig.camera import PinholeCamera, Window
 from ..rig.imaging import Ambient
 from ..rig.light import Lamp
+from ..rig.plausibility import (
+    length_warnings,
+    mirror_warnings,
+    place_warnings,
+    pupil_warnings,
+    view_warnings,
+    wavelength_warnings,
+)
 from ..rig.rig import Rig, RigGeometry, RigLike
-from ..spec import Spec, file_digest
-from ..status import Status
+from .observation import EYES, Index, PoseTruth
 from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
 
 # Parts worn on a face may press the skin a little. Farther than 45 mm from an eye, the face is only a guess.

@@ -6,8 +6,8 @@ import os
 from functools import cache
 from pathlib import Path
 
-from ..errors import InputError
-from ..spec import read_yaml
+from ..base.errors import InputError
+from ..base.spec import read_yaml
 from .scene import Scene
 from .spec import DATASET_KIND, NOT_A_SCENE, SceneSpec, Surfaces
 

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.spec import FileSpec, KeyProblem, Positive, Spec, Vec2, Vec3
 from ..eye.catalogue import load_eye
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.parts import Side
 from ..eye.spec import EyeSpec
-from ..observation import MAX_GLINTS
 from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
@@ -24,7 +24,7 @@ from ..rig.imaging import Ambient, Lens, Motion
 from ..rig.light import aimed
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
-from ..spec import FileSpec, KeyProblem, Positive, Spec, Vec2, Vec3
+from .observation import MAX_GLINTS
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]

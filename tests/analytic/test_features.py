@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.features import features
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.fixation import fixations
 from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
 from eyerender.eye.spec import EyeSpec
-from eyerender.geometry.surfaces import components, join
-from eyerender.geometry.transforms import normalize, tilt_rotation
 from eyerender.optics.purkinje import purkinje_points
 from eyerender.optics.solve import apparent_points
+from eyerender.optics.surfaces import components, join
 from eyerender.optics.trace import inward_path, trace
+from eyerender.optics.transforms import normalize, tilt_rotation
 from eyerender.rig.camera import PinholeCamera, distort
-from eyerender.status import Status
 from tests.support.paths import load
 
 # Reference world (X, Y, Z) = (y, z, x).

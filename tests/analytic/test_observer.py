@@ -9,7 +9,7 @@ import pytest
 
 from eyerender.analytic.features import features
 from eyerender.analytic.observer import trace
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.eye.fixation import fixations
 from eyerender.scene import Scene, load_scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec

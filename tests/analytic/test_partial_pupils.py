@@ -10,15 +10,15 @@ import pytest
 
 from eyerender.analytic.features import features
 from eyerender.analytic.observer import pupil_features, seen_arcs_deg, trace
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses
 from eyerender.gaze.regression import pupil_glint_vectors
-from eyerender.observation import Observations
 from eyerender.rig.camera import PinholeCamera
 from eyerender.scene import Scene
+from eyerender.scene.observation import Observations
 from eyerender.scene.spec import SceneSpec
-from eyerender.status import Status
 from tests.support.exhaustive import exhaustive
 
 

@@ -14,7 +14,7 @@ import pytest
 from eyerender.backends.choose import VARIANTS, Backend, BackendState, choose_backend
 from eyerender.backends.doctor import backend_states, doctor_report
 from eyerender.backends.llvm import find_llvm
-from eyerender.errors import BackendError, InputError
+from eyerender.base.errors import BackendError, InputError
 
 needs_llvm = pytest.mark.skipif(find_llvm() is None, reason="no libLLVM here can render")
 
@@ -111,7 +111,7 @@ def test_state_without_a_library_names_the_fix(monkeypatch: pytest.MonkeyPatch) 
 def test_process_without_a_library_ends_with_one_line_and_no_abort(tmp_path: Path) -> None:
     code = (
         "import sys\nfrom eyerender.backends import llvm\nllvm.candidates = lambda: iter(())\n"
-        "from eyerender.errors import BackendError\nfrom eyerender.backends.choose import choose_backend\n"
+        "from eyerender.base.errors import BackendError\nfrom eyerender.backends.choose import choose_backend\n"
         "try:\n    choose_backend('llvm')\nexcept BackendError as error:\n    sys.exit(f'{error.exit_code}: {error}')\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

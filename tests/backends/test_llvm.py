@@ -25,8 +25,8 @@ from eyerender.backends.llvm import ENVIRONMENT, VARIANT, candidates, find_llvm,
 from eyerender.backends.probe import REFUSAL_AGE_S, Verdict, probe, run_probe
 from eyerender.backends.remedies import has_archive, llvm_command, runtime_command
 from eyerender.backends.set_up import setup_llvm
-from eyerender.errors import BackendError
-from eyerender.storage.cachefolder import cache_folder
+from eyerender.base.errors import BackendError
+from eyerender.base.storage.cachefolder import cache_folder
 
 COMPILER = shutil.which("cc")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
@@ -325,7 +325,7 @@ def test_mitsuba_imported_before_without_a_library_is_a_clear_error(good: Path) 
         from eyerender.backends.libraries import load_runtime
         load_runtime()
         import mitsuba
-        from eyerender.errors import BackendError
+        from eyerender.base.errors import BackendError
         from eyerender.backends.choose import choose_backend
         try:
             choose_backend("llvm")

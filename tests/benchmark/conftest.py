@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import make_ideal_images as ideal
-from eyerender.errors import BackendError
+from eyerender.base.errors import BackendError
 from eyerender.imaging.images import render_folder
 from eyerender.scene import Scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
@@ -45,4 +45,4 @@ def rendered(tmp_path_factory):
 @pytest.fixture
 def no_report(monkeypatch):
     """A bench whose report is not drawn, which takes longer than the bench itself."""
-    monkeypatch.setattr("eyerender.benchmark.run.write_bench_report", lambda *_: None)
+    monkeypatch.setattr("eyerender.apps.benchmark.run.write_bench_report", lambda *_: None)

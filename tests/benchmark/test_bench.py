@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eyerender.benchmark.conventions import OPENCV
-from eyerender.benchmark.folder import load_labelled
-from eyerender.benchmark.own import ellipse_of_mask
-from eyerender.benchmark.registry import defaults, names, resolve
-from eyerender.benchmark.run import bench_extractors
-from eyerender.benchmark.separate import cheshm_pupil, eight_bits, pupil_of
-from eyerender.benchmark.shipped import PUPIL_LABS_PYTHON, cheshm_python, pupil_labs_python
+from eyerender.apps.benchmark.conventions import OPENCV
+from eyerender.apps.benchmark.folder import load_labelled
+from eyerender.apps.benchmark.own import ellipse_of_mask
+from eyerender.apps.benchmark.registry import defaults, names, resolve
+from eyerender.apps.benchmark.run import bench_extractors
+from eyerender.apps.benchmark.separate import cheshm_pupil, eight_bits, pupil_of
+from eyerender.apps.benchmark.shipped import PUPIL_LABS_PYTHON, cheshm_python, pupil_labs_python
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.extraction.baseline import contour_pupil
 from eyerender.folders.imagefile import read_image, write_png
-from eyerender.geometry.ellipse import Ellipse, iou, signed_distance
+from eyerender.optics.ellipse import Ellipse, iou, signed_distance
 from tests.support.paths import ROOT, SCRIPTS
 
 
@@ -198,7 +198,7 @@ def test_cheshm_s_answers_are_rotated_rectangles_or_missing():
 @pytest.mark.skipif(cheshm_python() is None, reason="scripts/setup_cheshm.sh has not been run")
 @pytest.mark.parametrize("name", ["pure", "else_", "excuse", "swirski"])
 def test_cheshm_s_detectors_in_their_own_environment(drawn, tmp_path, name):
-    data = bench_extractors(drawn, tmp_path / "out", [f"eyerender.benchmark.shipped:{name}"])
+    data = bench_extractors(drawn, tmp_path / "out", [f"eyerender.apps.benchmark.shipped:{name}"])
     summary = data["extractors"][0]["summary"]
     assert "cheshm" in data["extractors"][0]["says"]
     assert summary["error"] == 0
@@ -330,7 +330,7 @@ def test_a_broken_table_names_the_line(line, message, tmp_path):
 def test_failures_have_thumbnails(drawn, tmp_path, monkeypatch):
     """An extractor that finds another ellipse: the report shows the first of its failures."""
     for other in ("factor_figure", "curve_figure"):
-        monkeypatch.setattr(f"eyerender.report.benchmark.{other}", lambda *_: "<svg></svg>")
+        monkeypatch.setattr(f"eyerender.apps.benchmark.page.{other}", lambda *_: "<svg></svg>")
     given = "tests.benchmark.test_bench:beside"
     bench_extractors(drawn, tmp_path / "out", [f"beside={given}"])
     assert "the first images of every kind of failure" in (tmp_path / "out" / "report.html").read_text()

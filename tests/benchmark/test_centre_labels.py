@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from eyerender.benchmark.curves import curves_of
-from eyerender.benchmark.folder import load_labelled
-from eyerender.benchmark.protocol import Reply
-from eyerender.benchmark.score import score
-from eyerender.benchmark.summary import summarise
-from eyerender.errors import InputError
+from eyerender.apps.benchmark.curves import curves_of
+from eyerender.apps.benchmark.folder import load_labelled
+from eyerender.apps.benchmark.protocol import Reply
+from eyerender.apps.benchmark.score import score
+from eyerender.apps.benchmark.summary import summarise
+from eyerender.base.errors import InputError
 from eyerender.folders.imagefile import read_any_image, write_png
-from eyerender.geometry.ellipse import Ellipse
+from eyerender.optics.ellipse import Ellipse
 
 SIZE = (120, 80)  # width, height
 

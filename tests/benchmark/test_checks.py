@@ -8,13 +8,13 @@ import shutil
 import numpy as np
 import pytest
 
-from eyerender.benchmark import answercache
-from eyerender.benchmark.checks import Requirement, compare_with, problems_of
-from eyerender.benchmark.exact import mcnemar
-from eyerender.benchmark.folder import load_labelled
-from eyerender.benchmark.run import bench_extractors
+from eyerender.apps.benchmark import answercache
+from eyerender.apps.benchmark.checks import Requirement, compare_with, problems_of
+from eyerender.apps.benchmark.exact import mcnemar
+from eyerender.apps.benchmark.folder import load_labelled
+from eyerender.apps.benchmark.run import bench_extractors
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 
 COUNTING = """
 from pathlib import Path
@@ -48,7 +48,7 @@ def test_identical_runs_are_byte_equal_and_ask_nothing_again(drawn, counting, tm
     bench_extractors(drawn, out[0], [first])
     assert len(asked()) == 6 + 1  # the first image twice: the first call loads libraries
     with monkeypatch.context() as patch:  # two reports tell whether they are equal
-        patch.setattr("eyerender.benchmark.run.write_bench_report", lambda *_: None)
+        patch.setattr("eyerender.apps.benchmark.run.write_bench_report", lambda *_: None)
         bench_extractors(drawn, out[1], [first])
     assert len(asked()) == 7
     bench_extractors(drawn, out[2], [first], fresh=True, jobs=2)

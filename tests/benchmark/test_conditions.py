@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from eyerender.benchmark.conditions import _mirrored, balanced, of_pixels, of_scene, of_shape, tags
-from eyerender.benchmark.glintlabels import TrueGlint, false_kind, measured
-from eyerender.geometry.ellipse import Ellipse
+from eyerender.apps.benchmark.conditions import _mirrored, balanced, of_pixels, of_scene, of_shape, tags
+from eyerender.apps.benchmark.glintlabels import TrueGlint, false_kind, measured
+from eyerender.optics.ellipse import Ellipse
 
 PUPIL = Ellipse(np.array([100.0, 80.0]), np.array([30.0, 28.0]), 0.5)
 NONE = np.zeros((0, 2))

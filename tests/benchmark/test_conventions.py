@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from eyerender.benchmark.conventions import OPENCV, Conventions
-from eyerender.errors import InputError
-from eyerender.geometry.ellipse import Ellipse, signed_distance
+from eyerender.apps.benchmark.conventions import OPENCV, Conventions
+from eyerender.base.errors import InputError
+from eyerender.optics.ellipse import Ellipse, signed_distance
 
 COMBINATIONS = list(
     itertools.product(

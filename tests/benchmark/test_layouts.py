@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from eyerender.benchmark.folder import load_labelled
+from eyerender.apps.benchmark.folder import load_labelled
+from eyerender.base.errors import InputError
 from eyerender.dataset.export.coco import run_lengths
 from eyerender.dataset.export.video import LosslessVideo
-from eyerender.errors import InputError
 from eyerender.folders.imagefile import read_image, write_png
-from eyerender.geometry.ellipse import Ellipse, iou, signed_distance
+from eyerender.optics.ellipse import Ellipse, iou, signed_distance
 
 PUPIL = Ellipse(np.array([90.25, 70.5]), np.array([30.0, 24.0]), 0.5)
 SHAPE = (160, 200)

@@ -10,12 +10,12 @@ import tracemalloc
 
 import pytest
 
-from eyerender.benchmark.asking import ask_extractors
-from eyerender.benchmark.folder import load_labelled
-from eyerender.benchmark.options import BenchOptions
-from eyerender.benchmark.process import ExtractorProcess, Failed
-from eyerender.benchmark.protocol import Request
-from eyerender.benchmark.registry import ExtractorCommand, resolve
+from eyerender.apps.benchmark.asking import ask_extractors
+from eyerender.apps.benchmark.folder import load_labelled
+from eyerender.apps.benchmark.options import BenchOptions
+from eyerender.apps.benchmark.process import ExtractorProcess, Failed
+from eyerender.apps.benchmark.protocol import Request
+from eyerender.apps.benchmark.registry import ExtractorCommand, resolve
 
 HEAD = """
 import json, os, subprocess, sys, time

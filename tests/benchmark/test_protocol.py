@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from eyerender.benchmark.conventions import OPENCV, Conventions
-from eyerender.benchmark.protocol import Greeting, Reply, Request
-from eyerender.errors import InputError
+from eyerender.apps.benchmark.conventions import OPENCV, Conventions
+from eyerender.apps.benchmark.protocol import Greeting, Reply, Request
+from eyerender.base.errors import InputError
 
 GOOD = {"status": "ok", "centre_px": [10, 20], "semi_axes_px": [5, 4], "angle_rad": 0.1}
 

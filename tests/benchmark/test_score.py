@@ -13,15 +13,15 @@ import pytest
 from scipy.stats import norm
 
 import make_ideal_images as ideal
-from eyerender.benchmark.bound import Edge, edge_of, is_bounded, measure_edge
-from eyerender.benchmark.folder import LabelledImage, load_labelled
-from eyerender.benchmark.glintlabels import GlintLook, TrueGlint
-from eyerender.benchmark.protocol import Reply
-from eyerender.benchmark.score import GlintScore, Score, score, score_glints
-from eyerender.benchmark.summary import bins, breakdown, efficiency, failures, summarise
-from eyerender.errors import InputError
+from eyerender.apps.benchmark.bound import Edge, edge_of, is_bounded, measure_edge
+from eyerender.apps.benchmark.folder import LabelledImage, load_labelled
+from eyerender.apps.benchmark.glintlabels import GlintLook, TrueGlint
+from eyerender.apps.benchmark.protocol import Reply
+from eyerender.apps.benchmark.score import GlintScore, Score, score, score_glints
+from eyerender.apps.benchmark.summary import bins, breakdown, efficiency, failures, summarise
+from eyerender.base.errors import InputError
 from eyerender.folders.imagefile import read_image
-from eyerender.geometry.ellipse import Ellipse, signed_distance
+from eyerender.optics.ellipse import Ellipse, signed_distance
 
 PUPIL = Ellipse(np.array([50.0, 40.0]), np.array([20.0, 16.0]), 0.4)
 IMAGE = LabelledImage(

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from eyerender.benchmark.asking import Run
-from eyerender.benchmark.conventions import Conventions
-from eyerender.benchmark.curves import curves_of
-from eyerender.benchmark.failurekinds import kind_of
-from eyerender.benchmark.folder import LabelledImage
-from eyerender.benchmark.glintlabels import TrueGlint
-from eyerender.benchmark.intervals import subject_interval, wilson
-from eyerender.benchmark.paired import common_errors, pairs_of
-from eyerender.benchmark.protocol import Greeting
-from eyerender.benchmark.registry import ExtractorCommand
-from eyerender.benchmark.results import suggested_origin
-from eyerender.benchmark.score import Outcome, Score
-from eyerender.benchmark.summary import bins, summarise
-from eyerender.geometry.ellipse import Ellipse
+from eyerender.apps.benchmark.asking import Run
+from eyerender.apps.benchmark.conventions import Conventions
+from eyerender.apps.benchmark.curves import curves_of
+from eyerender.apps.benchmark.failurekinds import kind_of
+from eyerender.apps.benchmark.folder import LabelledImage
+from eyerender.apps.benchmark.glintlabels import TrueGlint
+from eyerender.apps.benchmark.intervals import subject_interval, wilson
+from eyerender.apps.benchmark.paired import common_errors, pairs_of
+from eyerender.apps.benchmark.protocol import Greeting
+from eyerender.apps.benchmark.registry import ExtractorCommand
+from eyerender.apps.benchmark.results import suggested_origin
+from eyerender.apps.benchmark.score import Outcome, Score
+from eyerender.apps.benchmark.summary import bins, summarise
+from eyerender.optics.ellipse import Ellipse
 
 
 def test_wilson_is_that_of_scipy():

@@ -222,8 +222,8 @@ def test_an_address_is_refused_in_one_line(command, output, place, capsys):
 
 
 def test_the_api_refuses_addresses_too(place):
-    from eyerender.errors import InputError
-    from eyerender.storage.files import make_folder, write_text
+    from eyerender.base.errors import InputError
+    from eyerender.base.storage.files import make_folder, write_text
 
     for write in (make_folder, lambda path: write_text(path, "")):
         with pytest.raises(InputError, match="is an address"):

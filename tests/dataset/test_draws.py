@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, loguniform, qmc, truncnorm, uniform
 
+from eyerender.base.errors import InputError
 from eyerender.dataset.draws import parse_draw, random_value, truncated_normal, unit_number
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.dataset.template import Template, Turn, sobol_block
-from eyerender.errors import InputError
 from tests.support.dataset_specs import mapping, plan
 
 

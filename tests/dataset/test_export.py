@@ -17,17 +17,17 @@ import yaml
 from PIL import Image
 from scipy.io import loadmat
 
-from eyerender.benchmark.folder import load_labelled
+from eyerender.apps.benchmark.folder import load_labelled
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset.columns import type_first
 from eyerender.dataset.export import FORMATS, export, parquet
 from eyerender.dataset.export.coco import run_lengths
 from eyerender.dataset.export.gaze import yaw_pitch_deg
 from eyerender.dataset.export.video import LosslessVideo
-from eyerender.errors import InputError
 from eyerender.folders.imagefile import read_image, write_png
 from eyerender.folders.imagefolder import ImageFolder
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.optics.ellipse import Ellipse, iou
 
 pytestmark = pytest.mark.render
 SPLITS = {"train": 12, "validation": 6, "test": 6}

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset.export import FORMATS, Encoding, export
 from eyerender.dataset.export.encoding import measured_gain
-from eyerender.errors import InputError
 from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageFolder
 

@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
+from eyerender.base.errors import InputError
 from eyerender.dataset.done import sum_of
 from eyerender.dataset.export import FORMATS, export
-from eyerender.errors import InputError
 from tests.support.fabricated import SHARD, fabricate, peak_bytes
 
 pytestmark = [pytest.mark.render, pytest.mark.packaging]

@@ -9,9 +9,9 @@ from itertools import pairwise
 
 import pytest
 
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset.export import FORMATS, export
-from eyerender.errors import InputError
 from eyerender.folders.imagefolder import ImageFolder
 
 pytestmark = pytest.mark.render

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
+from eyerender.base.errors import EyerenderError
 from eyerender.cli.main import run
 from eyerender.dataset import run as dataset_run
 from eyerender.dataset.assemble import verify_dataset
@@ -24,7 +25,6 @@ from eyerender.dataset.maker import MadeSample, Maker
 from eyerender.dataset.pool import Events
 from eyerender.dataset.shard import verify, write_shard
 from eyerender.dataset.worker import Job
-from eyerender.errors import EyerenderError
 from eyerender.folders.imagefolder import finished
 from eyerender.imaging.capture import render_windows
 from eyerender.scene import load_scene

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset.cluster import ShardActor
 from eyerender.dataset.files import sums_of_files
@@ -24,7 +25,6 @@ from eyerender.dataset.realise import frames_of
 from eyerender.dataset.shard import write_shard
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.dataset.worker import Job
-from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.folders.imagefile import read_image
 from tests.support import stages

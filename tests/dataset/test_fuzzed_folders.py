@@ -15,19 +15,19 @@ from typing import Any
 import pytest
 from hypothesis import given
 
-from eyerender.applications.quickstart import compare_folder
+from eyerender.apps.inspection import inspect
+from eyerender.apps.quickstart import compare_folder
+from eyerender.base.errors import BackendError
 from eyerender.dataset.assemble import assemble
 from eyerender.dataset.done import sum_of
 from eyerender.dataset.export import FORMATS, export
 from eyerender.dataset.runfile import begin
 from eyerender.dataset.shard import withdraw_damaged
 from eyerender.dataset.validate import validate
-from eyerender.errors import BackendError
 from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageFolder, finished
 from eyerender.gaze.records import load_observations
 from eyerender.imaging.imageobserver import scene_of
-from eyerender.inspection import inspect
 from tests.support.dataset_specs import make, plan
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 

@@ -11,8 +11,8 @@ from eyerender.eye.parts import ConicSpec
 from eyerender.eye.spec import EyeSpec
 from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageFolder
-from eyerender.geometry.ellipse import Ellipse, points_on_ellipse, signed_distance
 from eyerender.imaging.labels import moments_ellipse
+from eyerender.optics.ellipse import Ellipse, points_on_ellipse, signed_distance
 from eyerender.scene.spec import SceneSpec
 
 pytestmark = pytest.mark.render

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from eyerender.base.errors import InputError
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, find_dataset
-from eyerender.errors import InputError
 
 SEED = {"draw": "integer", "low": 1, "high": 1000000}
 

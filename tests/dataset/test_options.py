@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
+from eyerender.base.errors import InputError
 from eyerender.dataset.options import PlanOptions
 from eyerender.dataset.plan import Plan
-from eyerender.errors import InputError
 from tests.support.dataset_specs import mapping, write
 
 

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 import eyerender as er
+from eyerender.base.errors import InputError
 from eyerender.dataset.options import PlanOptions
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import realise
 from eyerender.dataset.run import generate
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.dataset.validate import validate
-from eyerender.errors import InputError
 from tests.support import own_scenes
 from tests.support.dataset_specs import command, mapping, plan, tree
 from tests.support.paths import ROOT

@@ -11,12 +11,12 @@ from pathlib import PurePosixPath
 import numpy as np
 import pytest
 
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset.export import export
 from eyerender.dataset.merge import merge
 from eyerender.dataset.status import status
 from eyerender.dataset.validate import validate
-from eyerender.errors import InputError
 from eyerender.eye.spec import EyeSpec
 from eyerender.folders.imagefile import write_png
 from eyerender.folders.imagefolder import ImageFolder

@@ -9,6 +9,7 @@ from pathlib import PurePosixPath
 import numpy as np
 import pytest
 
+from eyerender.base.errors import EyerenderError, InputError
 from eyerender.dataset.assemble import assemble, verify_dataset
 from eyerender.dataset.line import image_line
 from eyerender.dataset.maker import MadeImage, MadeSample
@@ -18,7 +19,6 @@ from eyerender.dataset.realise import realise
 from eyerender.dataset.runfile import begin
 from eyerender.dataset.shard import Staged, commit
 from eyerender.dataset.status import status
-from eyerender.errors import EyerenderError, InputError
 from eyerender.folders.imagefolder import ImageFolder, PackedEntry
 from eyerender.imaging.labels import EyeInWindow, known_labels
 from tests.support.dataset_specs import plan, tree

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import yaml
 
+from eyerender.base.errors import InputError
 from eyerender.dataset.draws import unit_number
 from eyerender.dataset.plan import RANKED_SUBJECTS, Plan
 from eyerender.dataset.realise import frames_of, realise
 from eyerender.dataset.selection import Selection, in_spread_order
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
-from eyerender.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import mapping, plan, write

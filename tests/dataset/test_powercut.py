@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from eyerender.base.storage.files import read_json
 from eyerender.dataset.assemble import verify_dataset
 from eyerender.dataset.shard import verify
 from eyerender.folders.imagefolder import finished
-from eyerender.storage.files import read_json
 from tests.support.dataset_specs import make, plan, tree, write
 from tests.support.powercut import Disk, record
 

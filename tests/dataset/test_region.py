@@ -8,11 +8,11 @@ import shutil
 import numpy as np
 import pytest
 
+from eyerender.base.errors import BackendError
 from eyerender.dataset.export import export
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, find_dataset
 from eyerender.dataset.validate import validate
-from eyerender.errors import BackendError
 from eyerender.folders.imagefile import read_image, write_png
 from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import make

@@ -7,13 +7,13 @@ import shutil
 
 import pytest
 
+from eyerender.base.errors import InputError
+from eyerender.base.storage.files import write_json
 from eyerender.cli.main import run
 from eyerender.dataset.assemble import damage, verify_dataset
 from eyerender.dataset.runfile import begin, refuse_taken
 from eyerender.dataset.shard import verify
-from eyerender.errors import InputError
 from eyerender.folders.outfolder import MARKER
-from eyerender.storage.files import write_json
 from tests.support.dataset_specs import make, plan, tree
 
 pytestmark = pytest.mark.render

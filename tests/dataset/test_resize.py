@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from eyerender.base.errors import InputError
 from eyerender.dataset.run import generate
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.dataset.validate import validate
-from eyerender.errors import InputError
 from tests.support.dataset_specs import mapping, tree, write
 
 pytestmark = pytest.mark.render

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pytest
 
+from eyerender.base.errors import EyerenderError, InputError
+from eyerender.base.storage.lock import run_lock
 from eyerender.dataset.options import RunOptions
 from eyerender.dataset.pool import LocalPool
 from eyerender.dataset.realise import frames_of
 from eyerender.dataset.run import worker_count
 from eyerender.dataset.worker import Job
-from eyerender.errors import EyerenderError, InputError
 from eyerender.folders.imagefolder import finished
-from eyerender.storage.lock import run_lock
 from tests.support import stages
 from tests.support.dataset_specs import command, make, plan, tree, write
 

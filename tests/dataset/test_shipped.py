@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from eyerender.base.errors import BackendError
 from eyerender.dataset.maker import Maker
 from eyerender.dataset.picturesize import scaled
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
-from eyerender.errors import BackendError
 from eyerender.imaging.images import render_folder
 from eyerender.scene import Scene, is_dataset, load_scene, shipped_files, shipped_scenes
 from eyerender.scene.spec import SceneSpec

@@ -7,11 +7,11 @@ import time
 
 import pytest
 
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset import rates
 from eyerender.dataset.rates import Rate, keep_rate, last_rate
 from eyerender.dataset.status import SILENT_S, status
-from eyerender.errors import InputError
 from tests.support.dataset_specs import plan
 
 

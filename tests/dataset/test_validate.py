@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
+from eyerender.base.errors import InputError, UnfinishedRunWarning
 from eyerender.cli.main import run
 from eyerender.dataset.export import export
 from eyerender.dataset.validate import validate
 from eyerender.dataset.validation.truth import SceneTruth
-from eyerender.errors import InputError, UnfinishedRunWarning
 from eyerender.folders.imagefile import read_image, write_png
 from eyerender.imaging.labels import EyeInWindow
 from eyerender.scene import load_scene

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import yaml
 
+from eyerender.base.errors import InputError
 from eyerender.dataset.expressions import evaluate, names_of
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
-from eyerender.errors import InputError
 from tests.support.dataset_specs import mapping, plan, write
 
 PUPIL = "scene.eye.pupil_diameter_mm"

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import eyerender as er
+from eyerender.base.errors import InputError
 from eyerender.design.choice import SiteInformation, choose_lights, noise_of_some, site_information
 from eyerender.design.information import case_of, information_of_instants
-from eyerender.errors import InputError
 
 
 def twelve_sites() -> er.Scene:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eyerender.applications.sweeps import GOALS, SweepRun, pareto, run_sweep
-from eyerender.applications.sweepspec import Places, SweepSpec, layouts_of
-from eyerender.errors import InputError
+from eyerender.apps.sweeps.run import GOALS, SweepRun, pareto, run_sweep
+from eyerender.apps.sweeps.spec import Places, SweepSpec, layouts_of
+from eyerender.base.errors import InputError
 
 SWEEP: dict[str, Any] = {
     "format": 1,

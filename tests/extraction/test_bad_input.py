@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import make_ideal_images as ideal
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
 from eyerender.extraction import FAST, REFINED, Extraction, ExtractionSettings, extract
-from eyerender.status import Status
 
 
 def _check(found: Extraction) -> None:

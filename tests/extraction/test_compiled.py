@@ -8,6 +8,7 @@ import time
 import numpy as np
 
 import make_ideal_images as ideal
+from eyerender.base.jit import argument_types, functions, used
 from eyerender.extraction import extract
 from eyerender.extraction.compile import compile_all
 from eyerender.extraction.glints import detection, gaussian_model, prescreening, subtraction
@@ -23,7 +24,6 @@ from eyerender.extraction.pupil import (
     places,
     refinement,
 )
-from eyerender.jit import argument_types, functions, used
 from tests.support import extraction_oracles as oracles
 
 CONDITIONS = ("eight-glints", "lid", "jpeg")

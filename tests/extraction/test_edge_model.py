@@ -12,7 +12,7 @@ from eyerender.extraction import extract
 from eyerender.extraction.pupil.covariance import to_axes
 from eyerender.extraction.pupil.edge_model import EdgeModel
 from eyerender.extraction.pupil.least_squares import FIXED
-from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct
+from eyerender.optics.ellipse import Ellipse, fit_ellipse_direct
 from tests.support.extraction_oracles import Place, Profile, jacobian, moved
 
 

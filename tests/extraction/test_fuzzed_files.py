@@ -17,10 +17,10 @@ import pytest
 from PIL import Image
 
 import make_ideal_images as ideal
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.folders.imagefile import read_image
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.optics.ellipse import Ellipse, iou
 
 Mutation = Callable[[bytes, np.random.Generator], bytes]
 

@@ -8,13 +8,13 @@ from scipy.special import ndtr
 
 import led_images
 import make_ideal_images as ideal
+from eyerender.base.status import Status
 from eyerender.extraction import extract
 from eyerender.extraction.glints import deblending, fitting, gaussian_model, windows
 from eyerender.extraction.glints.classification import Eye, compared, features
 from eyerender.extraction.glints.fits import SpotFit
 from eyerender.extraction.preprocessing import DN, Prepared, prepare
-from eyerender.geometry.ellipse import Ellipse
-from eyerender.status import Status
+from eyerender.optics.ellipse import Ellipse
 from tests.support.extraction_oracles import pixel_profile
 
 SEEDS = range(20_000, 20_008)

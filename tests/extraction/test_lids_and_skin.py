@@ -8,7 +8,7 @@ import pytest
 import make_ideal_images as ideal
 from eyerender.extraction import FAST, REFINED, extract
 from eyerender.extraction.glints.prescreening import gaussian_like
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.optics.ellipse import Ellipse, iou
 
 
 def _truth(drawing) -> Ellipse:

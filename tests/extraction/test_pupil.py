@@ -18,7 +18,7 @@ from eyerender.extraction.pupil.covariance import (
     towards_round,
 )
 from eyerender.extraction.pupil.places import SECTORS, Place
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.optics.ellipse import Ellipse, iou
 
 SEEDS = range(20_000, 20_006)
 

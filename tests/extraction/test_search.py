@@ -10,7 +10,7 @@ import numpy as np
 import make_ideal_images as ideal
 from eyerender.extraction import FAST, extract
 from eyerender.extraction.pupil.glare import inpaint_glints
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.optics.ellipse import Ellipse, iou
 
 
 def _truth(drawing) -> Ellipse:

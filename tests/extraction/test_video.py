@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import make_ideal_images as ideal
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.extraction import REFINED, extract, extract_eyes
 from eyerender.extraction.video import SUFFIXES, Frame, VideoReader, VideoWriter, follow
-from eyerender.geometry.ellipse import Ellipse, iou
+from eyerender.optics.ellipse import Ellipse, iou
 
 SEEDS = range(20_300, 20_306)
 SMALL = ideal.Condition(size=(320, 240), semi_axis=(18, 30), noise=(2, 2), aspect=(0.8, 1.0))

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import yaml
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
 from eyerender.eye.catalogue import FOLDER, catalogue_files, catalogue_names, load_eye
 from eyerender.eye.parts import GradientLensSpec
 from eyerender.eye.shells import shelled
 from eyerender.eye.spec import EyeSpec
-from eyerender.geometry.surfaces_biconic import Biconic
-from eyerender.geometry.surfaces_quadric import Quadric
+from eyerender.optics.surfaces_biconic import Biconic
+from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import trace
-from eyerender.status import Status
 
 NAMES = ("E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop", "keratoconus")
 

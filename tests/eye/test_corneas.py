@@ -14,14 +14,14 @@ from scipy.optimize import minimize
 
 import eyerender as er
 from eyerender.analytic.features import features
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
 from eyerender.eye.meshes import eye_meshes
 from eyerender.eye.parts import TopographySpec, ZernikeSpec
 from eyerender.eye.pose import Poses
 from eyerender.eye.topography import read_topography
 from eyerender.optics.solve import apparent_points
 from eyerender.rig.camera import PinholeCamera
-from eyerender.status import Status
 from tests.support.corneas import (
     GOLDEN,
     conic_depth,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.eye.batch import stack_eyes, take_eyes
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.spec import EyeSpec

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
 from eyerender.eye.batch import stack_eyes
 from eyerender.eye.catalogue import catalogue_names, load_eye
 from eyerender.eye.fixation import RESIDUAL_LIMIT_MM, entrance_window_centre, fixate
 from eyerender.eye.landmarks import field_direction, incident_node, nodal_rays, path_to_retina
 from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
 from eyerender.eye.spec import EyeSpec
-from eyerender.geometry.surfaces import components, join
+from eyerender.optics.surfaces import components, join
 from eyerender.optics.trace import trace
-from eyerender.status import Status
 from tests.support.paths import load
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import yaml
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.format1 import upgraded
 from eyerender.eye.parts import GradientLensSpec
 from eyerender.eye.spec import EyeSpec
-from eyerender.geometry.surfaces_quadric import Quadric
-from eyerender.geometry.transforms import rotation_x, rotation_y, rotation_z, tilt_rotation
+from eyerender.optics.surfaces_quadric import Quadric
+from eyerender.optics.transforms import rotation_x, rotation_y, rotation_z, tilt_rotation
 from tests.support.surfaces import centre_of
 
 CENTRED: list[tuple[dict[str, Any], list[float]]] = [

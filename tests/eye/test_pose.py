@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from eyerender.eye.batch import stack_eyes
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses, Turning, into_eye, listing_torsion, rigid_motion
-from eyerender.geometry.surfaces import components, join
+from eyerender.optics.surfaces import components, join
 from tests.support.paths import load
 
 

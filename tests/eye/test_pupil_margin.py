@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.margin import HARMONICS, PupilMargin, drawn_contour
 from eyerender.eye.parts import ConicSpec, Side

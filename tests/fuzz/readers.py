@@ -127,7 +127,7 @@ def _beside_metadata(folder: Path) -> None:
 
 
 def suppress_input() -> Any:
-    from eyerender.errors import InputError
+    from eyerender.base.errors import InputError
 
     return suppress(InputError)
 
@@ -337,13 +337,13 @@ def _run_file_seeds() -> list[bytes]:
 
 
 def _benchmark(path: Path) -> Any:
-    from eyerender.benchmark.folder import load_labelled
+    from eyerender.apps.benchmark.folder import load_labelled
 
     return load_labelled(path.parent)
 
 
 def _study(path: Path) -> Any:
-    from eyerender.study.images import read_images
+    from eyerender.apps.study.images import read_images
 
     return read_images(path.parent)
 

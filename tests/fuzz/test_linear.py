@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from eyerender.errors import EyerenderError
+from eyerender.base.errors import EyerenderError
+from eyerender.base.storage.files import read_json
 from eyerender.gaze.records import load_observations
 from eyerender.region.head import _objects
 from eyerender.rig.opencv import read_opencv
-from eyerender.storage.files import read_json
 
 SIZE = 100_000
 # What is linear takes 0.8 s of processor time at most (a file of so many broken lines). A step that is quadratic as a

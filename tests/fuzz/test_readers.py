@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from tests.fuzz.readers import READERS
 
 SECONDS = 5

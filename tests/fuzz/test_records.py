@@ -16,8 +16,8 @@ from eyerender.analytic.observer import trace
 from eyerender.gaze.predictions import predictions
 from eyerender.gaze.records import load_observations, rig_from_mapping
 from eyerender.gaze.store import choose_estimator, fit_estimator, load_estimator, save_estimator
-from eyerender.observation import Observations
 from eyerender.scene import Scene, load_scene
+from eyerender.scene.observation import Observations
 from eyerender.scene.spec import SceneSpec
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 

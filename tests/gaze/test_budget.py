@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import eyerender as er
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.gaze.budget import displacement, error_vectors_deg
 from eyerender.gaze.estimate import GazePoints, angular_error_deg
 

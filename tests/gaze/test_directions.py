@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import eyerender as er
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.gaze.budget import error_vectors_deg
 from eyerender.gaze.recalibration import angles_of, direction_of
-from eyerender.observation import Observations
 from eyerender.scene import load_scene
+from eyerender.scene.observation import Observations
 
 DEPTHS_MM = (400.0, 1400.0, 3000.0)
 ANGLES_DEG = [(a, e) for e in (-8, -2, 4) for a in (-12, -6, 0, 6, 12)]

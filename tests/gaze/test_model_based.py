@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
 from eyerender.gaze.cornea import from_all_glints, from_plane
 from eyerender.gaze.guestrin import GuestrinEizenman
 from eyerender.gaze.hennessey import Hennessey
@@ -16,7 +17,6 @@ from eyerender.gaze.parameters import EyeParameters, ParameterBounds
 from eyerender.gaze.rays import unit
 from eyerender.gaze.twocamera import ShihWuLiu
 from eyerender.rig.camera import Camera
-from eyerender.status import Status
 from tests.support.gaze import observations, rig
 
 EYE = EyeParameters(cornea_radius_mm=7.9, pupil_distance_mm=4.3, index=1.3375, alpha_deg=5.2, beta_deg=1.8)

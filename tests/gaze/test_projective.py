@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.gaze.crossratio import CrossRatio
 from eyerender.gaze.homography import Homography, homography, transformed
 from eyerender.rig.camera import Camera

@@ -7,8 +7,8 @@ import pytest
 
 import eyerender as er
 from eyerender.analytic.observer import trace
+from eyerender.base.status import Status
 from eyerender.rig.rig import RigGeometry
-from eyerender.status import Status
 
 ONE_CAMERA = [
     er.gaze.Regression("R3"),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.arrays import frozen
-from eyerender.errors import InputError
+from eyerender.base.arrays import frozen
+from eyerender.base.errors import InputError
 from eyerender.gaze.estimate import GazePoints, binocular_average
 from eyerender.gaze.quality import quality
 from eyerender.gaze.regression import Regression, pupil_glint_vectors

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eyerender.arrays import frozen
-from eyerender.errors import InputError
+from eyerender.base.arrays import frozen
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
 from eyerender.gaze.estimate import angular_error_deg, binocular_average
 from eyerender.gaze.regression import FUNCTIONS, Regression, pupil_glint_vectors
 from eyerender.gaze.validation import gaze_errors, leave_one_target_out
-from eyerender.status import Status
 from tests.support.regression import RIG, synthetic
 
 

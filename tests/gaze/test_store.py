@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.gaze.predictions import predictions
 from eyerender.gaze.records import load_observations, rig_from_mapping
 from eyerender.gaze.regression import EyeFit, Regression
@@ -413,7 +413,7 @@ def test_predictions_without_targets_have_no_errors(guestrin):
     fitted, _ = fit_estimator(choose_estimator("guestrin-eizenman"), seen, rig)
     from dataclasses import replace
 
-    from eyerender.arrays import frozen
+    from eyerender.base.arrays import frozen
 
     blind = replace(seen, index=replace(seen.index, target_mm=frozen(np.full((len(seen), 3), np.nan))))
     data = predictions(fitted, blind, rig)

@@ -15,14 +15,14 @@ import yaml
 from hypothesis import given
 
 import eyerender as er
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.gaze.columns import CsvColumns
 from eyerender.gaze.predictions import predictions
 from eyerender.gaze.records import load_observations
 from eyerender.gaze.store import choose_estimator, fit_estimator
 from eyerender.gaze.table import observations_from_csv
-from eyerender.observation import EYES, Observations
+from eyerender.scene.observation import EYES, Observations
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import ks_2samp, spearmanr
 
+from eyerender.apps.inspection import inspect
+from eyerender.apps.inspection.comparing import sample_of
+from eyerender.apps.inspection.duplicates import equal_pictures, near_duplicates
+from eyerender.apps.inspection.outliers import outliers, scores
+from eyerender.apps.inspection.reading import read
+from eyerender.apps.inspection.statistics import rank_correlations
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
-from eyerender.inspection import inspect
-from eyerender.inspection.comparing import sample_of
-from eyerender.inspection.duplicates import equal_pictures, near_duplicates
-from eyerender.inspection.outliers import outliers, scores
-from eyerender.inspection.reading import read
-from eyerender.inspection.statistics import rank_correlations
 from tests.support.drawn_dataset import FRAMES, draw, packed
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from eyerender.apps.inspection import inspect
 from eyerender.folders.imagefile import read_image, write_png
-from eyerender.inspection import inspect
 from tests.support.drawn_dataset import draw
 
 ROWS = 400

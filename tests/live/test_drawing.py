@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import eyerender as er
+from eyerender.apps.live.drawing import colours_of, extent_mm, strokes
+from eyerender.apps.live.readout import feature_table
+from eyerender.apps.live.setup import Setup
 from eyerender.imaging.capture import eye_motion
-from eyerender.live.drawing import colours_of, extent_mm, strokes
-from eyerender.live.readout import feature_table
-from eyerender.live.setup import Setup
 from eyerender.report.style import ANALYTIC, IMAGE
 
 

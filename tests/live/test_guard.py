@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from eyerender.live.guard import Guard, new_token
+from eyerender.apps.live.guard import Guard, new_token
 
 TOKEN = new_token()
 HOME = f"/{TOKEN}/"

@@ -11,9 +11,7 @@ import pytest
 from PIL import Image
 
 import eyerender as er
-from eyerender.folders.imagefile import preview
-from eyerender.imaging.capture import render_job
-from eyerender.live.painter import (
+from eyerender.apps.live.painter import (
     BUDGET_S,
     PREVIEW_PX,
     Order,
@@ -24,7 +22,9 @@ from eyerender.live.painter import (
     enlarged,
     line_of,
 )
-from eyerender.live.setup import Setup
+from eyerender.apps.live.setup import Setup
+from eyerender.folders.imagefile import preview
+from eyerender.imaging.capture import render_job
 
 pytestmark = pytest.mark.render
 
@@ -98,8 +98,8 @@ def test_a_picture_is_shown_at_once_and_grows_better(painter, setup):
 
 
 def test_bands_and_passes_give_the_picture_of_the_renderer(painter, blurry, monkeypatch):
-    monkeypatch.setattr("eyerender.live.painter.BUDGET_S", 0.0)
-    monkeypatch.setattr("eyerender.live.painter.BAND_PX", 4000)
+    monkeypatch.setattr("eyerender.apps.live.painter.BUDGET_S", 0.0)
+    monkeypatch.setattr("eyerender.apps.live.painter.BAND_PX", 4000)
     tab = Tab(painter, "f")
     tab.ask(order(1, blurry, extract=False))
     while (shown := tab.next()).samples < 16:

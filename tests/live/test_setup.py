@@ -12,10 +12,10 @@ import pytest
 import yaml
 
 import eyerender as er
-from eyerender.errors import InputError
-from eyerender.live.readout import calibrated, gaze_line
-from eyerender.live.setup import Setup, directions
-from eyerender.live.source import python_source
+from eyerender.apps.live.readout import calibrated, gaze_line
+from eyerender.apps.live.setup import Setup, directions
+from eyerender.apps.live.source import python_source
+from eyerender.base.errors import InputError
 
 
 def setup_of(name):

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.geometry.surfaces import Surface
-from eyerender.geometry.surfaces_biconic import Biconic
-from eyerender.geometry.surfaces_quadric import Quadric
-from eyerender.geometry.transforms import tilt_rotation
+from eyerender.base.status import Status
 from eyerender.optics.solve import apparent_points
+from eyerender.optics.surfaces import Surface
+from eyerender.optics.surfaces_biconic import Biconic
+from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import inward_path, trace
-from eyerender.status import Status
+from eyerender.optics.transforms import tilt_rotation
 from tests.support.exhaustive import WIDTH_MM, exhaustive
 
 

@@ -9,16 +9,16 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
+from eyerender.base.status import Status
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.landmarks import path_to_retina
 from eyerender.eye.shells import shelled
-from eyerender.geometry.surfaces import components, join
-from eyerender.geometry.surfaces_quadric import Quadric
-from eyerender.geometry.transforms import normalize, rotation_z
 from eyerender.optics import gradient
 from eyerender.optics.gradient import GradientMedium
+from eyerender.optics.surfaces import components, join
+from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import trace
-from eyerender.status import Status
+from eyerender.optics.transforms import normalize, rotation_z
 
 
 @lru_cache

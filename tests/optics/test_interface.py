@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.geometry.surfaces import components, join
-from eyerender.geometry.transforms import normalize
 from eyerender.optics.interface import fresnel, reflect, refract
 from eyerender.optics.media import TEARS, CauchyMedium, ConstantMedium
+from eyerender.optics.surfaces import components, join
+from eyerender.optics.transforms import normalize
 from tests.support.paths import load
 
 

@@ -7,9 +7,9 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from eyerender.base.status import Status
 from eyerender.eye.catalogue import load_eye
 from eyerender.optics.purkinje import purkinje_points
-from eyerender.status import Status
 
 DISTANCE = 500.0
 # (radius, conic constant, apex) and the index behind, as the literature has them (Navarro 1985; Le Grand 1980).

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from eyerender.base.status import Status
 from eyerender.eye.catalogue import catalogue_names, load_eye
 from eyerender.eye.pose import Poses, Turning, into_eye
-from eyerender.geometry.surfaces import components, join
-from eyerender.geometry.surfaces_biconic import Biconic
-from eyerender.geometry.surfaces_quadric import Quadric
-from eyerender.geometry.transforms import tilt_rotation
 from eyerender.optics.purkinje import purkinje_points
 from eyerender.optics.shooting import connect
 from eyerender.optics.solve import apparent_points
+from eyerender.optics.surfaces import components, join
+from eyerender.optics.surfaces_biconic import Biconic
+from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
-from eyerender.status import Status
+from eyerender.optics.transforms import tilt_rotation
 from tests.support.mirror import mirror_points
 from tests.support.paths import load
 from tests.support.surfaces import quadric_of

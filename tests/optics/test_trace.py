@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.geometry.surfaces_quadric import Quadric
+from eyerender.base.status import Status
+from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
-from eyerender.status import Status
 from tests.support.paths import load
 from tests.support.surfaces import quadric_of
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.features import features
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.kappa import kappa_deg, pupillary_axis, with_kappa
 from eyerender.eye.pose import Poses

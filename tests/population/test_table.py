@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.population.correlation import completed, nearest_correlation
 from eyerender.population.marginals import Lognormal, Mixture, Normal, Part, Uniform
 from eyerender.population.model import Model, Reference, default_reference

@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 
 from eyerender.analytic.features import features
 from eyerender.analytic.observer import trace
+from eyerender.base.status import Status
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.eye.spec import EyeSpec
-from eyerender.geometry.transforms import rotation_x, rotation_y, rotation_z
-from eyerender.observation import Observations
+from eyerender.optics.transforms import rotation_x, rotation_y, rotation_z
 from eyerender.rig.camera import Camera, PinholeCamera
 from eyerender.scene import Scene
-from eyerender.status import Status
+from eyerender.scene.observation import Observations
 from tests.support.fuzzing import budget
 from tests.support.scenes import MODELS, RESOLUTION_PX, mapped, mappings, mirrored, number, points, scene_of
 

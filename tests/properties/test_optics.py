@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eyerender.base.status import Status
 from eyerender.eye.catalogue import load_eye
 from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import inward_path, outward_path, trace
-from eyerender.status import Status
 from tests.support.fuzzing import budget
 from tests.support.mirror import mirror_points
 from tests.support.scenes import MODELS, points

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage, special
 
-from eyerender.geometry.ellipse import Ellipse
-from eyerender.realism.figures import EyePicture
+from eyerender.apps.realism.figures import EyePicture
+from eyerender.optics.ellipse import Ellipse
 
 WIDE, HIGH, CENTRE, R, PUPIL = 640, 512, (320.0, 230.0), 100.0, 38.0
 LEVELS = {"pupil": 30.0, "iris": 75.0, "sclera": 100.0, "skin": 160.0}

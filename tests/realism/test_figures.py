@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from eyerender.apps.realism.figures import BANDS_R, FIGURES, measure, noise
 from eyerender.folders.imagefolder import PUPIL as PUPIL_CLASS
-from eyerender.realism.figures import BANDS_R, FIGURES, measure, noise
 from tests.realism import drawn
 from tests.realism.drawn import CENTRE, LEVELS, PUPIL, R
 

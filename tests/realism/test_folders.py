@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from eyerender.apps.realism import measure_folder, realism
+from eyerender.apps.realism.figures import FIGURES
+from eyerender.apps.realism.folder import Skipped, open_source, pictures
 from eyerender.cli.main import run
 from eyerender.folders.imagefile import write_png
-from eyerender.realism import measure_folder, realism
-from eyerender.realism.figures import FIGURES
-from eyerender.realism.folder import Skipped, open_source, pictures
 from tests.realism import drawn
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.realism.figures import Scaled
-from eyerender.realism.folder import FolderFigures
-from eyerender.realism.patches import KINDS, patches
+from eyerender.apps.realism.figures import Scaled
+from eyerender.apps.realism.folder import FolderFigures
+from eyerender.apps.realism.patches import KINDS, patches
 from tests.realism import drawn
 
 _IMAGES = 14
@@ -39,7 +39,7 @@ def test_patches_have_equal_scale_and_exposure():
 @pytest.mark.packaging
 def test_only_different_folders_are_told_apart():
     pytest.importorskip("sklearn")
-    from eyerender.realism.separability import separability
+    from eyerender.apps.realism.separability import separability
 
     one, same, other = _folder(0, 8.0), _folder(100, 8.0), _folder(200, 3.5)
     alike, apart = separability(one, same)["iris"], separability(one, other)["iris"]

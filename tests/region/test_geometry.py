@@ -14,7 +14,7 @@ from trimesh import Trimesh
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.pose import Poses, rigid_motion
-from eyerender.geometry.vectors import dots
+from eyerender.optics.vectors import dots
 from eyerender.region.anatomy import Lashes, Region
 from eyerender.region.brow import brow
 from eyerender.region.contour import COLUMNS, contour, inner_margins

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
 from eyerender.region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.region import mapcache
 from eyerender.region.anatomy import Region
 from eyerender.region.mapcache import kept

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.region.iris import ANGULAR, MARGIN_MM, RADIAL, WIDTH_MM, DrawnPattern, IrisPattern, iris_maps
 from eyerender.region.look import Look
 from eyerender.region.texture import sclera_texture, skin_texture

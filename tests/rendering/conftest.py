@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from eyerender.backends.choose import choose_backend
-from eyerender.errors import BackendError
+from eyerender.base.errors import BackendError
 
 if TYPE_CHECKING:
     from eyerender.rendering.renderer import Renderer

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from eyerender.arrays import frozen
+from eyerender.base.arrays import frozen
 from eyerender.region.anatomy import Region
 from eyerender.rig.camera import Camera
 from eyerender.rig.imaging import Ambient

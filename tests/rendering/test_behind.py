@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.folders.imagefolder import ImageFolder
 from eyerender.imaging.capture import check_windows

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from eyerender.arrays import frozen
+from eyerender.base.arrays import frozen
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.spec import EyeSpec
-from eyerender.geometry.surfaces import components
+from eyerender.optics.surfaces import components
 from eyerender.rendering.records.job import parameters_of, tables
 from eyerender.rig.light import Lamp
 from tests.support.corneas import conic_depth, eye_with, grid_of, keratoconus, measured_shapes, zernike_of

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.rig.imaging import Ambient, Panel, RadianceMap
 from tests.support.render_oracles import corneal_share, mirror_pixel
 from tests.support.render_rigs import BLACK, LampRig, eye_of, job_of, remote_rig

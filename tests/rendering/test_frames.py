@@ -8,8 +8,8 @@ import threading
 import numpy as np
 import pytest
 
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.folders.imagefolder import FRAME, IMAGE_SCHEMAS, PUPIL, RENDERED_SCHEMA, ImageFolder
 from eyerender.imaging.capture import noiseless, render_job, render_windows
 from eyerender.imaging.imageobserver import ImageObserver

@@ -14,8 +14,8 @@ import yaml
 from scipy import ndimage
 
 from eyerender.analytic.observer import trace
+from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.imaging.capture import render_job, render_windows
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.imaging.capture import render_job
 from eyerender.region.texture import film_ripples
 from eyerender.rendering.records.job import parameters_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.imaging.capture import render_windows
 from eyerender.rig.defocus import confusion_px, defocused, disc, vignette
 from eyerender.rig.imaging import Lens

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from eyerender.arrays import frozen
+from eyerender.base.arrays import frozen
 from eyerender.region.anatomy import Region
 from eyerender.region.skin import SHEET_ROWS, skin_map
 from eyerender.rig.camera import Camera

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from scipy import ndimage
 
-from eyerender.arrays import Floats, frozen
+from eyerender.base.arrays import Floats, frozen
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeModel
 from eyerender.region.iris import ANGULAR, RADIAL, WIDTH_MM, DrawnPattern, IrisPattern, iris_maps

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from eyerender.arrays import frozen
+from eyerender.base.arrays import frozen
 from eyerender.rendering.integrator import framebuilder
 from eyerender.rig.camera import Camera
 from eyerender.rig.light import Lamp

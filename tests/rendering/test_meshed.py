@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.eye.meshes import cornea_patches, eye_meshes
 from eyerender.imaging.capture import render_job
 from eyerender.scene.shipped import load_scene

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eyerender.errors import InputError
-from eyerender.geometry.surfaces import components
+from eyerender.base.errors import InputError
 from eyerender.optics.purkinje import purkinje_path, purkinje_points
 from eyerender.optics.shooting import ray_tube
+from eyerender.optics.surfaces import components
 from eyerender.rendering.glints.purkinje import stack
 from tests.support.render_oracles import centroid, corneal_share
 from tests.support.render_rigs import BLACK, RIGS, eye_of, head_rig, job_of, remote_rig

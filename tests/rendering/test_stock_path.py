@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eyerender.arrays import frozen
+from eyerender.base.arrays import frozen
 from eyerender.rig.camera import Camera
 from eyerender.rig.light import Lamp
 from tests.support.render_oracles import cos4, stock

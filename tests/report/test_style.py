@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from eyerender.apps.study.figures import lines_figure, map_figure, sensitivity_figure, waterfall_figure
 from eyerender.report.style import figure, svg
-from eyerender.study.figures import lines_figure, map_figure, sensitivity_figure, waterfall_figure
 
 NAN = float("nan")
 

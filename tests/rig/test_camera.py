@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.rig.camera import Camera
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, special, stats
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.rig import psf
 from eyerender.rig.camera import Camera
 from eyerender.rig.exposure import (

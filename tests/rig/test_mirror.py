@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.gaze.records import rig_from_mapping
 from eyerender.rig.camera import Camera
 from eyerender.rig.rig import Rig

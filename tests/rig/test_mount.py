@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eyerender.analytic.observer import trace
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.rig.mount import Mount
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec

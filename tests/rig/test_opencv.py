@@ -13,12 +13,12 @@ import yaml
 from hypothesis import given
 
 import eyerender as er
+from eyerender.base.errors import InputError
+from eyerender.base.spec import file_digest
 from eyerender.cli.main import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
-from eyerender.errors import InputError
 from eyerender.rig.opencv import read_opencv, rotation_of
-from eyerender.spec import file_digest
 from tests.support.fuzzing import CASES, budget, garbled, proper
 
 K = np.array([[1200.5, 0.0, 322.25], [0.0, 1198.75, 238.5], [0.0, 0.0, 1.0]])

@@ -9,14 +9,14 @@ import pytest
 from scipy.optimize import minimize
 
 from eyerender.analytic.observer import trace
-from eyerender.arrays import frozen
-from eyerender.errors import InputError
+from eyerender.apps.study.authors_estimators import AuthorsGuestrinEizenman, MinimumNormRegression
+from eyerender.base.arrays import frozen
+from eyerender.base.errors import InputError
 from eyerender.gaze.determined import monomials
 from eyerender.gaze.guestrin import GuestrinEizenman
 from eyerender.gaze.parameters import EyeParameters
 from eyerender.gaze.regression import Regression, pupil_glint_vectors
 from eyerender.scene import load_scene
-from eyerender.study.authors_estimators import AuthorsGuestrinEizenman, MinimumNormRegression
 
 EYE = EyeParameters(cornea_radius_mm=7.9, pupil_distance_mm=4.3, index=1.3375, alpha_deg=5.2, beta_deg=1.8)
 

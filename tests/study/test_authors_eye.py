@@ -7,7 +7,7 @@ import pytest
 
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.landmarks import field_direction, incident_node
-from eyerender.geometry.surfaces_quadric import Quadric
+from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.scene import load_scene
 from tests.support.surfaces import centre_of
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from eyerender.study.budget import ALGORITHM, BOTH, EYE, IMAGE, NOISE, budgets
-from eyerender.study.page_parts import budget_values
-from eyerender.study.run import run_study
+from eyerender.apps.study.budget import ALGORITHM, BOTH, EYE, IMAGE, NOISE, budgets
+from eyerender.apps.study.page_parts import budget_values
+from eyerender.apps.study.run import run_study
 
 
 @dataclass

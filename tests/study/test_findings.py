@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from eyerender.study import featureclouds, findings
-from eyerender.study import literature as lit
-from eyerender.study.blignaut import Outcome
+from eyerender.apps.study import featureclouds, findings
+from eyerender.apps.study import literature as lit
+from eyerender.apps.study.blignaut import Outcome
 
 
 def of(found, name):

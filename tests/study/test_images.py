@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
-from eyerender.dataset.plan import Plan
-from eyerender.dataset.validate import validate
-from eyerender.folders.imagefile import read_image
-from eyerender.imaging.causes import without_noise
-from eyerender.study import blignaut, guestrin
-from eyerender.study.images import (
+from eyerender.apps.study import blignaut, guestrin
+from eyerender.apps.study.images import (
     dataset_spec,
     in_sequence,
     make_images,
     read_images,
     shots,
 )
-from eyerender.study.observing import Observing
-from eyerender.study.options import StudyOptions
-from eyerender.study.replicate import facing, scenes_of
-from eyerender.study.run import run_study
+from eyerender.apps.study.observing import Observing
+from eyerender.apps.study.options import StudyOptions
+from eyerender.apps.study.replicate import facing, scenes_of
+from eyerender.apps.study.run import run_study
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.validate import validate
+from eyerender.folders.imagefile import read_image
+from eyerender.imaging.causes import without_noise
 from tests.support import stages
 from tests.support.paths import ROOT
 from tests.support.study_scenes import small_scenes
@@ -137,8 +137,8 @@ KILLED = """
 import sys
 from pathlib import Path
 sys.path.insert(0, {root!r})
-from eyerender.study.images import make_images
-from eyerender.study.options import StudyOptions
+from eyerender.apps.study.images import make_images
+from eyerender.apps.study.options import StudyOptions
 from tests.support.study_scenes import small_scenes
 make_images("small", small_scenes(), Path({folder!r}), StudyOptions(workers=1))
 """

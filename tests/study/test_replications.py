@@ -8,6 +8,11 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace as observe
+from eyerender.apps.study import blignaut, guestrin
+from eyerender.apps.study import literature as lit
+from eyerender.apps.study.findings import t_tests
+from eyerender.apps.study.observing import Observing
+from eyerender.apps.study.replicate import blignaut_part, guestrin_part
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.landmarks import field_direction, path_to_retina
 from eyerender.eye.spec import EyeSpec
@@ -16,11 +21,6 @@ from eyerender.optics.solve import apparent_points
 from eyerender.optics.trace import trace
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
-from eyerender.study import blignaut, guestrin
-from eyerender.study import literature as lit
-from eyerender.study.findings import t_tests
-from eyerender.study.observing import Observing
-from eyerender.study.replicate import blignaut_part, guestrin_part
 from tests.support import guestrin_by_hand
 
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
+from eyerender.apps.study.layouts import known_layouts
+from eyerender.apps.study.rigs import REGIONS, regions, thirds
 from eyerender.cli.main import run
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
-from eyerender.study.layouts import known_layouts
-from eyerender.study.rigs import REGIONS, regions, thirds
 
 
 def test_every_layout_sees_a_pupil_and_glints_straight_ahead():

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
+from eyerender.apps.study import guestrin, head_mounted, observers_compared
+from eyerender.apps.study.conditions import FIXED, PARAMETERS, SHIFTED, TRACKERS, conditions_part, people_part
+from eyerender.apps.study.images import StudyImages, facing_scene
+from eyerender.apps.study.observing import Observing, moved, with_index_of
+from eyerender.apps.study.run import run_study
+from eyerender.base.errors import InputError
+from eyerender.base.status import Status
 from eyerender.cli.main import run
-from eyerender.errors import InputError
 from eyerender.scene import load_scene
-from eyerender.status import Status
-from eyerender.study import guestrin, head_mounted, observers_compared
-from eyerender.study.conditions import FIXED, PARAMETERS, SHIFTED, TRACKERS, conditions_part, people_part
-from eyerender.study.images import StudyImages, facing_scene
-from eyerender.study.observing import Observing, moved, with_index_of
-from eyerender.study.run import run_study
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_the_report_is_one_file(folders, name):
 @pytest.fixture
 def no_figures(monkeypatch):
     """Reports without their figures, at which nobody looks."""
-    monkeypatch.setattr("eyerender.study.figures.svg", lambda _fig: "<svg></svg>")
+    monkeypatch.setattr("eyerender.apps.study.figures.svg", lambda _fig: "<svg></svg>")
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -186,7 +186,7 @@ def test_images_that_are_not_there_are_refused():
 def test_known_feature_errors_and_paired_differences():
     from dataclasses import replace
 
-    from eyerender.arrays import frozen
+    from eyerender.base.arrays import frozen
 
     scene = guestrin.scene("E2", {"eyes"})
     truth = trace(scene)

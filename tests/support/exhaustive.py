@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from eyerender.base.status import Status
 from eyerender.optics.trace import inward_path, outward_path, trace
-from eyerender.status import Status
 
 WIDTH_MM = 6.6
 """Out to here the surfaces must not meet each other; exits beyond are not asked for."""

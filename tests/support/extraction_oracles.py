@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.special import erf, ndtr
 
-from eyerender.arrays import Bools, Bytes, Floats, Indices, Singles
+from eyerender.base.arrays import Bools, Bytes, Floats, Indices, Singles
 from eyerender.extraction.glints.detection import (
     _RING_COS,
     _RING_SIN,
@@ -39,7 +39,7 @@ from eyerender.extraction.pupil.least_squares import FIXED, KURTOSIS_LIMITS
 from eyerender.extraction.pupil.outline import DARK, SHADED
 from eyerender.extraction.pupil.places import SECTORS
 from eyerender.extraction.statistics import median, quantile
-from eyerender.geometry.ellipse import Ellipse, fit_ellipse_direct, points_on_ellipse, signed_distance
+from eyerender.optics.ellipse import Ellipse, fit_ellipse_direct, points_on_ellipse, signed_distance
 
 _RING_STEPS = np.repeat((0.1, 0.5, 0.9), 24)
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)

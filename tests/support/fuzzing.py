@@ -20,7 +20,7 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from eyerender.errors import EyerenderError
+from eyerender.base.errors import EyerenderError
 
 MEMORY_BYTES = 3 * 2**30  # beyond what the process has mapped before
 CPU_S = 20.0

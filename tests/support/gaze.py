@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from eyerender.arrays import frozen
-from eyerender.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
+from eyerender.base.arrays import frozen
+from eyerender.base.status import Status
 from eyerender.rig.camera import PinholeCamera
 from eyerender.rig.light import Lamp
 from eyerender.rig.rig import RigGeometry
 from eyerender.rig.screen import ScreenPlane
-from eyerender.status import Status
+from eyerender.scene.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
 
 ETS_TO_WORLD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # (z away from the user, x to the user's right, y up), the user at z = +658: the one-camera vectors.

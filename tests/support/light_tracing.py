@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import qmc
 
-from eyerender.geometry.surfaces import components
+from eyerender.optics.surfaces import components
 from eyerender.rendering.records.job import RenderJob
 from eyerender.rig.light import Lamp
 from tests.support.mirror import mirror_points

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from nicegui import Client, core
 
+from eyerender.apps.live.page import Tab
 from eyerender.cli.main import run
-from eyerender.live.page import Tab
 
 
 def report() -> None:

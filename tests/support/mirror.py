@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from eyerender.arrays import FloatLike, Floats, Statuses
-from eyerender.geometry.surfaces import Surface, components, join
+from eyerender.base.arrays import FloatLike, Floats, Statuses
 from eyerender.optics.solve import mirrored_rays
+from eyerender.optics.surfaces import Surface, components, join
 
 
 class MirrorPoints(NamedTuple):

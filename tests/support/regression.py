@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from eyerender.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
+from eyerender.base.status import Status
 from eyerender.rig.rig import Rig
-from eyerender.status import Status
+from eyerender.scene.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
 
 RIG = Rig.from_mapping(
     {

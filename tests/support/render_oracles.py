@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.path import Path as Outline
 from scipy.optimize import least_squares
 
-from eyerender.arrays import Floats
+from eyerender.base.arrays import Floats
 from eyerender.eye.model import EyeModel
 from eyerender.optics.media import TEARS
 from eyerender.optics.solve import apparent_points

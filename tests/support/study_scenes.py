@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from eyerender.apps.study import guestrin
+from eyerender.apps.study.images import shots
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
-from eyerender.study import guestrin
-from eyerender.study.images import shots
 
 
 def small_scenes(eyes: Sequence[str] = ("E1", "E2")) -> list[Scene]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from eyerender.geometry.surfaces_quadric import Quadric
+from eyerender.optics.surfaces_quadric import Quadric
 
 
 def quadric_of(row, sign):

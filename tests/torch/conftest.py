@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eyerender.errors import BackendError
+from eyerender.base.errors import BackendError
 from tests.support.dataset_specs import make, plan
 
 CHANGES = {"count": 20, "subjects": 4, "labels": {"noiseless": True}}

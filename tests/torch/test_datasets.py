@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.errors import InputError, UnfinishedRunWarning
+from eyerender.base.errors import InputError, UnfinishedRunWarning
 from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import plan
 from tests.support.paths import ROOT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.errors import InputError
+from eyerender.base.errors import InputError
 from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import TINY, make, plan
 
@@ -79,7 +79,7 @@ def test_folders_of_different_cameras_join_at_one_size(folder, pair):
 
 
 def test_stretched_ellipses_are_those_of_stretched_points():
-    from eyerender.geometry.ellipse import fit_ellipse_direct, points_on_ellipse
+    from eyerender.optics.ellipse import fit_ellipse_direct, points_on_ellipse
     from eyerender.torch import _fitted
 
     own = torch.tensor([40.0, 30.0, 12.0, 5.0, 0.7])

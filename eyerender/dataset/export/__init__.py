@@ -13,12 +13,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ...errors import InputError
+from ...base.errors import InputError
+from ...base.progress import Progress, notify
+from ...base.storage.files import write_json, write_text
 from ...folders.exported import EXPORT
 from ...folders.imagefolder import DATASET, ImageFolder
 from ...folders.outfolder import staged
-from ...progress import Progress, notify
-from ...storage.files import write_json, write_text
 from ..assemble import verify_dataset, verify_finished
 from ..validation.problems import WRONG
 from . import coco, ellseg, imagefolder, labels, openeds, parquet, table, teyed, webdataset, yolo

@@ -20,10 +20,10 @@ from typing import IO, Any
 
 import numpy as np
 
-from ...arrays import Bools
+from ...base.arrays import Bools
+from ...base.storage.files import write_bytes
 from ...folders.imagefile import png_bytes
-from ...geometry.ellipse import Ellipse
-from ...storage.files import write_bytes
+from ...optics.ellipse import Ellipse
 from .gaze import DIRECTIONS, gaze_of, pupil_of
 from .item import Item, Items
 from .keypoints import box, keypoints, names

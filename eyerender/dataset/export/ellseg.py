@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.io import savemat
 
-from ...arrays import Floats
-from ...errors import InputError
-from ...storage.files import write_bytes
+from ...base.arrays import Floats
+from ...base.errors import InputError
+from ...base.storage.files import write_bytes
 from .item import Item, Items
 
 _MAT_TEXT = b"MATLAB 5.0 MAT-file".ljust(116)

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
+from ...base.errors import InputError
 
 GAMMA = 2.2
 # A measured gain brings this share of all pixels to at most this part of full scale. The rest is headroom for brighter

@@ -10,8 +10,8 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+from ...base.storage.files import write_bytes
 from ...folders.imagefolder import ARRAY_KEYS, METADATA
-from ...storage.files import write_bytes
 from ..columns import type_first
 from ..done import KINDS, picture_file
 from .item import Item, Items

@@ -13,12 +13,12 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Bytes, Floats, Ints
-from ...errors import InputError
+from ...base.arrays import Bytes, Floats, Ints
+from ...base.errors import InputError
+from ...base.processes import ordered
 from ...folders.imagefile import image_of, png_bytes
 from ...folders.imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, Entries, ImageEntry, ImageFolder, opened_entries
-from ...geometry.ellipse import Ellipse, signed_distance
-from ...processes import ordered
+from ...optics.ellipse import Ellipse, signed_distance
 from ..interleaving import scrambled
 from ..validation.problems import WRONG
 from .encoding import RAW, Encoding

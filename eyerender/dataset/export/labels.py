@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError
+from ...base.errors import InputError
 from ...folders.imagefolder import ImageFolder
 from ...folders.packed import PackedLines
 from .item import Item, Items

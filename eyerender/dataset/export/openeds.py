@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...arrays import Bytes
+from ...base.arrays import Bytes
+from ...base.storage.files import write_bytes
 from ...folders.imagefile import png_bytes
-from ...storage.files import write_bytes
 from .item import Item, Items
 
 

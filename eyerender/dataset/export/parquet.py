@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from ...errors import InputError
+from ...base.errors import InputError
 from .item import Item, Items
 from .table import row_of
 

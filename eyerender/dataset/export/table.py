@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ...storage.files import write_bytes
+from ...base.storage.files import write_bytes
 from .gaze import gaze_of, pupil_of
 from .item import Item, Items
 

@@ -23,9 +23,9 @@ from typing import IO
 
 import numpy as np
 
-from ...arrays import Bytes
-from ...errors import InputError
-from ...geometry.ellipse import Ellipse
+from ...base.arrays import Bytes
+from ...base.errors import InputError
+from ...optics.ellipse import Ellipse
 from .item import Item, Items
 from .video import LosslessVideo
 

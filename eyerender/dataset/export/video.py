@@ -13,7 +13,7 @@ from types import TracebackType
 import cv2
 import numpy as np
 
-from ...arrays import Bytes
+from ...base.arrays import Bytes
 
 FRAMES_PER_SECOND = 25
 

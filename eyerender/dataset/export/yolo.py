@@ -17,10 +17,10 @@ import numpy as np
 import yaml
 from scipy import ndimage
 
-from ...arrays import Bools, Floats
+from ...base.arrays import Bools, Floats
+from ...base.storage.files import write_bytes
 from ...folders.imagefile import png_bytes
 from ...folders.imagefolder import IRIS, PUPIL, SCLERA
-from ...storage.files import write_bytes
 from .item import Item, Items
 from .keypoints import box, keypoints, names
 

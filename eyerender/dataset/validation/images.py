@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Bools, Floats
+from ...base.arrays import Bools, Floats
 from ...folders.imagefolder import FRAME, IRIS, PUPIL, ImageEntry
 from ...imaging.labels import moments_ellipse
 from ...rig.camera import Window

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Ints
-from ...errors import InputError
+from ...base.arrays import Ints
+from ...base.errors import InputError
+from ...base.status import Status
+from ...base.storage.files import shown
 from ...folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
-from ...observation import Observations
-from ...status import Status
-from ...storage.files import shown
+from ...scene.observation import Observations
 from .problems import WRONG, Problems
 from .shards import hashed
 from .truth import DatasetTruth, SceneTruth

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Bools, Floats
-from ...geometry.ellipse import points_on_ellipse
+from ...base.arrays import Bools, Floats
+from ...optics.ellipse import points_on_ellipse
 from ...rig.camera import Window
 
 # A mask is traced in single precision, which moves an outline by at most .004 px (measured on the shipped eyes, seen at

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backends.choose import BackendChoice
+from ...base.progress import Progress
+from ...base.storage.files import shown
 from ...folders.imagefolder import ARRAY_KEYS, ImageEntry, ImageFolder
-from ...progress import Progress
-from ...storage.files import shown
 from ..done import KINDS, cpu_family, read_done, run_versions
 from ..maker import Maker
 from .problems import Problems

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Ints
-from ...errors import InputError
+from ...base.arrays import Ints
+from ...base.errors import InputError
+from ...base.progress import Progress
+from ...base.storage.files import opened, parse_json, shown
+from ...base.storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
 from ...folders.imagefolder import LINES, METADATA, PACKED_SCHEMA, SHARDS, ImageFolder, finished, shard_name
-from ...progress import Progress
-from ...storage.files import opened, parse_json, shown
-from ...storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
 from ..assemble import damage, shards_of
 from ..shard import verify
 from .problems import SHOWN, Problems, differences

@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 
 from ...analytic.observer import trace
-from ...arrays import Bools, Floats
-from ...errors import InputError
+from ...base.arrays import Bools, Floats
+from ...base.errors import InputError
+from ...base.storage.files import parse_json, shown
 from ...folders.imagefolder import DATASET, RESULTS, ImageFolder, shard_name, versions
 from ...imaging.labels import EyeInWindow, known_labels, limbus_px
-from ...observation import EYES, Observations, version_of
 from ...region.mesh import lid_margins
 from ...rendering.glints.occlusion import lid_margins_px
 from ...rendering.glints.tracing import GlintScene, glint_table
 from ...rendering.records.job import film_index, globe_of
 from ...scene import Frames, Scene
+from ...scene.observation import EYES, Observations, version_of
 from ...scene.spec import SceneSpec
-from ...storage.files import parse_json, shown
 from ..done import KINDS, picture_file
 from ..line import image_line, image_name
 from ..ownscenes import GivenScene

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Floats, frozen
-from ...geometry.ellipse import Ellipse, signed_distance
-from ...status import Status
+from ...base.arrays import Floats, frozen
+from ...base.status import Status
+from ...optics.ellipse import Ellipse, signed_distance
 from ..preprocessing import DN, Image
 from ..result import GlintResult
 from ..settings import ExtractionSettings

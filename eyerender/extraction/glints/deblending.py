@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...arrays import Bools, Floats
+from ...base.arrays import Bools, Floats
 from ..preprocessing import DN, Image
 from .fits import SpotFit, joined
 from .fitting import UNEXPLAINED, FittedSpots, fit_spots, report

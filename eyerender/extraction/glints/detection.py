@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices, Singles
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Floats, Indices, Singles
+from ...base.jit import compiled, inlined
+from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, Prepared, as_image
 from ..pupil.edges import nearest
 from ..pupil.glare import around

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
+from ...base.arrays import Bools, Floats, Indices
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Bools, Floats
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Floats
+from ...base.jit import compiled, inlined
 from ..preprocessing import Image
 from ..products import solve
 from .detection import SMOOTH_PX

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Floats, Indices
+from ...base.jit import compiled, inlined
 from ..products import add_products, copy, largest_size, solve
 from .windows import WINDOWS, SpotPixels, Windows, light_of_others, profile
 

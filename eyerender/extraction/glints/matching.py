@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Floats, Indices
-from ...errors import InputError
-from ...geometry.transforms import normalize
+from ...base.arrays import Floats, Indices
+from ...base.errors import InputError
+from ...optics.transforms import normalize
 
 CORNEA_RADIUS_MM = 7.8
 # Distances in a typical adult eye: apex to centre of rotation, and from there to the entrance pupil and to the cornea's

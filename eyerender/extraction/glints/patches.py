@@ -12,8 +12,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from ...arrays import Bytes, Floats, Indices
-from ...geometry.ellipse import Ellipse
+from ...base.arrays import Bytes, Floats, Indices
+from ...optics.ellipse import Ellipse
 from ..preprocessing import DN, Image, Prepared
 from ..pupil.glare import around
 from ..statistics import median

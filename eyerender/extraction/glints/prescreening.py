@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Floats, Indices
+from ...base.jit import compiled, inlined
 from ..preprocessing import DN, Image
 from ..products import add_products, solve
 

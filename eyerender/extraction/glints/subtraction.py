@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from ...arrays import Bools, Floats
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled
+from ...base.arrays import Bools, Floats
+from ...base.jit import compiled
+from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, Part, Prepared
 from ..pupil.glare import around
 from .detection import Spots

@@ -11,8 +11,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Bools, Floats, Indices
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Floats, Indices
+from ...base.jit import compiled, inlined
 from ..preprocessing import Image
 
 Windows = tuple[Indices, Floats, Floats, Floats]  # first, plane, centre and radius of SpotPixels

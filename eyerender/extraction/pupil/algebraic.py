@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from ...arrays import Floats
-from ...jit import compiled, inlined
+from ...base.arrays import Floats
+from ...base.jit import compiled, inlined
 from ..products import solve
 
 

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ...arrays import Bools
-from ...geometry.ellipse import Ellipse, iou
+from ...base.arrays import Bools
+from ...optics.ellipse import Ellipse, iou
 from ..preprocessing import Prepared
 from ..settings import Shape
 from .candidates import Candidate, Interior, candidate_at, inspect_interior

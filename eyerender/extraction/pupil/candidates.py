@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Bools, Floats, Indices
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Floats, Indices
+from ...base.jit import compiled, inlined
+from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, Prepared, as_image
 from ..products import copy
 from ..settings import Shape

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Bools, Floats
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Floats
+from ...base.jit import compiled, inlined
+from ...optics.ellipse import Ellipse
 from ..products import selected, selected_rows
 from ..settings import Shape
 from ..statistics import quantile_of

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled
+from ...base.arrays import Bools, Floats, Indices
+from ...base.jit import compiled
+from ...optics.ellipse import Ellipse
 from .places import BLOCK, COS_T, COS_U, NX, NY, SECTORS, SIN_T, SIN_U, Place, places, sector_at
 
 SHAPE = 5  # number of parameters

@@ -23,9 +23,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Floats, Indices
+from ...base.jit import compiled, inlined
+from ...optics.ellipse import Ellipse
 from .places import BLOCK, COS_U, CURVATURE, SIN_U, places, sector_at
 
 # Columns of a block of profiles, all by the distance d: the edge E (first), its derivatives by the distance, sigma and

@@ -9,8 +9,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from ...arrays import Bools, Bytes, Floats, Indices
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Bytes, Floats, Indices
+from ...base.jit import compiled, inlined
 from ..preprocessing import Image, as_image
 from ..statistics import median, quantile_of
 from .candidates import Candidate

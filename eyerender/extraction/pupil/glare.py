@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ...arrays import Bools, Floats
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled
+from ...base.arrays import Bools, Floats
+from ...base.jit import compiled
+from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, as_image
 from ..statistics import quantile
 from .places import SECTORS

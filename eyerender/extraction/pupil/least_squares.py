@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
-from ...jit import compiled, inlined, summing
+from ...base.arrays import Bools, Floats, Indices
+from ...base.jit import compiled, inlined, summing
 from ..products import add_products, largest_size, solve
 from .covariance import SHAPE
 from .edge_model import (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
+from ...base.arrays import Bools, Floats, Indices
 from ..statistics import median
 from .consensus import UNEVEN
 from .edge_model import EdgeModel, boundary_terms, levels_and_slopes

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...arrays import Bools, Floats
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled
+from ...base.arrays import Bools, Floats
+from ...base.jit import compiled
+from ...optics.ellipse import Ellipse
 from ..preprocessing import Image
 from ..statistics import quantile_of
 from .boundary import PupilCandidate

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Indices
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled, inlined
+from ...base.arrays import Bools, Floats, Indices
+from ...base.jit import compiled, inlined
+from ...optics.ellipse import Ellipse
 
 SECTORS = 48  # equal steps of the ellipse's parameter u
 STEPS = 3  # Newton steps to the nearest point; they reach 1e-6 px up to b / 2 away

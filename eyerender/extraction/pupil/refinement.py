@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Bools, Floats
-from ...geometry.ellipse import Ellipse
-from ...jit import compiled
+from ...base.arrays import Bools, Floats
+from ...base.jit import compiled
+from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, Part
 from .algebraic import direct_fits
 from .covariance import SHAPE, distance_slopes, hidden_part, sector_excess, to_axes, towards_round

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from ...geometry.ellipse import Ellipse, iou
+from ...optics.ellipse import Ellipse, iou
 from ..preprocessing import Prepared, invert
 from ..result import PupilResult
 from ..settings import LEAST_PX, Shape

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from ...errors import InputError
+from ...base.errors import InputError
 from ..spec import EyeSpec
 
 FOLDER = Path(__file__).parent
@@ -26,7 +26,7 @@ def catalogue_names() -> tuple[str, ...]:
 @cache
 def catalogue_files() -> Mapping[str, Path]:
     """Return the path of the eye file of each name."""
-    return {path.stem: path for path in (*_PACKAGE.glob("*/eyes/*.yaml"), *FOLDER.glob("*.yaml"))}
+    return {path.stem: path for path in (*_PACKAGE.glob("**/eyes/*.yaml"), *FOLDER.glob("*.yaml"))}
 
 
 def load_eye(name_or_path: str | Path) -> EyeSpec:

@@ -19,7 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ...arrays import Bools, Floats
+from ...base.arrays import Bools, Floats
 
 Visible = Callable[[Floats], Bools]
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...arrays import Bools, Floats
+from ...base.arrays import Bools, Floats
 from ...region.mesh import LID_MARKS, LidMargins, RegionMesh
 from ...rig.camera import PinholeCamera
 

@@ -15,17 +15,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...arrays import Bools, Floats
-from ...errors import InputError
+from ...base.arrays import Bools, Floats
+from ...base.errors import InputError
+from ...base.status import Status
 from ...eye.model import EyeModel
-from ...geometry.surfaces import Surface, components, join
 from ...optics.gradient import GradientMedium
 from ...optics.interface import fresnel
 from ...optics.purkinje import purkinje_path, purkinje_points
 from ...optics.shooting import ray_tube
+from ...optics.surfaces import Surface, components, join
 from ...optics.trace import Crossing, Traced, trace
 from ...rig.light import Lamp
-from ...status import Status
 from .cutdiscs import Nodes
 from .tracing import GlintScene, Image, disc_points
 

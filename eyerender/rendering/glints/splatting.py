@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Singles, frozen
+from ...base.arrays import Bools, Floats, Singles, frozen
 from ...rig import defocus, psf
 from ...rig.camera import Window
 from ...rig.light import Lamp

@@ -24,18 +24,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import ArrayValue, Bools, Floats, frozen, remembered
+from ...base.arrays import ArrayValue, Bools, Floats, frozen, remembered
+from ...base.status import Status
 from ...eye.model import EyeModel
-from ...geometry.surfaces import Surface, components, join
-from ...geometry.transforms import normalize
 from ...optics.fermat_kernels import RESIDUAL_LIMIT_MM
 from ...optics.interface import fresnel
 from ...optics.shooting import ray_tube
 from ...optics.solve import mirrored_rays
+from ...optics.surfaces import Surface, components, join
 from ...optics.trace import Crossing
+from ...optics.transforms import normalize
 from ...rig.camera import PinholeCamera
 from ...rig.light import Lamp
-from ...status import Status
 from ..hits.meshes import MirrorPoints, SurfaceMesh
 from .cutdiscs import POINT, Nodes, cut_nodes, quadrature, rim
 

@@ -22,11 +22,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints
+from ...base.arrays import Bools, Floats, Ints
 from ...eye.meshes import Patch, cornea_patches
 from ...eye.model import EyeModel
-from ...geometry.surfaces import Surface as ExactSurface
-from ...geometry.transforms import normalize
+from ...optics.surfaces import Surface as ExactSurface
+from ...optics.transforms import normalize
 from ..records.frame import aligned_copy, upload_array
 from ..records.surfaces import Bundle, NormalForm, Surface
 

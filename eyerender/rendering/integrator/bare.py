@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Ints, frozen
+from ...base.arrays import Ints, frozen
 from ..hits.primary import intersect
 from ..records.frame import Frame, aligned_copy
 from ..records.recording import recorded

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Singles
+from ...base.arrays import Singles
 from ...rig.camera import Window
 from ...rig.stray import block_px, misses_light
 from .film import Film, start

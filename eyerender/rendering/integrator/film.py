@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Singles
+from ...base.arrays import Singles
 from ...rig.camera import Window
 from ..records.frame import SMALL, Frame
 from ..records.recording import recorded, syntax

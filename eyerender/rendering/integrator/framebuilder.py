@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...errors import InputError
+from ...base.errors import InputError
 from ...region.mesh import RegionMesh, region_mesh
 from ...rig.imaging import Ambient
 from ..hits.meshes import Meshes, meshed

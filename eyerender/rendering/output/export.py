@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...arrays import Floats
-from ...errors import InputError
+from ...base.arrays import Floats
+from ...base.errors import InputError
 from ...eye.meshes import Patch, eye_meshes
 from ...eye.model import EyeModel
 from ...region.anatomy import Region

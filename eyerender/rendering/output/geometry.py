@@ -15,11 +15,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import ArrayValue, Bools, Bytes, Floats, Indices, Singles, frozen, sealed
+from ...base.arrays import ArrayValue, Bools, Bytes, Floats, Indices, Singles, frozen, sealed
 from ...eye.model import EyeModel
 from ...folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
-from ...geometry.surfaces import Surface, Xyz
 from ...optics.interface import dot
+from ...optics.surfaces import Surface, Xyz
 from ...region.mesh import sheet_codes
 from ..hits.eyeshape import EyeShape
 from ..hits.primary import behind, facing, hit_before

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import ArrayValue, Bools, Bytes, frozen, sealed
+from ...base.arrays import ArrayValue, Bools, Bytes, frozen, sealed
 from ...folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ...rig.camera import Window
 from ..hits.eyeshape import EyeShape

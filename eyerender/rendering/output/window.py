@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import ArrayValue, Bools, Singles, frozen, sealed
-from ...errors import InputError
+from ...base.arrays import ArrayValue, Bools, Singles, frozen, sealed
+from ...base.errors import InputError
 from ...rig import defocus, exposure, psf, stray
 from ...rig.camera import PinholeCamera, Window
 from ...rig.imaging import Lens

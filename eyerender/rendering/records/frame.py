@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Floats, Reals, Singles
+from ...base.arrays import Floats, Reals, Singles
 from .caches import Caches
 from .job import LampTable
 from .parameters import FrameParameters, Kind, Parameters, packed, rebuilt

@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import ArrayValue, Floats, frozen, remembered
-from ...errors import InputError
+from ...base.arrays import ArrayValue, Floats, frozen, remembered
+from ...base.errors import InputError
 from ...eye.entrance import entrance_pupil
 from ...eye.fundus import FundusLight, Spread, fundus_light
 from ...eye.model import EyeModel
-from ...geometry.surfaces import Surface
-from ...geometry.surfaces_biconic import Biconic
-from ...geometry.surfaces_measured import Measured
-from ...geometry.surfaces_quadric import Quadric
 from ...optics.media import TEARS
+from ...optics.surfaces import Surface
+from ...optics.surfaces_biconic import Biconic
+from ...optics.surfaces_measured import Measured
+from ...optics.surfaces_quadric import Quadric
 from ...region.anatomy import Region
 from ...region.globe import Globe
 from ...region.limbus import upwards

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Floats
-from ...geometry.surfaces_measured import Measured
-from ...geometry.topography import spline_coefficients
+from ...base.arrays import Floats
+from ...optics.surfaces_measured import Measured
+from ...optics.topography import spline_coefficients
 
 SPACING_MM = 0.15
 _MARGIN_MM = 1.2

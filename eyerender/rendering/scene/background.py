@@ -15,8 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import ArrayValue, Bools, Floats, Ints, Singles
-from ...geometry.vectors import lengths
+from ...base.arrays import ArrayValue, Bools, Floats, Ints, Singles
+from ...optics.vectors import lengths
 from ...region.look import Look
 from ...region.mapcache import kept
 from ...region.texture import skin_texture

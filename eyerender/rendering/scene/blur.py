@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Floats, Reals
+from ...base.arrays import Floats, Reals
 from ...region.mesh import RegionMesh
 from ...rig import defocus, psf
 from ...rig.camera import Window

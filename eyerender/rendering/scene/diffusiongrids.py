@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints, Singles, frozen
+from ...base.arrays import Bools, Floats, Ints, Singles, frozen
 from ...optics.diffusion import half_space_length_mm, slab_length_mm
 from ...region.globe import Globe
 from ...region.mesh import RegionMesh, sheet_neighbours

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...arrays import Singles
-from ...errors import EyerenderError
+from ...base.arrays import Singles
+from ...base.errors import EyerenderError
 
 
 @contextmanager

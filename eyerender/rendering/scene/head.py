@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Floats
-from ...errors import InputError
+from ...base.arrays import Floats
+from ...base.errors import InputError
 from ...region.anatomy import Region
 from ...region.globe import Globe
 from ...region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows

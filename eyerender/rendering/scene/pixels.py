@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...arrays import Bools, Floats
+from ...base.arrays import Bools, Floats
 from ...region.mesh import HAIRS, RegionMesh
 from ...rig.camera import PinholeCamera, Window
 

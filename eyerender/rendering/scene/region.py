@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Bools, Floats, Singles
+from ...base.arrays import Bools, Floats, Singles
 from ...region.anatomy import Region
 from ...region.contour import COLUMNS
 from ...region.globe import Globe

@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from ...arrays import Bools, Floats, Ints, Singles, frozen, remembered
+from ...base.arrays import Bools, Floats, Ints, Singles, frozen, remembered
 from ...eye.model import EyeModel, Stop
-from ...geometry.surfaces import Surface
+from ...optics.surfaces import Surface
 from ...region.limbus import lower, upwards
 from ...region.look import LIMBAL_RING, Look
 from .chamberrays import Walls, air_side, trace_inside

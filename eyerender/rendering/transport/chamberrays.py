@@ -7,13 +7,13 @@ from functools import cached_property
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints
+from ...base.arrays import Bools, Floats, Ints
 from ...eye.meshes import chamber_rim
-from ...geometry.graphs import distances
-from ...geometry.surfaces import Surface, components
-from ...geometry.surfaces_graph import GraphSurface
-from ...geometry.vectors import dots, lengths
+from ...optics.graphs import distances
 from ...optics.interface import fresnel
+from ...optics.surfaces import Surface, components
+from ...optics.surfaces_graph import GraphSurface
+from ...optics.vectors import dots, lengths
 
 _WEAK, _FEW = 0.25, 4  # one in _FEW is traced for all of the rays that the cornea mirrors less than _WEAK
 _STEPS = 20  # crossings and mirrorings of a ray

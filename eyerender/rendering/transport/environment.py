@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Floats, frozen
-from ...errors import InputError
+from ...base.arrays import Floats, frozen
+from ...base.errors import InputError
 from ...rig.imaging import RadianceMap
 from ...rig.light import Lamp
 from ..records.frame import upload_scalars

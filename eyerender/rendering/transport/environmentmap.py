@@ -22,12 +22,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import ArrayValue, Floats, frozen
-from ...errors import InputError
+from ...base.arrays import ArrayValue, Floats, frozen
+from ...base.errors import InputError
+from ...base.spec import file_digest
+from ...base.storage.files import opened
 from ...rig.imaging import RadianceMap
 from ...rig.surroundings import paint
-from ...spec import file_digest
-from ...storage.files import opened
 from ..scene.exr import second_thread
 
 _WIDTH, _HEIGHT = 1024, 512

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_array
 
-from ...arrays import Floats, Ints, Reals, remembered
+from ...base.arrays import Floats, Ints, Reals, remembered
 from ..hits.interaction import SurfaceInteraction, outer_albedo
 from ..hits.primary import TriangleHit, appearance, intersect
 from ..materials.albedo import iris_albedo

@@ -14,9 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Floats, Ints
+from ...base.arrays import Floats, Ints
 from ...eye.model import EyeModel
-from ...geometry.vectors import dots, lengths
+from ...optics.vectors import dots, lengths
 from ...region.globe import Globe
 from ...region.look import Look
 from ..records.eyecache import EyeCache

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Floats
+from ...base.arrays import Floats
 from ..records.frame import upload_array
 from ..records.recording import syntax
 

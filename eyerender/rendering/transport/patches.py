@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...arrays import ArrayValue, Bools, Floats, Ints, Singles
+from ...base.arrays import ArrayValue, Bools, Floats, Ints, Singles
 from ...region.globe import Globe
 from ...region.mesh import RegionMesh
 

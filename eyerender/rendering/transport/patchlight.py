@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Floats
+from ...base.arrays import Floats
 from ..records.caches import Caches
 from ..records.frame import Frame, Lights, sequence
 from ..records.recording import recorded, syntax

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...arrays import Bools, Floats, Ints
+from ...base.arrays import Bools, Floats, Ints
 from ..records.frame import Frame, Lights, upload_array
 from ..records.job import LampTable, RenderJob
 from ..scene.background import Background

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Floats
+from ...base.arrays import Floats
 from ..records.frame import upload_array, upload_scalars
 from .chamber import IRIS_RINGS, ROOT_RINGS, Chamber
 from .chamber import TURNS as IRIS_TURNS

@@ -20,8 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Floats, Singles
-from ...geometry.vectors import crosses
+from ...base.arrays import Floats, Singles
+from ...optics.vectors import crosses
 from ...region.mesh import HAIRS, RegionMesh
 from ...rig.light import Lamp
 from ..records.frame import quotient, upload_array

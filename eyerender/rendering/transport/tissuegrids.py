@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import Ints
+from ...base.arrays import Ints
 from ...region.skin import BANDS, SHEET_ROWS
 from ..records.frame import aligned_copy
 from ..scene.diffusiongrids import SIDE, WIDTH, GlobeCells, SheetCells

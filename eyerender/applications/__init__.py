@@ -1,1 +1,0 @@
-"""Applications that compose the package: the quickstart and surveys of populations."""

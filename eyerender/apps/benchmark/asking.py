@@ -1,0 +1,192 @@
+"""Run extractors on images: several processes at a time, stored answers first, failures as results."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+from ...base.errors import InputError
+from ...base.jit import ensure_compiled
+from .answercache import AnswerCache, StoredAnswer
+from .folder import LabelledImage
+from .options import BenchOptions
+from .process import ExtractorProcess, Failed
+from .protocol import Greeting, Reply, Request
+from .registry import ExtractorCommand
+from .score import Score, failed, score
+
+# Number of consecutive failures after which an extractor is no longer run.
+PATIENCE = 3
+_OWN = "eyerender.apps.benchmark.shipped:own_"
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Results of one extractor: its greeting (None if it never came), and a score per image."""
+
+    extractor: ExtractorCommand
+    greeting: Greeting | None
+    scores: tuple[Score, ...]
+
+    @property
+    def reports_glints(self) -> bool:
+        """Whether the extractor announced that it reports glints."""
+        return self.greeting is not None and "glints" in self.greeting.reports
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """A reply with its round-trip time, or the reason of a failure."""
+
+    reply: Reply | None
+    trip_s: float = 0.0
+    failure: str = ""
+
+
+def ask_extractors(
+    extractors: Sequence[ExtractorCommand],
+    images: Sequence[LabelledImage],
+    options: BenchOptions,
+    *,
+    keys: Sequence[str] = (),
+    caches: Sequence[AnswerCache] = (),
+    step: Callable[[str], None] = lambda _name: None,
+) -> list[Run]:
+    """Run every extractor on every image; the scores include every failure.
+
+    The images of an extractor are divided among `options.jobs` processes. The results do not depend on their number.
+
+    Args:
+        extractors: the extractors.
+        images: the images.
+        options: jobs, time limits, and whether to use stored answers.
+        keys: `image_key` of every image, if there are caches.
+        caches: stored answers of every extractor.
+        step: called with an extractor's name after each of its answers.
+    """
+    if any(argument.startswith(_OWN) for extractor in extractors for argument in extractor.argv):
+        ensure_compiled()  # once, before the clocks of several processes run
+    known = list(caches) or [AnswerCache(None) for _ in extractors]
+    names = list(keys) or [str(k) for k in range(len(images))]
+    askers = [
+        _Asker(extractor, images, options, cache, names, step)
+        for extractor, cache in zip(extractors, known, strict=True)
+    ]
+    size = -(-len(images) // options.jobs) or 1
+    parts = [range(start, min(start + size, len(images))) for start in range(0, len(images), size)]
+    with ThreadPoolExecutor(options.jobs) as pool:
+        try:
+            for done in [pool.submit(asker.ask, part) for asker in askers for part in parts]:
+                done.result()
+        except BaseException:
+            for asker in askers:
+                asker.stop()
+            pool.shutdown(cancel_futures=True)
+            raise
+    return [asker.run() for asker in askers]
+
+
+class _Asker:
+    """Runs one extractor on images, from several threads."""
+
+    def __init__(
+        self,
+        extractor: ExtractorCommand,
+        images: Sequence[LabelledImage],
+        options: BenchOptions,
+        cache: AnswerCache,
+        keys: Sequence[str],
+        step: Callable[[str], None],
+    ) -> None:
+        self._extractor, self._images, self._options = extractor, images, options
+        self._cache, self._keys, self._step = cache, keys, step
+        self._answers: list[_Answer | None] = [None] * len(images)
+        self._greeting: Greeting | None = None
+        self._processes: set[ExtractorProcess] = set()
+        self._lock = threading.Lock()
+        self._stopped = False
+
+    def ask(self, rows: range) -> None:
+        """Process some images in turn; after `PATIENCE` consecutive failures the remaining ones get no answer."""
+        process: ExtractorProcess | None = None
+        failures = 0
+        try:
+            for row in rows:
+                if self._stopped or failures >= PATIENCE:
+                    return
+                try:
+                    self._answers[row], process = self._answer(row, process)
+                    failures = 0
+                except Failed as failure:
+                    failures += 1
+                    self._answers[row] = _Answer(None, failure=str(failure))
+                    if self._greeting is None:
+                        return
+                self._step(self._extractor.name)
+        finally:
+            self._close(process)
+
+    def stop(self) -> None:
+        """End all processes of this extractor."""
+        self._stopped = True
+        with self._lock:
+            processes = list(self._processes)
+        for process in processes:
+            process.close()
+
+    def run(self) -> Run:
+        """Score all answers; images after `PATIENCE` consecutive failures count as not processed."""
+        greeting = self._greeting
+        reports = greeting.reports if greeting else ()
+        scores, failures, given_up = [], 0, ""
+        for image, answer in zip(self._images, self._answers, strict=True):
+            if given_up or answer is None or answer.reply is None:
+                reason = given_up or (answer.failure if answer else "not asked")
+                scores.append(failed(image, reason, "glints" in reports))
+                failures += 1
+                if not given_up and greeting is None:
+                    given_up = reason
+                elif not given_up and failures >= PATIENCE:
+                    given_up = f"not asked after {PATIENCE} failures in a row, the last: {reason}"
+                continue
+            failures = 0
+            scores.append(score(image, answer.reply, answer.trip_s, reports))
+        named = (replace(s, subject=i.subject or i.name) for s, i in zip(scores, self._images, strict=True))
+        return Run(self._extractor, greeting, tuple(named))
+
+    def _answer(self, row: int, process: ExtractorProcess | None) -> tuple[_Answer, ExtractorProcess | None]:
+        """Return the answer for one image, stored or new, and the process to use next."""
+        stored = None if self._options.fresh else self._cache.get(self._keys[row])
+        if stored is not None:
+            with suppress(InputError):  # another version may have stored it
+                greeting = Greeting.parse(stored.greeting)
+                reply = Reply.parse(stored.line, stored.request_id, greeting.conventions)
+                self._greeting = self._greeting or greeting
+                return _Answer(reply, stored.trip_s), process
+        if process is None or not process.alive:
+            process = self._open(process)
+        image = self._images[row]
+        reply, trip_s = process.ask(Request(row, str(image.path.resolve()), image.bit_depth, image.hints))
+        if reply.error is None:
+            self._cache.put(self._keys[row], StoredAnswer(row, reply.line, process.greeting_line, trip_s))
+        return _Answer(reply, trip_s), process
+
+    def _open(self, before: ExtractorProcess | None) -> ExtractorProcess:
+        self._close(before)
+        options = self._options
+        process = ExtractorProcess(
+            self._extractor.argv, start_timeout_s=options.start_timeout_s, timeout_s=options.timeout_s
+        )
+        with self._lock:
+            self._processes.add(process)
+            self._greeting = self._greeting or process.greeting
+        return process
+
+    def _close(self, process: ExtractorProcess | None) -> None:
+        if process is not None:
+            process.close()
+            with self._lock:
+                self._processes.discard(process)

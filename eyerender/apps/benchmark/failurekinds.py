@@ -1,0 +1,82 @@
+"""Classify what a wrong ellipse shows instead of the pupil."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...base.arrays import Bytes
+from ...folders.imagefolder import BACKGROUND, FRAME
+from ...optics.ellipse import Ellipse, iou, signed_distance
+from .folder import LabelledImage
+
+FailureKind = Literal["near miss", "glint", "iris", "lash or lid", "shadow", "elsewhere"]
+KINDS: dict[FailureKind, str] = {
+    "near miss": "overlaps the pupil with an IoU of 0.7 and more",
+    "glint": "a small ellipse, at most half as wide as the pupil, around a glint",
+    "iris": "overlaps the iris with an IoU of 0.5 and more; without its label, a larger ellipse about the pupil",
+    "lash or lid": "crosses the border between eye and skin, or a lid's margin",
+    "shadow": "darker than its surroundings, but none of these",
+    "elsewhere": "none of these",
+}
+_NEAR, _IRIS, _SMALL = 0.7, 0.5, 0.5
+_SMALL_PX = 6.0  # semi-axis of an ellipse around a glint where no pupil is seen
+_CROSSES = 0.05  # share of an ellipse on either side of the border between eye and skin
+# Ratio of the widths of iris and pupil: 11 to 13 mm by 1.5 to 8 mm.
+_IRIS_RATIO = (1.4, 8.0)
+
+
+def kind_of(found: Ellipse, image: LabelledImage, grey: NDArray[Any], mask: Bytes | None) -> FailureKind:
+    """Return the kind of a wrong ellipse: the first of `KINDS` that applies.
+
+    Args:
+        found: the ellipse.
+        image: the labels of the image.
+        grey: (h, w) pixels of the image.
+        mask: (h, w) classes of the pixels; None if unknown, when lids are known only by their margins.
+    """
+    true = image.pupil
+    if true is not None and iou(found, true) >= _NEAR:
+        return "near miss"
+    small = _SMALL_PX if true is None else _SMALL * math.sqrt(float(true.semi_axes_px.prod()))
+    if _on_glint(found, image) and math.sqrt(float(found.semi_axes_px.prod())) <= small:
+        return "glint"
+    if _is_iris(found, image):
+        return "iris"
+    inside = _inside(found, grey.shape)
+    if _crosses_lid(found, image, inside, mask):
+        return "lash or lid"
+    around = _inside(found.scaled(1.5), grey.shape) & ~inside
+    if inside.any() and around.any() and np.median(grey[inside]) < 0.9 * np.median(grey[around]):
+        return "shadow"
+    return "elsewhere"
+
+
+def _on_glint(found: Ellipse, image: LabelledImage) -> bool:
+    spots = np.array([g.xy_px for g in image.glints]).reshape(-1, 2)
+    return bool(np.any(signed_distance(found, spots) < 1.0)) if len(spots) else False
+
+
+def _is_iris(found: Ellipse, image: LabelledImage) -> bool:
+    if image.iris is not None:
+        return iou(found, image.iris) >= _IRIS
+    if image.pupil is None:
+        return False
+    ratio = math.sqrt(found.area_px2 / image.pupil.area_px2)
+    concentric = np.hypot(*(found.centre_px - image.pupil.centre_px)) < 0.5 * image.pupil.semi_axes_px[0]
+    return bool(concentric) and _IRIS_RATIO[0] <= ratio <= _IRIS_RATIO[1]
+
+
+def _crosses_lid(found: Ellipse, image: LabelledImage, inside: NDArray[np.bool_], mask: Bytes | None) -> bool:
+    if mask is not None and inside.any():
+        skin = float(np.mean(np.isin(mask[inside], (BACKGROUND, FRAME))))
+        return _CROSSES <= skin <= 1.0 - _CROSSES
+    return any(bool(np.any(signed_distance(found, margin) < 0.0)) for margin in image.lids_px)
+
+
+def _inside(ellipse: Ellipse, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return np.asarray(signed_distance(ellipse, np.stack([x, y], axis=-1)) < 0.0)

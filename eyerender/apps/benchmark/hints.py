@@ -1,0 +1,75 @@
+"""Hints for extractors about the user's own images: hints.json in the folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from ...base.errors import InputError
+from ...base.spec import NonNegative, Number, Positive, Spec, Vec3
+from ...base.storage.files import read_json, shown
+
+HINTS = "hints.json"
+HINTS_SCHEMA = "eyerender/hints/1"
+
+
+class RigHints(Spec):
+    """Camera and lights, in the form given to extractors.
+
+    Attributes:
+        K: camera matrix, px.
+        R: rotation from the world to the camera.
+        t_mm: translation from the world to the camera.
+        distortion: OpenCV's coefficients.
+        lights_mm: positions of the lights in the world.
+        eye_mm: approximate position of the eye in the world.
+        eye_sd_mm: its standard deviation per axis.
+    """
+
+    K: tuple[Vec3, Vec3, Vec3]
+    R: tuple[Vec3, Vec3, Vec3]
+    t_mm: Vec3
+    distortion: Annotated[tuple[Number, ...], Field(max_length=14)] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    lights_mm: Annotated[tuple[Vec3, ...], Field(max_length=1000)]
+    eye_mm: Vec3
+    eye_sd_mm: NonNegative = 5.0
+
+
+class FolderHints(Spec):
+    """Hints for every image of a folder; a missing key is unknown.
+
+    Attributes:
+        gamma: encoding gamma of the pixel values, 1 for linear ones.
+        polarity: whether the pupil is darker or brighter than the iris.
+        radius_px: smallest and largest semi-axis of a pupil.
+        rig: camera and lights.
+    """
+
+    gamma: Annotated[float, Field(ge=0.1, le=10)] | None = None
+    polarity: Literal["dark", "bright", "auto"] = "auto"
+    radius_px: tuple[Positive, Positive] | None = None
+    rig: RigHints | None = None
+
+    @classmethod
+    def load(cls, folder: Path) -> FolderHints:
+        """Read hints.json of a folder; without the file, nothing is known.
+
+        Raises:
+            InputError: naming the wrong key.
+        """
+        path = folder / HINTS
+        if not path.exists():
+            return cls()
+        data = read_json(path, follow=False)
+        schema = data.pop("schema", None)
+        if schema != HINTS_SCHEMA:
+            raise InputError(f"must be {HINTS_SCHEMA!r}, not {shown(schema)}", source=str(path), path="schema")
+        return cls.from_mapping(data, source=str(path))
+
+    def to_request(self) -> dict[str, Any]:
+        """Return the hints of a request; an unknown gamma becomes 1."""
+        rig = None if self.rig is None else self.rig.model_dump(mode="json")
+        radius = None if self.radius_px is None else list(self.radius_px)
+        return {"polarity": self.polarity, "gamma": self.gamma or 1.0, "radius_px": radius, "rig": rig}

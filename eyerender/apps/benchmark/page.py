@@ -1,0 +1,529 @@
+"""The report of an extractor benchmark, from its JSON and rows: table, error plots, breakdowns, reasons."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...optics.ellipse import Ellipse
+from ...report.page import Card, Figure, Page, Section, Table, write_page
+from ...report.style import TARGET, figure, legend_above, svg
+
+Row = dict[str, Any]
+
+# The colours are Okabe and Ito's; an extractor keeps its colour and marker in every figure.
+_LOOK = (
+    ("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "^"), ("#CC79A7", "D"), ("#E69F00", "v"), ("#56B4E9", "P"),
+    ("#777777", "X"), ("#000000", "*"),
+)  # fmt: skip
+_OUTCOMES = (("right", "#0072B2"), ("wrong", "#D55E00"), ("none", "#bbbbbb"), ("error", "#222222"))
+_PANELS = 4
+_GAMMA = {"folder": "stated by the folder", "given": "given", "assumed": "assumed, because nothing states it"}
+_MOST = 24  # thumbnails of an extractor
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Thumbnail:
+    """A failure: the extractor, the kind of failure, the image (h, w), the true pupil and the reported one."""
+
+    extractor: str
+    text: str
+    image: NDArray[Any]
+    truth: Ellipse | None
+    found: Ellipse | None
+
+
+def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: Sequence[Thumbnail] = ()) -> None:
+    """Write one self-contained HTML file from the benchmark's JSON, its rows (extractor and image), and thumbnails."""
+    entries, cards = data["extractors"], _cards(data)
+    varying = [name for name in data["factors"] if any(e["breakdown"].get(name) for e in entries)]
+    sections = [
+        Section(
+            "Results",
+            tables=(_pupil_table(entries), _rate_table(entries), _glint_table(entries), _recall_table(entries)),
+        ),
+        Section(
+            "Compared in pairs",
+            [
+                "The same images, extractor against extractor. An image is a success if its pupil is right, or if none "
+                "is reported where none is. p is the exact McNemar test's, not corrected for the number of pairs. "
+                "Errors are compared on the pupils that both find right."
+            ],
+            tables=(_pair_table(data["pairs"]), _common_table(data["common"])),
+        ),
+        Section("Errors", figures=_error_figures(data, rows)),
+        Section(
+            "Other thresholds",
+            ["Share of the images with a pupil that are right, if another overlap or another error is allowed."],
+            [Figure(curve_figure(entries), "Overlap, centre error in radii of the pupil, and confidence.")],
+        ),
+        Section(
+            "Breakdown",
+            [
+                "The figures show the median centre error of the right pupils, and the share of right pupils, against "
+                "every quantity that varies in this folder. Noise, blur and contrast are the folder's own figures if "
+                "it states them; otherwise they are measured along the true outline."
+            ],
+            [Figure(factor_figure(data, name), f"By {data['factors'][name]['what']}.") for name in varying],
+            [_factor_table(data, name) for name in varying],
+        ),
+        Section(
+            "Hard conditions",
+            [
+                "Share of right answers on the images of each condition; an image may be of several. Where no pupil is "
+                "seen, the answer that there is none is right."
+            ],
+            tables=(_condition_table(data),),
+        ),
+        Section("Failures", figures=_thumbnail_figures(thumbnails), tables=(_failure_table(entries),)),
+        Section("How this was made", _how(data), tables=(_convention_table(entries),)),
+    ]
+    if data["not_run"]:
+        table = Table(
+            header=("extractor", "why"),
+            rows=[(e["name"], e["reason"]) for e in data["not_run"]],
+            caption="Not run",
+            wide=(1,),
+        )
+        sections[6] = replace(sections[6], tables=(_failure_table(entries), table))
+    write_page(path, Page(f"{data['folder']}: extractors compared", _lead(data), cards, sections))
+
+
+def _cards(data: Row) -> list[Card]:
+    """Return the cards at the top of the report."""
+    entries, edge = data["extractors"], data["edge"]
+    best = [e for e in entries if e["summary"]["right"]]
+    cards = [Card(f"{data['with_pupil']} of {data['images']}", "images that show a pupil")]
+    if edge["n"]:
+        text = f"noise / pupil-iris step (DN of 8 bits) / sigma of the blurred edge (px), medians; {edge['source']}"
+        cards.append(Card(f"{edge['noise_dn']:.2f} / {edge['step_dn']:.1f} / {edge['sigma_px']:.2f}", text))
+    if best:
+        least = min(best, key=lambda e: e["summary"]["centre_px"]["median"])
+        cards.append(
+            Card(f"{least['summary']['centre_px']['median']:.4f} px", f"least median centre error: {least['name']}")
+        )
+        most = max(best, key=lambda e: e["summary"]["rates"]["right"])
+        cards.append(Card(_percent(most["summary"]["rates"]["right"]), f"most pupils right: {most['name']}"))
+    return cards
+
+
+def _thumbnail_figures(thumbnails: Sequence[Thumbnail]) -> list[Figure]:
+    names = dict.fromkeys(one.extractor for one in thumbnails)
+    caption = (
+        "{}: the first images of every kind of failure, the most frequent kinds first. The true pupil is green, the "
+        "reported one dashed and orange; the contrast is stretched."
+    )
+    return [
+        Figure(thumbnail_figure([t for t in thumbnails if t.extractor == name][:_MOST]), caption.format(name))
+        for name in names
+    ]
+
+
+def thumbnail_figure(thumbnails: Sequence[Thumbnail]) -> str:
+    """Draw failures side by side, each cropped to a few pupil sizes."""
+    columns = min(len(thumbnails), _PANELS)
+    rows = math.ceil(len(thumbnails) / columns)
+    with figure(11.0, 3.2 * rows, columns, rows) as (fig, axes):
+        for ax, one in zip(np.ravel(axes), thumbnails, strict=False):
+            image = np.asarray(one.image, dtype=np.float64)
+            (height, width), shown = image.shape, one.truth or one.found
+            x0, y0, x1, y1 = 0, 0, width, height
+            if shown is not None:
+                (cx, cy), reach = shown.centre_px, 3.0 * float(shown.semi_axes_px[0]) + 10.0
+                x0, x1 = (round(float(np.clip(cx + side * reach, 0, width))) for side in (-1, 1))
+                y0, y1 = (round(float(np.clip(cy + side * reach, 0, height))) for side in (-1, 1))
+            part = image[y0:y1, x0:x1] if x1 > x0 and y1 > y0 else image
+            low, high = np.percentile(part, (0.5, 99.5))
+            extent = (x0 - 0.5, x0 + part.shape[1] - 0.5, y0 + part.shape[0] - 0.5, y0 - 0.5)
+            ax.imshow(part, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), extent=extent, interpolation="nearest")
+            for ellipse, colour, style in ((one.truth, "#3ddc5a", "-"), (one.found, "#E69F00", "--")):
+                if ellipse is not None:
+                    ax.plot(*ellipse.points(120).T, style, color=colour, lw=1.2)
+            ax.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
+            ax.set_title("\n".join(textwrap.wrap(one.text, 40)[:4]), fontsize=7)
+        return svg(fig)
+
+
+def look(names: Sequence[str], name: str) -> tuple[str, str]:
+    """Return colour and marker of an extractor."""
+    return _LOOK[list(names).index(name) % len(_LOOK)]
+
+
+def cumulative_figure(data: Row, rows: Sequence[Row]) -> str:
+    """Draw the share of images with a pupil whose centre error is below x; failures count as infinite errors."""
+    names = [e["name"] for e in data["extractors"]]
+    with figure(9.0, 4.2) as (fig, ax):
+        for name in names:
+            mine = [r for r in rows if r["extractor"] == name and r["outcome"] not in ("absent", "false")]
+            errors = np.sort([r["centre_px"] for r in mine if r["centre_px"] is not None])
+            if len(errors):
+                share = np.arange(1, len(errors) + 1) / len(mine)
+                ax.step(np.maximum(errors, 1e-5), share, where="post", color=look(names, name)[0], lw=1.8, label=name)
+        bounds = np.array([r["bound_sigma_px"] for r in rows[: data["images"]] if r["bound_sigma_px"] is not None])
+        if len(bounds):
+            # This is a radial error of two equal normal components: P(e < x) = 1 - exp(-x^2 / (2 sigma^2)).
+            x = np.geomspace(bounds.min() * 0.05, bounds.max() * 5.0, 200)
+            share = (1.0 - np.exp(-0.5 * (x[:, None] / bounds) ** 2)).mean(axis=1)
+            ax.plot(x, share, color=TARGET, lw=1.2, ls="--", label="Cramér-Rao bound")
+        ax.set_xscale("log")
+        ax.set(xlabel="pupil centre error (px)", ylabel="share of the images", ylim=(0, 1.02))
+        if names:
+            fig.legend(loc="outside upper center", ncols=4, frameon=False)
+        return svg(fig)
+
+
+def outcome_figure(entries: Sequence[Row]) -> str:
+    """Draw the outcomes right, wrong, none and error as shares of the images with a pupil."""
+    with figure(9.0, 1.2 + 0.4 * len(entries)) as (fig, ax):
+        y = np.arange(len(entries))
+        left = np.zeros(len(entries))
+        for outcome, colour in _OUTCOMES:
+            share = np.array([e["summary"]["rates"][outcome] or 0.0 for e in entries])
+            ax.barh(y, share, left=left, height=0.62, color=colour, label=outcome)
+            left += share
+        ax.set_yticks(y, [e["name"] for e in entries])
+        ax.set_ylim(len(entries) - 0.5, -0.5)
+        ax.grid(axis="y", visible=False)
+        ax.set(xlabel="share of the images with a pupil", xlim=(0, 1))
+        fig.legend(loc="outside upper center", ncols=4, frameon=False)
+        return svg(fig)
+
+
+def curve_figure(entries: Sequence[Row]) -> str:
+    """Draw the share of right pupils over overlap, centre error and required confidence."""
+    names = [e["name"] for e in entries]
+    with figure(11.0, 3.6, 3) as (fig, axes):
+        for e in entries:
+            colour = look(names, e["name"])[0]
+            curves = e["curves"]
+            for ax, key in zip(axes, ("iou", "centre_radii"), strict=False):
+                share = [np.nan if y is None else y for y in curves[key]["share"]]
+                ax.plot(curves[key]["x"], share, color=colour, lw=1.6, label=e["name"])
+            sure = curves["confidence"]
+            if sure is not None:
+                right = [np.nan if y is None else y for y in sure["right"]]
+                axes[2].plot(sure["answered"], right, color=colour, lw=1.6)
+        axes[0].set(xlabel="IoU, at least", ylabel="share of the images", ylim=(0, 1.02))
+        axes[1].set(xlabel="centre error (radii), at most", ylim=(0, 1.02), xscale="log")
+        axes[2].set(
+            xlabel="share answered with a confidence", ylabel="right ones of these", xlim=(0, 1), ylim=(0, 1.02)
+        )
+        legend_above(fig, axes[0], 4)
+        return svg(fig)
+
+
+def vector_figure(names: Sequence[str], everyone: Sequence[str], rows: Sequence[Row]) -> str:
+    """Draw centre errors as vectors, one panel per extractor with its own scale; up to four panels."""
+    with figure(11.0, 3.3, _PANELS) as (fig, axes):
+        for ax, name in zip(axes, names, strict=False):
+            colour, marker = look(everyone, name)
+            mine = [r for r in rows if r["extractor"] == name and r["outcome"] == "right"]
+            xy = np.array([(r["centre_x_px"], r["centre_y_px"]) for r in mine]).reshape(-1, 2)
+            limit = 1.15 * float(np.abs(xy).max()) if len(xy) else 1.0
+            limit = max(limit, 1e-3)
+            ax.axhline(0, color="#888888", lw=0.8)
+            ax.axvline(0, color="#888888", lw=0.8)
+            ax.scatter(*xy.T, s=20, color=colour, marker=marker, edgecolor="white", linewidth=0.4)
+            if len(xy):
+                ax.scatter(*xy.mean(axis=0), marker="+", s=130, color=TARGET)
+            ax.set(
+                xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", title=f"{name} (n = {len(xy)})",
+                xlabel="x (px)", ylabel="y (px, down)",
+            )  # fmt: skip
+            ax.locator_params(nbins=4)
+        for ax in axes[len(names) :]:
+            ax.axis("off")  # the layout would ignore invisible axes
+        return svg(fig)
+
+
+def factor_figure(data: Row, name: str) -> str:
+    """Draw the median centre error and the share of right pupils over one factor."""
+    entries = data["extractors"]
+    names = [e["name"] for e in entries]
+    what = data["factors"][name]
+    with figure(11.0, 3.5, 2) as (fig, axes):
+        for entry in entries:
+            colour, marker = look(names, entry["name"])
+            bins = entry["breakdown"].get(name, [])
+            x = [b["median"] for b in bins]
+            shape = {"color": colour, "marker": marker, "ms": 6, "lw": 1.3, "label": entry["name"]}
+            errors = [np.nan if b["centre_px"]["median"] is None else max(b["centre_px"]["median"], 1e-5) for b in bins]
+            axes[0].plot(x, errors, **shape)
+            axes[1].plot(x, [b["rates"]["right"] for b in bins], **shape)
+        bins = entries[0]["breakdown"].get(name, [])
+        bound = _bounds(entries, name)
+        if any(b is not None for b in bound):
+            y = [np.nan if b is None else b for b in bound]
+            axes[0].plot([b["median"] for b in bins], y, color=TARGET, lw=1.2, ls="--", label="Cramér-Rao bound")
+        axes[0].set_yscale("log")
+        axes[0].set(ylabel="median centre error (px)")
+        axes[1].set(ylabel="share of pupils right", ylim=(-0.03, 1.05))
+        for ax in axes:
+            ax.set(xlabel=f"{what['what']} ({what['unit']})" if what["unit"] != "1" else what["what"])
+        legend_above(fig, axes[0], 5)
+        return svg(fig)
+
+
+def _bounds(entries: Sequence[Row], name: str) -> list[float | None]:
+    """Compute the median bound in each bin, from the bounds that each extractor states for its right pupils."""
+    columns = [[b["efficiency"]["bound_median_px"] for b in e["breakdown"].get(name, [])] for e in entries]
+    return [next((v for v in column if v is not None), None) for column in zip(*columns, strict=True)]
+
+
+def _error_figures(data: Row, rows: Sequence[Row]) -> list[Figure]:
+    entries = data["extractors"]
+    names = [e["name"] for e in entries]
+    out = [
+        Figure(outcome_figure(entries), "Outcome for every image that shows a pupil."),
+        Figure(
+            cumulative_figure(data, rows),
+            "Share of the images with a pupil whose centre error is below a given value. A curve that ends below 1 "
+            "lost the other pupils. Further left and up is better.",
+        ),
+    ]
+    for k in range(0, len(names), _PANELS):
+        some = names[k : k + _PANELS]
+        caption = (
+            "Centre errors, found minus true, of the right pupils. The cross is their mean, the bias. Scales differ."
+        )
+        out.append(Figure(vector_figure(some, names, rows), caption if k + _PANELS >= len(names) else ""))
+    return out
+
+
+def _pupil_table(entries: Sequence[Row]) -> Table:
+    header = (
+        "extractor", "right", "centre error: median", "95 %", "bias x", "bias y", "efficiency", "bias a", "bias b",
+        "boundary", "IoU",
+    )  # fmt: skip
+    rows = []
+    for e in entries:
+        s = e["summary"]
+        bias, axes = s["centre_bias_px"] or (None, None), s["semi_axes_bias_px"] or (None, None)
+        rows.append(
+            (
+                e["name"], f"{s['right']} of {s['with_pupil']}", _px(s["centre_px"]["median"]),
+                _px(s["centre_px"]["p95"]), *map(_signed, bias), _number(s["efficiency"]["value"], 2),
+                *map(_signed, axes), _px(s["boundary_px"]["median"]), _number(s["iou"]["median"], 4),
+            )
+        )  # fmt: skip
+    caption = (
+        "Errors of the right pupils, in px. Efficiency: Cramér-Rao bound divided by the error, median of the ratio; "
+        "1 reaches the bound. Boundary: mean distance of the true outline, median over the images. Times are in "
+        "times.json."
+    )
+    return Table(header=header, rows=rows, caption=caption)
+
+
+def _condition_table(data: Row) -> Table:
+    """Return one row per condition that occurs: its images, and each extractor's share of right answers."""
+    rows = []
+    for name, condition in data["conditions"].items():
+        if condition["images"]:
+            shares = []
+            for entry in data["extractors"]:
+                s = entry["conditions"][name]
+                absent = s["without_pupil"] - s["false"] - (s["errors"] - s["error"])
+                shares.append(_percent((s["right"] + absent) / s["images"]))
+            rows.append((name, condition["what"], str(len(condition["images"])), *shares))
+    header = ("condition", "what", "images", *(e["name"] for e in data["extractors"]))
+    return Table(header=header, rows=rows, caption="Right answers by condition", wide=(1,))
+
+
+def _rate_table(entries: Sequence[Row]) -> Table:
+    rows = []
+    for e in entries:
+        s = e["summary"]
+        spans = s["intervals"]
+        rates = [_percent(s["rates"][o]) for o, _ in _OUTCOMES]
+        rates[:1] = [rates[0], _span(spans["right"]["wilson"]), _span(spans["right"]["subjects"])]
+        absent = f"{s['false']} of {s['without_pupil']}" if s["without_pupil"] else "-"
+        worst = s["centre_px_of_all_found"]
+        rows.append((e["name"], *rates, absent, _px(worst["p95"]), _px(worst["worst"])))
+    header = (
+        "extractor", "right", "95 %", "95 %, subjects", "wrong", "none", "error", "pupil where none is",
+        "all found: 95 %", "worst",
+    )  # fmt: skip
+    caption = (
+        "Rates, and the centre errors (px) including wrong pupils. The first interval is Wilson's for independent "
+        "images; the second resamples subjects. results.json has both for every rate."
+    )
+    return Table(header=header, rows=rows, caption=caption)
+
+
+def _pair_table(pairs: Sequence[Row]) -> Table:
+    rows = []
+    for pair in pairs:
+        medians = pair["centre_px"] or (None, None)
+        counts = (str(pair["only_first"]), str(pair["only_second"]), f"{pair['p']:.2g}", str(pair["common"]))
+        rows.append((pair["first"], pair["second"], *counts, *map(_px, medians)))
+    header = ("first", "second", "only first", "only second", "p", "both right", "first: median error", "second")
+    return Table(header=header, rows=rows, caption="Successes of only one of two extractors.", folded=len(rows) > 20)
+
+
+def _common_table(common: Row) -> Table:
+    rows = [
+        (name, _px(e["centre_px"]["median"]), _px(e["centre_px"]["p95"]), _px(e["boundary_px"]["median"]))
+        for name, e in common["extractors"].items()
+    ]
+    caption = f"Errors (px) on the {common['n']} pupils that all of these find right."
+    return Table(header=("extractor", "centre error: median", "95 %", "boundary"), rows=rows, caption=caption)
+
+
+def _glint_table(entries: Sequence[Row]) -> Table:
+    rows = []
+    for e in entries:
+        g = e["summary"]["glints"]
+        if g is None:
+            rows.append((e["name"], *["-"] * 8))
+            continue
+        swaps = f"{g['swapped']} of {g['named']}" if g["named"] else "-"
+        rows.append(
+            (
+                e["name"], f"{g['matched']} of {g['true']}", _percent(g["recall"]), _percent(g["precision"]), swaps,
+                str(g["unnamed"]), _px(g["error_px"]["median"]), _px(g["error_px"]["p95"]),
+                ", ".join(f"{n} {kind}" for kind, n in g["false_kinds"].items()) or "-",
+            )
+        )  # fmt: skip
+    header = (
+        "extractor",
+        "found",
+        "recall",
+        "precision",
+        "identity swaps",
+        "unnamed",
+        "error: median",
+        "95 %",
+        "false",
+    )
+    return Table(
+        header=header,
+        rows=rows,
+        caption="Glints: a reported glint matches a true one within 2 px, or within its radius and 1 px if that is "
+        "more. Errors are in px. Swaps: matches with the wrong light, of the matches with a light. Unnamed: matches "
+        "without a light, although the lights are known. A dash means that the extractor does not search for glints.",
+        wide=(8,),
+    )
+
+
+def _recall_table(entries: Sequence[Row]) -> Table:
+    """Return the recall of glints by saturation, visible share and position."""
+    rows = []
+    for e in entries:
+        groups = (e["summary"]["glints"] or {}).get("recall_by", {})
+        for group, members in groups.items():
+            for name, g in members.items():
+                rows.append((e["name"], group, name, f"{g['matched']} of {g['true']}", _percent(g["recall"])))
+    header = ("extractor", "by", "glints", "found", "recall")
+    return Table(header=header, rows=rows, caption="Recall of glints by their look and place.")
+
+
+def _factor_table(data: Row, name: str) -> Table:
+    what = data["factors"][name]
+    rows = []
+    for e in data["extractors"]:
+        for b in e["breakdown"].get(name, []):
+            span = f"{b['low']:.4g}" if b["low"] == b["high"] else f"{b['low']:.4g} to {b['high']:.4g}"
+            bias = b["centre_bias_px"] or (None, None)
+            g = b["glints"]
+            rows.append(
+                (
+                    e["name"], span, str(b["with_pupil"]), *(_percent(b["rates"][o]) for o, _ in _OUTCOMES),
+                    _px(b["centre_px"]["median"]), _px(b["centre_px"]["p95"]), _signed(bias[0]), _signed(bias[1]),
+                    _number(b["efficiency"]["value"], 2), _px(b["boundary_px"]["median"]),
+                    _percent(g["recall"]) if g else "-",
+                )
+            )  # fmt: skip
+    header = (
+        "extractor", what["what"] if what["unit"] == "1" else f"{what['what']} ({what['unit']})", "images", "right",
+        "wrong", "none", "error", "centre: median", "95 %", "bias x", "bias y", "efficiency", "boundary",
+        "glint recall",
+    )  # fmt: skip
+    return Table(header=header, rows=rows, caption=f"By {what['what']}", folded=True)
+
+
+def _failure_table(entries: Sequence[Row]) -> Table:
+    rows = [
+        (e["name"], f["outcome"], str(f["count"]), f["reason"], f["first"])
+        for e in entries
+        for f in e["failures"]
+    ]  # fmt: skip
+    caption = "Every reason why an image has no right pupil." if rows else "Every extractor found every pupil right."
+    return Table(
+        header=("extractor", "outcome", "images", "reason", "first image"), rows=rows, caption=caption, wide=(3,)
+    )
+
+
+def _convention_table(entries: Sequence[Row]) -> Table:
+    rows = []
+    for e in entries:
+        c = e["conventions"]
+        words = "-" if c is None else (
+            f"(0, 0) is a pixel's {c['pixel_origin']}; {c['axes']} axes; angle of the {c['angle_of']} axis in "
+            f"{c['angle_unit']}, positive {c['angle_toward']}"
+        )  # fmt: skip
+        rows.append((e["name"], e["given"], e["says"] or "-", words))
+    return Table(
+        header=("extractor", "given as", "calls itself", "declares"),
+        rows=rows,
+        caption="Declared conventions; answers are converted before they are compared.",
+        wide=(3,),
+    )
+
+
+def _how(data: Row) -> list[str]:
+    versions = ", ".join(f"{name} {v}" for name, v in data["versions"].items())
+    gammas = "; ".join(f"{g['gamma']:g} for {g['images']} images ({_GAMMA[g['from']]})" for g in data["gamma"])
+    return [
+        f"Each extractor uses one thread. {versions}.",
+        f"Encoding gamma given to the extractors: {gammas}.",
+        *(f"{e['name']}: {e['suggested_origin']['text']}." for e in data["extractors"] if e["suggested_origin"]),
+        "Cramér-Rao bound of the centre, per axis: (s / step) sqrt(2 sigma_b / (sqrt(pi) sqrt(a b))). Here s is "
+        "the noise, step the grey-level step from pupil to iris, and sigma_b the blur of the edge, including the "
+        "pixel. The median distance is 1.177 times the bound. It holds for a fully visible outline. In rendered "
+        "images, the true outline is not exactly an ellipse and the renderer adds noise, so other errors "
+        "dominate.",
+    ]
+
+
+def _lead(data: Row) -> list[str]:
+    """What is compared, and when a pupil counts as right."""
+    lead = [
+        "Every extractor ran in its own process, on the same images and with the same information: the image, its bit "
+        "depth and, if the folder has a rig, the rig and the range of likely pupil sizes, but never the truth.",
+        "A pupil is right if the intersection over union of its ellipse and the true one is above 0.9, and wrong for "
+        "another ellipse. None means that the extractor reported no pupil, and error that it gave no usable answer. "
+        "The errors are those of the right pupils.",
+    ]
+    if data.get("centres_only"):
+        lead.append(
+            f"{data['centres_only']} images have labels of the pupil's centre only. There, a pupil is right if its "
+            "centre is within 5 px, and overlap, axes and boundary are unknown."
+        )
+    return lead
+
+
+def _px(value: float | None) -> str:
+    return _number(value, 4)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _span(ends: Sequence[float] | None) -> str:
+    return "-" if ends is None else f"{100 * ends[0]:.1f} to {100 * ends[1]:.1f} %"
+
+
+def _signed(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.4f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.0f} %" if value in (0.0, 1.0) else f"{100 * value:.1f} %"

@@ -1,0 +1,92 @@
+"""What was found in one dataset."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ...base.arrays import Floats
+from .duplicates import Pair
+from .faults import KINDS
+from .outliers import Outlier
+from .reading import Contents
+from .statistics import Distribution, strongest
+
+_LISTED = 100  # images of each kind of fault in the JSON
+_PAIRS = 40
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inspection:
+    """What was found in one dataset.
+
+    Attributes:
+        contents: what was read.
+        splits: split -> number of images and set of subjects.
+        shared: subject -> splits, of subjects in more than one.
+        equal: places of pictures with the same pixels, by groups.
+        near: pairs of near-duplicates.
+        outliers: the most unusual images.
+        distributions: of each column.
+        correlated: names of the columns that vary, and (m, m) their rank correlations.
+    """
+
+    contents: Contents
+    splits: dict[str, tuple[int, set[int]]]
+    shared: dict[int, list[str]]
+    equal: list[list[int]]
+    near: list[Pair]
+    outliers: list[Outlier]
+    distributions: dict[str, Distribution]
+    correlated: tuple[list[str], Floats]
+
+    @property
+    def strongest(self) -> list[tuple[str, str, float]]:
+        """The strongest correlations."""
+        return strongest(*self.correlated, _PAIRS)
+
+    def faults(self) -> dict[str, list[tuple[int, str]]]:
+        """Places and details of the faults of each kind, in the order of `KINDS`."""
+        found: dict[str, list[tuple[int, str]]] = defaultdict(list)
+        for at in sorted(self.contents.faults):
+            for fault in self.contents.faults[at]:
+                found[fault.kind].append((at, fault.detail))
+        return {kind: found[kind] for kind in KINDS if kind in found}
+
+    def name(self, at: int) -> str:
+        """Name of an image, or of its line."""
+        return self.contents.names[at] or f"line {int(self.contents.rows[at]) + 1}"
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what the JSON holds of the dataset."""
+        c = self.contents
+        return {
+            "path": str(c.folder.path),
+            "images": len(c.folder.entries),
+            "images_read": len(c),
+            "unfinished": bool(c.folder.unfinished),
+            "splits": {name: {"images": n, "subjects": len(own)} for name, (n, own) in self.splits.items()},
+            "subjects_in_two_splits": {str(subject): names for subject, names in self.shared.items()},
+            "groups": {name: _counts(values) for name, values in c.groups.items()},
+            "faults": {kind: self._listed(found) for kind, found in self.faults().items()},
+            "outliers": [
+                {"image": self.name(o.at), "distance": o.distance, "reasons": [asdict(r) for r in o.reasons]}
+                for o in self.outliers
+            ],
+            "near_duplicates": [[self.name(p.first), self.name(p.second), p.correlation] for p in self.near[:_LISTED]],
+            "columns": {name: d.to_mapping() for name, d in self.distributions.items()},
+            "correlations": [list(pair) for pair in self.strongest],
+        }
+
+    def _listed(self, found: Sequence[tuple[int, str]]) -> dict[str, Any]:
+        images = [{"image": self.name(at), "detail": detail} for at, detail in found[:_LISTED]]
+        return {"count": len(found), "images": images}
+
+
+def _counts(values: Any) -> dict[str, int]:
+    kinds, counts = np.unique([str(v) for v in values if v is not None], return_counts=True)
+    return {str(kind): int(count) for kind, count in zip(kinds, counts, strict=True)}

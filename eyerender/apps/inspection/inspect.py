@@ -1,0 +1,140 @@
+"""The command inspect: read one dataset or two, find what is wrong or unusual, and write a page."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...base.errors import InputError
+from ...base.progress import Progress
+from ...base.storage.files import refuse_special
+from .comparing import Shift, only_in, shares, shifts
+from .duplicates import equal_pictures, near_duplicates
+from .faults import KINDS, Fault
+from .found import Inspection
+from .outliers import outliers
+from .reading import Contents, matrix, read, split_of_subjects
+from .statistics import distribution, rank_correlations
+
+SCHEMA = "eyerender/inspection/1"
+IMAGES = 100_000
+"""Images that are read of a dataset, by default at most."""
+
+
+def inspect(
+    folder: str | Path,
+    other: str | Path | None = None,
+    *,
+    output: str | Path | None = None,
+    images: int = IMAGES,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Look into a dataset, and write a page about it.
+
+    Args:
+        folder: the dataset's folder.
+        other: a second dataset, to which it is compared.
+        output: the HTML page; None: no page.
+        images: the largest number of images that are read of a dataset, spread evenly over it.
+        workers: processes that read them; the result does not depend on their number.
+        progress: called with (images read, images to read, what).
+
+    Returns:
+        What was found (`eyerender/inspection/1`): `datasets`, one or two, and `difference`.
+
+    Raises:
+        InputError: a folder is not a dataset, or the page cannot be written to.
+        EyerenderError: the page cannot be written.
+    """
+    if images < 1:
+        raise InputError("must be >= 1", source="--images")
+    if output is not None:
+        refuse_special(output)
+    paths = [folder] if other is None else [folder, other]
+    found = [examine(read(path, limit=images, workers=workers, progress=progress)) for path in paths]
+    moved = shifts(found[0].contents, found[1].contents) if other is not None else []
+    data = {
+        "schema": SCHEMA,
+        "kinds": dict(KINDS),
+        "datasets": [one.to_mapping() for one in found],
+        "difference": _difference(found, moved) if other is not None else None,
+    }
+    if output is not None:
+        from .page import write  # matplotlib loads slowly
+
+        write(Path(output), found, moved)
+    return data
+
+
+def examine(contents: Contents) -> Inspection:
+    """Find out all about what was read of one dataset; faults of several images are added to `contents`."""
+    splits = split_of_subjects(contents)
+    shared = _shared(contents, splits)
+    _same_frames(contents)
+    equal = equal_pictures(contents.digests)
+    for group in equal:
+        for at in group[1:]:
+            contents.add(at, Fault("same picture", f"as {contents.names[group[0]]}"))
+    near = near_duplicates(contents.thumbnails, contents.digests)
+    for pair in near:
+        contents.add(pair.second, Fault("near-duplicate", f"of {contents.names[pair.first]}: {pair.correlation:.5f}"))
+    distributions = {name: distribution(contents, name) for name in sorted(contents.columns)}
+    varying = [name for name, d in distributions.items() if len(d.counts)]
+    values = matrix(contents, varying) if varying else np.zeros((len(contents), 0))
+    return Inspection(
+        contents=contents,
+        splits=splits,
+        shared=shared,
+        equal=equal,
+        near=near,
+        outliers=outliers(values, varying),
+        distributions=distributions,
+        correlated=(varying, rank_correlations(values)),
+    )
+
+
+def _shared(contents: Contents, splits: Mapping[str, tuple[int, set[int]]]) -> dict[int, list[str]]:
+    """Subjects that are in more than one split; the first image of each is at fault."""
+    places: dict[int, list[str]] = defaultdict(list)
+    for name, (_, subjects) in splits.items():
+        for subject in subjects:
+            places[subject].append(name)
+    shared = {subject: names for subject, names in sorted(places.items()) if len(names) > 1}
+    for subject, names in shared.items():
+        own = np.flatnonzero(contents.subjects == subject)
+        if len(own):
+            contents.add(int(own[0]), Fault("subject in two splits", f"subject {subject}: {', '.join(names)}"))
+    return shared
+
+
+def _same_frames(contents: Contents) -> None:
+    """Note lines that name a frame, or a file, that another line has."""
+    files: dict[str, int] = {}
+    frames: dict[tuple[Any, ...], int] = {}
+    cameras, eyes = (contents.groups.get(name, [None] * len(contents)) for name in ("camera", "eye"))
+    for at, name in enumerate(contents.names):
+        if not name:
+            continue
+        first = files.setdefault(name, at)
+        frame = (int(contents.frames[at]), cameras[at], eyes[at])
+        twin = frames.setdefault(frame, at) if frame[0] >= 0 else at
+        if first != at:
+            contents.add(at, Fault("same frame", f"its file is that of line {int(contents.rows[first]) + 1}"))
+        elif twin != at:
+            contents.add(at, Fault("same frame", f"frame {frame[0]}, as {contents.names[twin]}"))
+
+
+def _difference(found: Sequence[Inspection], moved: Sequence[Shift]) -> dict[str, Any]:
+    first, second = (one.contents for one in found)
+    return {
+        "columns": [asdict(shift) for shift in moved],
+        "groups": [{"group": name, "distance": d, "shares": rows} for name, d, rows in shares(first, second)],
+        "only_in_first": only_in(first, second),
+        "only_in_second": only_in(second, first),
+    }

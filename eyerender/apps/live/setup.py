@@ -1,0 +1,209 @@
+"""State of one tab of the live page: a scene modified by its knobs, and the selected frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...base.arrays import Floats
+from ...base.errors import InputError
+from ...rig.camera import Camera
+from ...rig.rig import Rig
+from ...scene import Frames, Scene
+from ...scene.observation import EYES
+from ...scene.scene import demand_d
+from ...scene.spec import MOST_ACCOMMODATION_D, EyeDirection, SceneSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setup:
+    """A scene with one fixation and one head position, selected from a scene that may have many.
+
+    Methods that change something return a new setup, and raise `InputError` for a value that does not fit.
+
+    Attributes:
+        origin: the spec as it was loaded, with all of its fixations and head positions.
+        scene: the current scene, with one fixation and one head position.
+        eye: the selected eye, "right" or "left".
+        camera: number of the selected camera.
+        fixation: number of the current fixation of `origin`; None for a gaze set by the user.
+        head: number of the head position of `origin`.
+    """
+
+    origin: SceneSpec
+    scene: Scene
+    eye: str
+    camera: int = 0
+    fixation: int | None = 0
+    head: int = 0
+
+    @classmethod
+    def of(cls, scene: Scene) -> Self:
+        """Start with the first frame of a scene."""
+        spec = scene.spec
+        # Eyes respond to the mean of all targets, so they must not respond to the current one only.
+        if spec.person is not None or spec.subject.accommodation_d == "targets":
+            demand = min(demand_d(spec, scene.targets_mm), MOST_ACCOMMODATION_D)
+            scene = scene.with_({"subject.accommodation_d": demand})
+        start = cls(origin=spec, scene=scene, eye=spec.subject.eyes[0])
+        return start.following(0).with_head(0)
+
+    @property
+    def fixations(self) -> int:
+        """Number of fixations of the loaded scene."""
+        targets = self._targets()
+        return len(targets) if targets is not None else len(self.origin.poses or ())
+
+    @property
+    def apex_mm(self) -> Floats:
+        """Apex of the selected unrotated eye, (3,) mm in the world."""
+        head = np.array(self.scene.spec.subject.head_positions_mm[0])
+        return np.asarray(self.scene.eye_position_mm(self.eye) + head)
+
+    def frames(self) -> Frames:
+        """Compute all frames of the current fixation: a row for each camera and eye."""
+        return self.scene.frames()
+
+    def row(self, frames: Frames) -> int:
+        """Return the selected row of `frames`."""
+        index = frames.index
+        return int(np.flatnonzero((index.camera == self.camera) & (index.eye == EYES.index(self.eye)))[0])
+
+    def changed(self, changes: Mapping[str, Any]) -> Self:
+        """Change keys of the scene by their paths."""
+        return replace(self, scene=self.scene.with_(changes))
+
+    def looking(self, azimuth_deg: float, elevation_deg: float) -> Self:
+        """Turn the optic axes of the eyes in a direction, ignoring targets."""
+        return replace(self, scene=self.scene.with_(gaze_deg=(azimuth_deg, elevation_deg)), fixation=None)
+
+    def following(self, fixation: int) -> Self:
+        """Fixate a target of the loaded scene, or take one of its poses."""
+        if not 0 <= fixation < self.fixations:
+            raise InputError(f"there is no fixation {fixation}, only {self.fixations}", path="fixation")
+        targets = self._targets()
+        if targets is not None:
+            scene = self.scene.with_(target_mm=targets[fixation])
+        else:
+            pose = (self.origin.poses or ())[fixation]
+            scene = self.scene.with_(gaze_deg=(pose.azimuth_deg, pose.elevation_deg))
+        return replace(self, scene=scene, fixation=fixation)
+
+    def with_head(self, head: int) -> Self:
+        """Move the head to one of the positions of the loaded scene."""
+        places = self.origin.subject.head_positions_mm
+        return replace(self.changed({"subject.head_positions_mm": [places[head]]}), head=head)
+
+    def with_opening(self, share: float) -> Self:
+        """Open the lids to a share of their opening: 1 open, 0 shut."""
+        if self.scene.spec.region is None:
+            raise InputError("the scene has no lids; add a region to it", path="region.blink")
+        return self.changed({"region.blink": round(1 - share, 6)})
+
+    def with_light(self, light: int, **changes: Any) -> Self:
+        """Change a light; rings are replaced by single LEDs (`Rig.with_light`)."""
+        return self._with_rig(self.scene.spec.rig.with_light(light, **changes))
+
+    def with_light_added(self, light: int) -> Self:
+        """Add a copy of a light, shifted sideways by a twelfth of its distance to the eye."""
+        place = self.scene.rig.lights[light].position_mm
+        aside = np.cross(place - self.apex_mm, [0.0, 0.0, 1.0])
+        if not aside.any():
+            aside = np.array([0.0, np.linalg.norm(place - self.apex_mm), 0.0])
+        return self._with_rig(self.scene.spec.rig.with_light_copied(light, np.round(aside / 12, 3)))
+
+    def without_light(self, light: int) -> Self:
+        """Remove a light."""
+        return self._with_rig(self.scene.spec.rig.without_light(light))
+
+    def with_camera_added(self, camera: int) -> Self:
+        """Add a copy of a camera at the same position, with another name."""
+        cameras = self.scene.spec.rig.cameras
+        copy = {**cameras[camera].to_mapping(), "name": f"camera {len(cameras)}"}
+        return self.changed({"rig.cameras": [*(one.to_mapping() for one in cameras), copy]})
+
+    def without_camera(self, camera: int) -> Self:
+        """Remove a camera and select the first one."""
+        return replace(self._with_rig(self.scene.spec.rig.without_camera(camera)), camera=0)
+
+    def with_focal_length(self, camera: int, focal_length: float) -> Self:
+        """Change a camera's focal length, in the unit used by the scene (mm or px)."""
+        key, _ = self.focal_length(camera)
+        return self.changed({f"rig.cameras.{camera}.{key}": focal_length})
+
+    def focal_length(self, camera: int) -> tuple[str, float | None]:
+        """Return key and value of a camera's focal length; the value is None if a calibration defines the lens."""
+        spec = self.scene.spec.rig.cameras[camera]
+        key = "focal_length_px" if spec.focal_length_mm is None else "focal_length_mm"
+        return key, getattr(spec, key)
+
+    def with_camera_at(self, camera: int, position_mm: ArrayLike) -> Self:
+        """Move a camera. A camera with a target point keeps looking at it; others keep their direction."""
+        spec = self.scene.spec.rig.cameras[camera]
+        # For a camera with a mirror, the numeric position is that of the mirror image.
+        place = np.round(np.asarray(position_mm if spec.mirror is None else spec.mirror.image_of(position_mm)), 6)
+        if spec.calibration is None:
+            return self.changed({f"rig.cameras.{camera}.position_mm": place.tolist()})
+        turn = spec.unmirrored().R
+        return self.changed({f"rig.cameras.{camera}.calibration.t_mm": (-turn @ place).tolist()})
+
+    def with_camera_aimed(self, camera: int) -> Self:
+        """Turn a camera to the selected eye."""
+        spec = self.scene.spec.rig.cameras[camera]
+        if spec.calibration is not None:
+            raise InputError("has a calibration, which fixes its direction", path=f"rig.cameras.{camera}")
+        path = f"rig.cameras.{camera}"
+        aim = self.apex_mm if spec.mirror is None else spec.mirror.image_of(self.apex_mm)
+        return self.changed({f"{path}.look_at_mm": aim.tolist(), f"{path}.pan_deg": None, f"{path}.tilt_deg": None})
+
+    def saved(self) -> SceneSpec:
+        """Return the spec to save: the changes of the knobs, with all fixations and head positions of the loaded scene.
+
+        A gaze set by the user replaces the fixations. Files are absolute paths, so the scene means the same in every
+        folder.
+        """
+        shown = self.scene.located()
+        data = shown.to_mapping()
+        data["subject"] = {**data["subject"], "head_positions_mm": self.origin.subject.head_positions_mm}
+        if self.fixation is not None:
+            data["subject"]["accommodation_d"] = self.origin.subject.accommodation_d
+            data.pop("targets", None)
+            data.pop("poses", None)
+            kept = self.origin.to_mapping()
+            data |= {key: kept[key] for key in ("targets", "poses") if key in kept}
+        model = data["eye"].get("model")
+        if isinstance(model, str) and model.endswith((".yaml", ".yml")) and self.scene.base is not None:
+            data["eye"]["model"] = str((self.scene.base / model).resolve())
+        return SceneSpec.from_mapping(data)
+
+    def with_all_targets(self) -> Scene | None:
+        """Restore all targets of the loaded scene, on the current screen; None if it gives poses."""
+        if self.origin.targets is None:
+            return None
+        spec = self.scene.spec.model_copy(update={"targets": self.origin.targets, "poses": None})
+        return self.scene.replaced(spec, rig=self.scene.rig)
+
+    def _with_rig(self, rig: Rig) -> Self:
+        return replace(self, scene=self.scene.with_(rig=rig))
+
+    def _targets(self) -> Any:
+        """Return the targets of the loaded scene on the current screen, (f, 3); None if it gives poses."""
+        scene = self.with_all_targets()
+        return None if scene is None else scene.targets_mm
+
+
+def named(cameras: tuple[Camera, ...]) -> list[str]:
+    """Return labels of cameras: number and name."""
+    return [f"{k}: {camera.name}" for k, camera in enumerate(cameras)]
+
+
+def directions(setup: Setup) -> EyeDirection:
+    """Return the direction of the selected eye's optic axis, rounded to a knob's precision."""
+    frames = setup.frames()
+    row = setup.row(frames)
+    azimuth, elevation = np.degrees([frames.pose.azimuth_rad[row], frames.pose.elevation_rad[row]])
+    return EyeDirection(azimuth_deg=round(float(azimuth), 2), elevation_deg=round(float(elevation), 2))

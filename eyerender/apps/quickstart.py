@@ -1,0 +1,124 @@
+"""The quickstart: fixate, render, extract, calibrate on both observers' features, compare, and report."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from ..backends.choose import BackendChoice
+from ..base.arrays import Ints
+from ..base.errors import Warn
+from ..base.progress import Progress, notify
+from ..folders.imagefolder import ImageFolder, same_run
+from ..gaze.estimate import GazeEstimator
+from ..gaze.regression import Regression
+from ..imaging.comparison import Comparison, compare
+from ..imaging.imageobserver import ImageObserver, scene_of
+from ..imaging.images import render_folder
+from ..report.comparison import Timing, write_report
+from ..rig.plausibility import saturation_warnings
+from ..scene import Scene, load_scene
+
+REPORT = "report.html"
+
+
+def run_quickstart(
+    folder: str | Path,
+    *,
+    scene: str = "quickstart",
+    eye: str | None = None,
+    backend: BackendChoice = "auto",
+    threads: int | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    warn: Warn | None = None,
+) -> Comparison:
+    """Render a scene, compare both observers on it, and write images and `report.html` into a folder.
+
+    Images in the folder that have the same scene, seed and versions are reused.
+
+    Args:
+        folder: the folder.
+        scene: a scene file, or the name of a shipped scene.
+        eye: replaces the scene's eye model.
+        backend: the render backend.
+        threads: total number of processor threads; None: all.
+        overwrite: replace the contents of the folder.
+        progress: called with (done, total, note).
+        warn: called for probable mistakes in the scene before the work starts, and for saturated images before they are
+            written or reused; it may raise.
+
+    Raises:
+        InputError: the folder holds something else and `overwrite` is not given.
+        BackendError: no backend can render.
+    """
+    folder = Path(folder)
+    loaded = load_scene(scene, eye=eye)
+    if warn is not None:
+        warn(loaded.warnings())
+    count = len(loaded.index())
+
+    def step(offset: int, what: str) -> Progress:
+        def show(done: int, _total: int, _note: str) -> None:
+            notify(progress, offset + done, 2 * count + 1, what)
+
+        return show
+
+    start = time.monotonic()
+    timings = []
+    if overwrite or not same_run(folder, loaded.digest()):
+        render_folder(
+            loaded,
+            folder,
+            backend=backend,
+            threads=threads,
+            overwrite=overwrite,
+            progress=step(0, "rendering"),
+            warn=warn,
+        )
+        timings.append(Timing(f"observing and rendering {count} windows", time.monotonic() - start))
+    start = time.monotonic()
+    images = ImageFolder.load(folder)
+    if warn is not None:
+        saturated = images.dataset.get("statistics", {}).get("images_saturated", 0)
+        warn(saturation_warnings(saturated, len(images.entries), loaded.source))
+    result = _compared(images, loaded, Regression(), "", step(count, "extracting"))
+    timings.append(Timing("extracting and calibrating", time.monotonic() - start))
+    write_report(folder / REPORT, loaded, result, images.entries, timings)
+    notify(progress, 2 * count + 1, 2 * count + 1, "done")
+    return result
+
+
+def compare_folder(
+    path: str | Path, *, estimator: GazeEstimator | None = None, name: str = "", progress: Progress | None = None
+) -> Comparison:
+    """Extract the features of a folder's images and compare them with the exact ones, in pixels and in gaze error.
+
+    Args:
+        path: a folder that `render`, `quickstart` or `generate` wrote.
+        estimator: gaze estimator used for both; default: `er.gaze.Regression("R3")`.
+        name: name of the estimator in the result; default: as for `compare`.
+        progress: called with (images done, images in all, "").
+
+    Raises:
+        InputError: the folder is of another kind, or an image or a record in it cannot be read.
+    """
+    images = ImageFolder.load(path)
+    return _compared(images, scene_of(images), estimator or Regression(), name, progress)
+
+
+def _compared(
+    images: ImageFolder, scene: Scene, estimator: GazeEstimator, name: str, progress: Progress | None
+) -> Comparison:
+    truth = images.truth()
+    found = ImageObserver().observe_entries(images.entries, truth.index, scene, progress=progress)
+    return compare(truth, found, scene.rig, estimator, name, subjects=_subjects(images))
+
+
+def _subjects(images: ImageFolder) -> Ints | None:
+    """Return the subject of each record of a dataset; None for a rendered folder."""
+    if images.dataset.get("kind") != "dataset":
+        return None
+    return np.array([int(entry.line["subject"]) for entry in images for _ in entry.records], dtype=np.int64)

@@ -1,0 +1,474 @@
+"""The report on a rig: bound, dropout and coverage over a population, errors of estimators, and eye safety.
+
+Ray optics gives all features; nothing is rendered. The features are exact, so an estimator's errors are its model bias
+(wrong assumptions about people's eyes), without noise.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..analytic.observer import trace
+from ..backends.choose import BackendChoice
+from ..base.arrays import Floats, Ints, finite_or_none
+from ..base.errors import InputError
+from ..base.progress import Progress, notify
+from ..base.storage.files import write_json
+from ..design.crowd import OUTLINE, SHIFTS_MM, coverage_of, figures_of_people, figures_of_shifts, users_of
+from ..design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
+from ..design.people import CALIBRATION_CELLS, GRID, LOST, Figures, Survey, place_of
+from ..design.safety import NOTE, eye_exposure
+from ..design.unknowns import Unknowns
+from ..folders.outfolder import staged
+from ..gaze.estimate import ray_errors_deg
+from ..gaze.store import choose_estimator
+from ..imaging.imageobserver import ImageObserver
+from ..population.people import Person
+from ..report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
+from ..report.style import figure, svg
+from ..scene import Scene
+from ..scene.people import Population
+from ..scene.spec import SceneSpec, Targets
+from ..scene.subject import Subject
+
+SCHEMA = "eyerender/rig/1"
+REPORT, PEOPLE, GAZE, SUMMARY = "report.html", "people.csv", "gaze.csv", "summary.json"
+ESTIMATORS = ("direction-regression", "hennessey", "guestrin-eizenman", "maximum-likelihood")
+NOISE_ONLY = "noise only"
+TRAITS = ("age", "lids open (mm)", "fissure wide (mm)", "pupils apart (mm)")
+_TARGET_MM = 1000.0
+_SLIPPING = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigSize:
+    """Size of the computation.
+
+    Attributes:
+        people: number of people.
+        sample: number of people whose gaze is estimated on exact features.
+        images: number of people whose gaze is estimated on rendered images, 25 each.
+        workers: processes; None: one for each processor.
+        seed: seed of the people.
+        slippage_mm: standard deviation of the eyes' positions along each axis.
+        relief_mm: additional standard deviation of the eyes' distance from the rig.
+        azimuth_deg: half range of gaze, horizontally.
+        elevation_deg: half range of gaze, vertically.
+    """
+
+    people: int = 200
+    sample: int = 5
+    images: int = 0
+    workers: int | None = None
+    seed: int = 0
+    slippage_mm: float = 1.5
+    relief_mm: float = 0.0
+    azimuth_deg: float = 20.0
+    elevation_deg: float = 15.0
+
+    def __post_init__(self) -> None:
+        """Raise an error for numbers out of range, naming the command's option."""
+        for name, low, high in (
+            ("people", 1, 10**6), ("sample", 0, 1000), ("images", 0, 1000), ("seed", 0, 2**63 - 1),
+            ("slippage_mm", 0, 20), ("relief_mm", 0, 20),
+            ("azimuth_deg", 1, 60), ("elevation_deg", 1, 60), ("workers", 1, 1024),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(f"must be {low} to {high}, not {value:g}", source=f"--{name.replace('_', '-')}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bias:
+    """Errors of one estimator: (people, targets) degrees, NaN where there is no estimate; or a reason."""
+
+    name: str
+    error_deg: Floats
+    reason: str = ""
+
+
+def run_rig(
+    scene: Scene,
+    population: Population,
+    output: str | Path,
+    size: RigSize = RigSize(),
+    *,
+    unknowns: Unknowns | None = None,
+    backend: BackendChoice = "auto",
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Evaluate a scene's rig over a population; write report.html, summary.json, people.csv and gaze.csv into a folder.
+
+    Args:
+        scene: provides the rig, sensor, first eye and first head position.
+        population: the people.
+        output: the folder.
+        size: number of people, and range of gaze.
+        unknowns: the priors of the bound; default: `Unknowns.population()`.
+        backend: renders the images.
+        overwrite: replace the contents of the folder.
+        progress: called with (people done, people in all, what).
+
+    Raises:
+        InputError: the folder is not empty, or no drawn eye is physically possible.
+    """
+    survey = Survey(
+        scene=scene.located().to_mapping(),
+        population=population.to_mapping(),
+        seed=size.seed,
+        azimuth_deg=size.azimuth_deg,
+        elevation_deg=size.elevation_deg,
+        slippage_mm=size.slippage_mm,
+        relief_mm=size.relief_mm,
+        unknowns=(Unknowns.population() if unknowns is None else unknowns).to_mapping(),
+    )
+    noise = sensor_noise(scene)
+    with staged(output, overwrite=overwrite) as folder:
+        found = figures_of_people(survey, noise, size.people, workers=size.workers, progress=progress)
+        if not len(found.subject):
+            raise InputError("no eye of this population is physically possible", source="--population")
+        biases = estimator_errors(survey, found.subject[: size.sample].tolist(), progress)
+        pictured = estimator_errors(
+            survey, found.subject[: size.images].tolist(), progress, images=True, backend=backend
+        )
+        slipped = figures_of_shifts(survey, noise, min(_SLIPPING, size.people), workers=size.workers)
+        data = summary(scene, survey, found, biases, noise)
+        data["estimators_on_images"] = _errors_of(pictured)
+        data["slippage"] = _slippage_of(*slipped)
+        write_json(folder / SUMMARY, data)
+        _write_people(folder / PEOPLE, found)
+        _write_gaze(folder / GAZE, survey, found)
+        write_page(folder / REPORT, page_of(scene, survey, found, data))
+    return data
+
+
+def estimator_errors(
+    survey: Survey,
+    subjects: Sequence[int],
+    progress: Progress | None = None,
+    *,
+    images: bool = False,
+    backend: BackendChoice = "auto",
+) -> list[Bias]:
+    """Compute gaze errors of the estimators for some people, calibrated on nine targets a metre away.
+
+    Args:
+        survey: the rig and the people.
+        subjects: numbers of the people.
+        progress: called with (people done, people in all, what).
+        images: use extracted features of rendered images of 25 targets, instead of exact features of 81.
+        backend: the render backend for these images.
+    """
+    cells = np.array([GRID * r + c for r in range(0, GRID, 2) for c in range(0, GRID, 2)])
+    cells = cells if images else np.arange(GRID * GRID)
+    chosen = np.flatnonzero(np.isin(cells, CALIBRATION_CELLS))
+    errors = {name: np.full((len(subjects), len(cells)), np.nan) for name in ESTIMATORS}
+    reasons = dict.fromkeys(ESTIMATORS, "")
+    for k, subject in enumerate(subjects):
+        scene = _scene_of(survey, subject, cells)
+        seen = ImageObserver(backend=backend).observe(scene.frames()) if images else trace(scene, boundary_points=30)
+        for name in ESTIMATORS:
+            try:
+                fitted = choose_estimator(name).fit(seen.take(np.isin(seen.index.fixation, chosen)), scene.rig)
+                rays = fitted.predict_rays(seen, scene.rig)  # type: ignore[attr-defined]
+            except (InputError, np.linalg.LinAlgError) as error:
+                reasons[name] = str(error) or "the targets do not determine it"
+                continue
+            for camera in range(len(scene.rig.cameras)):
+                rows = np.flatnonzero(seen.index.camera == camera)
+                found = ray_errors_deg(seen.take(rows), _taken(rays, rows))
+                errors[name][k, seen.index.fixation[rows]] = np.fmin(errors[name][k, seen.index.fixation[rows]], found)
+        notify(progress, k + 1, len(subjects), "people with images" if images else "estimators")
+    for name, found in errors.items():
+        without = float(np.isnan(found).mean(axis=1).max(initial=0.0))
+        if not reasons[name] and without > 0.05:
+            reasons[name] = (
+                f"no estimate in up to {100 * without:.0f} % of a person's directions, where features are missing"
+            )
+    return [Bias(name=name, error_deg=errors[name], reason=reasons[name]) for name in ESTIMATORS]
+
+
+def _taken(rays: Any, rows: Any) -> Any:
+    return type(rays)(rays.origin_mm[rows], rays.direction[rows], rays.reason[rows])
+
+
+def _scene_of(survey: Survey, subject: int, cells: Ints) -> Scene:
+    """Build the scene of a person who looks at targets a metre away in the directions `cells` of the 81."""
+    spec = SceneSpec.from_mapping(survey.scene)
+    person = Population.from_mapping(survey.population).person(subject, survey.seed)
+    base = Scene.of(spec)
+    side = spec.subject.eyes[0]
+    place = place_of(survey, base, person)
+    half = person.apex_distance_mm / 2.0
+    head = place - np.array([0.0, half if side == "left" else -half, 0.0])
+    azimuth, elevation = np.radians(survey.directions_deg[cells]).T
+    way = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
+    )
+    own = Subject.of(
+        person, eyes=(side,), head_positions_mm=(tuple(head.tolist()),), luminance_cd_m2=survey.luminance_cd_m2
+    )
+    return Scene(
+        own, spec.rig, targets=Targets.at(place + _TARGET_MM * way), wavelength_nm=spec.wavelength_nm,
+        sensor=spec.sensor, lens=spec.lens, ambient=spec.ambient, image=spec.image,
+    )  # fmt: skip
+
+
+def summary(
+    scene: Scene, survey: Survey, found: Figures, biases: Sequence[Bias], noise: FeatureNoise
+) -> dict[str, Any]:
+    """Return the content of summary.json."""
+    side = scene.spec.subject.eyes[0]
+    place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
+    try:
+        safety: dict[str, Any] = eye_exposure(scene.rig, place, wavelength_nm=scene.spec.wavelength_nm).to_mapping()
+    except InputError as error:
+        safety = {"note": NOTE, "reason": str(error)}
+    lights = len(scene.rig.lights) * len(scene.rig.cameras)
+    return {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "people": len(found.subject),
+        "refused": found.refused.tolist(),
+        "directions": GRID * GRID,
+        "seed": survey.seed,
+        "unknowns": dict(survey.unknowns),
+        "noise": {
+            "outline_px": noise.outline_px.tolist(),
+            "glint_px": [[finite_or_none(v) for v in row] for row in noise.glint_px],
+        },
+        "bound_deg": {
+            "note": NOISE_ONLY, "median": finite_or_none(np.median(found.bound_deg)), **users_of(found.bound_deg)
+        },
+        "frame_to_frame_deg": {
+            "note": NOISE_ONLY, "median": finite_or_none(np.median(found.noise_deg)), **users_of(found.noise_deg)
+        },
+        "coverage": coverage_of(found),
+        "glints_missing": {
+            name: float(found.lost[..., k].mean() / max(lights, 1)) for k, name in enumerate(LOST)
+        },
+        "estimators": _errors_of(biases),
+        "safety": safety,
+    }  # fmt: skip
+
+
+def _errors_of(biases: Sequence[Bias]) -> dict[str, Any]:
+    return {
+        bias.name: {**users_of(bias.error_deg), "people": len(bias.error_deg), "reason": bias.reason or None}
+        for bias in biases
+    }
+
+
+def _slippage_of(shifts_mm: Floats, found: Sequence[Figures]) -> list[dict[str, Any]]:
+    """Compute noise and coverage at each shift of the eye."""
+    return [
+        {
+            "shift_mm": shift.tolist(),
+            "noise_deg": finite_or_none(np.median(figures.noise_deg)),
+            "covered_2_glints": coverage_of(figures)["outline_and_2_glints"],
+        }
+        for shift, figures in zip(shifts_mm, found, strict=True)
+    ]
+
+
+def _write_people(path: Path, found: Figures) -> None:
+    """Write one row per person."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["subject", "bound_e95_deg", "frame_to_frame_e95_deg", "outline", "glints", "covered_2_glints"])
+        for k, subject in enumerate(found.subject):
+            covered = (found.outline[k] >= OUTLINE) & (found.glints[k] >= 2)
+            e95 = (np.quantile(v[k], 0.95, method="higher") for v in (found.bound_deg, found.noise_deg))
+            means = (found.outline[k].mean(), found.glints[k].mean(), covered.mean())
+            writer.writerow([subject, *(f"{value:.6g}" for value in (*e95, *means))])
+
+
+def _write_gaze(path: Path, survey: Survey, found: Figures) -> None:
+    """Write one row per direction."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        names = [f"glints_missing_{name}" for name in LOST]
+        writer.writerow(
+            ["azimuth_deg", "elevation_deg", "bound_deg", "frame_to_frame_deg", "outline", "glints", *names]
+        )
+        for k, direction in enumerate(survey.directions_deg):
+            values = [np.median(found.bound_deg[:, k]), np.median(found.noise_deg[:, k]), found.outline[:, k].mean()]
+            values += [found.glints[:, k].mean(), *found.lost[:, k].mean(axis=0)]
+            writer.writerow([f"{value:.6g}" for value in (*direction, *values)])
+
+
+def page_of(scene: Scene, survey: Survey, found: Figures, data: dict[str, Any]) -> Page:
+    """Compose the report's page."""
+    share, cornea = data["coverage"]["outline_and_2_glints"], data["safety"].get("cornea_share")
+    cards = [
+        Card(f"{100 * share:.1f} %", "of people and directions with two glints and 60 % of the outline"),
+        Card(degrees_text(data["frame_to_frame_deg"]["U50E95"]), "noise of gaze, median person (U50E95, noise only)"),
+        Card(degrees_text(data["bound_deg"]["U95E95"]),
+             "after a calibration, 95th-percentile person (U95E95, noise only)"),
+        Card("not known" if cornea is None else f"{100 * cornea:.1f} %", f"of the corneal limit ({NOTE})"),
+    ]  # fmt: skip
+    sections = (
+        _gaze_section(survey, found), _who_section(survey, found, data), _slippage_section(data), _bias_section(data),
+        _safety_section(data),
+    )  # fmt: skip
+    lead = [
+        _answer(data),
+        f"{data['people']} people look in {GRID * GRID} directions in front of the rig of '{scene.name}'. "
+        "Everything but errors on images follows from ray optics.",
+        "The bound is the smallest error that any unbiased estimator can have with these features. It counts noise "
+        "alone. What an estimator assumes wrongly about the eye comes on top. U50E95 and U95E95 are the median and the "
+        "95th-percentile person's 95th-percentile error over the directions.",
+    ]
+    return Page(f"Rig report: {scene.name}", lead, cards, sections)
+
+
+def _answer(data: dict[str, Any]) -> str:
+    """Say in a few sentences how good the rig is."""
+    share, bound, noise = data["coverage"]["outline_and_2_glints"], data["bound_deg"], data["frame_to_frame_deg"]
+    fixation = np.sqrt(2.0 / len(CALIBRATION_CELLS)) * FIXATION_DEG
+    parts = [f"In short: the rig sees two glints and 60 % of the pupil's outline in {100 * share:.1f} % of all cases."]
+    if noise["U50E95"] is None:
+        parts.append("For the median person, the features do not determine gaze in every direction.")
+    else:
+        parts.append(f"The sensor's noise moves the gaze of the median person by {degrees_text(noise['U50E95'])}.")
+    if bound["U50E95"] is not None:
+        parts.append(
+            f"After a calibration on nine targets the bound is {degrees_text(bound['U50E95'])}, of which the noise of "
+            f"fixation alone is {degrees_text(float(fixation))}."
+        )
+    known = {name: one["U50E95"] for name, one in data["estimators"].items() if one["U50E95"] is not None}
+    if known:
+        best = min(known, key=lambda name: known[name])
+        parts.append(f"The best estimator, {best}, has model errors of {degrees_text(known[best])}.")
+    return " ".join(parts)
+
+
+def _gaze_section(survey: Survey, found: Figures) -> Section:
+    covered = (found.outline >= OUTLINE) & (found.glints >= 2)
+    most = max(int(found.glints.max()), 1)
+    maps = (
+        ("noise of gaze (median, deg; noise only)", np.median(found.noise_deg, axis=0), (None, None)),
+        ("visible glints (mean)", found.glints.mean(axis=0), (0, most)),
+        ("visible share of the outline (mean)", found.outline.mean(axis=0), (0, 1)),
+        ("people with 2 glints and 60 % of the outline", covered.mean(axis=0), (0, 1)),
+    )  # fmt: skip
+    a, e = survey.azimuth_deg, survey.elevation_deg
+    drawn = []
+    for title, values, (low, high) in maps:
+        with figure(3.3, 2.7) as (fig, ax):
+            grid = np.where(np.isfinite(values), values, np.nan).reshape(GRID, GRID)
+            image = ax.imshow(grid, extent=(-a, a, -e, e), aspect="auto", vmin=low, vmax=high)
+            fig.colorbar(image)
+            ax.grid(False)
+            ax.set_xlabel("azimuth to the left (deg)")
+            ax.set_ylabel("elevation (deg)")
+            drawn.append(
+                Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over azimuth and elevation of the optic axis.", True)
+            )
+    return Section("Where does the rig see well?", [], drawn)
+
+
+def _who_section(survey: Survey, found: Figures, data: dict[str, Any]) -> Section:
+    covered = ((found.outline >= OUTLINE) & (found.glints >= 2)).mean(axis=1)
+    noise = np.quantile(found.noise_deg, 0.95, axis=1, method="higher")
+    worst = np.lexsort((-noise, covered))[:10]
+    population = Population.from_mapping(survey.population)
+    rows = [
+        [str(found.subject[k]), f"{100 * covered[k]:.0f} %", f"{found.glints[k].mean():.1f}",
+         f"{100 * found.outline[k].mean():.0f} %", degrees_text(finite_or_none(noise[k])),
+         *_traits_of(population.person(int(found.subject[k]), survey.seed))]
+        for k in worst
+    ]  # fmt: skip
+    shares = data["coverage"]
+    coverage = [
+        ["60 % of the outline", f"{100 * shares['outline']:.1f} %"],
+        *([f"and at least {k} glints", f"{100 * shares[f'outline_and_{k}_glints']:.1f} %"] for k in (1, 2, 3)),
+    ]
+    why = {"ray": "no ray: the mirror point is off the cornea", "sensor": "off the sensor", "lid": "behind a lid"}
+    missing = [[why[name], f"{100 * share:.1f} %"] for name, share in data["glints_missing"].items()]
+    tables = [
+        Table(header=["visible", "people x directions"], rows=coverage, caption="Coverage."),
+        Table(header=["reason", "glints"], rows=missing, caption="Why glints are missing. Lashes are not considered."),
+        Table(header=["person", "covered", "glints", "outline", "noise, 95th percentile", *TRAITS], rows=rows,
+              caption="The ten people for whom the rig covers least; those with the same coverage by their noise."),
+    ]  # fmt: skip
+    return Section("For whom does it fail?", [], [], tables)
+
+
+def _traits_of(person: Person) -> list[str]:
+    """Return a person's `TRAITS` as text."""
+    fissure = person.region().fissure
+    opening = f"{fissure.upper_mm + fissure.lower_mm:.1f}"
+    return [f"{person.number('age_years'):.0f}", opening, f"{fissure.width_mm:.1f}", f"{person.ipd_mm:.1f}"]
+
+
+def _slippage_section(data: dict[str, Any]) -> Section:
+    rows = data["slippage"]
+    plane, away = rows[: len(SHIFTS_MM) ** 2], rows[len(SHIFTS_MM) ** 2 :]
+    drawn = []
+    for key, title, (low, high) in (
+        ("noise_deg", "noise of gaze (median, deg)", (None, None)),
+        ("covered_2_glints", "share of directions with two glints and 60 % of the outline", (0, 1)),
+    ):
+        values = np.array([np.nan if row[key] is None else row[key] for row in plane]).reshape(2 * (len(SHIFTS_MM),))
+        with figure(3.3, 2.7) as (fig, ax):
+            image = ax.imshow(values, extent=(-3.75, 3.75, -3.75, 3.75), aspect="auto", vmin=low, vmax=high)
+            fig.colorbar(image)
+            ax.grid(False)
+            ax.set_xlabel("eye to the left (mm)")
+            ax.set_ylabel("eye up (mm)")
+            drawn.append(Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over the place of the eye.", True))
+    table = [
+        [f"{row['shift_mm'][0]:+.1f} mm", degrees_text(row["noise_deg"]), f"{100 * row['covered_2_glints']:.1f} %"]
+        for row in away
+    ]
+    text = f"The first {_SLIPPING} people in all directions, with the eye shifted against the rig."
+    head = ["nearer by", "noise", "covered"]
+    return Section("What does slippage do?", [text], drawn, [Table(header=head, rows=table)])
+
+
+def _bias_section(data: dict[str, Any]) -> Section:
+    tables = []
+    for key, what in (("estimators", "exact features"), ("estimators_on_images", "rendered images of 25 targets")):
+        rows = [
+            [name, degrees_text(v["U50E95"]) if v["U50E95"] is not None else "—",
+             degrees_text(v["U95E95"]) if v["U95E95"] is not None else "—", v["reason"] or ""]
+            for name, v in data[key].items()
+        ]  # fmt: skip
+        count = max((v["people"] for v in data[key].values()), default=0)
+        if count:
+            columns = 4 if any(row[3] for row in rows) else 3
+            caption = f"Errors on {what}, {count} {'person' if count == 1 else 'people'}."
+            head = ["estimator", "U50E95", "U95E95", "note"][:columns]
+            tables.append(Table(header=head, rows=[row[:columns] for row in rows], caption=caption, wide=(3,)))
+    text = (
+        "Estimators that need no screen, each calibrated on nine targets. Errors on exact features have no noise: this "
+        "is what each estimator assumes wrongly about the eye. Errors on rendered images add noise, lids, lashes and "
+        "the extractor. With few people, U50E95 and U95E95 are almost the same."
+    )
+    return Section("What do estimators add?", [text], [], tables)
+
+
+def _safety_section(data: dict[str, Any]) -> Section:
+    safety = data["safety"]
+    if "lights" not in safety:
+        return Section("Eye safety", [f"{safety['reason']}. This is {NOTE}."])
+    rows = []
+    for light in safety["lights"]:
+        retina = light["retina"]
+        known = retina if isinstance(retina, str) else f"{100 * retina['share']:.2g} % of its limit"
+        rows.append([str(light["light"]), f"{light['distance_mm']:.1f}", f"{light['cornea_w_m2']:.3g}", known])
+    text = (
+        f"All LEDs together: {safety['cornea_w_m2']:.3g} W/m² at the cornea, limit "
+        f"{safety['cornea_limit_w_m2']:g} W/m² (IEC 62471, ICNIRP 2013; long exposure), at the nearest "
+        f"place of an eye box of 3 mm about the eye. This is {NOTE}."
+    )
+    head = ["LED", "distance (mm)", "cornea (W/m²)", "retina"]
+    return Section("Eye safety", [text], [], [Table(header=head, rows=rows, wide=(3,))])

@@ -1,0 +1,326 @@
+"""Conditions beyond the paper: errors over gaze direction, head position, pupil size and eye parameters.
+
+Two trackers are calibrated at the central head position with a 4 mm pupil, on analytic features of both studies'
+corrected scenes: the model-based one of [28] (nine targets, index fixed) and the interpolation-based one of [29] (R8 on
+C14). Angles are measured from the right eye (model-based) or the mid-point of both (interpolation).
+
+Pupils are tested twice: widening about a fixed centre, and about a centre that shifts with the diameter (`eye.margin`).
+The eyes of a published model are mirror images of each other, so their horizontal errors cancel in the mean of both.
+Therefore the report also has the errors of the right eye alone, and those of a few drawn people, whose eyes differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from ...analytic.observer import trace
+from ...base.arrays import Floats, frozen
+from ...base.errors import InputError
+from ...eye.spec import EyeSpec
+from ...gaze.estimate import angular_error_deg, binocular_average
+from ...gaze.guestrin import GuestrinEizenman
+from ...gaze.quality import Quality, quality
+from ...gaze.regression import Regression
+from ...scene import Scene
+from ...scene.observation import EYES, Observations
+from ...scene.spec import SceneSpec
+from . import blignaut, guestrin
+from .literature import CALIBRATION_SETS
+from .results import Row, mean_row
+
+TRACKERS = ("model-based", "interpolation")
+FUNCTION, CALIBRATION = "R8", "C14"
+CALIBRATED_MM = 4.0
+DIAMETERS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
+HEAD_MM = (-40.0, -20.0, 0.0, 20.0, 40.0)
+GRID = (13, 11)
+NOISE_PX, SAMPLES, SEED = 0.05, 100, 2014
+DRAWN_PEOPLE = "drawn people"
+"""Name of the job of drawn people, among the names of eye models."""
+PEOPLE_PRESET, PEOPLE_SEED, PEOPLE = "adults", 0, 4
+FIXED, SHIFTED = "centre fixed", "centre shifts"
+CENTRES: dict[str, dict[str, Any]] = {FIXED: {}, SHIFTED: {"margin": {}}}
+"""Ways in which the pupil widens -> keys of the scene's eye."""
+QUALITY = tuple(field.name for field in fields(Quality))
+
+
+def _with_lens(axis: int) -> str:
+    """Return the paths of the positions of the stop and, if there is one, the lens.
+
+    Both move together, so that the lens does not cross the stop.
+    """
+    stop, where = f"stop.position_mm.{axis}", f"position_mm.{axis}"
+    surfaces = f"{stop}&lens.surfaces.0.{where}&lens.surfaces.1.{where}"
+    return f"{surfaces}|{stop}&lens.front.{where}&lens.back.{where}|{stop}"
+
+
+# Label, path in the eye file, step, unit. Each parameter is changed by plus and minus one step.
+PARAMETERS: tuple[tuple[str, str, float, str], ...] = (
+    ("corneal radius", "cornea.0.shape.radius_mm|cornea.0.shape.radii_mm", 0.1, "mm"),
+    ("corneal asphericity Q", "cornea.0.shape.conic_constant|cornea.0.shape.conic_constants", 0.05, ""),
+    ("index behind the cornea", "cornea.0.medium.index|cornea.0.medium.cauchy.0", 0.005, ""),
+    ("cornea moved nasally", "cornea.0.position_mm.1", 0.1, "mm"),
+    ("cornea moved up", "cornea.0.position_mm.2", 0.1, "mm"),
+    ("cornea tilted about y", "cornea.0.tilt_deg.1", 1.0, "deg"),
+    ("cornea tilted about z", "cornea.0.tilt_deg.2", 1.0, "deg"),
+    ("posterior corneal radius", "cornea.1.shape.radius_mm", 0.1, "mm"),
+    ("corneal thickness", "cornea.1.position_mm.0", -0.05, "mm"),
+    ("pupil and lens moved back", _with_lens(0), -0.1, "mm"),
+    ("pupil and lens moved nasally", _with_lens(1), 0.1, "mm"),
+    ("pupil and lens moved up", _with_lens(2), 0.1, "mm"),
+    ("centres of rotation moved back", "rotation.azimuth_centre_mm.0&rotation.elevation_centre_mm.0", -0.5, "mm"),
+    ("fovea, horizontal angle", "fovea.field_deg.0", 0.5, "deg"),
+    ("fovea, vertical angle", "fovea.field_deg.1", 0.5, "deg"),
+)
+
+
+@dataclass(slots=True, kw_only=True)
+class ConditionsPart:
+    """Results of one eye model; errors in degrees.
+
+    Maps (rows, columns) by tracker are NaN where there is no estimate.
+    """
+
+    eye_model: str
+    screen_maps: dict[str, Floats] = field(default_factory=dict)
+    head_maps: dict[str, Floats] = field(default_factory=dict)
+    diameters: dict[str, list[float]] = field(default_factory=dict)
+    """Mean errors over `DIAMETERS_MM`, by name of the curve: tracker, eyes, and how the pupil widens."""
+    sensitivity: list[dict[str, Any]] = field(default_factory=list)
+    precision: dict[str, dict[str, float]] = field(default_factory=dict)
+    rows: list[Row] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class PeoplePart:
+    """Mean errors (deg) of drawn people over `DIAMETERS_MM`, by subject and curve as in `ConditionsPart.diameters`."""
+
+    diameters: dict[int, dict[str, list[float]]] = field(default_factory=dict)
+    rows: list[Row] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class _Tracker:
+    """A calibrated tracker; observations have one row per target in the scene's order for each head position."""
+
+    name: str
+    estimator: GuestrinEizenman | Regression
+    scene: Scene
+
+    def points(self, seen: Observations) -> tuple[Observations, Floats]:
+        """Estimate gaze points, by frame."""
+        gaze = self.estimator.predict(seen, self.scene.rig)
+        if self.name == "interpolation":
+            seen, gaze = binocular_average(seen, gaze)
+        return seen, np.asarray(gaze.point_mm)
+
+    def from_mm(self, seen: Observations) -> Floats:
+        """Return the points from which the angles are measured, (n, 3)."""
+        place = np.asarray(seen.index.head_mm)
+        return place if self.name == "interpolation" else place + seen.index.eye_position_mm
+
+    def errors_by_eye_deg(self, seen: Observations) -> dict[str, Floats]:
+        """Compute the errors (n,) of the tracker's gaze, and of each single eye if the tracker averages both."""
+        index = seen.index
+        if self.name == "model-based":
+            return {EYES[0]: self.errors_deg(seen)}
+        points = self.estimator.predict(seen, self.scene.rig).point_mm
+        single = angular_error_deg(points, index.target_mm, index.eye_position_mm + index.head_mm)
+        return {"both": self.errors_deg(seen)} | {side: single[index.eye == k] for k, side in enumerate(EYES)}
+
+    def errors_deg(self, seen: Observations) -> Floats:
+        """Compute the errors (n,) deg by frame."""
+        frames, points = self.points(seen)
+        return angular_error_deg(points, frames.index.target_mm, self.from_mm(frames))
+
+
+def conditions_part(eye: str) -> ConditionsPart:
+    """Compute all conditions for one eye model."""
+    out = ConditionsPart(eye_model=eye)
+    for name in TRACKERS:
+        tracker, seen = _calibrated(_scene(name, eye))
+        errors = tracker.errors_deg(seen)
+        keys = {"protocol": "corrected", "observer": "analytic", "eye_model": eye}
+        both = {"eye": "both", "function": FUNCTION, "calibration": CALIBRATION}
+        keys |= {"eye": "right"} if name == "model-based" else both
+        columns, rows = GRID if name == "model-based" else (15, 9)
+        wide = _changed(tracker.scene, {"targets": {"grid": [columns, rows]}})
+        over = tracker.errors_deg(trace(wide))
+        out.screen_maps[name] = over.reshape(columns, rows).T
+        out.rows.append(mean_row(errors, variant=f"{name}, as calibrated", **keys))
+        out.rows.append(mean_row(over, variant=f"{name}, {columns} x {rows} targets", **keys))
+        out.head_maps[name], head_rows = _over_heads(tracker, keys)
+        out.rows += head_rows
+        curves, pupil_rows = _over_diameters(tracker, eye, sides=("both", EYES[0]))
+        out.diameters |= curves
+        out.rows += pupil_rows
+        out.precision[name] = _precision(tracker, seen)
+    base = {name: _mean(_scene(name, eye)) for name in TRACKERS}
+    for label, paths, step, unit in PARAMETERS:
+        own = _scene(TRACKERS[0], eye).eye_spec
+        more, less = _eye_with(own, paths, step), _eye_with(own, paths, -step)
+        if more is None or less is None:
+            continue
+        entry: dict[str, Any] = {"parameter": label, "step": abs(step), "unit": unit}
+        for name in TRACKERS:
+            entry[name] = {"base": base[name], "at_plus": None, "at_minus": None, "per_step": None, "reason": None}
+            try:
+                up, down = (_mean(_scene(name, eye).replaced(eye_spec=spec)) for spec in (more, less))
+            except InputError as error:
+                # A changed eye may transmit no ray. That is a result for this parameter only.
+                entry[name]["reason"] = str(error)
+                continue
+            entry[name] |= {"at_plus": up, "at_minus": down, "per_step": 0.5 * (up - down)}
+        out.sensitivity.append(entry)
+    return out
+
+
+def people_part() -> PeoplePart:
+    """Compute the errors over the pupil's diameter for a few drawn people."""
+    out = PeoplePart()
+    for subject in range(PEOPLE):
+        out.diameters[subject] = {}
+        for name in TRACKERS:
+            choice = {"preset": PEOPLE_PRESET, "seed": PEOPLE_SEED, "subject": subject}
+            data = _scene(name, "E2").spec.to_mapping()
+            data["subject"].pop("ipd_mm", None)
+            data["eye"] = {"pupil_diameter_mm": data["eye"].get("pupil_diameter_mm") or CALIBRATED_MM}
+            data = {key: value for key, value in data.items() if key not in ("look", "region")}
+            scene = Scene.of(SceneSpec.from_mapping({**data, "population": choice}, source=name))
+            tracker, _ = _calibrated(scene)
+            label = f"{PEOPLE_PRESET} {PEOPLE_SEED}/{subject}"
+            # A person's eye file has its own shift of the centre.
+            curves, rows = _over_diameters(tracker, label, sides=("both", *EYES), centres={SHIFTED: {}})
+            out.diameters[subject] |= curves
+            out.rows += rows
+    return out
+
+
+def _over_diameters(
+    tracker: _Tracker, eye: str, *, sides: Sequence[str], centres: dict[str, dict[str, Any]] | None = None
+) -> tuple[dict[str, list[float]], list[Row]]:
+    """Compute mean errors over the diameters by curve, with their rows."""
+    curves: dict[str, list[float]] = {}
+    rows = []
+    for centre, keys in (CENTRES if centres is None else centres).items():
+        for diameter in DIAMETERS_MM:
+            scene = _changed(tracker.scene, {"eye": {"pupil_diameter_mm": diameter, **keys}})
+            for side, errors in tracker.errors_by_eye_deg(trace(scene)).items():
+                if side not in sides:
+                    continue
+                more = {} if tracker.name == "model-based" else {"function": FUNCTION, "calibration": CALIBRATION}
+                row = mean_row(
+                    errors, protocol="corrected", observer="analytic", eye_model=eye, eye=side,
+                    variant=f"{tracker.name}, pupil {diameter:g} mm, {centre}", **more,
+                )  # fmt: skip
+                rows.append(row)
+                mean = np.nan if row.mean_deg is None else row.mean_deg
+                curves.setdefault(curve(tracker.name, side, centre), []).append(mean)
+    return curves, rows
+
+
+def curve(tracker: str, side: str, centre: str) -> str:
+    """Return the name of a curve of errors over the pupil's diameter."""
+    return f"{tracker}, {side} {'eyes' if side == 'both' else 'eye'}, {centre}"
+
+
+def _scene(tracker: str, eye: str) -> Scene:
+    """Build the scene in which a tracker is calibrated: one head position."""
+    if tracker == "interpolation":
+        return blignaut.scene(eye, blignaut.CORRECTED)
+    scene = guestrin.scene(eye, guestrin.CORRECTED)
+    return _changed(scene, {"subject": {"eyes": ["right"], "head_positions_mm": [[0.0, 0.0, 0.0]]}})
+
+
+def _changed(scene: Scene, changes: dict[str, dict[str, Any]]) -> Scene:
+    """Replace keys of a scene's groups; the eye's spec stays."""
+    data = scene.spec.to_mapping()
+    for group, values in changes.items():
+        data[group] = values if group == "targets" else {**data[group], **values}
+    spec = SceneSpec.from_mapping(data)
+    return scene.replaced(spec)
+
+
+def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:
+    """Calibrate the scene's tracker in it; also return the observations used."""
+    seen = trace(scene)
+    if len(scene.rig.lights) > 1:
+        fitted = guestrin.estimator(guestrin.CORRECTED).fit(seen, scene.rig)
+        return _Tracker("model-based", fitted, scene), seen
+    some = seen.take(np.isin(seen.index.fixation, np.array(CALIBRATION_SETS[CALIBRATION]) - 1))
+    regression = Regression(FUNCTION).fit(some, scene.rig)
+    return _Tracker("interpolation", regression, scene), seen
+
+
+def _mean(scene: Scene) -> float:
+    """Compute the mean error of the scene's tracker, calibrated on the scene's own eye."""
+    tracker, seen = _calibrated(scene)
+    return float(np.nanmean(tracker.errors_deg(seen)))
+
+
+def _over_heads(tracker: _Tracker, keys: dict[str, Any]) -> tuple[Floats, list[Row]]:
+    """Compute mean errors (depth, sideways) of nine targets over head positions."""
+    places = [[x, y, 0.0] for x in HEAD_MM for y in HEAD_MM]
+    scene = _changed(tracker.scene, {"targets": {"grid": [3, 3]}, "subject": {"head_positions_mm": places}})
+    errors = tracker.errors_deg(trace(scene)).reshape(len(places), -1)
+    rows = [
+        mean_row(e, variant=f"{tracker.name}, head at ({p[0]:g}, {p[1]:g}, 0) mm", **keys)
+        for p, e in zip(places, errors, strict=True)
+    ]
+    with np.errstate(invalid="ignore"):
+        return errors.mean(axis=1).reshape(len(HEAD_MM), len(HEAD_MM)), rows
+
+
+def _precision(tracker: _Tracker, seen: Observations) -> dict[str, float]:
+    """Compute accuracy and precision with Gaussian noise on the features, averaged over the fixations."""
+    rng = np.random.default_rng(SEED)
+    samples = []
+    for _ in range(SAMPLES):
+        frames, points = tracker.points(_noisy(seen, rng))
+        samples.append(points)
+    found = quality(np.stack(samples), frames.index.target_mm, tracker.from_mm(frames))
+    return {name: float(np.nanmean(getattr(found, name))) for name in QUALITY}
+
+
+def _noisy(seen: Observations, rng: np.random.Generator) -> Observations:
+    """Add independent Gaussian noise of `NOISE_PX` to x and y of features."""
+    pupil = seen.pupil.centre_px + rng.normal(0.0, NOISE_PX, seen.pupil.centre_px.shape)
+    glints = seen.glints.xy_px + rng.normal(0.0, NOISE_PX, seen.glints.xy_px.shape)
+    return replace(
+        seen, pupil=replace(seen.pupil, centre_px=frozen(pupil)), glints=replace(seen.glints, xy_px=frozen(glints))
+    )
+
+
+def _eye_with(spec: EyeSpec, paths: str, change: float) -> EyeSpec | None:
+    """Change a parameter of an eye; return None if it has no such parameter.
+
+    `paths` names alternatives (|), each of one or more (&) dotted paths; a list is changed in all its numbers.
+    """
+    for alternative in paths.split("|"):
+        data: Any = spec.to_mapping()
+        if all(_add(data, path.split("."), change) for path in alternative.split("&")):
+            try:
+                return EyeSpec.from_mapping(data)
+            except InputError:
+                return None
+    return None
+
+
+def _add(node: Any, path: Sequence[str], change: float) -> bool:
+    """Add to the number at a path, in place; return False if there is none."""
+    for k, key in enumerate(path):
+        index: Any = int(key) if isinstance(node, list) else key
+        if isinstance(node, list) and not 0 <= index < len(node):
+            return False
+        if isinstance(node, dict) and node.get(index) is None:
+            return False
+        if k < len(path) - 1:
+            node = node[index]
+            continue
+        value = node[index]
+        node[index] = [v + change for v in value] if isinstance(value, list) else value + change
+    return True

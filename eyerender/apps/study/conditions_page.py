@@ -1,0 +1,169 @@
+"""Findings, summary and report values of the study of conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...base.arrays import Floats
+from . import conditions as c
+from .conditions import ConditionsPart, PeoplePart
+from .figures import lines_figure, map_figure, sensitivity_figure
+from .page_parts import Report, Values, number
+from .results import Finding
+
+_WHO = {
+    "model-based": "Guestrin & Eizenman (2006), nine targets, index fixed",
+    "interpolation": f"{c.FUNCTION} calibrated on {c.CALIBRATION}",
+}
+
+
+_D1 = "largest error on the screen (deg)"
+_D2 = "largest mean error over head positions within 40 mm (deg)"
+_D3 = "largest change of the mean error over pupils of 2 to 8 mm (deg)"
+
+
+def findings(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> list[Finding]:
+    """Return the effects of the conditions as findings without a published claim."""
+    out = []
+
+    def add(name: str, rule: str, value: float, detail: str) -> None:
+        out.append(Finding(name, "corrected", "analytic", rule, float(value), "none", None, detail))
+
+    for tracker in c.TRACKERS:
+        for part in parts:
+            base = next(r.mean_deg for r in part.rows if r.variant == f"{tracker}, as calibrated") or np.nan
+            detail = f"as calibrated {base:.4f} deg"
+            add("D1", f"{part.eye_model}, {tracker}: {_D1}", np.nanmax(part.screen_maps[tracker]), detail)
+            add("D2", f"{part.eye_model}, {tracker}: {_D2}", np.nanmax(part.head_maps[tracker]), detail)
+    curves = [(p.eye_model, name, values) for p in parts for name, values in p.diameters.items()]
+    curves += [
+        (f"{c.PEOPLE_PRESET} {subject}", name, values)
+        for p in people
+        for subject, by_name in p.diameters.items()
+        for name, values in by_name.items()
+    ]
+    for who, name, values in curves:
+        base = values[c.DIAMETERS_MM.index(c.CALIBRATED_MM)]
+        change = np.nanmax(np.abs(np.array(values) - base))
+        add(
+            "D3",
+            f"{who}, {name}: {_D3}",
+            change,
+            f"{base:.4f} deg at 4 mm, {values[0]:.4f} at 2, {values[-1]:.4f} at 8",
+        )
+    return out
+
+
+def more(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> dict[str, Any]:
+    """Return the content of the summary besides its rows."""
+    return {
+        "trackers": _WHO,
+        "noise": {"sigma_px": c.NOISE_PX, "samples": c.SAMPLES, "seed": c.SEED},
+        "head_positions_mm": list(c.HEAD_MM),
+        "pupil_diameters_mm": list(c.DIAMETERS_MM),
+        "models": [
+            {
+                "eye_model": part.eye_model,
+                "screen_maps_deg": {k: _listed(v) for k, v in part.screen_maps.items()},
+                "head_maps_deg": {k: _listed(v) for k, v in part.head_maps.items()},
+                "sensitivity": part.sensitivity,
+                "precision": part.precision,
+                "diameters_deg": part.diameters,
+            }
+            for part in parts
+        ],
+        "people": {
+            "preset": c.PEOPLE_PRESET,
+            "seed": c.PEOPLE_SEED,
+            "diameters_deg": {str(subject): found for part in people for subject, found in part.diameters.items()},
+        },
+    }
+
+
+def page(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found: Sequence[Finding]) -> Report:
+    """Compose the report."""
+    head = np.array(c.HEAD_MM)
+    moved = ("to the subject's left (mm)", "towards the screen (mm)", "mean error (deg)", [(0.0, 0.0)])
+    across = ("to the subject's right (mm)", "up (mm)", "error (deg)")
+    values: Values = {
+        "trackers": {t: _WHO[t] for t in c.TRACKERS},
+        "models": [p.eye_model for p in parts],
+        "largest": [
+            (" ".join(f"{p.eye_model}\u00a0{np.nanmax(p.head_maps[t]):.2f}" for p in parts), t) for t in c.TRACKERS
+        ],
+        "screen_maps": {
+            t: map_figure(
+                {p.eye_model: p.screen_maps[t] for p in parts}, *_screen_axes(t, parts[0].screen_maps[t]), *across
+            )
+            for t in c.TRACKERS
+        },
+        "head_maps": {
+            t: map_figure({p.eye_model: p.head_maps[t] for p in parts}, head, head, *moved) for t in c.TRACKERS
+        },
+        "diameters": {t: _over_diameters(t, {p.eye_model: p.diameters for p in parts}) for t in c.TRACKERS},
+        "people": {
+            t: _over_diameters(t, {f"person {k}": found for p in people for k, found in p.diameters.items()})
+            for t in c.TRACKERS
+            if people
+        },
+        "sensitivity": _sensitivity_figure(parts),
+        "failed": [text for p in parts if (text := _failed(p))],
+        "noise_px": f"{c.NOISE_PX:g}",
+        "samples": c.SAMPLES,
+        "seed": c.SEED,
+        "precision": [
+            (t, p.eye_model, *(f"{p.precision[t][k]:.4f}" for k in c.QUALITY)) for t in c.TRACKERS for p in parts
+        ],
+        "values": [(f.id, f.rule, f"{f.value:.4f}", f.detail) for f in found],
+        "rows": [
+            (r.eye_model, r.variant or "", number(r.mean_deg), number(r.sd_deg), str(r.n), str(r.missing))
+            for r in [*(r for p in parts for r in p.rows), *(r for p in people for r in p.rows)]
+        ],
+    }
+    return Report("conditions.html.j2", values)
+
+
+def _over_diameters(tracker: str, who: dict[str, dict[str, list[float]]]) -> str:
+    """Draw a tracker's errors over the pupil's diameter: a panel per curve, a line per eye model or person."""
+    names = [name for name in next(iter(who.values())) if name.startswith(tracker)]
+    panels = {name.removeprefix(f"{tracker}, "): {k: curves[name] for k, curves in who.items()} for name in names}
+    return lines_figure(panels, c.DIAMETERS_MM, "diameter of the anatomical pupil (mm)", "mean error (deg)")
+
+
+def _sensitivity_figure(parts: Sequence[ConditionsPart]) -> str:
+    order = [name for name, *_ in c.PARAMETERS]
+    entries = sorted((e for p in parts for e in p.sensitivity), key=lambda e: order.index(e["parameter"]))
+    names = list(dict.fromkeys(_label(e) for e in entries))
+    steps = {
+        (t, p.eye_model, _label(e)): 1000 * e[t]["per_step"]
+        for t in c.TRACKERS
+        for p in parts
+        for e in p.sensitivity
+        if e[t]["per_step"] is not None
+    }
+    changes = {
+        t: {p.eye_model: [steps.get((t, p.eye_model, n), np.nan) for n in names] for p in parts} for t in c.TRACKERS
+    }
+    return sensitivity_figure(names, changes, "change of the mean error (thousandths of a degree)")
+
+
+def _screen_axes(tracker: str, values: Floats) -> tuple[Floats, Floats]:
+    """Return the screen coordinates of a map's columns (from the subject's left) and rows (from the top)."""
+    w, h = (377.0, 301.0) if tracker == "model-based" else (495.0, 280.0)
+    return np.linspace(-w / 2, w / 2, values.shape[1]), np.linspace(h / 2, -h / 2, values.shape[0])
+
+
+def _label(entry: dict[str, Any]) -> str:
+    return f"{entry['parameter']} ({entry['step']:g} {entry['unit']})".replace(" )", ")")
+
+
+def _failed(part: ConditionsPart) -> str:
+    lost = {e["parameter"]: e[t]["reason"] for e in part.sensitivity for t in c.TRACKERS if e[t]["reason"]}
+    return "; ".join(f"{part.eye_model}, {name}: none ({reason})" for name, reason in lost.items())
+
+
+def _listed(values: Floats) -> list[list[float | None]]:
+    return [[None if not np.isfinite(v) else float(v) for v in row] for row in values]

@@ -1,0 +1,109 @@
+"""Observe a study's scenes by ray optics, or in the images of a dataset (see `images`).
+
+A camera that does not see an eye is turned about its nodal point until it faces it. This changes no ray. Its features
+are transferred to the study's camera along their rays,
+
+    x_cam = R R_turned^T ray,    pixel = K x_cam / z
+
+so that estimators and rig do not change. An ellipse is transferred by its outline, because its centre is not the image
+of a centre. For a camera without distortion it becomes another ellipse exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ...analytic.observer import trace
+from ...base.arrays import Floats, Ints, frozen
+from ...base.errors import InputError
+from ...optics.ellipse import fit_ellipse_direct, points_on_ellipse
+from ...rig.camera import PinholeCamera
+from ...scene import Scene
+from ...scene.observation import Observations, concatenate
+from .images import Shot, StudyImages, shots
+
+OUTLINE_POINTS = 64
+ObserverKind = Literal["analytic", "image", "image-noiseless"]
+
+
+@dataclass(frozen=True, slots=True)
+class Observing:
+    """Observer of a study's scenes: ray optics, or images with or without the sensor's noise.
+
+    Images without noise may be exposed again with the noise of `noise_seed`; `noise_seeds` is the number of such
+    exposures that a study compares.
+    """
+
+    kind: ObserverKind = "analytic"
+    images: StudyImages | None = None
+    noise_seeds: int = 0
+    noise_seed: int | None = None
+
+    def exposures(self) -> list[Observing]:
+        """Return observers of the same images, exposed again with the noise of one seed each."""
+        return [replace(self, noise_seed=seed) for seed in range(self.noise_seeds)]
+
+    def observe(self, scene: Scene, *, facing: bool = False) -> Observations:
+        """Observe every (frame, eye) of a scene; with `facing`, the cameras are turned to the eyes.
+
+        Raises:
+            InputError: no pose of an eye fixates a target, or images do not exist.
+        """
+        if self.kind == "analytic":
+            return trace(scene)
+        if self.images is None:
+            raise InputError("the image observer needs images")
+        parts, order = [], []
+        for shot in self.shots(scene, facing=facing, spp=self.images.spp):
+            seen = self.images.observe(shot.scene, self.noise_seed)
+            if facing:
+                seen = moved(seen, shot.scene.rig.cameras[0], scene.rig.cameras[0])
+            parts.append(with_index_of(seen, scene, shot.rows))
+            order.append(shot.rows)
+        return concatenate(parts).take(np.argsort(np.concatenate(order)))
+
+    def shots(self, scene: Scene, *, facing: bool = False, spp: int | None = None) -> list[Shot]:
+        """Return the shots that this observer needs of a scene; none for ray optics."""
+        return [] if self.kind == "analytic" else shots(scene, noise=self.kind == "image", facing=facing, spp=spp)
+
+
+def moved(observations: Observations, seen_by: PinholeCamera, told: PinholeCamera) -> Observations:
+    """Transfer pupil ellipses and glints to another camera with the same nodal point; covariances are dropped."""
+
+    def pixels(places: Floats) -> Floats:
+        cam = seen_by.rays(places) @ told.R.T
+        front = cam[..., 2] > 0
+        z = np.where(front, cam[..., 2], np.nan)
+        return told.pixels_of(cam[..., 0] / z, cam[..., 1] / z)
+
+    pupil, glints = observations.pupil, observations.glints
+    n = len(observations)
+    outline = points_on_ellipse(pupil.centre_px, pupil.semi_axes_px, pupil.angle_rad, OUTLINE_POINTS)
+    ellipse = fit_ellipse_direct(pixels(outline))
+    centre, spots = ellipse.centre_px, pixels(glints.xy_px)
+    return replace(
+        observations,
+        pupil=replace(
+            pupil,
+            centre_px=frozen(centre),
+            in_image=frozen(told.in_image(centre), bool),
+            semi_axes_px=frozen(ellipse.semi_axes_px),
+            angle_rad=frozen(ellipse.angle_rad),
+            points_px=frozen(np.full((n, 0, 2), np.nan)),
+            covariance=frozen(np.full((n, 5, 5), np.nan)),
+        ),
+        glints=replace(
+            glints,
+            xy_px=frozen(spots),
+            in_image=frozen(told.in_image(spots), bool),
+            covariance=frozen(np.full((*spots.shape, 2), np.nan)),
+        ),
+    )
+
+
+def with_index_of(observations: Observations, scene: Scene, rows: Ints) -> Observations:
+    """Attach rows of a scene's index to observations."""
+    return replace(observations, index=scene.index().take(rows))

@@ -1,0 +1,1 @@
+"""Sweeps: many layouts of a rig, judged over people."""

@@ -1,0 +1,279 @@
+"""Sweeps of rigs: each layout over a population, on all processors, resumable, in shards; then the Pareto front.
+
+Each finished layout is a file in `layouts/`, which a later run keeps. The result of a layout depends on nothing but the
+sweep and the layout's number.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...base.arrays import Bools, finite_or_none
+from ...base.errors import EyerenderError, InputError
+from ...base.processes import process_pool
+from ...base.progress import Progress, Say, notify
+from ...base.storage.files import make_folder, read_json, write_json
+from ...base.storage.lock import final_lock, run_lock
+from ...design.choice import choose_lights, noise_of_some
+from ...design.crowd import coverage_of, users_of
+from ...design.noise import sensor_noise
+from ...design.people import Survey, figures_of, sites_seen
+from ...design.safety import eye_exposure
+from ...design.unknowns import Unknowns
+from ...folders.outfolder import clear, refuse_non_empty
+from ...scene import Scene
+from ...scene.spec import SceneSpec
+from .page import write_report
+from .spec import Layout, SweepSpec, layouts_of
+
+SCHEMA, LAYOUT_SCHEMA = "eyerender/sweep/1", "eyerender/sweep-layout/1"
+MARKER, SUMMARY, TABLE, LAYOUTS, REPORT = "sweep.json", "summary.json", "layouts.csv", "layouts", "report.html"
+CHOOSERS = 12
+"""People whose information chooses LEDs."""
+GOALS = ("noise_deg", "dropout", "leds", "cornea_w_m2")
+"""Quantities of which a good layout has little; they define the Pareto front."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepRun:
+    """Options of a sweep run.
+
+    Attributes:
+        workers: processes; None: one for each processor.
+        part: (K, N): evaluate only every N-th layout, beginning with the K-th.
+        overwrite: replace the contents of the folder.
+    """
+
+    workers: int | None = None
+    part: tuple[int, int] = (1, 1)
+    overwrite: bool = False
+
+
+def run_sweep(
+    spec: SweepSpec,
+    scene: Scene,
+    output: str | Path,
+    how: SweepRun = SweepRun(),
+    *,
+    progress: Progress | None = None,
+    say: Say = lambda _text: None,
+) -> dict[str, Any]:
+    """Evaluate the missing layouts of a sweep; once all are there, write summary.json, layouts.csv and report.html.
+
+    Args:
+        spec: the sweep.
+        scene: the sweep's base scene (`spec.base`).
+        output: the folder, which may hold a part of the same sweep.
+        how: options of the run.
+        progress: called with (layouts done, layouts of this run, what).
+        say: called with a message for each problem that does not end the run.
+
+    Raises:
+        InputError: a layout is impossible, or the folder holds something else.
+    """
+    folder = Path(output)
+    layouts = layouts_of(spec, scene)
+    settings = {"schema": SCHEMA, "sweep": _digest(spec, scene), "layouts": len(layouts), "spec": spec.to_mapping()}
+    _claim(folder, settings, how.overwrite)
+    k, n = how.part
+    with run_lock(folder, how.part, say):
+        mine = [layout for layout in layouts if layout.number % n == k - 1]
+        missing = [layout for layout in mine if not _path(folder, layout.number).is_file()]
+        done = len(mine) - len(missing)
+        for number, record in _evaluated(spec, missing, how.workers):
+            write_json(_path(folder, number), {"schema": LAYOUT_SCHEMA, **record})
+            done += 1
+            notify(progress, done, len(mine), "layouts")
+    with final_lock(folder, say):
+        absent = sum(not _path(folder, layout.number).is_file() for layout in layouts)
+        if absent:
+            return {"schema": SCHEMA, "complete": False, "layouts": len(layouts), "missing": absent}
+        return _finish(folder, spec, scene, layouts)
+
+
+def _path(folder: Path, number: int) -> Path:
+    return folder / LAYOUTS / f"{number:06d}.json"
+
+
+def _digest(spec: SweepSpec, scene: Scene) -> str:
+    content = {"spec": spec.to_mapping(), "scene": scene.located().to_mapping()}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _claim(folder: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
+    """Create the folder for this sweep, or check that it belongs to it.
+
+    Raises:
+        InputError: the folder holds something else.
+        EyerenderError: the folder cannot be written.
+    """
+    marker = folder / MARKER
+    try:
+        if overwrite and marker.is_file() and folder.is_dir():
+            clear(folder)
+        if marker.is_file():
+            if read_json(marker).get("sweep") != settings["sweep"]:
+                raise InputError("holds another sweep; choose another folder or give --overwrite", source=str(folder))
+            return
+        refuse_non_empty(folder, overwrite)
+        make_folder(folder)
+        if overwrite:
+            clear(folder)
+        (folder / LAYOUTS).mkdir(exist_ok=True)
+        write_json(marker, settings)
+    except OSError as error:
+        raise EyerenderError(f"{folder}: cannot be written ({error.strerror or error})") from None
+
+
+def _evaluated(spec: SweepSpec, layouts: Sequence[Layout], workers: int | None) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield results of layouts as worker processes finish them."""
+    count = min(workers or os.cpu_count() or 1, len(layouts))
+    if count <= 1:
+        yield from ((layout.number, evaluate(spec, layout)) for layout in layouts)
+        return
+    todo = iter(layouts)
+    with process_pool(count) as pool:
+        running: dict[Future[dict[str, Any]], int] = {}
+
+        def start(some: int) -> None:
+            running.update({pool.submit(evaluate, spec, layout): layout.number for layout in islice(todo, some)})
+
+        start(2 * count)
+        while running:
+            ready, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in ready:
+                yield running.pop(future), future.result()
+            start(len(ready))
+
+
+def evaluate(spec: SweepSpec, layout: Layout) -> dict[str, Any]:
+    """Evaluate one layout: choose its LEDs, and compute bound, dropout and exposure over the population."""
+    survey = _survey(spec, layout.scene)
+    scene = Scene.of(SceneSpec.from_mapping(layout.scene))
+    sites, chosen = len(scene.rig.lights), tuple(range(len(scene.rig.lights)))
+    if layout.lights < sites:
+        (known,) = sites_seen(survey, [noise_of_some(scene, layout.lights)], min(CHOOSERS, spec.people))
+        chosen = choose_lights(known, layout.lights)
+        leds = [layout.scene["rig"]["lights"][k] for k in chosen]
+        data = {**layout.scene, "rig": {**layout.scene["rig"], "lights": leds}}
+        survey, scene = _survey(spec, data), Scene.of(SceneSpec.from_mapping(data))
+    found = figures_of(survey, sensor_noise(scene), 0, spec.people)
+    if not len(found.subject):
+        raise InputError("no eye of this population is physically possible", path="population")
+    coverage = coverage_of(found)
+    return {
+        "number": layout.number,
+        "values": dict(layout.values),
+        "leds": len(chosen),
+        "chosen": list(chosen),
+        "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
+        "people": len(found.subject),
+        "frame_to_frame_deg": users_of(found.noise_deg),
+        "bound_deg": users_of(found.bound_deg),
+        "noise_deg": finite_or_none(np.median(found.noise_deg)),
+        "coverage": coverage,
+        "dropout": 1.0 - coverage["outline_and_2_glints"],
+        **_exposure(scene),
+    }
+
+
+def _survey(spec: SweepSpec, scene: Mapping[str, Any]) -> Survey:
+    return Survey(
+        scene=scene,
+        population=spec.people_of().to_mapping(),
+        seed=spec.seed,
+        azimuth_deg=spec.azimuth_deg,
+        elevation_deg=spec.elevation_deg,
+        slippage_mm=spec.slippage_mm,
+        relief_mm=spec.relief_mm,
+        unknowns=Unknowns.population().to_mapping(),
+    )
+
+
+def _exposure(scene: Scene) -> dict[str, Any]:
+    """Compute the corneal irradiance at the scene's eye, or why it is unknown."""
+    side = scene.spec.subject.eyes[0]
+    place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
+    try:
+        found = eye_exposure(scene.rig, place, wavelength_nm=scene.spec.wavelength_nm)
+    except InputError as error:
+        return {"cornea_w_m2": None, "cornea_share": None, "exposure_reason": str(error)}
+    return {"cornea_w_m2": float(found.cornea_w_m2.sum()), "cornea_share": found.cornea_share, "exposure_reason": None}
+
+
+def pareto(rows: Sequence[Mapping[str, Any]]) -> Bools:
+    """Return which rows no other row dominates; an unknown value counts as the worst."""
+    table = np.array([[np.inf if row[goal] is None else float(row[goal]) for goal in GOALS] for row in rows])
+    beaten = np.zeros(len(table), dtype=bool)
+    for k, one in enumerate(table):
+        beaten[k] = bool(((table <= one).all(axis=1) & (table < one).any(axis=1)).any())
+    return ~beaten
+
+
+def _finish(folder: Path, spec: SweepSpec, scene: Scene, layouts: Sequence[Layout]) -> dict[str, Any]:
+    """Read all layouts and write the results."""
+    rows = [_read(_path(folder, layout.number), layout.number) for layout in layouts]
+    front = pareto(rows)
+    rows = [
+        {**{k: v for k, v in row.items() if k != "schema"}, "pareto": bool(best)}
+        for row, best in zip(rows, front, strict=True)
+    ]
+    data = {
+        "schema": SCHEMA,
+        "complete": True,
+        "scene": scene.name,
+        "people": spec.people,
+        "seed": spec.seed,
+        "goals": list(GOALS),
+        "layouts": len(rows),
+        "pareto": [row["number"] for row in rows if row["pareto"]],
+        "rows": rows,
+    }
+    write_json(folder / SUMMARY, data)
+    _write_table(folder / TABLE, rows)
+    write_report(folder / REPORT, data)
+    return data
+
+
+_KEYS = {
+    "values", "leds", "chosen", "lights_mm", "people", "frame_to_frame_deg", "bound_deg", "noise_deg", "coverage",
+    "dropout", "cornea_w_m2", "cornea_share",
+}  # fmt: skip
+
+
+def _read(path: Path, number: int) -> dict[str, Any]:
+    """Read the result of a layout.
+
+    Raises:
+        InputError: this package did not write the file.
+    """
+    row = read_json(path)
+    if row.get("schema") != LAYOUT_SCHEMA or row.get("number") != number or not row.keys() >= _KEYS:
+        raise InputError(f"is not the result of layout {number}; remove it", source=str(path))
+    return row
+
+
+def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a CSV table with one row per layout."""
+    names = list(rows[0]["values"])
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["layout", *names, "noise_deg", "U50E95_deg", "U95E95_deg", "dropout", "leds", "cornea_w_m2",
+                         "cornea_share", "chosen", "pareto"])  # fmt: skip
+        for row in rows:
+            users = row["frame_to_frame_deg"]
+            values = [json.dumps(row["values"][name]) for name in names]
+            writer.writerow([row["number"], *values, row["noise_deg"], users["U50E95"], users["U95E95"], row["dropout"],
+                             row["leds"], row["cornea_w_m2"], row["cornea_share"],
+                             " ".join(map(str, row["chosen"])), row["pareto"]])  # fmt: skip

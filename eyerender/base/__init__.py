@@ -1,0 +1,1 @@
+"""What every package uses: errors, array values, specs, storage, progress, processes, compilation, versions."""

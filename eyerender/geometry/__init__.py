@@ -1,1 +1,0 @@
-"""Geometry shared by every observer: transforms, surfaces and the ellipse."""

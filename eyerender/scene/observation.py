@@ -1,0 +1,587 @@
+"""Observations: what an observer reports of every (frame, eye), as structs of arrays, and their JSON records.
+
+Both observers report this type, and gaze estimators take nothing else. A frame is one exposure of one camera and may
+contain both eyes; an observation belongs to (frame, eye). Where a status is not OK the numbers beside it are NaN in
+memory and null in the record, and there is a reason. A pupil of which only arcs are visible has a status of its own,
+PARTIAL. In a record a status is a word: "ok", "partial", or "missing" for all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.arrays import ArrayValue, Bools, Columns, Floats, Ints, Objects, Statuses, column, frozen
+from ..base.errors import InputError, Problems
+from ..base.status import Status
+from ..base.storage.files import shown
+
+RECORD = 2
+"""Version of the records that are written by default; `SCHEMAS` are the versions that are read."""
+SCHEMAS = {1: "eyerender/record/1", 2: "eyerender/record/2"}
+EYES = ("right", "left")
+
+# Largest number of boundary points of one pupil (ten per degree) and of all pupils of a batch; a point takes 25 bytes.
+MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
+# Largest number of glints of all observations of a batch; each has a status and a reason.
+MAX_GLINTS = 5_000_000
+# Limits in a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
+_MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Index(Columns):
+    """Identity of each observation; all arrays (n,) or (n, 3).
+
+    Attributes:
+        frame: number of the frame.
+        fixation: index of the fixation. Fixations, cameras and heads are counted from 0 in the scene's order; -1 is
+            unknown.
+        camera: index of the camera.
+        head: index of the head position.
+        eye: 0 for the right and 1 for the left eye, -1 where unknown.
+        eye_model: name of the eye model.
+        target_mm: (n, 3) NaN where there is no target.
+        head_mm: (n, 3) head position.
+        eye_position_mm: (n, 3) apex of the unrotated eye in the world, without `head_mm`.
+    """
+
+    frame: Ints
+    fixation: Ints = column()
+    camera: Ints = column()
+    head: Ints = column()
+    eye: Ints = column()
+    eye_model: Objects = column()
+    target_mm: Floats = column(3)
+    head_mm: Floats = column(3)
+    eye_position_mm: Floats = column(3)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PoseTruth(Columns):
+    """True pose of the eye, arrays (n,) in radians, NaN where unknown; `residual_mm` is its miss of the target."""
+
+    azimuth_rad: Floats
+    elevation_rad: Floats = column()
+    torsion_rad: Floats = column()
+    residual_mm: Floats = column()
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PupilFeatures(Columns):
+    """The apparent pupil in full-sensor pixels, arrays with a leading axis n.
+
+    Where the status is PARTIAL, centre, axes and angle are NaN, `points_px` holds the visible points with NaN in place
+    of the others, and `arc_ellipse` is the ellipse of the visible points.
+
+    Attributes:
+        status: (n,) of `Status`.
+        reason: (n,) why it is not OK, in words, with details where there are any.
+        in_image: (n,) whether the pupil lies on the sensor.
+        centre_px: (n, 2) centre of the direct least-squares ellipse of the boundary.
+        semi_axes_px: (n, 2) a >= b of that ellipse.
+        angle_rad: (n,) angle of a, in [0, pi).
+        anatomical_centre_px: (n, 2) image of the stop's centre.
+        points_px: (n, k, 2) the boundary itself.
+        covariance: (n, 5, 5) over (cx, cy, a, b, angle).
+        arcs_deg: (n, m, 2) visible arcs of the true boundary, from and to in degrees of the stop's parameter; NaN where
+            there are fewer than m.
+        arc_ellipse: (n, 5) (cx, cy, a, b px, angle rad); NaN where the visible points do not determine it.
+    """
+
+    status: Statuses
+    reason: Objects = column()
+    in_image: Bools = column()
+    centre_px: Floats = column(2)
+    semi_axes_px: Floats = column(2)
+    angle_rad: Floats = column()
+    anatomical_centre_px: Floats = column(2)
+    points_px: Floats = column(0, 2)
+    covariance: Floats = column(5, 5)
+    arcs_deg: Floats = column(0, 2)
+    arc_ellipse: Floats = column(5)
+
+    @property
+    def ok(self) -> Bools:
+        """Whether the whole pupil was found, (n,)."""
+        return np.asarray(self.status == Status.OK)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class GlintFeatures(Columns):
+    """Glints in full-sensor pixels, arrays with leading axes (n, m); `light` is -1 where it is unknown.
+
+    `status` (n, m) are `Status`, with a `reason` in words where it is not OK. Rows with fewer than m glints are padded
+    with status NONE.
+    """
+
+    LEADING = 2
+
+    status: Statuses
+    light: Ints = column()
+    reason: Objects = column()
+    in_image: Bools = column()
+    xy_px: Floats = column(2)
+    covariance: Floats = column(2, 2)
+
+    @property
+    def ok(self) -> Bools:
+        """Whether a glint was found, (n, m)."""
+        return np.asarray(self.status == Status.OK)
+
+    def of_light(self, light: int) -> tuple[Floats, Bools]:
+        """Return the position (n, 2) px of one light's glint, and whether it was found (n,)."""
+        n, m = self.light.shape
+        if m == 0:
+            return np.full((n, 2), np.nan), np.zeros(n, dtype=bool)
+        here = (self.light == light) & self.ok
+        found = here.any(axis=1)
+        xy = self.xy_px[np.arange(n), here.argmax(axis=1)]
+        return np.where(found[:, None], xy, np.nan), found
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Observations(ArrayValue):
+    """A batch of observations, in frame order and with the right eye first within a frame."""
+
+    index: Index
+    pose: PoseTruth
+    pupil: PupilFeatures
+    glints: GlintFeatures
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def take(self, rows: Any) -> Observations:
+        """Select rows (indices, a slice or a mask)."""
+        return Observations(**{part.name: getattr(self, part.name).take(rows) for part in fields(self)})
+
+    def with_targets(self, target_mm: ArrayLike) -> Observations:
+        """Replace the targets by points (n, 3) or (3,) mm in the world, NaN where there is none."""
+        targets = np.broadcast_to(np.asarray(target_mm, dtype=float), (len(self), 3))
+        return replace(self, index=replace(self.index, target_mm=frozen(targets)))
+
+    def records(self, version: int = RECORD) -> Iterator[dict[str, Any]]:
+        """Yield one record (docs/formats.md) per observation; every key is present, null where it does not apply.
+
+        Args:
+            version: version of the record; in version 1 a partial pupil is a missing one.
+        """
+        for i in range(len(self)):
+            yield self._record(i, version)
+
+    def _record(self, i: int, version: int) -> dict[str, Any]:
+        at, pose, pupil, glints = self.index, self.pose, self.pupil, self.glints
+        # Plain integers: comparing a NumPy integer with a Status takes 20 times as long.
+        status, glint_status = Status(int(pupil.status[i])), list(map(Status, glints.status[i].tolist()))
+        if version == 1 and status == Status.PARTIAL:
+            status = Status.NOT_FOUND
+        return {
+            "schema": SCHEMAS[version],
+            "frame": int(at.frame[i]),
+            "fixation": _count(at.fixation[i]),
+            "camera": _count(at.camera[i]),
+            "eye": EYES[int(at.eye[i])] if at.eye[i] >= 0 else None,
+            "eye_model": at.eye_model[i],
+            "target_mm": _numbers(at.target_mm[i]),
+            "head_mm": _numbers(at.head_mm[i]),
+            "eye_position_mm": _numbers(at.eye_position_mm[i]),
+            "pose": {
+                "azimuth_deg": _numbers(np.degrees(pose.azimuth_rad[i])),
+                "elevation_deg": _numbers(np.degrees(pose.elevation_rad[i])),
+                "torsion_deg": _numbers(np.degrees(pose.torsion_rad[i])),
+                "residual_mm": _numbers(pose.residual_mm[i]),
+            },
+            "pupil": {
+                "status": status.label,
+                "reason": pupil.reason[i] or None,
+                "in_image": bool(pupil.in_image[i]) if status in (Status.OK, Status.PARTIAL) else None,
+                "centre_px": _numbers(pupil.centre_px[i]),
+                "semi_axes_px": _numbers(pupil.semi_axes_px[i]),
+                "angle_rad": _numbers(pupil.angle_rad[i]),
+                "anatomical_centre_px": _numbers(pupil.anatomical_centre_px[i]),
+                "points_px": _points(pupil.points_px[i]),
+                "covariance": _numbers(pupil.covariance[i]),
+                **(_arcs_of(pupil, i) if version > 1 else {}),
+            },
+            "glints": [
+                {
+                    "light": _count(glints.light[i, j]),
+                    "status": glint_status[j].label,
+                    "reason": glints.reason[i, j] or None,
+                    "in_image": bool(glints.in_image[i, j]) if glint_status[j] == Status.OK else None,
+                    "xy_px": _numbers(glints.xy_px[i, j]),
+                    "covariance": _numbers(glints.covariance[i, j]),
+                }
+                for j in range(len(glint_status))
+                if glint_status[j] != Status.NONE
+            ],
+        }
+
+    @classmethod
+    def from_records(
+        cls, records: Sequence[dict[str, Any]], *, source: str = "", complete: bool = False
+    ) -> Observations:
+        """Read records of any version.
+
+        A key that is left out counts as null. A feature with a place and without a status is 'ok'. Without a `frame`
+        in any record, every record is a frame of its own.
+
+        Args:
+            records: the records.
+            source: name of their file in messages.
+            complete: whether every key must be there, as this package writes them.
+
+        Raises:
+            InputError: naming the records and the keys.
+        """
+        rows = list(records)
+        reader = _Reader(rows, source, complete)
+        eye = reader.texts("eye")
+        for k, name in enumerate(eye):
+            if name is not None and name not in EYES:
+                reader.refuse(k, "eye", "must be 'right' or 'left'")
+                eye[k] = None
+        head = reader.array("head_mm", (3,))
+        reason = reader.texts("pupil.reason")
+        centre, semi_axes = reader.array("pupil.centre_px", (2,)), reader.array("pupil.semi_axes_px", (2,))
+        placed = np.asarray(np.isfinite(centre).all(axis=1))
+        status = reader.statuses("pupil.status", reason, placed)
+        for row in np.flatnonzero(status == Status.OK).tolist():
+            centre_given, axes_given = (
+                rows[row].get("pupil", {}).get(key) is not None for key in ("centre_px", "semi_axes_px")
+            )
+            if not centre_given or (semi_axes[row] <= 0).any() or (complete and not axes_given):
+                reader.refuse(row, "pupil", "is 'ok', but has no centre or semi-axes")
+        found = cls(
+            index=Index(
+                frame=reader.frames(),
+                fixation=reader.counts("fixation"),
+                camera=reader.counts("camera"),
+                head=count_heads(head),
+                eye=np.array([EYES.index(e) if e else -1 for e in eye], np.int64),
+                eye_model=reader.texts("eye_model"),
+                target_mm=reader.array("target_mm", (3,)),
+                head_mm=head,
+                eye_position_mm=reader.array("eye_position_mm", (3,)),
+            ),
+            pose=PoseTruth(
+                azimuth_rad=np.radians(reader.array("pose.azimuth_deg", ())),
+                elevation_rad=np.radians(reader.array("pose.elevation_deg", ())),
+                torsion_rad=np.radians(reader.array("pose.torsion_deg", ())),
+                residual_mm=reader.array("pose.residual_mm", ()),
+            ),
+            pupil=PupilFeatures(
+                status=status,
+                reason=reason,
+                in_image=reader.flags("pupil.in_image"),
+                centre_px=centre,
+                semi_axes_px=semi_axes,
+                angle_rad=reader.array("pupil.angle_rad", ()),
+                anatomical_centre_px=reader.array("pupil.anatomical_centre_px", (2,)),
+                points_px=reader.points("pupil.points_px"),
+                covariance=reader.array("pupil.covariance", (5, 5)),
+                arcs_deg=reader.arcs(),
+                arc_ellipse=reader.arc_ellipses(),
+            ),
+            glints=reader.glints(),
+        )
+        reader.problems.check()
+        return found
+
+
+class _Reader:
+    """Read columns from records, and collect the record number and key of everything that is wrong.
+
+    Raises:
+        InputError: an entry is not a record at all.
+    """
+
+    def __init__(self, records: list[dict[str, Any]], source: str, complete: bool) -> None:
+        self.records = records
+        self.complete = complete
+        self.problems = Problems(source)
+        for k, record in enumerate(records):
+            if not isinstance(record, dict):
+                self.problems.add("must be a record", f"records.{k}")
+            elif "schema" not in record:
+                self.refuse(k, "schema", f"missing; write {SCHEMAS[RECORD]!r}")
+            elif record["schema"] not in SCHEMAS.values():
+                known = " and ".join(map(repr, SCHEMAS.values()))
+                self.refuse(k, "schema", f"is {shown(record['schema'])}; this version reads {known}")
+            else:
+                for part in ("pose", "pupil"):
+                    if not isinstance(record.get(part, {}), dict):
+                        self.refuse(k, part, "must be an object")
+        self.problems.check()
+
+    def values(self, path: str) -> list[Any]:
+        """Return the value at a path of each record; None where it is missing."""
+        return [self._value(k, path) for k in range(len(self.records))]
+
+    def _value(self, k: int, path: str) -> Any:
+        value: Any = self.records[k]
+        for key in path.split("."):
+            if key not in value:
+                if self.complete:
+                    self.refuse(k, path, "missing")
+                return None
+            value = value[key]
+        return value
+
+    def refuse(self, k: int, path: str, reason: str) -> None:
+        self.problems.add(reason, f"records.{k}.{path}")
+
+    def texts(self, path: str) -> Objects:
+        out = np.empty(len(self.records), dtype=object)
+        for k, value in enumerate(self.values(path)):
+            if value is None or (isinstance(value, str) and len(value) <= _MAX_TEXT):
+                out[k] = value
+            else:
+                self.refuse(k, path, f"must be null or a text of at most {_MAX_TEXT} characters")
+        return out
+
+    def statuses(self, path: str, reasons: Objects, placed: Bools) -> Statuses:
+        """Read statuses; where a record has none, use `placed` (n,), which says whether there is a feature."""
+        labels = self.texts(path)
+        for k, label in enumerate(labels):
+            if label is None and not self.complete:
+                labels[k] = "ok" if placed[k] else "missing"
+            elif not label:
+                self.refuse(k, path, "must be 'ok' or 'missing'")
+            elif self.records[k]["schema"] != SCHEMAS[1] and label not in ("ok", "partial", "missing"):
+                self.refuse(k, path, "must be 'ok', 'partial' or 'missing'")
+        return frozen([int(Status.of_record(*said)) for said in zip(labels, reasons, strict=True)], np.int8)
+
+    def flags(self, path: str) -> Bools:
+        values = self.values(path)
+        for k, value in enumerate(values):
+            if not (value is None or isinstance(value, bool)):
+                self.refuse(k, path, "must be true, false or null")
+        return frozen([value is True for value in values], bool)
+
+    def counts(self, path: str) -> Ints:
+        out = np.full(len(self.records), -1, np.int64)
+        for k, value in enumerate(self.values(path)):
+            if value is None or _is_count(value):
+                out[k] = -1 if value is None else value
+            else:
+                self.refuse(k, path, "must be a whole number or null")
+        return frozen(out, np.int64)
+
+    def frames(self) -> Ints:
+        """Read the frame numbers; if no record has one, number the records."""
+        given = [record.get("frame") is not None for record in self.records]
+        if not self.complete and not any(given):
+            return frozen(np.arange(len(given)), np.int64)
+        for k in np.flatnonzero(~np.array(given)) if not self.complete else ():
+            self.refuse(int(k), "frame", "missing; number the frames of all records or of none")
+        return self.counts("frame")
+
+    def array(self, path: str, shape: tuple[int, ...]) -> Floats:
+        out = np.full((len(self.records), *shape), np.nan)
+        for k, value in enumerate(self.values(path)):
+            if value is not None:
+                found = _array(value)
+                if found is None or found.shape != shape:
+                    self.refuse(k, path, f"must be null or {'x'.join(map(str, shape)) or 'one'} number(s)")
+                else:
+                    out[k] = found
+        return frozen(out)
+
+    def points(self, path: str, values: list[Any] | None = None, what: str = "points") -> Floats:
+        """Read lists of points as (n, longest, 2), padded with NaN."""
+        values = self.values(path) if values is None else values
+        for k, value in enumerate(values):
+            if not (value is None or (isinstance(value, list) and len(value) <= MAX_BOUNDARY_POINTS)):
+                self.refuse(k, path, f"must be null or a list of at most {MAX_BOUNDARY_POINTS} {what}")
+                values[k] = None
+        width = max((len(value) for value in values if value), default=0)
+        _check_width(len(values), width, MAX_POINTS, "boundary points", self.problems.source)
+        out = np.full((len(values), width, 2), np.nan)
+        for k, value in enumerate(values):
+            if value:
+                found = _array(value)
+                if found is None or found.shape != (len(value), 2):
+                    self.refuse(k, path, f"must be null or a list of {what}")
+                else:
+                    out[k, : len(value)] = found
+        return frozen(out)
+
+    def second(self, path: str) -> list[Any]:
+        """Read a key that was added in version 2; None in records of version 1."""
+        return [
+            None if record["schema"] == SCHEMAS[1] else self._value(k, path) for k, record in enumerate(self.records)
+        ]
+
+    def arcs(self) -> Floats:
+        path = "pupil.arcs_deg"
+        return self.points(path, self.second(path), "arcs [from, to]")
+
+    def arc_ellipses(self) -> Floats:
+        out = np.full((len(self.records), 5), np.nan)
+        for k, value in enumerate(self.second("pupil.arc_ellipse")):
+            if value is None:
+                continue
+            parts = [value.get(key) for key in _ELLIPSE_KEYS] if isinstance(value, dict) else []
+            arrays = [_array(part) for part in parts]
+            shapes = [None if a is None else a.shape for a in arrays]
+            if shapes == [(2,), (2,), ()]:
+                out[k] = np.concatenate([np.ravel(a) for a in arrays])  # type: ignore[arg-type]
+            else:
+                self.refuse(k, "pupil.arc_ellipse", f"must be null or an object of {', '.join(_ELLIPSE_KEYS)}")
+        return frozen(out)
+
+    def glints(self) -> GlintFeatures:
+        rows = [[] if entries is None and not self.complete else entries for entries in self.values("glints")]
+        for k, entries in enumerate(rows):
+            if not isinstance(entries, list) or len(entries) > _MAX_ENTRIES:
+                self.refuse(k, "glints", f"must be a list of at most {_MAX_ENTRIES}")
+                rows[k] = []
+        n, m = len(rows), max(map(len, rows), default=0)
+        _check_width(n, m, MAX_GLINTS, "glints", self.problems.source)
+        light, status = np.full((n, m), -1, np.int64), np.full((n, m), Status.NONE, np.int8)
+        reason = np.full((n, m), None, object)
+        inside, xy, covariance = np.zeros((n, m), bool), np.full((n, m, 2), np.nan), np.full((n, m, 2, 2), np.nan)
+        for k, entries in enumerate(rows):
+            for j, g in enumerate(entries):
+                if not self.complete and isinstance(g, dict):
+                    g = {**_NO_GLINT, **g}
+                    if g["status"] is None:
+                        g["status"] = "missing" if g["xy_px"] is None else "ok"
+                why = _glint_problem(g)
+                if why is not None:
+                    self.refuse(k, f"glints.{j}", f"is no glint record: {why}")
+                    continue
+                light[k, j] = -1 if g["light"] is None else g["light"]
+                status[k, j] = int(Status.of_record(g["status"], g["reason"]))
+                reason[k, j], inside[k, j] = g["reason"], bool(g["in_image"])
+                if g["xy_px"] is not None:
+                    xy[k, j] = g["xy_px"]
+                if g["covariance"] is not None:
+                    covariance[k, j] = g["covariance"]
+        return GlintFeatures(
+            light=light, status=status, reason=reason, in_image=inside, xy_px=xy, covariance=covariance
+        )
+
+
+def _arcs_of(pupil: PupilFeatures, i: int) -> dict[str, Any]:
+    """Write the keys of a pupil that version 2 of the record added."""
+    ellipse = _numbers(pupil.arc_ellipse[i])
+    parts = None if ellipse is None else (ellipse[:2], ellipse[2:4], ellipse[4])
+    return {
+        "arcs_deg": _points(pupil.arcs_deg[i]),
+        "arc_ellipse": None if parts is None else dict(zip(_ELLIPSE_KEYS, parts, strict=True)),
+    }
+
+
+_ELLIPSE_KEYS = ("centre_px", "semi_axes_px", "angle_rad")
+_NO_GLINT = dict.fromkeys(("light", "status", "reason", "in_image", "xy_px", "covariance"))
+
+
+def _glint_problem(g: Any) -> str | None:
+    """Describe what is wrong with one glint of a record; None if nothing is."""
+    if not isinstance(g, dict):
+        return "must be an object"
+    for key in _NO_GLINT:
+        if key not in g:
+            return f"{key} is missing"
+    light, status, reason, in_image = g["light"], g["status"], g["reason"], g["in_image"]
+    for fits, message in (
+        (light is None or _is_count(light), "light must be a whole number or null"),
+        (isinstance(status, str) and 0 < len(status) <= _MAX_TEXT, "status must be 'ok' or 'missing'"),
+        (reason is None or (isinstance(reason, str) and len(reason) <= _MAX_TEXT), "reason must be null or a text"),
+        (in_image is None or isinstance(in_image, bool), "in_image must be true, false or null"),
+    ):
+        if not fits:
+            return message
+    for key, shape in (("xy_px", (2,)), ("covariance", (2, 2))):
+        if g[key] is not None and ((found := _array(g[key])) is None or found.shape != shape):
+            return f"{key} must be null or {'x'.join(map(str, shape))} numbers"
+    if g["status"] == "ok" and g["xy_px"] is None:
+        return "it is 'ok', but has no xy_px"
+    return None
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
+
+
+def _array(value: Any) -> Floats | None:
+    """Convert numbers to an array if they are small enough to be squared; None for anything else."""
+    try:
+        found = np.asarray(value)
+    except (ValueError, OverflowError):  # rows of unequal length
+        return None
+    if found.dtype.kind not in "iuf" or not (np.abs(found) <= _LARGEST).all():
+        return None
+    return found
+
+
+def _check_width(rows: int, width: int, limit: int, what: str, source: str = "") -> None:
+    """Limit the width to which rows are padded, so that one wide record cannot exhaust the memory."""
+    if rows * width > limit:
+        raise InputError(f"{rows} records of up to {width} {what} are more than {limit} {what}", source=source)
+
+
+def count_heads(head_mm: Floats) -> Ints:
+    """Number head positions (n, 3) from 0: equal positions have one number, in order of appearance.
+
+    Records store the positions only, not these numbers.
+    """
+    heads: dict[bytes, int] = {}
+    return frozen([heads.setdefault((np.round(h, 9) + 0.0).tobytes(), len(heads)) for h in head_mm], np.int64)
+
+
+def version_of(record: dict[str, Any]) -> int:
+    """Read the format version of a record; raise `KeyError` or `ValueError` if it is not a record."""
+    return {schema: version for version, schema in SCHEMAS.items()}[str(record["schema"])]
+
+
+def concatenate(parts: Iterable[Observations]) -> Observations:
+    """Concatenate batches in order; pad glints and boundary points to the widest."""
+    batches = list(parts)
+    if len(batches) == 1:
+        return batches[0]
+
+    def joined(name: str) -> Any:
+        groups = [getattr(b, name) for b in batches]
+        columns = {}
+        for f in fields(groups[0]):
+            arrays = [getattr(g, f.name) for g in groups]
+            width = max((a.shape[1] for a in arrays if a.ndim > 1), default=0)
+            limit, what = (MAX_GLINTS, "glints") if name == "glints" else (MAX_POINTS, "boundary points")
+            if f.name in ("points_px", "light"):
+                _check_width(sum(map(len, arrays)), width, limit, what)
+            columns[f.name] = np.concatenate([_widened(a, width) for a in arrays])
+        return replace(groups[0], **columns)
+
+    return Observations(index=joined("index"), pose=joined("pose"), pupil=joined("pupil"), glints=joined("glints"))
+
+
+def _widened(a: Any, width: int) -> Any:
+    if a.ndim < 2 or a.shape[1] == width:
+        return a
+    fill = {"f": np.nan, "i": -1, "b": False, "O": None}[a.dtype.kind]  # -1 is Status.NONE as well
+    return np.concatenate([a, np.full((len(a), width - a.shape[1], *a.shape[2:]), fill, dtype=a.dtype)], axis=1)
+
+
+def _numbers(values: Any) -> Any:
+    a = np.asarray(values, dtype=float)
+    return None if not np.all(np.isfinite(a)) else a.tolist()
+
+
+def _points(values: Floats) -> Any:
+    good = values[np.isfinite(values).all(axis=-1)]
+    return good.tolist() if len(good) else None
+
+
+def _count(value: Any) -> int | None:
+    return int(value) if value >= 0 else None
