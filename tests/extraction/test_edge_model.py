@@ -9,11 +9,11 @@ from scipy import integrate, ndimage, optimize, special
 
 import make_ideal_images as ideal
 from eyerender.extraction import extract
-from eyerender.extraction.pupil.covariance import to_axes
-from eyerender.extraction.pupil.edge_model import EdgeModel
-from eyerender.extraction.pupil.least_squares import FIXED
-from eyerender.optics.ellipse import Ellipse, fit_ellipse_direct
-from tests.support.extraction_oracles import Place, Profile, jacobian, moved
+from eyerender.extraction.pupil.covariance import reshaped, to_axes
+from eyerender.extraction.pupil.edge_model import EdgeModel, boundary_terms
+from eyerender.extraction.pupil.least_squares import Pixels, Sums
+from eyerender.optics.ellipse import Ellipse, fit_ellipse_direct, signed_distance
+from tests.support import pixel_model
 
 
 def test_blurred_edge_of_a_disc():
@@ -22,6 +22,8 @@ def test_blurred_edge_of_a_disc():
     The model's error is second order in s / R: below (s / R)^2 / 4 of the step.
     """
     radius, sigma = 13.0, 1.04
+    disc = Ellipse(np.zeros(2), np.full(2, radius), 0.0)
+    model = EdgeModel(ellipse=disc, inner_dn=0.0, outer=np.array([1.0]), sigma_px=sigma)
     for offset in (-2.0, -0.7, 0.0, 0.4, 1.5, 3.0):
         r = radius + offset
 
@@ -29,7 +31,7 @@ def test_blurred_edge_of_a_disc():
             return q / sigma**2 * np.exp(-0.5 * ((r - q) / sigma) ** 2) * special.ive(0, r * q / sigma**2)
 
         exact = 1.0 - integrate.quad(density, max(0.0, r - 12 * sigma), radius)[0]
-        edge = Profile.of(np.array([offset]), np.array([1.0 / radius]), sigma).edge
+        edge = model.level(np.array([0.6 * r]), np.array([0.8 * r]))
         assert edge[0] == pytest.approx(exact, abs=0.25 * (sigma / radius) ** 2)
 
 
@@ -38,7 +40,7 @@ def test_level_of_a_blurred_ellipse():
     ellipse, sigma, fine = Ellipse(np.array([31.3, 29.6]), np.array([19.0, 13.0]), 0.6), 1.2, 8
     axis = (np.arange(64 * fine) + 0.5) / fine - 0.5
     x, y = np.meshgrid(axis, axis)
-    mask = (Place.of(ellipse, x.ravel(), y.ravel()).distance.reshape(x.shape) > 0.0).astype(float)
+    mask = (signed_distance(ellipse, np.stack([x, y], axis=-1)) > 0.0).astype(float)
     blurred = ndimage.gaussian_filter(mask, sigma * fine).reshape(64, fine, 64, fine).mean(axis=(1, 3))
     model = EdgeModel(ellipse=ellipse, inner_dn=20.0, outer=np.array([75.0]), sigma_px=np.sqrt(sigma**2 + 1.0 / 12.0))
     columns, rows = np.meshgrid(np.arange(64.0), np.arange(64.0))
@@ -50,37 +52,54 @@ def test_distance_is_the_nearest_points():
     rng = np.random.default_rng(3)
     ellipse = Ellipse(np.array([50.0, 40.0]), np.array([30.0, 18.0]), 1.1)
     points = ellipse.scaled(1.0).points(40) + rng.normal(0.0, 3.0, (40, 2))
-    place = Place.of(ellipse, points[:, 0], points[:, 1])
+    model = EdgeModel(ellipse=ellipse, inner_dn=0.0, outer=np.array([1.0]), sigma_px=1.0)
+    _, (distance, *_) = boundary_terms(*points.T.copy(), model.numbers())
     outline = ellipse.points(200_000)
     nearest = np.array([np.hypot(*(outline - p).T).min() for p in points])
-    np.testing.assert_allclose(np.abs(place.distance), nearest, atol=2e-5)
-    inside = np.array([ellipse.conic() @ [x * x, x * y, y * y, x, y, 1.0] < 0.0 for x, y in points])
-    np.testing.assert_array_equal(place.distance < 0.0, inside)
+    np.testing.assert_allclose(np.abs(distance), nearest, atol=2e-5)
+    np.testing.assert_array_equal(distance < 0.0, signed_distance(ellipse, points) < 0.0)
 
 
-@pytest.mark.parametrize("b", [15.0, 20.98])
-def test_jacobian_is_the_models_slope(b):
-    """Of a nearly round ellipse too, whose axes turn far with a small change of its shape."""
-    outer = np.array([75.0, 6.0, -4.0, 3.0, 2.0])
-    ellipse = Ellipse(np.array([40.2, 38.7]), np.array([21.0, b]), 0.8)
+def _leaning(b):
+    """Model with every term: texture, slope, tails and a lean; and pixels near its boundary."""
     model = EdgeModel(
-        ellipse=ellipse,
+        ellipse=Ellipse(np.array([40.2, 38.7]), np.array([21.0, b]), 0.8),
         inner_dn=20.0,
-        outer=outer,
+        outer=np.array([75.0, 6.0, -4.0, 3.0, 2.0]),
         sigma_px=1.3,
         slope=-1.2,
         kurtosis=0.7,
         lean=(0.4, -0.9),
     )
-    rng = np.random.default_rng(4)
-    base = model.ellipse.points(300) + rng.normal(0.0, 1.0, (300, 2))
-    place = Place.of(model.ellipse, base[:, 0], base[:, 1])
-    _, slopes, _ = jacobian(model, place)
+    pixels = model.ellipse.points(300) + np.random.default_rng(4).normal(0.0, 1.0, (300, 2))
+    return model, *pixels.T.copy()
+
+
+@pytest.mark.parametrize("b", [15.0, 20.98])
+def test_level_is_the_formulas(b):
+    model, x, y = _leaning(b)
+    np.testing.assert_allclose(model.level(x, y), pixel_model.level(model, x, y), atol=1e-6)
+
+
+def _stepped(model, step):
+    """The model after a step of its parameters, as the fit applies it."""
+    numbers = model.numbers() + step
+    numbers[:5] = reshaped(model.ellipse, step).numbers()
+    return EdgeModel.of(numbers)
+
+
+@pytest.mark.parametrize("b", [15.0, 20.98])
+def test_jacobian_is_the_models_slope(b):
+    """Of a nearly round ellipse too, whose axes turn far with a small change of its shape."""
+    model, x, y = _leaning(b)
+    # One sector per pixel, and a residual of 1 everywhere: the sums of slopes times residual are the slopes.
+    each = np.arange(x.size)
+    slopes = Sums.of(Pixels(x, y, model.level(x, y) + 1.0, each, each), model, np.zeros(x.size)).pull
     for k in range(slopes.shape[0]):
         step = np.zeros(slopes.shape[0])
         step[k] = 1e-5
-        up, down = moved(model, step), moved(model, -step)
-        slope = (up.level(base[:, 0], base[:, 1]) - down.level(base[:, 0], base[:, 1])) / 2e-5
+        up, down = _stepped(model, step), _stepped(model, -step)
+        slope = (pixel_model.level(up, x, y) - pixel_model.level(down, x, y)) / 2e-5
         # The shape's columns leave out how a pixel's place along the boundary changes with it: small terms.
         tolerance = 1.2 if k < 5 else 1e-5
         assert np.abs(slopes[k] - slope).max() < tolerance
@@ -93,8 +112,7 @@ def test_covariance_of_the_axes_follows_the_shape_matrix():
     covariance = np.diag([0.02, 0.03, 0.05, 0.04, 0.06]) ** 2
     rng = np.random.default_rng(6)
     draws = rng.multivariate_normal(np.zeros(5), covariance, 4000)
-    model = EdgeModel(ellipse=ellipse, inner_dn=0.0, outer=np.array([1.0]), sigma_px=1.0)
-    ellipses = [moved(model, np.concatenate([d, np.zeros(FIXED - 5)])).ellipse for d in draws]
+    ellipses = [reshaped(ellipse, d) for d in draws]
     sample = np.array([[*e.centre_px, *e.semi_axes_px, e.angle_rad] for e in ellipses])
     stated = np.sqrt(np.diag(to_axes(covariance, ellipse)))
     np.testing.assert_allclose(sample.std(axis=0), stated, rtol=0.05)
@@ -106,7 +124,7 @@ def test_refined_maximum_is_the_least_squares_one():
     found = extract(drawing.image).pupil
     e = found.ellipse
     yy, xx = np.mgrid[: drawing.image.shape[0], : drawing.image.shape[1]]
-    near = np.abs(Place.of(e, xx.ravel().astype(float), yy.ravel().astype(float)).distance) < 3.5
+    near = np.abs(signed_distance(e, np.stack([xx.ravel(), yy.ravel()], axis=-1))) < 3.5
     x, y = xx.ravel()[near].astype(float), yy.ravel()[near].astype(float)
     data = drawing.image.ravel()[near].astype(float)
 
@@ -116,7 +134,7 @@ def test_refined_maximum_is_the_least_squares_one():
     likely = 4.0 / np.array([*first, 0.15 * 55.0 / e.semi_axes_px[1], 1.0, *lean])
 
     def residual(p):
-        level = EdgeModel(
+        model = EdgeModel(
             ellipse=Ellipse(p[:2], p[2:4], p[4]),
             inner_dn=p[5],
             outer=p[6:9],
@@ -124,7 +142,8 @@ def test_refined_maximum_is_the_least_squares_one():
             slope=p[10],
             kurtosis=p[11],
             lean=p[12:],
-        ).level(x, y)
+        )
+        level = pixel_model.level(model, x, y)
         return np.concatenate([level - data, likely * p[[7, 8, 10, 11, 12, 13]]])
 
     start = np.array([*e.centre_px, *e.semi_axes_px, e.angle_rad, 20.0, 75.0, 0.0, 0.0, 1.1, 0.0, 0.0, 0.0, 0.0])
@@ -146,7 +165,7 @@ def test_tailed_blur_and_a_slope_leave_no_bias():
             np.array([47.0, 44.0]) + rng.uniform(-1.0, 1.0, 2), np.array([20.0, 18.0]), rng.uniform(0.0, 3.0)
         )
         x, y = np.meshgrid(*((np.arange(n * fine) + 0.5) / fine - 0.5 for n in (width, height)))
-        distance = Place.of(ellipse, x.ravel(), y.ravel()).distance.reshape(x.shape)
+        distance = signed_distance(ellipse, np.stack([x, y], axis=-1))
         sharp = np.where(distance < 0.0, 3000.0, 16000.0 * (1.0 - 0.006 * np.maximum(distance, 0.0)))
         blurred = sum(0.5 * ndimage.gaussian_filter(sharp, sigma * fine, truncate=6.0) for sigma in (0.55, 1.1))
         image = blurred.reshape(height, fine, width, fine).mean(axis=(1, 3)) + rng.normal(0.0, 40.0, (height, width))
@@ -185,11 +204,10 @@ def test_uneven_margin_leaves_no_bias():
         )
         phase, size = rng.uniform(0.0, 2.0 * np.pi, 6), rng.uniform(0.5, 1.0, 6)
         size *= 0.32 * np.sqrt(2.0) / np.hypot.reduce(size)
-        place = Place.on(ellipse, np.cos(t), np.sin(t))
+        outline = ellipse.points_at(np.cos(t), np.sin(t))
+        normals = pixel_model.nearest(ellipse, *outline.T).normal
         out = sum(a * np.cos(k * t + p) for k, (a, p) in enumerate(zip(size, phase, strict=True), start=3))
-        cos, sin = np.cos(ellipse.angle_rad), np.sin(ellipse.angle_rad)
-        normals = np.stack([place.nx * cos - place.ny * sin, place.nx * sin + place.ny * cos], axis=-1)
-        margin = ellipse.points_at(place.cos_t, place.sin_t) + out[:, None] * normals
+        margin = outline + out[:, None] * normals
         best = fit_ellipse_direct(margin)
         mask = np.zeros((height * fine, width * fine), np.uint8)
         corners = np.rint(((margin + 0.5) * fine - 0.5) * 16.0).astype(np.int32)

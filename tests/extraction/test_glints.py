@@ -15,7 +15,7 @@ from eyerender.extraction.glints.classification import Eye, compared, features
 from eyerender.extraction.glints.fits import SpotFit
 from eyerender.extraction.preprocessing import DN, Prepared, prepare
 from eyerender.optics.ellipse import Ellipse
-from tests.support.extraction_oracles import pixel_profile
+from tests.support.pixel_model import pixel_profile
 
 SEEDS = range(20_000, 20_008)
 

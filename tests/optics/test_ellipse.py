@@ -12,7 +12,6 @@ import pytest
 from eyerender.base.arrays import FloatLike
 from eyerender.base.errors import InputError
 from eyerender.optics import ellipse as el
-from tests.support.extraction_oracles import from_cv2
 from tests.support.paths import load
 
 
@@ -148,6 +147,12 @@ def test_conic_round_trip_and_sign():
     np.testing.assert_allclose(at_centre, -1.0, atol=1e-8)
     for no_ellipse in ([1.0, 0.0, -1.0, 0.0, 0.0, -1.0], [1.0, 0.0, 1.0, 0.0, 0.0, 1.0]):  # hyperbola, imaginary
         assert np.isnan(parameters_from_conic(no_ellipse)[0]).all()
+
+
+def from_cv2(rotated_rect):
+    """Convert OpenCV's rotated rectangle: centre, full axes (width, height), degrees of the width from +x toward +y."""
+    centre, axes, degrees = rotated_rect
+    return el.Ellipse(np.array(centre), 0.5 * np.array(axes), math.radians(degrees))
 
 
 def _to_cv2(ellipse):
