@@ -47,7 +47,9 @@ def _folder() -> Path | None:
     if cache is None or not os.access(cache, os.W_OK):
         return None
     package = Path(__file__).parents[1]
-    sources = sorted([*package.glob("extraction/**/*.py"), *package.glob("*/*kernels.py")])
+    sources = sorted(
+        [*package.glob("extraction/**/*.py"), *package.glob("*/*kernels.py"), *package.glob("*/formulas.py")]
+    )
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:_DIGITS]
     return cache / "kernels" / digest
 
