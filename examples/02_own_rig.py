@@ -14,7 +14,7 @@ import eyerender as er
 SAMPLES = 16  # small: 2
 
 camera = er.Camera.looking_at((0, 0, 0), position_mm=(45, -10, -25), focal_length_px=1500, size_px=(480, 400))
-ring = er.Led(ring=er.LedRing(radius_mm=14, count=8), intensity_mw_sr=2)
+ring = er.Led(ring=er.rig.LedRing(radius_mm=14, count=8), intensity_mw_sr=2)
 rig = er.Rig(cameras=[camera], lights=[ring])
 changed = rig.with_light(2, moved_mm=(0, 4, 0))
 

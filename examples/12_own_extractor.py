@@ -37,7 +37,7 @@ def find(image, request):
 find.reports = ["pupil"]
 """)
 os.environ["PYTHONPATH"] = os.pathsep.join([str(out), os.environ.get("PYTHONPATH", "")])
-result = er.bench_extractors(out / "images", out / "bench", ["own-fast", "darkest:find"])
+result = er.apps.bench_extractors(out / "images", out / "bench", ["own-fast", "darkest:find"])
 medians = {e["name"]: e["summary"]["centre_px_of_all_found"]["median"] for e in result["extractors"]}
 print(medians, "report:", out / "bench" / "report.html")
 

@@ -41,7 +41,7 @@ healthy, ill = eye_with(0.0, 0.0), eye_with(0.040, 0.060)
 # A headset's ring of LEDs shows the cone: its glints no longer lie on a circle.
 scale = SIZE[0] / 560
 camera = er.Camera.looking_at((-2, 0, 0), position_mm=(34, -8, -12), focal_length_px=1650 * scale, size_px=SIZE)
-rig = er.Rig(cameras=[camera], lights=[er.Led(ring=er.LedRing(radius_mm=22, count=20), intensity_mw_sr=0.2)])
+rig = er.Rig(cameras=[camera], lights=[er.Led(ring=er.rig.LedRing(radius_mm=22, count=20), intensity_mw_sr=0.2)])
 look = er.Look(iris_contrast=0.8)
 pictures, seen = [], []
 for spec in (healthy, ill):

@@ -21,7 +21,7 @@ rig = er.Rig(
     screen=er.Screen((600, 0, 0), (400, 240)),
 )
 subject = er.Subject(er.Eye("E4", pupil_diameter_mm=4.0), eyes=["right"])
-scene = er.Scene(subject, rig, targets=er.Targets(grid=GRID), lens=er.Lens(glare=0.1), image=er.Picture(spp=SPP))
+scene = er.Scene(subject, rig, targets=er.Targets(grid=GRID), lens=er.rig.Lens(glare=0.1), image=er.Picture(spp=SPP))
 steps = er.budget_steps(scene.frames(), seeds=SEEDS)
 print(list(steps))
 

@@ -22,8 +22,8 @@ scene = er.load_scene("headset").with_({"rig.lights": lights})
 # %%
 # What each LED adds to what is known of a frame in which the headset may have slipped. The best ones are chosen by
 # greedy exchange.
-added = er.site_information(scene.frames(), noise=er.noise_of_some(scene, 4))
-chosen = {count: er.choose_lights(added, count) for count in (1, 2, 4, 6)}
+added = er.design.site_information(scene.frames(), noise=er.design.noise_of_some(scene, 4))
+chosen = {count: er.design.choose_lights(added, count) for count in (1, 2, 4, 6)}
 for count, numbers in chosen.items():
     print(f"{count} LEDs: {numbers}")
 

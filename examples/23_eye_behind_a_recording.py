@@ -31,7 +31,7 @@ seen = replace(exact, glints=replace(exact.glints, xy_px=glints), pupil=replace(
 
 # %%
 # The fit starts from E2 and knows how much adults differ.
-noise = er.FeatureNoise.of(0.05, 0.02, rig=scene.rig)
+noise = er.design.FeatureNoise.of(0.05, 0.02, rig=scene.rig)
 fit = er.fit_eye(seen, scene.rig, er.Unknowns.population(), prior="E2", noise=noise)[0]
 found = fit.to_mapping()
 for name, value in found["person"].items():

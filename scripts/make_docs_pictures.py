@@ -136,7 +136,7 @@ def main(out: Path) -> None:
             shrunk(scratch / f"{what}.png", out / f"view_{what}.png", 900)
         er.preview("dataset_region", scratch / "sheet.png")
         shrunk(scratch / "sheet.png", out / "sheet.jpg", 840)
-        er.run_quickstart(scratch / "quickstart")
+        er.apps.run_quickstart(scratch / "quickstart")
         screenshot(scratch / "quickstart" / "report.html", scratch / "report.png")
         shrunk(scratch / "report.png", out / "report.jpg", 800)
 

@@ -157,7 +157,7 @@ def test_a_camera_in_an_eye_is_warned_of():
 
 
 def test_one_led_of_a_ring_can_be_moved():
-    ring = er.LedRing(radius_mm=20, count=6)
+    ring = er.rig.LedRing(radius_mm=20, count=6)
     rig = er.Rig(cameras=RIG.cameras, lights=(er.Led((600, 0, 100)), er.Led(ring=ring, radius_mm=1.5)))
     moved = rig.with_light(3, moved_mm=(0, 0, 2), intensity_mw_sr=5)
     before, after = rig.build().lights, moved.build().lights

@@ -18,11 +18,17 @@ GROUPS = {
     "api_rigs": ("Rigs: cameras, lights, screens, sensors", ("rig",)),
     "api_design": ("Rig design: information, noise, fits of eyes", ("design",)),
     "api_observers": ("Observers, observations and comparison", ("",)),
-    "api_datasets": ("Datasets and folders of images", ("dataset", "folders", "benchmark")),
+    "api_datasets": ("Datasets and folders of images", ("dataset", "folders")),
 }
 
-# Pages that end with the names of a namespace which are not among the package's own.
-NAMESPACES = {"api_eyes": "region", "api_rigs": "rig", "api_datasets": "dataset"}
+# The namespaces whose names stand on each page, below the package's own.
+NAMESPACES = {
+    "api_eyes": ["eye", "region", "population"],
+    "api_rigs": ["rig"],
+    "api_design": ["design"],
+    "api_observers": ["apps"],
+    "api_datasets": ["dataset"],
+}
 
 # PyTorch need not be installed where the site is built.
 TORCH = """# Datasets for PyTorch
@@ -72,9 +78,8 @@ def pages() -> dict[str, str]:
         names = [name for name, its in where.items() if its == page]
         text = f"# {title}\n\n" + api_section("eyerender", names)
         made["api_names"] += f"## {title}\n\n" + summary("eyerender", names)
-        if space := NAMESPACES.get(page):
-            more = [name for name in getattr(er, space).__all__ if name not in er.__all__]
-            text += f"\n## Also in `er.{space}`\n\n" + api_section(f"eyerender.{space}", more)
+        for space in NAMESPACES.get(page, []):
+            text += f"\n## In `er.{space}`\n\n" + api_section(f"eyerender.{space}", getattr(er, space).__all__)
         made[page] = text
     made["api_names"] += "## Gaze estimators, in `er.gaze`\n\n" + summary("eyerender.gaze", er.gaze.__all__)
     made["api_gaze"] = "# Gaze estimators\n\n" + api_section("eyerender.gaze", er.gaze.__all__)

@@ -1,1 +1,8 @@
-"""Products built from the package: benchmark, studies, inspection, realism, rigs, sweeps, surveys, quickstart, live."""
+"""Products built from the package: benchmark, studies, inspection, realism, rigs, sweeps, surveys, quickstart, live.
+
+The names in `__init__.pyi` load their modules on first use.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,14 +3,12 @@ from .anatomy import Face as Face
 from .anatomy import Fissure as Fissure
 from .anatomy import Lashes as Lashes
 from .anatomy import Lid as Lid
-from .anatomy import Region as Region
 from .anatomy import Skin as Skin
 from .anatomy import TearFilm as TearFilm
 from .headspec import Head as Head
 from .headspec import HeadParts as HeadParts
 from .iris import IrisPattern as IrisPattern
 from .look import Fundus as Fundus
-from .look import Look as Look
 from .look import Scattering as Scattering
 from .mesh import LidMargins as LidMargins
 from .mesh import RegionMesh as RegionMesh

@@ -1,5 +1,4 @@
 from .camera import CalibrationFile as CalibrationFile
-from .camera import Camera as Camera
 from .camera import CameraCalibration as CameraCalibration
 from .camera import Mirror as Mirror
 from .camera import PinholeCamera as PinholeCamera
@@ -14,16 +13,12 @@ from .imaging import RadianceMap as RadianceMap
 from .imaging import Star as Star
 from .imaging import Sun as Sun
 from .light import Lamp as Lamp
-from .light import Led as Led
 from .light import LedRing as LedRing
 from .opencv import OpenCvCalibration as OpenCvCalibration
 from .opencv import read_opencv as read_opencv
-from .rig import Rig as Rig
 from .rig import RigGeometry as RigGeometry
 from .rig import RigLike as RigLike
-from .screen import Screen as Screen
 from .screen import ScreenPlane as ScreenPlane
-from .sensor import Sensor as Sensor
 from .surroundings import paint as paint
 
 __all__: list[str]

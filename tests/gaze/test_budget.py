@@ -231,7 +231,7 @@ def test_images_are_steps_of_their_own(tmp_path):
     assert np.abs(centres - steps["image"][0].pupil.centre_px).max() < 0.5
     again = er.budget_steps(scene.frames(), seeds=1)
     np.testing.assert_array_equal(again["noise"][0].pupil.centre_px, centres[0])
-    lens = scene.with_(lens=er.Lens(glare=0.05))
+    lens = scene.with_(lens=er.rig.Lens(glare=0.05))
     assert list(er.budget_steps(lens.frames(), seeds=1)) == [
         "estimator", "eye model", "optics", "extraction", "image formation", "noise",
     ]  # fmt: skip

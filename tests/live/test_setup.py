@@ -102,7 +102,7 @@ def test_head_positions_are_kept():
 def test_a_calibrated_camera_moves_without_turning(desk):
     camera = desk.scene.rig.cameras[0]
     numbers = {"K": camera.K, "R": camera.R, "t_mm": camera.t}
-    fixed = er.Camera(resolution_px=camera.resolution_px, calibration=er.CameraCalibration(**numbers))
+    fixed = er.Camera(resolution_px=camera.resolution_px, calibration=er.rig.CameraCalibration(**numbers))
     scene = desk.scene.with_(rig=er.Rig(cameras=(fixed,), lights=desk.origin.rig.lights, screen=desk.origin.rig.screen))
     moved = Setup.of(scene).with_camera_at(0, [650.0, 10.0, -200.0])
     after = moved.scene.rig.cameras[0]

@@ -1,0 +1,7 @@
+from .benchmark.options import BenchOptions as BenchOptions
+from .benchmark.protocol import Extractor as Extractor
+from .benchmark.run import bench_extractors as bench_extractors
+from .quickstart import compare_folder as compare_folder
+from .quickstart import run_quickstart as run_quickstart
+
+__all__: list[str]

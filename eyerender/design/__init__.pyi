@@ -1,0 +1,11 @@
+from .choice import SiteInformation as SiteInformation
+from .choice import choose_lights as choose_lights
+from .choice import noise_of_some as noise_of_some
+from .choice import site_information as site_information
+from .fit import EyeFit as EyeFit
+from .information import Information as Information
+from .noise import FeatureNoise as FeatureNoise
+from .safety import Exposure as Exposure
+from .safety import eye_exposure as eye_exposure
+
+__all__: list[str]
