@@ -35,13 +35,13 @@ from .imaging.capture import render_windows as render_windows
 from .imaging.causes import budget_steps as budget_steps
 from .imaging.comparison import Comparison as Comparison
 from .imaging.comparison import compare as compare
+from .imaging.folder import export_scene as export_scene
+from .imaging.folder import render_folder as render_folder
 from .imaging.imageobserver import ImageObserver as ImageObserver
 from .imaging.imageobserver import detect as detect
 from .imaging.images import LabelledImage as LabelledImage
 from .imaging.images import auto_exposed as auto_exposed
-from .imaging.images import export_scene as export_scene
 from .imaging.images import render as render
-from .imaging.images import render_folder as render_folder
 from .region.anatomy import Region as Region
 from .region.look import Look as Look
 from .report.comparison import write_report as write_report

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from eyerender.analytic.observer import trace
-from eyerender.folders.imagefolder import PUPIL
 from eyerender.imaging.capture import render_windows
 from eyerender.optics.ellipse import Ellipse, signed_distance
 from eyerender.scene import Scene
+from eyerender.scene.parts import PUPIL
 from eyerender.scene.spec import SceneSpec
 from make_ideal_images import Drawing
 

@@ -19,7 +19,7 @@ from eyerender.dataset import assemble, croissant, done
 from eyerender.folders.imagefile import write_png
 from eyerender.folders.imagefolder import DONE, LINES, LOG, SHARDS, write_dataset
 from eyerender.folders.outfolder import MARKER, clear, refuse_non_empty, staged
-from eyerender.imaging.images import render_folder
+from eyerender.imaging.folder import render_folder
 from eyerender.scene import load_scene
 
 LINE = {"file_name": "images/a.png", "window_px": {"x0": 3, "y0": 4, "width": 5, "height": 6}, "records": []}

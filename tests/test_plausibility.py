@@ -14,7 +14,7 @@ from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import shipped_datasets
-from eyerender.imaging.images import render_folder
+from eyerender.imaging.folder import render_folder
 from eyerender.rig.plausibility import is_saturated
 from eyerender.rig.sensor import Sensor
 from eyerender.scene import Scene, load_scene, shipped_scenes

@@ -15,8 +15,8 @@ from ..folders.imagefolder import ImageFolder, same_run
 from ..gaze.estimate import GazeEstimator
 from ..gaze.regression import Regression
 from ..imaging.comparison import Comparison, compare
+from ..imaging.folder import render_folder
 from ..imaging.imageobserver import ImageObserver, scene_of
-from ..imaging.images import render_folder
 from ..report.comparison import Timing, write_report
 from ..rig.plausibility import saturation_warnings
 from ..scene import Scene, load_scene

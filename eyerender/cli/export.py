@@ -35,7 +35,7 @@ def export_scene(
         side: The eye, right or left (default: the first one that the frame shows).
         spp: Samples per pixel requested in the file; the stock path integrator needs many.
     """
-    from ..imaging.images import export_scene as write
+    from ..imaging.folder import export_scene as write
     from ..scene import load_scene
 
     heed = Heed(strict)

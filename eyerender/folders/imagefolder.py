@@ -46,8 +46,6 @@ STAGE = ".partial-"
 _BATCH = 1024  # number of lines whose records are in memory at a time
 _MAX_PX = 2**31
 
-BACKGROUND, SCLERA, IRIS, PUPIL, FRAME = 0, 1, 2, 3, 4  # classes of a mask
-
 CONVENTIONS = {
     "world_frame": "mm; origin midway between the corneal apexes of the unrotated eyes at the reference head position; "
     "+x to the screen, +y to the subject's left, +z up",

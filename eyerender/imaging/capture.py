@@ -24,8 +24,9 @@ from ..scene import Frames, Scene, as_frames
 from ..scene.observation import EYES
 
 if TYPE_CHECKING:
+    from ..rendering.output.window import RenderedWindow
     from ..rendering.records.job import RenderJob
-    from ..rendering.renderer import RenderedWindow, Renderer
+    from ..rendering.renderer import Renderer
 
 # For one image, this is a day's work for a fast processor.
 MAX_SAMPLES = 10**12

@@ -1,28 +1,24 @@
-"""Labelled images: frames rendered in memory, a scene rendered into a folder or exported for the stock renderer."""
+"""Labelled images rendered in memory, and the automatic exposure of a scene's images."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from ..analytic.observer import trace
 from ..backends.choose import BackendChoice
-from ..base.errors import InputError, Warn
+from ..base.errors import InputError
 from ..base.progress import Progress
-from ..folders.imagefile import Writer, png_bytes, preview
-from ..folders.imagefolder import FRAME, write_dataset
-from ..folders.outfolder import MARKER, refuse_non_empty, staged
+from ..folders.imagefile import png_bytes, preview
 from ..rig.exposure import electrons
-from ..rig.plausibility import is_saturated, saturation_warnings
 from ..rig.rig import RigLike
 from ..scene import Frame, Frames, Scene, as_frames
-from ..scene.observation import EYES
-from .capture import EyeImage, check_windows, make_renderer, render_job, render_windows
-from .labels import image_labels, seen_labels
+from ..scene.parts import FRAME
+from .capture import EyeImage, make_renderer, render_windows
+from .labels import image_labels
 
 if TYPE_CHECKING:
     from ..rendering.renderer import Renderer
@@ -102,84 +98,6 @@ def render(
     return out[0] if isinstance(frames, Frame) else out
 
 
-def render_folder(
-    scene: Scene,
-    path: str | Path,
-    *,
-    backend: BackendChoice = "auto",
-    threads: int | None = None,
-    overwrite: bool = False,
-    exr: bool = False,
-    progress: Progress | None = None,
-    warn: Warn | None = None,
-) -> dict[str, Any]:
-    """Render a scene into a folder of labelled images (docs/formats.md); on an error, nothing is left.
-
-    Args:
-        scene: the scene.
-        path: the folder to write.
-        backend: the render backend.
-        threads: total number of processor threads; None: all.
-        overwrite: replace the contents of the folder.
-        exr: also write the noise-free linear irradiance as EXR.
-        progress: called with (images done, images in all, "").
-        warn: called for saturated images before the folder is put in place; if it raises, nothing is written. Warnings
-            that need no rendering are in `Scene.warnings`.
-
-    Returns:
-        A mapping (schema eyerender/render/1): path, number of images, warnings of both kinds.
-    """
-    warnings = scene.warnings()
-    refuse_non_empty(path, overwrite)  # before the work, not after it
-    frames = scene.frames()
-    truth = trace(frames)
-    records = list(truth.records())
-    lines: list[dict[str, Any]] = []
-    saturated = 0
-    spec = scene.spec
-    with staged(path, overwrite=overwrite) as folder, Writer() as writer:
-        (folder / "images").mkdir()
-        (folder / "masks").mkdir()
-        for image in render_windows(frames, backend=backend, threads=threads, progress=progress):
-            line: dict[str, Any] = {
-                "file_name": f"images/{image.name}.png",
-                "mask_file_name": f"masks/{image.name}.png",
-                "window_px": dict(zip(("x0", "y0", "width", "height"), image.window, strict=True)),
-                "bit_depth": spec.sensor.bit_depth,
-                "gamma": spec.sensor.gamma,
-                "records": [records[image.row]],
-                "labels": seen_labels(image, truth),
-                "parameters": {
-                    "eye_model": scene.eye_name,
-                    "pupil_diameter_mm": scene.stop_diameter_mm(records[image.row]["eye"]),
-                    "wavelength_nm": spec.wavelength_nm,
-                    "spp": spec.image.spp,
-                    "seed": spec.seed,
-                    "camera": image.camera,
-                    **scene.person_numbers(records[image.row]["eye"]),
-                },
-            }
-            writer.put(folder / line["file_name"], image.counts)
-            writer.put(folder / line["mask_file_name"], image.parts)
-            if exr:
-                from ..rendering.scene.exr import write_exr
-
-                write_exr(folder / "images" / f"{image.name}.exr", image.irradiance)
-            lines.append(line)
-            saturated += is_saturated(image.counts, spec.sensor)
-        found = saturation_warnings(saturated, len(lines), scene.source)
-        if warn is not None:
-            warn(found)
-        statistics = {"images": len(lines), "images_saturated": saturated, "observations": len(truth)}
-        write_dataset(folder, lines, spec=spec.to_mapping(), digest=scene.digest(), statistics=statistics)
-    return {
-        "schema": "eyerender/render/1",
-        "path": str(path),
-        "images": len(lines),
-        "warnings": [warning.to_mapping() for warning in (*warnings, *found)],
-    }
-
-
 _LOOKED_AT = 6  # number of frames on which the exposure is measured
 _LONGEST_MS = 1000.0
 
@@ -234,40 +152,3 @@ def settled_exposure_ms(scene: Scene, level: float, renderer: Renderer, *, share
     if not charge * sensor.gain > 1e-3 or room <= 0:
         return None
     return float(f"{min(sensor.exposure_ms * room / (charge * sensor.gain), _LONGEST_MS):.4g}")
-
-
-def export_scene(
-    scene: Scene, path: str | Path, *, frame: int = 0, side: str | None = None, spp: int = 64, overwrite: bool = False
-) -> dict[str, Any]:
-    """Write one frame as PLY meshes and a Mitsuba XML file, which the stock `mitsuba` command renders directly.
-
-    Args:
-        scene: the scene.
-        path: the folder to write; on an error, nothing is left.
-        frame: the frame, counted from 0.
-        side: the eye, right or left; by default the first one that the frame shows.
-        spp: samples per pixel requested in the file.
-        overwrite: replace the contents of the folder.
-
-    Returns:
-        A mapping (schema eyerender/export-scene/1): path, name of the XML file, names of all files.
-
-    Raises:
-        InputError: there is no such frame or eye, the scene cannot be rendered, or the folder is not empty.
-    """
-    from ..rendering.output.export import export_scene as write_job
-
-    check_windows(scene)
-    frames = scene.frames()
-    if side is not None and side not in EYES:
-        raise InputError("must be right or left", source="--side")
-    index = frames.index
-    rows = [r for r in range(len(frames)) if index.frame[r] == frame and side in (None, EYES[index.eye[r]])]
-    if not rows:
-        shown = " and ".join(scene.spec.subject.eyes)
-        raise InputError(f"the scene has frames 0 to {int(index.frame.max())}, eyes {shown}", source="--frame")
-    with staged(path, overwrite=overwrite) as folder:
-        name = write_job(render_job(frames, rows[0]), folder, spp=spp).name
-    made = Path(path)
-    files = sorted(str(p.relative_to(made)) for p in made.rglob("*") if p.is_file() and p.name != MARKER)
-    return {"schema": "eyerender/export-scene/1", "path": str(path), "scene": name, "files": files}

@@ -21,12 +21,12 @@ from ..base.status import Status
 from ..eye.entrance import entrance_pupil_mm
 from ..eye.fixation import fixations
 from ..eye.model import EyeModel
-from ..folders.imagefolder import IRIS, PUPIL
 from ..optics.ellipse import fit_ellipse_direct
 from ..region.limbus import lower
 from ..rig.camera import PinholeCamera, Window, in_window
 from ..scene import Frames, Scene
 from ..scene.observation import EYES, Observations
+from ..scene.parts import IRIS, PUPIL
 from .capture import EyeImage, eye_motion
 
 _OUTLINE_POINTS = 60

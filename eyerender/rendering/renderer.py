@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Singles
-from ..folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from .glints.splatting import MirrorImages, Shine
 from .integrator.coarsesensor import CoarseSensor
 from .integrator.film import mean_radiance, start
@@ -28,8 +27,6 @@ from .scene.region import RegionScene
 
 if TYPE_CHECKING:
     from ..backends.choose import Backend
-
-__all__ = ["BACKGROUND", "FRAME", "IRIS", "PUPIL", "SCLERA", "PartLabels", "RenderJob", "RenderedWindow", "Renderer"]
 
 
 class Renderer:

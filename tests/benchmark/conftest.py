@@ -6,7 +6,7 @@ import pytest
 
 import make_ideal_images as ideal
 from eyerender.base.errors import BackendError
-from eyerender.imaging.images import render_folder
+from eyerender.imaging.folder import render_folder
 from eyerender.scene import Scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 

@@ -127,7 +127,7 @@ def small(tmp_path_factory):
 def rendered(small, monkeypatch):
     """The scene; its pictures are not rendered again."""
     path, images = small
-    monkeypatch.setattr("eyerender.imaging.images.render_windows", lambda *_args, **_keys: iter(images))
+    monkeypatch.setattr("eyerender.imaging.folder.render_windows", lambda *_args, **_keys: iter(images))
     return path
 
 

@@ -11,7 +11,7 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
-from eyerender.imaging.images import render_folder
+from eyerender.imaging.folder import render_folder
 from eyerender.scene import Scene, is_dataset, load_scene, shipped_files, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import make

@@ -11,7 +11,7 @@ import pytest
 
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.validate import SAMPLE, sampled, validate
-from eyerender.imaging.images import render_folder
+from eyerender.imaging.folder import render_folder
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 

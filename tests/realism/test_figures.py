@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eyerender.apps.realism.figures import BANDS_R, FIGURES, measure, noise
-from eyerender.folders.imagefolder import PUPIL as PUPIL_CLASS
+from eyerender.scene.parts import PUPIL as PUPIL_CLASS
 from tests.realism import drawn
 from tests.realism.drawn import CENTRE, LEVELS, PUPIL, R
 

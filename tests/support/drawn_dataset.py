@@ -12,9 +12,10 @@ import numpy as np
 
 from eyerender.dataset.packing import pack
 from eyerender.folders.imagefile import write_png
-from eyerender.folders.imagefolder import DATASET_SCHEMA, IRIS, PACKED_SCHEMA, PUPIL, SCLERA, packed_index
+from eyerender.folders.imagefolder import DATASET_SCHEMA, PACKED_SCHEMA, packed_index
 from eyerender.imaging.labels import moments_ellipse
 from eyerender.optics.ellipse import Ellipse, signed_distance
+from eyerender.scene.parts import IRIS, PUPIL, SCLERA
 
 FRAMES = 10  # images of a subject
 SPLITS = ("train", "train", "train", "validation", "test")

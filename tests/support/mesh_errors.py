@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import binary_erosion
 
-from eyerender.folders.imagefolder import IRIS
 from eyerender.rendering.records.job import RenderJob
 from eyerender.rendering.renderer import Renderer
+from eyerender.scene.parts import IRIS
 from tests.support.render_oracles import contour_shift, outline
 from tests.support.render_rigs import PLAIN, RIGS, eye_of, job_of
 

@@ -19,8 +19,9 @@ from eyerender.rig.light import Lamp, Led, LedRing
 from eyerender.rig.sensor import Sensor
 
 if TYPE_CHECKING:
+    from eyerender.rendering.output.window import RenderedWindow
     from eyerender.rendering.records.job import RenderJob
-    from eyerender.rendering.renderer import RenderedWindow, Renderer
+    from eyerender.rendering.renderer import Renderer
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
 NO_FUNDUS = Fundus(reflectance=0.0)

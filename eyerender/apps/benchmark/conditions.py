@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.arrays import Bytes, Floats
-from ...folders.imagefolder import BACKGROUND
 from ...optics.ellipse import Ellipse, signed_distance
+from ...scene.parts import BACKGROUND
 
 CONDITIONS = {
     "no pupil": "the image shows no pupil",

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.arrays import Bytes
-from ...folders.imagefolder import BACKGROUND, FRAME
 from ...optics.ellipse import Ellipse, iou, signed_distance
+from ...scene.parts import BACKGROUND, FRAME
 from .folder import LabelledImage
 
 FailureKind = Literal["near miss", "glint", "iris", "lash or lid", "shadow", "elsewhere"]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from ...base.arrays import Bytes, Floats
-from ...folders.imagefolder import BACKGROUND, FRAME, SCLERA
 from ...optics.ellipse import Ellipse, signed_distance
+from ...scene.parts import BACKGROUND, FRAME, SCLERA
 
 MATCH_PX = 2.0  # matching distance for a glint that is a point
 Place = Literal["pupil", "edge", "iris", "sclera", "skin", ""]

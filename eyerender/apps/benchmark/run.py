@@ -15,8 +15,9 @@ from ...base.errors import InputError
 from ...base.progress import Progress, notify
 from ...base.storage.files import write_json
 from ...folders.imagefile import read_any_image
-from ...folders.imagefolder import IRIS, PUPIL, versions
+from ...folders.imagefolder import versions
 from ...folders.outfolder import refuse_non_empty, staged
+from ...scene.parts import IRIS, PUPIL
 from .answercache import AnswerCache, check_reference, image_key
 from .asking import Run, ask_extractors
 from .bound import Edge, edge_of, is_bounded

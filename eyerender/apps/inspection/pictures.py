@@ -13,7 +13,8 @@ from PIL import Image
 
 from ...base.arrays import Bytes
 from ...base.errors import InputError
-from ...folders.imagefolder import FRAME, IRIS, PUPIL, ImageEntry
+from ...folders.imagefolder import ImageEntry
+from ...scene.parts import FRAME, IRIS, PUPIL
 from .faults import Fault
 from .figures import PICTURE
 

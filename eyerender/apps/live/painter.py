@@ -38,8 +38,9 @@ from ...scene import Frames
 from ...scene.observation import Observations
 
 if TYPE_CHECKING:
+    from ...rendering.output.window import RenderedWindow
     from ...rendering.records.job import RenderJob
-    from ...rendering.renderer import RenderedWindow, Renderer
+    from ...rendering.renderer import Renderer
 
 PREVIEW_SPP = 4
 GOAL_SPP = 64

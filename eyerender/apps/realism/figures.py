@@ -16,8 +16,8 @@ from scipy import ndimage
 from ...base.arrays import Bools, Bytes, Floats, Singles
 from ...extraction.filters import median_filtered, resized
 from ...extraction.statistics import median, quantile
-from ...folders.imagefolder import BACKGROUND, IRIS, PUPIL, SCLERA
 from ...optics.ellipse import Ellipse
+from ...scene.parts import BACKGROUND, IRIS, PUPIL, SCLERA
 
 RADIUS_PX = 50.0  # R in the resized picture
 CLIPPED_CODE = 245.0  # out of 255; cameras clip slightly below full scale, and JPEG lowers clipped codes by a few

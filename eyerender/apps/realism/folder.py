@@ -19,8 +19,9 @@ from ...base.errors import InputError
 from ...base.storage.files import inside
 from ...extraction import FAST, extract
 from ...folders.imagefile import image_files, read_image
-from ...folders.imagefolder import IRIS, METADATA, PUPIL, ImageEntry, ImageFolder
+from ...folders.imagefolder import METADATA, ImageEntry, ImageFolder
 from ...optics.ellipse import Ellipse
+from ...scene.parts import IRIS, PUPIL
 from .figures import FIGURES, EyePicture
 from .limbus import iris_extent
 

@@ -17,8 +17,9 @@ from ...base.arrays import Bytes, Floats, Ints
 from ...base.errors import InputError
 from ...base.processes import ordered
 from ...folders.imagefile import image_of, png_bytes
-from ...folders.imagefolder import BACKGROUND, IRIS, METADATA, PUPIL, Entries, ImageEntry, ImageFolder, opened_entries
+from ...folders.imagefolder import METADATA, Entries, ImageEntry, ImageFolder, opened_entries
 from ...optics.ellipse import Ellipse, signed_distance
+from ...scene.parts import BACKGROUND, IRIS, PUPIL
 from ..interleaving import scrambled
 from ..validation.problems import WRONG
 from .encoding import RAW, Encoding

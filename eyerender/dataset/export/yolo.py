@@ -20,7 +20,7 @@ from scipy import ndimage
 from ...base.arrays import Bools, Floats
 from ...base.storage.files import write_bytes
 from ...folders.imagefile import png_bytes
-from ...folders.imagefolder import IRIS, PUPIL, SCLERA
+from ...scene.parts import IRIS, PUPIL, SCLERA
 from .item import Item, Items
 from .keypoints import box, keypoints, names
 

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.arrays import Bools, Floats
-from ...folders.imagefolder import FRAME, IRIS, PUPIL, ImageEntry
+from ...folders.imagefolder import ImageEntry
 from ...imaging.labels import moments_ellipse
 from ...rig.camera import Window
+from ...scene.parts import FRAME, IRIS, PUPIL
 from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
 from .problems import differences
 

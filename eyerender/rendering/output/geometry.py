@@ -17,10 +17,10 @@ import numpy as np
 
 from ...base.arrays import ArrayValue, Bools, Bytes, Floats, Indices, Singles, frozen, sealed
 from ...eye.model import EyeModel
-from ...folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ...optics.interface import dot
 from ...optics.surfaces import Surface, Xyz
 from ...region.mesh import sheet_codes
+from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..hits.eyeshape import EyeShape
 from ..hits.primary import behind, facing, hit_before
 from ..integrator.request import BoundFrame

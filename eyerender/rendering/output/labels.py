@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...base.arrays import ArrayValue, Bools, Bytes, frozen, sealed
-from ...folders.imagefolder import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ...rig.camera import Window
+from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..hits.eyeshape import EyeShape
 from ..hits.interaction import SurfaceInteraction, outer_albedo, tear_film
 from ..hits.meniscus import on_water

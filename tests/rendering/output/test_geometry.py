@@ -12,7 +12,7 @@ from eyerender.optics.trace import inward_path, trace
 from eyerender.region.anatomy import Lashes, Region
 from eyerender.region.look import Look
 from eyerender.rendering.output.geometry import BROW, LASHES, LOWER_LID, NOTHING, SKIN, UPPER_LID
-from eyerender.rendering.renderer import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
+from eyerender.scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from tests.support.render_rigs import eye_of, head_rig, job_of, remote_rig
 
 pytestmark = pytest.mark.render

@@ -10,12 +10,14 @@ import pytest
 
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.folders.imagefolder import FRAME, IMAGE_SCHEMAS, PUPIL, RENDERED_SCHEMA, ImageFolder
+from eyerender.folders.imagefolder import IMAGE_SCHEMAS, RENDERED_SCHEMA, ImageFolder
 from eyerender.imaging.capture import noiseless, render_job, render_windows
+from eyerender.imaging.folder import render_folder
 from eyerender.imaging.imageobserver import ImageObserver
-from eyerender.imaging.images import auto_exposed, render, render_folder
+from eyerender.imaging.images import auto_exposed, render
 from eyerender.rig.surroundings import paint
 from eyerender.scene import Scene
+from eyerender.scene.parts import FRAME, PUPIL
 from eyerender.scene.spec import SceneSpec
 
 pytestmark = pytest.mark.render

@@ -10,12 +10,12 @@ from scipy import ndimage
 
 import eyerender as er
 from eyerender.eye.meshes import chamber_rim
-from eyerender.folders.imagefolder import IRIS, PUPIL
 from eyerender.imaging.capture import render_job
 from eyerender.imaging.labels import EyeInWindow, iris_outline
 from eyerender.region.look import Look
 from eyerender.rendering.transport.chamber import IRIS as PLANE
 from eyerender.rendering.transport.chamber import RAYS, ROOT_RINGS, TURNS, bundles, chamber_of, through_limbus
+from eyerender.scene.parts import IRIS, PUPIL
 from tests.support.render_rigs import BLACK, PLAIN, eye_of, head_rig, job_of, remote_rig
 
 
