@@ -98,12 +98,20 @@ stop_ticker() {
 # The build backends are installed first and used without isolation: they are pinned too, and fetched once. Setuptools is
 # for the one package of the tests (jsonpath-rw) that has no wheel.
 install() {
-    wanted=$1
-    shift
-    case $wanted in *test*) backends="hatchling editables setuptools" ;; *) backends="hatchling editables" ;; esac
-    # shellcheck disable=SC2086
-    pip install --no-input --progress-bar off -c "$constraints" "$@" $backends &&
-        pip install --no-input --progress-bar off -c "$constraints" "$@" --no-build-isolation -e "$wanted"
+    pip install --no-input --progress-bar off -c "$constraints" hatchling editables setuptools &&
+        pip install --no-input --progress-bar off -c "$constraints" --no-build-isolation "$@"
+}
+
+# What extras need, one requirement a line.
+requirements() {
+    "$venv/bin/python" - "$root/pyproject.toml" "$@" <<'PYTHON'
+import sys
+import tomllib
+
+with open(sys.argv[1], "rb") as file:
+    extras = tomllib.load(file)["project"]["optional-dependencies"]
+print(*(requirement for extra in sys.argv[2:] for requirement in extras[extra]), sep="\n")
+PYTHON
 }
 
 failure() {
@@ -127,24 +135,33 @@ set_up() {
     trap '{ stop_ticker; say "interrupted; run the same command again"; } 2>&8; exit 130' INT TERM HUP
     began=$(date +%s)
     make_venv
-    rm -f "$venv"/.stamp-* "$venv"/.llvm*
-    printf '%s\n' "$root" >"$venv/.place" && : >"$venv/.incomplete" || die "cannot write to $venv"
-    find_pip
     case $1 in
-        all) wanted="$root[test,ray,fuzz]" stamps="all test run" size="1.6 GB" ;;
-        test) wanted="$root[test]" stamps="test run" size="1.3 GB" ;;
-        live) wanted="$root[live]" stamps="live run" size="1 GB" ;;
-        docs) wanted="$root[docs]" stamps="docs run" size="1 GB" ;;
-        *) wanted=$root stamps=run size="900 MB" ;;
+        all) parts="test ray fuzz" stamps="all test run" size="1.6 GB" ;;
+        test) parts=test stamps="test run" size="1.3 GB" ;;
+        live) parts=live stamps="live run" size="1 GB" ;;
+        docs) parts=docs stamps="docs run" size="1 GB" ;;
+        *) parts='' stamps=run size="900 MB" ;;
     esac
-    say "setting up $venv (about $size; later runs start at once) ..."
+    wanted=$venv/extras.txt
+    # shellcheck disable=SC2086
+    requirements $parts >"$wanted" || die "cannot write to $venv"
+    if is_set_up run; then # only the extras are missing
+        set -- -r "$wanted"
+        say "adding the extra '$1' to $venv ..."
+    else
+        rm -f "$venv"/.stamp-* "$venv"/.llvm*
+        printf '%s\n' "$root" >"$venv/.place" && : >"$venv/.incomplete" || die "cannot write to $venv"
+        set -- -r "$wanted" -e "$root"
+        say "setting up $venv (about $size; later runs start at once) ..."
+    fi
+    find_pip
     # Settings that would send the packages elsewhere than into .venv; all others stay as the machine has them.
     unset PIP_TARGET PIP_PREFIX PIP_ROOT PYTHONHOME
     export PIP_USER=0 PIP_DISABLE_PIP_VERSION_CHECK=1
     done_=
     for pause in 3 10 0; do
         start_ticker
-        if install "$wanted" >"$log" 2>&1 </dev/null; then done_=1; fi
+        if install "$@" >"$log" 2>&1 </dev/null; then done_=1; fi
         stop_ticker
         if [ -n "$done_" ] || grep -q 'No space left' "$log"; then break; fi
         [ "$pause" = 0 ] || { say "that failed; trying again in $pause s"; sleep "$pause"; }

@@ -7,6 +7,7 @@ integration.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 from collections import Counter
@@ -44,12 +45,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Register the options of scripts/test that are pytest's too."""
     parser.addoption("--fast", action="store_true", help="leave out what tests/data/not_quick.txt lists")
     parser.addoption("--record", action="store_true", help="write tests/data/not_quick.txt")
+    parser.addoption("--avx2", action="store_true", help="render with code for AVX2, whatever the processor has")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Measure the tests where that is asked for."""
+    """Measure the tests, or choose the code to render with, where that is asked for."""
     if config.getoption("--record"):
         config.pluginmanager.register(Recorder())
+    if config.getoption("--avx2"):
+        import drjit
+
+        core = ctypes.CDLL(str(Path(drjit.__file__).with_name("libdrjit-core.so")))
+        core._Z19jit_llvm_set_targetPKcS0_j(b"haswell", None, 8)  # no binding in Python
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -117,6 +117,35 @@ def test_failed_setup_leaves_no_stamp_and_says_one_line(checkout: Path) -> None:
     assert not list((checkout / ".venv").glob(".stamp*"))
 
 
+def test_help_of_a_command_with_an_extra_installs_nothing(checkout: Path) -> None:
+    stamped(checkout)
+    done = run(checkout, "./scripts/eyerender live --help")
+    assert (done.stdout, done.stderr) == ("live|--help|", "")
+
+
+def test_an_extra_is_added_to_what_is_installed(checkout: Path) -> None:
+    stamped(checkout)
+    python = checkout.parent / "bin" / "python3"
+    python.write_text(
+        f'#!/bin/sh\n[ "$1 $2" != "-m pip" ] || {{ echo "$@" >>asked; exit; }}\nexec {sys.executable} "$@"\n'
+    )
+    python.chmod(0o755)
+    done = run(checkout, "./scripts/eyerender live SCENE", EYERENDER_PYTHON=str(python))
+    assert done.stdout == "live|SCENE|", done.stderr
+    asked = (checkout / "asked").read_text()
+    assert "extras.txt" in asked
+    assert " -e " not in asked
+    assert (checkout / ".venv" / "extras.txt").read_text().startswith("nicegui")
+    assert all((checkout / ".venv" / f".stamp-{part}").read_text() == fingerprint(checkout) for part in ("run", "live"))
+
+
+def test_an_extra_that_cannot_be_added_leaves_no_stamp_of_its_own(checkout: Path) -> None:
+    stamped(checkout)
+    done = run(checkout, "./scripts/eyerender live SCENE", PIP_NO_INDEX="1", PIP_CONFIG_FILE="/dev/null")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert [path.name for path in (checkout / ".venv").glob(".stamp*")] == [".stamp-run"]
+
+
 def test_python_that_is_too_old_is_told(checkout: Path) -> None:
     old = checkout.parent / "bin" / "python3"
     old.write_text("#!/bin/sh\nexit 1\n")
