@@ -406,12 +406,12 @@ def _record(pupil: _Conic, glints: list[dict[str, Any]], seed: int) -> dict[str,
     """A record of the package's schema; keys that an ideal image does not have are null."""
     axes, angle = pupil.semi, pupil.angle % math.pi
     return {
-        "schema": "eyerender/record/1", "frame": seed, "fixation": None, "camera": 0, "eye": None, "eye_model": None,
+        "schema": "eyerender/record/2", "frame": seed, "fixation": None, "camera": 0, "eye": None, "eye_model": None,
         "target_mm": None, "head_mm": None, "eye_position_mm": None, "pose": None,
         "pupil": {
             "status": "ok", "reason": None, "in_image": True, "centre_px": pupil.centre.tolist(),
             "semi_axes_px": axes.tolist(), "angle_rad": angle, "anatomical_centre_px": None, "points_px": None,
-            "covariance": None,
+            "covariance": None, "arcs_deg": None, "arc_ellipse": None,
         },
         "glints": [
             {"light": i, "status": "ok" if glint["seen"] else "missing",

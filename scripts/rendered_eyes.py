@@ -64,13 +64,13 @@ def scene_of(
     about = RIGS[rig]
     azimuth, elevation = rng.uniform(-8.0, 8.0, 2)
     mapping: dict[str, Any] = {
-        "format": 1,
+        "format": 2,
         "name": "rendered",
         "eye": {"model": model, "pupil_diameter_mm": float(rng.uniform(*about["pupil_mm"]))},
         "subject": {"eyes": ["right"], "head_positions_mm": [rng.uniform(-0.5, 0.5, 3).tolist()]},
         "rig": {
             "cameras": [{"name": rig, "resolution_px": [640, 480], **about["camera"]}],
-            "lights": [{"position_mm": place, **about["lamp"]} for place in about["lamps"]],
+            "lights": [{"position_mm": place, "aim_mm": [0, 0, 0], **about["lamp"]} for place in about["lamps"]],
         },
         "poses": [{"azimuth_deg": float(azimuth), "elevation_deg": float(elevation)}],
         "image": {"window_px": about["window"], "spp": spp},

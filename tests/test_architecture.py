@@ -286,8 +286,7 @@ def test_observers_are_siblings(observer):
 
 def test_what_reproduces_a_papers_software_stays_in_the_studies():
     switches = "placed_by|tilt_order|index_rate|visual_axis|sum_of_errors|minimum_norm|E5-published"
-    # The reader of old eye files knows the first three.
-    core = [p for p in modules() if room(p) != "cli" and "study" not in p.parts and p.name != "format1.py"]
+    core = [p for p in modules() if room(p) != "cli" and "study" not in p.parts]
     found = [p.name for p in core if re.search(rf"\b({switches})\b", p.read_text(encoding="utf-8"))]
     assert found == []
     own = {"E1", "E2", "E3", "E4", "E5", "keratoconus"}

@@ -152,9 +152,9 @@ def test_the_page_on_stability_names_the_formats_of_the_code():
         on_page[name] = max(on_page.get(name, 0), int(version))
     assert {"record", "image", "gaze", "gaze-calibration"} <= on_page.keys()
     assert on_page == {name: newest[name] for name in on_page}
-    row = next(line for line in page.splitlines() if line.startswith("| eye (YAML)"))
-    oldest, *_, last = er.EyeSpec.FORMATS
-    assert row == f"| eye (YAML) | {last} | {oldest} to {last} |"
+    rows = {kind: line for line in page.splitlines() for kind in ("scene", "eye") if line.startswith(f"| {kind}")}
+    assert rows["scene"] == f"| scene, dataset spec (YAML) | {er.SceneSpec.FORMAT} |"
+    assert rows["eye"] == f"| eye (YAML) | {er.EyeSpec.FORMAT} |"
 
 
 def test_the_first_hour_leaves_no_file_in_the_checkout():

@@ -115,11 +115,20 @@ def test_everything_is_synced_before_dataset_json_takes_its_place(tmp_path, monk
     [
         ("metadata.jsonl", None, "holds no metadata.jsonl"),
         ("metadata.jsonl", "", "holds no images"),
-        ("metadata.jsonl", "{}\n", "line 1.schema: is None, not an image record"),
         (
             "metadata.jsonl",
-            json.dumps({"schema": "eyerender/image/1", **line(), "file_name": "../x"}),
+            "{}\n",
+            "line 1.schema: is None; this version reads 'eyerender/image/4' and 'eyerender/image/3'",
+        ),
+        (
+            "metadata.jsonl",
+            json.dumps({"schema": "eyerender/image/3", **line(), "file_name": "../x"}),
             "line 1.file_name: must be a path inside the folder",
+        ),
+        (
+            "metadata.jsonl",
+            json.dumps({"schema": "eyerender/image/2", **line()}),
+            "line 1.schema: is 'eyerender/image/2'",
         ),
         ("dataset.json", None, "dataset.json: no such file"),
         ("dataset.json", "[", "is not valid JSON"),

@@ -27,7 +27,7 @@ pytestmark = [
 ]
 WIDTH, HEIGHT = 96, 72
 SCENE = {
-    "format": 1,
+    "format": 2,
     "name": "grid",
     "eye": {"model": "E2"},
     "subject": {"eyes": ["right", "left"]},
@@ -88,7 +88,7 @@ def folder_of(path, count):
             frame, which = k // 2, k % len(lines)
             line: dict[str, Any] = {**lines[which], "file_name": f"images/{'even' if frame % 10 else which}.png"}
             line["records"][0]["frame"] = frame
-            file.write(json.dumps({"schema": "eyerender/image/1", **line}) + "\n")
+            file.write(json.dumps({"schema": "eyerender/image/3", **line}) + "\n")
     return path
 
 
@@ -129,7 +129,7 @@ def dataset_of(path, count, size):
     scene = {key: value for key, value in SCENE.items() if key not in ("format", "name")} | {
         "targets": {"grid": [1, 1]}
     }
-    spec = {"format": 1, "kind": "dataset", "name": "many", "count": count, "shard_size": size, "subjects": count // 10}
+    spec = {"format": 2, "kind": "dataset", "name": "many", "count": count, "shard_size": size, "subjects": count // 10}
     spec |= {"scene": scene | {"subject": {"eyes": ["right"]}}, "splits": {"train": 0.8, "test": 0.2}}
     plan = Plan.of(DatasetSpec.from_mapping(spec))
     (record,) = trace(plan.draw(0).build(), boundary_points=6).records()
@@ -146,7 +146,7 @@ def dataset_of(path, count, size):
                     subject, sequence = plan.subject_of(sample)
                     name = f"{shard:05d}/{sample:08d}-right.png"
                     line: dict[str, Any] = {
-                        "schema": "eyerender/image/1",
+                        "schema": "eyerender/image/4",
                         "file_name": f"images/{name}",
                         "mask_file_name": f"masks/{name}",
                     }

@@ -94,8 +94,9 @@ SCREEN = {"centre_mm": [650, 0, 0], "size_mm": [377, 301]}
         ({LAMP: [-60, 0, 0], "subject__head_positions_mm": [[0, 0, 0], [-300, 0, 0]]}, None),
         ({LAMP: [20, 31.5, 15], AIM: [0, 31.5, 0]}, []),
         ({LAMP: [-15, 75, 5], AIM: [0, 31.5, 0]}, []),
-        # Without an aim, a lamp beside an eye points to the bridge of the nose; one alike in all directions has none.
+        # A lamp beside an eye that points to the bridge of the nose; one alike in all directions has no aim.
         ({LAMP: [20, 31.5, 15]}, [("aim", "rig.lights.0.position_mm")]),
+        ({LAMP: [20, 31.5, 15], AIM: "nearest_eye"}, []),
         ({LAMP: [20, 31.5, 15], "rig__lights__0__lobe_exponent": 0.0}, []),
         (
             {"rig__lights__0": {"ring": {"radius_mm": 12, "count": 6}}, CAMERA: [-40, 0, 10]},
@@ -178,7 +179,7 @@ def scene_file(tmp_path, monkeypatch):
     Path("bright.yaml").write_text(yaml.safe_dump(changed(data, sensor__exposure_ms=4000)))
     Path("wide.yaml").write_text(yaml.safe_dump(changed(data, eye__pupil_diameter_mm=9.5)))
     dataset = changed(
-        DATASET, scene=data | {"format": 1}, count=3, subjects=1, shard_size=2, eye_parameters={}, require="nothing"
+        DATASET, scene=data | {"format": 2}, count=3, subjects=1, shard_size=2, eye_parameters={}, require="nothing"
     )
     dataset["scene"].pop("name")
     Path("dataset.yaml").write_text(

@@ -16,6 +16,7 @@ from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
 from eyerender.dataset.spec import DatasetSpec, find_dataset, shipped_datasets
 from eyerender.eye.catalogue import load_eye
+from eyerender.eye.spec import EyeSpec
 from eyerender.scene import load_scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 
@@ -24,19 +25,42 @@ def quickstart():
     return yaml.safe_load(shipped_scenes()["quickstart"].read_text(encoding="utf-8"))
 
 
-def test_lights_without_an_aim_follow_the_rule_of_the_files_format(tmp_path):
+def test_lights_without_an_aim_aim_at_the_nearest_eye(tmp_path):
     data = quickstart()
     data["rig"]["lights"] = [{"position_mm": [40, -50, 5]}, {"position_mm": [40, 50, 5], "aim_mm": [1, 2, 3]}]
-    aims = {}
-    for number in (1, 2):
-        data["format"] = number
-        path = tmp_path / "scene.yaml"
-        path.write_text(yaml.safe_dump(data), encoding="utf-8")
-        spec = SceneSpec.load(path)
-        aims[number] = [light.aim_mm for light in spec.rig.lights]
-        spec.dump(path)
-        assert SceneSpec.load(path) == spec
-    assert aims == {1: [(0, 0, 0), (1, 2, 3)], 2: ["nearest_eye", (1, 2, 3)]}
+    path = tmp_path / "scene.yaml"
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    spec = SceneSpec.load(path)
+    assert [light.aim_mm for light in spec.rig.lights] == ["nearest_eye", (1, 2, 3)]
+    spec.dump(path)
+    assert SceneSpec.load(path) == spec
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "found", "read"),
+    [
+        (SceneSpec, "name: old\nlens: {kind: 3}", 1, 2),
+        (DatasetSpec, "kind: dataset\nextends: nowhere.yaml", 1, 2),
+        (EyeSpec, "cornea: []\nlens: {index_rate: 2}", 1, 3),
+        (EyeSpec, "cornea: []", 2, 3),
+        (EyeSpec, "cornea: []", 4, 3),
+    ],
+)
+def test_a_file_of_another_version_has_one_line(tmp_path, kind, text, found, read):
+    path = tmp_path / "old.yaml"
+    path.write_text(f"format: {found}\n{text}\n", encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        kind.load(path)
+    assert str(caught.value) == f"{path}: format: is {found}; this version reads format {read}"
+    assert caught.value.others == ()
+
+
+def test_an_eye_of_another_version_in_a_scene_is_refused():
+    data = quickstart()
+    data["eye"]["model"] = {"format": 2, "name": 3}
+    with pytest.raises(InputError) as caught:
+        SceneSpec.from_mapping(data)
+    assert str(caught.value) == "eye.model.format: is 2; this version reads format 3"
 
 
 def test_shipped_scenes_load_and_come_back_from_their_own_yaml(tmp_path):
@@ -100,7 +124,7 @@ def test_spec_is_frozen():
         ("subject.head_positions_mm", [[0, 0, 0]] * 12_000, "make 216000 observations; a scene may have 200000"),
         ("image.spp", 10**9, "image.spp: must be <= 65536"),
         ("image.window_px", [10**6, 240], "image.window_px.0: must be <= 8192"),
-        ("format", 3, "format: is 3; this version reads format 1 and 2"),
+        ("format", 3, "format: is 3; this version reads format 2"),
         ("format", True, "format: is True"),
     ],
 )
@@ -131,23 +155,23 @@ def test_bad_keys_are_refused_with_their_path(tmp_path, path, value, words):
         ("name: a\nname: b", "'name' appears twice"),
         ("name: !!python/object/apply:os.system ['true']", "not valid YAML"),
         ("name: x", "format: missing"),
-        ("format: 1\nname: 2001-01-01", "not a number, text or list"),
-        ("format: 1\nseed: 2020-13-45", "line 2: not valid YAML: is no timestamp .month must be in 1..12"),
-        ("format: 1\nseed: " + "1" * 5000, "line 2: not valid YAML: a number of 5000 characters"),
-        ("format: 1\nseed: 1" + ":1" * 5000, "line 2: not valid YAML: a number of 10001 characters"),
-        ('format: 1\nseed: !!int "x"', "is no int"),
-        ("format: 1\nseed: !!timestamp x", "is no timestamp"),
-        ("%YAML 1." + "1" * 5000 + "\n---\nformat: 1", "not valid YAML: Exceeds the limit"),
-        ("format: 1\nseed: !!bool x", "is no bool"),
+        ("format: 2\nname: 2001-01-01", "not a number, text or list"),
+        ("format: 2\nseed: 2020-13-45", "line 2: not valid YAML: is no timestamp .month must be in 1..12"),
+        ("format: 2\nseed: " + "1" * 5000, "line 2: not valid YAML: a number of 5000 characters"),
+        ("format: 2\nseed: 1" + ":1" * 5000, "line 2: not valid YAML: a number of 10001 characters"),
+        ('format: 2\nseed: !!int "x"', "is no int"),
+        ("format: 2\nseed: !!timestamp x", "is no timestamp"),
+        ("%YAML 1." + "1" * 5000 + "\n---\nformat: 2", "not valid YAML: Exceeds the limit"),
+        ("format: 2\nseed: !!bool x", "is no bool"),
         ("? [1, 2]\n: 3", "unhashable key"),
-        ("format: 1\nname: !!binary aGVsbG8=", "not a number, text or list"),
-        ("format: 1\nname: !!set {a, b}", "not a number, text or list"),
-        ("format: 1\nname: &a [*a]", "'a' holds itself"),
-        ("format: 1\nname: *a", "undefined alias"),
-        ("format: 1\nname: " + "[" * 5000, "nested too deeply"),
-        ("format: 1\nname: " + "{a: " * 5000, "nested too deeply"),
-        ("format: 1\nname: !<" + "x" * 10_000 + "> 1", "could not determine a constructor"),
-        ("format: 1\nname: \x1b[31m", "special characters are not allowed"),
+        ("format: 2\nname: !!binary aGVsbG8=", "not a number, text or list"),
+        ("format: 2\nname: !!set {a, b}", "not a number, text or list"),
+        ("format: 2\nname: &a [*a]", "'a' holds itself"),
+        ("format: 2\nname: *a", "undefined alias"),
+        ("format: 2\nname: " + "[" * 5000, "nested too deeply"),
+        ("format: 2\nname: " + "{a: " * 5000, "nested too deeply"),
+        ("format: 2\nname: !<" + "x" * 10_000 + "> 1", "could not determine a constructor"),
+        ("format: 2\nname: \x1b[31m", "special characters are not allowed"),
         ("# " + "x" * (2**21 + 1), "too large"),
     ],
 )
@@ -185,7 +209,7 @@ def test_all_errors_of_a_file_are_reported_together(tmp_path, capsys):
 def test_an_error_above_a_deeper_one_is_not_reported():
     """The rig is wrong only because its camera is; the scene has no error of its own."""
     data = quickstart()
-    data["eye"]["model"] = {"format": 2, "name": 3}
+    data["eye"]["model"] = {"format": 3, "name": 3}
     data["rig"]["cameras"][0]["resolution_px"] = [1600.5, 1200]
     with pytest.raises(InputError) as caught:
         SceneSpec.from_mapping(data)
@@ -262,7 +286,7 @@ def test_only_regular_files_are_read(tmp_path, kind):
 
 def test_messages_quote_little_and_no_control_characters(tmp_path):
     with pytest.raises(InputError) as caught:
-        SceneSpec.from_mapping({"format": 1, "name": "x", "k\x1b[31m\n" + "y" * 10_000: 1, "rig": "z" * 10_000})
+        SceneSpec.from_mapping({"format": 2, "name": "x", "k\x1b[31m\n" + "y" * 10_000: 1, "rig": "z" * 10_000})
     assert len(str(caught.value)) < 800
     assert str(caught.value).isprintable()
     error = InputError("\x1b]0;title\x07 " + "r" * 10_000, source="s\n" + "s" * 10_000, path="p" * 10_000)

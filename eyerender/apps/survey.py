@@ -52,8 +52,8 @@ _FACE_RIG = {
         "position_mm": [500, 0, -60], "look_at_mm": [0, 0, 0], "focal_length_px": 4400, "resolution_px": [1600, 640],
     }],
     "lights": [
-        {"position_mm": [490, 110, -80], "radius_mm": 4, "intensity_mw_sr": 105},
-        {"position_mm": [490, -110, -80], "radius_mm": 4, "intensity_mw_sr": 105},
+        {"position_mm": [490, 110, -80], "radius_mm": 4, "aim_mm": [0, 0, 0], "intensity_mw_sr": 105},
+        {"position_mm": [490, -110, -80], "radius_mm": 4, "aim_mm": [0, 0, 0], "intensity_mw_sr": 105},
     ],
 }  # fmt: skip
 

@@ -26,12 +26,12 @@ from pydantic import (
     GetCoreSchemaHandler,
     Tag,
     ValidationError,
+    field_validator,
 )
 
 from .errors import InputError, Problems
 from .storage.files import opened, read_text, shown
 
-FORMAT = 1
 # Limits of a YAML file. Nodes are counted after expansion: an alias counts as much as the value that it repeats. A
 # scene with a list of 20,000 targets has 80,000 nodes; reading 100,000 takes some five seconds.
 MAX_YAML_BYTES, MAX_YAML_NODES, MAX_YAML_DEPTH = 2 * 2**20, 100_000, 64
@@ -189,10 +189,17 @@ class Spec(BaseModel):
 class FileSpec(Spec):
     """Base of specs that are a YAML file of their own and state the version of their format."""
 
-    FORMATS: ClassVar[tuple[int, ...]] = (FORMAT,)
-    """The versions that `load` reads; new files state the last one."""
+    FORMAT: ClassVar[int] = 1
+    """The version that is read and written."""
 
     format: int = Field(default=FORMAT, description="version of this file format")
+
+    @field_validator("format")
+    @classmethod
+    def _check_format(cls, found: int) -> int:
+        if found != cls.FORMAT:
+            raise ValueError(cls._other_format(found))
+        return found
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -204,18 +211,28 @@ class FileSpec(Spec):
         data = read_yaml(path)
         cls.refuse_other_kinds(data, source=str(path))
         if "format" not in data:
-            raise InputError(f"missing; write 'format: {cls.FORMATS[-1]}'", source=str(path), path="format")
-        if data["format"] not in cls.FORMATS or not isinstance(data["format"], int) or data["format"] is True:
-            *older, latest = map(str, cls.FORMATS)
-            known = f"{', '.join(older)} and {latest}" if older else latest
-            raise InputError(
-                f"is {shown(data['format'])}; this version reads format {known}", source=str(path), path="format"
-            )
+            raise InputError(f"missing; write 'format: {cls.FORMAT}'", source=str(path), path="format")
+        cls.refuse_other_formats(data, source=str(path))
         try:
             data = cls.gathered(data, Path(path).parent)
         except InputError as error:
             raise error.placed(source=str(path)) from None
         return cls.from_mapping(data, source=str(path))
+
+    @classmethod
+    def refuse_other_formats(cls, data: Mapping[str, Any], *, source: str = "") -> None:
+        """Raise an error for a mapping of another version, before its keys, which may differ, are checked.
+
+        Raises:
+            InputError: the version is not the one that is read.
+        """
+        found = data.get("format", cls.FORMAT)
+        if found != cls.FORMAT or isinstance(found, bool):
+            raise InputError(cls._other_format(found), source=source, path="format")
+
+    @classmethod
+    def _other_format(cls, found: object) -> str:
+        return f"is {shown(found)}; this version reads format {cls.FORMAT}"
 
     @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -231,6 +248,7 @@ class FileSpec(Spec):
         """
         if isinstance(data, Mapping):
             cls.refuse_other_kinds(data, source=source)
+            cls.refuse_other_formats(data, source=source)
         return super().from_mapping(data, source=source)
 
     @classmethod

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from ..base.errors import InputError
 from ..base.processes import usable_cpus
 from ..base.status import Status
-from ..scene.observation import EYES, MAX_BOUNDARY_POINTS, RECORD, SCHEMAS, Observations
+from ..scene.observation import EYES, MAX_BOUNDARY_POINTS, Observations
 from .app import app
 from .options import AtLeastOne, EyeModel, Result, Strict
 from .output import Heed, emit, progress
@@ -26,7 +26,6 @@ def features(
     eye: EyeModel = None,
     points: int = 30,
     purkinje: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (),
-    record: int = RECORD,
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -37,7 +36,6 @@ def features(
     Args:
         scene: A scene file, or the name of a shipped scene.
         points: Number of boundary points of the pupil.
-        record: Version of the records in the JSON, 1 or 2. Version 1 reports a partly visible pupil as missing.
         purkinje: Add these Purkinje images (1 to 4) and the deviation of the pupil from an ellipse to the JSON.
     """
     # `observers` would load OpenCV, which is not needed here.
@@ -48,7 +46,6 @@ def features(
         raise InputError("must be >= 6", source="--points")
     if points > MAX_BOUNDARY_POINTS:
         raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", source="--points")
-    _check_record(record)
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)
     heed(loaded.warnings())
@@ -56,7 +53,7 @@ def features(
     data: dict[str, Any] = {
         "schema": "eyerender/features/1",
         "rig": loaded.rig.to_mapping(),
-        "records": list(observed.records(record)),
+        "records": list(observed.records()),
     }
     if purkinje:
         data["purkinje"] = purkinje_records(observed, seen, (1, *sorted(set(purkinje) - {1})))
@@ -75,7 +72,6 @@ def extract(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     overlay: Path | None = None,
     processes: AtLeastOne = None,
-    record: int = RECORD,
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -94,7 +90,6 @@ def extract(
         overlay: Draw the results over the images: a folder for images (PNG), or a file for a video (.mp4, .avi or
             .mkv).
         processes: Number of images processed at the same time (default: one per processor).
-        record: Version of the records in the JSON, 1 or 2.
     """
     from ..base.storage.files import make_folder, refuse_special, written
     from ..extraction.settings import ExtractionSettings
@@ -109,7 +104,6 @@ def extract(
         raise InputError("must be between 0.1 and 10", source="--gamma")
     if eyes not in (1, 2):
         raise InputError("must be 1 or 2", source="--eyes")
-    _check_record(record)
     heed = Heed(strict)
     loaded = load_scene(scene) if scene is not None else None
     heed(loaded.warnings() if loaded is not None else ())
@@ -120,7 +114,7 @@ def extract(
         if len(images) > 1:
             raise InputError("give one video at a time", source=str(images[1]))
         with progress("extracting") as steps:
-            files = VideoOutput(output, overlay, record)
+            files = VideoOutput(output, overlay)
             result = observe_video(images[0], observer, files, scene=loaded, eyes=eyes, progress=steps, warn=heed)
         emit(result.to_mapping(), result.to_text(), json, heed)
         return 0
@@ -131,7 +125,7 @@ def extract(
             images, scene=loaded, progress=steps, eyes=eyes, pictures=overlay, warn=heed,
             processes=processes or usable_cpus(),
         )  # fmt: skip
-    records = list(observed.records(record))
+    records = list(observed.records())
     if output is not None:
         with written(output, sync=False) as file:
             file.writelines(json_module.dumps(one, allow_nan=False).encode() + b"\n" for one in records)
@@ -174,11 +168,6 @@ def compare(
         result = compare_folder(folder, estimator=chosen, name=name, progress=steps)
     emit(result.to_mapping(), result.to_text(), json, heed)
     return 0
-
-
-def _check_record(version: int) -> None:
-    if version not in SCHEMAS:
-        raise InputError(f"must be {' or '.join(map(str, SCHEMAS))}", source="--record")
 
 
 def _feature_table(observed: Observations, names: list[str] | None = None) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..base.errors import InputError
 from ..base.spec import read_yaml
-from ..base.storage.files import read_text
+from ..base.storage.files import read_text, shown
 from .draws import MARK, is_draw
 
 MAX_ROWS = 10_000
@@ -40,7 +40,11 @@ def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -
         file = local if local.is_file() else file_of(name)
     except InputError as error:
         raise InputError(error.reason, path=EXTENDS) from None
-    below = extended(read_yaml(file), file_of, folder, depth + 1)
+    below = read_yaml(file)
+    if below.get("format", data["format"]) != data["format"]:
+        reason = f"is {shown(below['format'])}; this version reads format {data['format']}"
+        raise InputError(reason, source=str(file), path="format")
+    below = extended(below, file_of, folder, depth + 1)
     own = {key: value for key, value in data.items() if key != EXTENDS}
     found: dict[str, Any] = _merged(below, own)
     return found

@@ -8,7 +8,7 @@ from typing import Any
 from ..population.table import default_table
 from ..rig.camera import Window
 from ..scene import Scene
-from ..scene.observation import EYES, RECORD
+from ..scene.observation import EYES
 from .realise import Realised
 
 
@@ -18,7 +18,7 @@ def image_name(sample: int, frame: int, frames: int, side: str) -> str:
 
 
 def image_line(
-    found: Realised, row: int, frames: int, window: Window, labels: dict[str, Any], record_version: int = RECORD
+    found: Realised, row: int, frames: int, window: Window, labels: dict[str, Any]
 ) -> tuple[str, dict[str, Any]]:
     """Return name and metadata of observation `row` of a sample; `frames` is the number of frames per sample."""
     sample, scene, observations = found.sample, found.scene, found.observations
@@ -26,7 +26,7 @@ def image_line(
     assert scene is not None
     assert observations is not None
     turn = sample.turn
-    (record,) = observations.take([row]).records(record_version)
+    (record,) = observations.take([row]).records()
     frame = record["frame"]
     side = EYES[int(observations.index.eye[row])]
     eye = sample.eye or scene.eye_file(side).to_mapping()

@@ -480,7 +480,7 @@ def _spec_of(
     # The number of samples may grow later, which must not change the plan.
     planned = count if changes.subjects is not None else _PLANNED
     name = own.reference.rpartition(":")[2]
-    return None, DatasetSpec(kind="dataset", format=1, name=name, count=planned, shard_size=_SHARD, scene={})
+    return None, DatasetSpec(kind="dataset", name=name, count=planned, shard_size=_SHARD, scene={})
 
 
 def _of_function(spec: DatasetSpec, own: OwnScenes, eye: str | None) -> Plan:

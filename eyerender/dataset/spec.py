@@ -16,7 +16,7 @@ from ..base.errors import InputError
 from ..base.spec import FileSpec, Positive, Spec
 from ..population.people import PopulationSpec
 from ..scene import is_shipped_dataset, refuse_folder, shipped_files
-from ..scene.spec import DATASET_KIND, NOT_A_DATASET, SceneSpec
+from ..scene.spec import DATASET_KIND, NOT_A_DATASET
 from .expressions import FUNCTIONS
 from .gathering import extended, with_tables
 from .selection import Selection
@@ -69,13 +69,11 @@ class LabelsSpec(Spec):
 
 
 class DatasetSpec(FileSpec):
-    """Content of a dataset file. Draws may replace any value of `scene`; see the documentation.
+    """Content of a dataset file. Draws may replace any value of `scene`; see the documentation."""
 
-    Its format is that of `scene`, unless the scene states its own.
-    """
+    FORMAT: ClassVar[int] = 2
 
-    FORMATS: ClassVar[tuple[int, ...]] = SceneSpec.FORMATS
-
+    format: int = Field(default=FORMAT, description="version of this file format")
     kind: Literal["dataset"] = Field(description="declares that the file is a dataset, not a scene")
     name: Annotated[str, Field(min_length=1, max_length=100)] = Field(description="name of the dataset")
     description: str = Field(default="", description="what the dataset is for, in a sentence")

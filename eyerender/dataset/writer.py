@@ -81,7 +81,7 @@ class DatasetWriter:
             raise InputError(f"must be one of {', '.join(_SETTINGS)}", path=key)
         if frames < 1:
             raise InputError("must be >= 1", path="frames")
-        fixed = {"format": 1, "kind": "dataset", "count": count, "attempts": 1, "scene": {}}
+        fixed = {"kind": "dataset", "count": count, "attempts": 1, "scene": {}}
         # The number of samples is no part of the plan, so the folder can grow.
         own = {"name": "own", "require": "nothing", "shard_size": 64, **settings, "planned": MAX_COUNT}
         scenes = OwnScenes(reference="", frames=frames, function=self._scene)

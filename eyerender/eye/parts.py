@@ -318,9 +318,9 @@ class EyeParts(FileSpec):
     `sources` maps a dotted path (or the beginning of one) to the source of its values.
     """
 
-    FORMATS: ClassVar[tuple[int, ...]] = (1, 2, 3)
+    FORMAT: ClassVar[int] = 3
 
-    format: int = Field(default=3, description="version of this file format")
+    format: int = Field(default=FORMAT, description="version of this file format")
     name: str = Field(description="name of the model")
     description: str = Field(default="", description="description of the model, in a sentence")
     cornea: tuple[SurfaceSpec, ...] = Field(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,7 +11,6 @@ from ..base.errors import InputError
 from ..base.spec import KeyProblem
 from .build import build_eye
 from .check import check_eye
-from .format1 import upgraded
 from .model import EyeModel
 from .parts import EyeParts, Side
 from .topography import with_topographies
@@ -22,22 +20,12 @@ class EyeSpec(EyeParts):
     """A right eye whose geometry is possible."""
 
     @classmethod
-    def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Convert a mapping of an older format to the current one, which describes the same eye."""
-        if data.get("format") == 1:
-            data = upgraded(data)
-        # Format 3 only added the shapes of measured corneas.
-        return {**data, "format": 3} if data.get("format") == 2 else data
-
-    @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
         """Read the files of measured points that the shapes name, and replace them by fitted grids."""
         return with_topographies(data, folder)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.format != self.FORMATS[-1]:
-            raise KeyProblem("format", f"must be {self.FORMATS[-1]} here, not {self.format}")
         try:
             check_eye(self)
         except InputError as error:

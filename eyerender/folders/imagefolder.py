@@ -30,10 +30,7 @@ from .imagefile import MAX_IMAGE_BYTES, array_of, image_of
 from .packed import INDEX, INDEX_TYPE, MEMBERS, PackedLines, read_member
 
 IMAGE_SCHEMA, RENDERED_SCHEMA = "eyerender/image/4", "eyerender/image/3"
-"""Schemas of a line in a dataset, and in a rendered folder, whose lines hold nothing that version 4 added."""
-# Version 3 has no diameters of the pupil, version 2 no masks of highlights, version 1 neither `gamma` nor the class 4
-# of masks; they are read wherever version 4 is.
-IMAGE_SCHEMAS = (IMAGE_SCHEMA, RENDERED_SCHEMA, "eyerender/image/2", "eyerender/image/1")
+"""Schemas of a line in a dataset, and in a rendered folder, whose lines have fewer keys."""
 DATASET_SCHEMA, PACKED_SCHEMA = "eyerender/dataset/1", "eyerender/dataset/2"
 """Schemas of dataset.json where each picture is a file, and where shards are packed."""
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
@@ -561,8 +558,9 @@ def _check_line(line: dict[str, Any], source: str, where: str) -> None:
     def refuse(key: str, reason: str) -> NoReturn:
         raise InputError(reason, source=source, path=f"{where}.{key}")
 
-    if line.get("schema") not in IMAGE_SCHEMAS:
-        refuse("schema", f"is {shown(line.get('schema'))}, not an image record ({IMAGE_SCHEMA!r})")
+    if line.get("schema") not in (IMAGE_SCHEMA, RENDERED_SCHEMA):
+        found = shown(line.get("schema"))
+        refuse("schema", f"is {found}; this version reads {IMAGE_SCHEMA!r} and {RENDERED_SCHEMA!r}")
     for key in FILE_KEYS:
         name = line.get(key)
         if not is_plain(name) and (name is not None or key == "file_name"):

@@ -16,7 +16,6 @@ from ..extraction import Extraction
 from ..extraction.overlay import overlay as drawn
 from ..extraction.video import VideoReader, VideoWriter, follow
 from ..scene import Scene
-from ..scene.observation import RECORD
 from .imageobserver import ImageObserver, colour_warning
 
 
@@ -51,12 +50,10 @@ class VideoOutput:
         records: one JSON object per line: the record, the frame's `time_s` (null if unknown) and the pupil's
             `confidence`.
         overlay: video with the results drawn over the frames (.mp4, .avi or .mkv).
-        version: version of the records.
     """
 
     records: Path | None = None
     overlay: Path | None = None
-    version: int = RECORD
 
 
 def observe_video(
@@ -93,7 +90,7 @@ def observe_video(
                 writer.add(drawn(frame.image, found, 255.0))
             seen = observer.observe_found(found, frame.number, frame.image.shape, scene=scene, source=str(path))
             if file is not None:
-                for line, one in zip(seen.records(output.version), found, strict=True):
+                for line, one in zip(seen.records(), found, strict=True):
                     file.write(_line(line, frame.time_s, one))
             count, pupils, coloured = count + 1, pupils + len(found), coloured + frame.colour
             ok += sum(one.pupil.ok for one in found)

@@ -5,7 +5,6 @@ Radiant intensity in direction w: I(w) = I0 max(0, cos(angle to the axis))^m (m 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
@@ -25,13 +24,6 @@ NEAREST_EYE: Literal["nearest_eye"] = "nearest_eye"
 # Corneal apexes of an adult with the mean distance of the pupils, 63.5 mm, whose head is at the world's origin. A lamp
 # has one aim for all who sit before it.
 _EYES_MM = np.array([[0.0, -31.75, 0.0], [0.0, 31.75, 0.0]])
-
-
-def aimed(lights: Any) -> Any:
-    """Let the lights of a file of format 2, as parsed, aim at the nearest eye where they do not say at what."""
-    if not isinstance(lights, list | tuple):
-        return lights
-    return [{"aim_mm": NEAREST_EYE, **light} if isinstance(light, Mapping) else light for light in lights]
 
 
 Aim = Annotated[
@@ -64,9 +56,9 @@ class Led(Spec):
     radius_mm: NonNegative = Field(default=0.0, description="radius of the emitting disc; 0 is a point")
     inner_radius_mm: NonNegative = Field(default=0.0, description="radius of the hole of a ring-shaped emitter")
     aim_mm: Aim = Field(
-        default=(0, 0, 0),
+        default=NEAREST_EYE,
         description="world point on its axis, or `nearest_eye`: the nearer of (0, -31.75, 0) and (0, 31.75, 0), where "
-        "an adult's corneas are, and the origin for a light midway; default: the origin, in files of format 2 the eye",
+        "an adult's corneas are, and the origin for a light midway",
     )
     intensity_mw_sr: Positive = Field(default=20.0, description="radiant intensity on the axis")
     lobe_exponent: NonNegative = Field(default=1.0, description="m of cos^m; 1 is Lambertian, 0 isotropic")

@@ -20,9 +20,8 @@ from ..base.errors import InputError, Problems
 from ..base.status import Status
 from ..base.storage.files import shown
 
-RECORD = 2
-"""Version of the records that are written by default; `SCHEMAS` are the versions that are read."""
-SCHEMAS = {1: "eyerender/record/1", 2: "eyerender/record/2"}
+RECORD_SCHEMA = "eyerender/record/2"
+"""Schema of a record."""
 EYES = ("right", "left")
 
 # Largest number of boundary points of one pupil (ten per degree) and of all pupils of a batch; a point takes 25 bytes.
@@ -168,23 +167,17 @@ class Observations(ArrayValue):
         targets = np.broadcast_to(np.asarray(target_mm, dtype=float), (len(self), 3))
         return replace(self, index=replace(self.index, target_mm=frozen(targets)))
 
-    def records(self, version: int = RECORD) -> Iterator[dict[str, Any]]:
-        """Yield one record (docs/formats.md) per observation; every key is present, null where it does not apply.
-
-        Args:
-            version: version of the record; in version 1 a partial pupil is a missing one.
-        """
+    def records(self) -> Iterator[dict[str, Any]]:
+        """Yield one record (docs/formats.md) per observation; every key is present, null where it does not apply."""
         for i in range(len(self)):
-            yield self._record(i, version)
+            yield self._record(i)
 
-    def _record(self, i: int, version: int) -> dict[str, Any]:
+    def _record(self, i: int) -> dict[str, Any]:
         at, pose, pupil, glints = self.index, self.pose, self.pupil, self.glints
         # Plain integers: comparing a NumPy integer with a Status takes 20 times as long.
         status, glint_status = Status(int(pupil.status[i])), list(map(Status, glints.status[i].tolist()))
-        if version == 1 and status == Status.PARTIAL:
-            status = Status.NOT_FOUND
         return {
-            "schema": SCHEMAS[version],
+            "schema": RECORD_SCHEMA,
             "frame": int(at.frame[i]),
             "fixation": _count(at.fixation[i]),
             "camera": _count(at.camera[i]),
@@ -209,7 +202,8 @@ class Observations(ArrayValue):
                 "anatomical_centre_px": _numbers(pupil.anatomical_centre_px[i]),
                 "points_px": _points(pupil.points_px[i]),
                 "covariance": _numbers(pupil.covariance[i]),
-                **(_arcs_of(pupil, i) if version > 1 else {}),
+                "arcs_deg": _points(pupil.arcs_deg[i]),
+                "arc_ellipse": _arc_ellipse(pupil.arc_ellipse[i]),
             },
             "glints": [
                 {
@@ -229,7 +223,7 @@ class Observations(ArrayValue):
     def from_records(
         cls, records: Sequence[dict[str, Any]], *, source: str = "", complete: bool = False
     ) -> Observations:
-        """Read records of any version.
+        """Read records.
 
         A key that is left out counts as null. A feature with a place and without a status is 'ok'. Without a `frame`
         in any record, every record is a frame of its own.
@@ -288,7 +282,7 @@ class Observations(ArrayValue):
                 anatomical_centre_px=reader.array("pupil.anatomical_centre_px", (2,)),
                 points_px=reader.points("pupil.points_px"),
                 covariance=reader.array("pupil.covariance", (5, 5)),
-                arcs_deg=reader.arcs(),
+                arcs_deg=reader.points("pupil.arcs_deg", "arcs [from, to]"),
                 arc_ellipse=reader.arc_ellipses(),
             ),
             glints=reader.glints(),
@@ -312,10 +306,9 @@ class _Reader:
             if not isinstance(record, dict):
                 self.problems.add("must be a record", f"records.{k}")
             elif "schema" not in record:
-                self.refuse(k, "schema", f"missing; write {SCHEMAS[RECORD]!r}")
-            elif record["schema"] not in SCHEMAS.values():
-                known = " and ".join(map(repr, SCHEMAS.values()))
-                self.refuse(k, "schema", f"is {shown(record['schema'])}; this version reads {known}")
+                self.refuse(k, "schema", f"missing; write {RECORD_SCHEMA!r}")
+            elif record["schema"] != RECORD_SCHEMA:
+                self.refuse(k, "schema", f"is {shown(record['schema'])}; this version reads {RECORD_SCHEMA!r}")
             else:
                 for part in ("pose", "pupil"):
                     if not isinstance(record.get(part, {}), dict):
@@ -356,7 +349,7 @@ class _Reader:
                 labels[k] = "ok" if placed[k] else "missing"
             elif not label:
                 self.refuse(k, path, "must be 'ok' or 'missing'")
-            elif self.records[k]["schema"] != SCHEMAS[1] and label not in ("ok", "partial", "missing"):
+            elif label not in ("ok", "partial", "missing"):
                 self.refuse(k, path, "must be 'ok', 'partial' or 'missing'")
         return frozen([int(Status.of_record(*said)) for said in zip(labels, reasons, strict=True)], np.int8)
 
@@ -396,9 +389,9 @@ class _Reader:
                     out[k] = found
         return frozen(out)
 
-    def points(self, path: str, values: list[Any] | None = None, what: str = "points") -> Floats:
+    def points(self, path: str, what: str = "points") -> Floats:
         """Read lists of points as (n, longest, 2), padded with NaN."""
-        values = self.values(path) if values is None else values
+        values = self.values(path)
         for k, value in enumerate(values):
             if not (value is None or (isinstance(value, list) and len(value) <= MAX_BOUNDARY_POINTS)):
                 self.refuse(k, path, f"must be null or a list of at most {MAX_BOUNDARY_POINTS} {what}")
@@ -415,19 +408,9 @@ class _Reader:
                     out[k, : len(value)] = found
         return frozen(out)
 
-    def second(self, path: str) -> list[Any]:
-        """Read a key that was added in version 2; None in records of version 1."""
-        return [
-            None if record["schema"] == SCHEMAS[1] else self._value(k, path) for k, record in enumerate(self.records)
-        ]
-
-    def arcs(self) -> Floats:
-        path = "pupil.arcs_deg"
-        return self.points(path, self.second(path), "arcs [from, to]")
-
     def arc_ellipses(self) -> Floats:
         out = np.full((len(self.records), 5), np.nan)
-        for k, value in enumerate(self.second("pupil.arc_ellipse")):
+        for k, value in enumerate(self.values("pupil.arc_ellipse")):
             if value is None:
                 continue
             parts = [value.get(key) for key in _ELLIPSE_KEYS] if isinstance(value, dict) else []
@@ -472,14 +455,10 @@ class _Reader:
         )
 
 
-def _arcs_of(pupil: PupilFeatures, i: int) -> dict[str, Any]:
-    """Write the keys of a pupil that version 2 of the record added."""
-    ellipse = _numbers(pupil.arc_ellipse[i])
-    parts = None if ellipse is None else (ellipse[:2], ellipse[2:4], ellipse[4])
-    return {
-        "arcs_deg": _points(pupil.arcs_deg[i]),
-        "arc_ellipse": None if parts is None else dict(zip(_ELLIPSE_KEYS, parts, strict=True)),
-    }
+def _arc_ellipse(values: Floats) -> dict[str, Any] | None:
+    """Write an ellipse (5,) of `PupilFeatures.arc_ellipse`; None where it is NaN."""
+    numbers = _numbers(values)
+    return None if numbers is None else dict(zip(_ELLIPSE_KEYS, (numbers[:2], numbers[2:4], numbers[4]), strict=True))
 
 
 _ELLIPSE_KEYS = ("centre_px", "semi_axes_px", "angle_rad")
@@ -538,11 +517,6 @@ def count_heads(head_mm: Floats) -> Ints:
     """
     heads: dict[bytes, int] = {}
     return frozen([heads.setdefault((np.round(h, 9) + 0.0).tobytes(), len(heads)) for h in head_mm], np.int64)
-
-
-def version_of(record: dict[str, Any]) -> int:
-    """Read the format version of a record; raise `KeyError` or `ValueError` if it is not a record."""
-    return {schema: version for version, schema in SCHEMAS.items()}[str(record["schema"])]
 
 
 def concatenate(parts: Iterable[Observations]) -> Observations:

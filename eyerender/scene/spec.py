@@ -21,7 +21,6 @@ from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
 from ..rig.imaging import Ambient, Lens, Motion
-from ..rig.light import aimed
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
 from .observation import MAX_GLINTS
@@ -217,14 +216,11 @@ LIFTED = ("eye", "person", "look", "region")
 
 
 class SceneSpec(FileSpec):
-    """Content of a scene file.
+    """Content of a scene file."""
 
-    In format 2 a light without `aim_mm` aims at the nearest eye, in format 1 midway between the eyes; nothing else
-    differs.
-    """
+    FORMAT: ClassVar[int] = 2
 
-    FORMATS: ClassVar[tuple[int, ...]] = (1, 2)
-
+    format: int = Field(default=FORMAT, description="version of this file format")
     name: Annotated[str, Field(min_length=1)] = Field(description="name of the scene, for reports")
     description: str = Field(default="", description="what the scene is for, in a sentence")
     eye: Eye = Field(default=Eye(), description="the eye model and its settings")
@@ -287,10 +283,7 @@ class SceneSpec(FileSpec):
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Move what the subject or its population says to the scene's own keys, and aim lights by the format's rule."""
-        rig = data.get("rig")
-        if data.get("format") == 2 and isinstance(rig, Mapping):
-            data = {**data, "rig": {**rig, "lights": aimed(rig.get("lights"))}}
+        """Move what the subject or its population says to the scene's own keys."""
         subject = data.get("subject")
         if isinstance(subject, Spec):
             rest = subject.to_mapping()

@@ -34,7 +34,7 @@ def looking_at(place):
 def scene(angle_deg, model="E2", azimuth_deg=0.0):
     angle = np.radians(angle_deg)
     spec = {
-        "format": 1,
+        "format": 2,
         "name": "aside",
         "eye": {"model": model},
         "subject": {"eyes": ["right"]},
@@ -150,25 +150,18 @@ def test_a_camera_behind_the_head_sees_the_back_of_the_iris():
     assert next(trace(scene(170.0)).records())["pupil"]["arcs_deg"] is None
 
 
-def test_version_1_of_the_record_has_no_partial_pupils():
-    observed = trace(scene(95.0))
-    (new,), (old,) = observed.records(), observed.records(1)
-    assert (new["schema"], old["schema"]) == ("eyerender/record/2", "eyerender/record/1")
-    assert (new["pupil"]["status"], old["pupil"]["status"]) == ("partial", "missing")
-    assert "arcs_deg" not in old["pupil"]
-    assert old["pupil"]["in_image"] is None
-    assert old["pupil"]["reason"] == new["pupil"]["reason"]
-    assert new["pupil"]["in_image"] is True
+def test_partial_and_whole_pupils_come_back_from_their_records():
+    lines = [*trace(scene(95.0)).records(), *trace(scene(40.0)).records()]
+    found = Observations.from_records(json.loads(json.dumps(lines)))
+    assert list(found.pupil.status) == [Status.PARTIAL, Status.OK]
+    assert json.loads(json.dumps(list(found.records()))) == lines
 
 
-def test_both_versions_are_read_together():
-    partial, whole = trace(scene(95.0)), trace(scene(40.0))
-    lines = [*partial.records(), *whole.records(1), *whole.records()]
-    both = Observations.from_records(json.loads(json.dumps(lines)))
-    assert list(both.pupil.status) == [Status.PARTIAL, Status.OK, Status.OK]
-    assert np.array_equal(both.pupil.centre_px[1], both.pupil.centre_px[2])
-    assert json.loads(json.dumps(list(both.records())))[0] == lines[0]
-    assert list(both.take([1]).records(1)) == [lines[1]]
+def test_a_record_of_another_version_is_refused_with_both_versions():
+    (line,) = trace(scene(40.0)).records()
+    words = "records.0.schema: is 'eyerender/record/1'; this version reads 'eyerender/record/2'"
+    with pytest.raises(InputError, match=words):
+        Observations.from_records([{**line, "schema": "eyerender/record/1"}])
 
 
 def test_a_damaged_partial_record_is_refused_by_name():

@@ -66,9 +66,10 @@ def _write_bad_things():
     contour = load_eye("E2").to_mapping()
     contour["stop"]["contour"] = {"cosines": [0.0, 1.5], "sines": [0.0, 0.0]}
     Path("contour.yaml").write_text(yaml.safe_dump(contour), encoding="utf-8")
-    Path("text.yaml").write_text("format: 1\nname: [", encoding="utf-8")
+    Path("text.yaml").write_text("format: 2\nname: [", encoding="utf-8")
     Path("binary.yaml").write_bytes(bytes(range(256)))
-    Path("date.yaml").write_text("format: 1\nseed: 2020-13-45", encoding="utf-8")
+    Path("old.yaml").write_text("format: 1\nlens: 3", encoding="utf-8")
+    Path("date.yaml").write_text("format: 2\nseed: 2020-13-45", encoding="utf-8")
     scene("lens.yaml", "rig.cameras.0", {"resolution_px": [640, 480], "calibration": {"file": "text.yaml"}})
     scene("nolens.yaml", "rig.cameras.0", {"resolution_px": [640, 480], "calibration": {"file": "none.yml"}})
     scene("focal.yaml", "rig.cameras.0.focal_length_mm", 1e300)
@@ -101,7 +102,7 @@ def _write_bad_things():
         json.dump({**dataset, "colour": 1}, file)
     Path("made/images").mkdir(parents=True)
     Path("sample").mkdir()
-    Path("sample/scene.yaml").write_text("format: 1", encoding="utf-8")
+    Path("sample/scene.yaml").write_text("format: 2", encoding="utf-8")
     Path("hollow").mkdir()
     Path("taken").mkdir()
     (Path("taken") / "thesis.txt").write_text("years of work")
@@ -116,8 +117,7 @@ TABLE = [
     (["features"], 2, "SCENE"),
     (["features", "nonsense"], 2, "nonsense: no such scene file; shipped scenes: blignaut2014"),
     (["features", "missing.yaml"], 2, "missing.yaml: no such file"),
-    (["features", "quickstart", "--record", "3"], 2, "--record: must be 1 or 2"),
-    (["features", "quickstart", "--record", "one"], 2, "--record"),
+    (["features", "old.yaml"], 2, "old.yaml: format: is 1; this version reads format 2"),
     (["features", "key.yaml"], 2, "key.yaml: rig.lights.0.colour: unknown key"),
     (["features", "type.yaml"], 2, "type.yaml: subject.ipd_mm: must be a valid number, not 'wide'"),
     (["features", "eye.yaml"], 2, "E9"),

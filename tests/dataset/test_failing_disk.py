@@ -115,7 +115,7 @@ def small(tmp_path_factory):
     """A scene of two frames, and their pictures."""
     path = tmp_path_factory.mktemp("scene") / "small.yaml"
     data = mapping()["scene"]
-    data |= {"name": "small", "format": 1, "targets": {"screen_mm": [[0.0, 0.0], [50.0, 20.0]]}}
+    data |= {"name": "small", "format": 2, "targets": {"screen_mm": [[0.0, 0.0], [50.0, 20.0]]}}
     data["eye"] = {"model": "E2", "pupil_diameter_mm": 4.0}
     data["subject"]["ipd_mm"] = 62.0
     data.pop("look")

@@ -26,7 +26,7 @@ def scene_of(**who):
     return Scene.of(
         SceneSpec.from_mapping(
             {
-                "format": 1,
+                "format": 2,
                 "name": "gaze",
                 "rig": {
                     "cameras": [{**camera, "resolution_px": [800, 400]}],

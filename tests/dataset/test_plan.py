@@ -46,17 +46,6 @@ def test_older_specs_still_give_their_samples(name):
         assert json.loads(json.dumps(made.draw(sample["sample"]).to_mapping())) == sample
 
 
-def test_lights_of_samples_follow_the_rule_of_the_specs_format(tmp_path):
-    draw = {"draw": "fixed", "value": [40.0, 50.0, 5.0]}
-    for number, aim in ((1, (0, 0, 0)), (2, "nearest_eye")):
-        data = mapping()
-        data["format"] = number
-        data["scene"]["rig"]["lights"] = [{"position_mm": draw}]
-        (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data), encoding="utf-8")
-        made = Plan.load(tmp_path / "spec.yaml")
-        assert SceneSpec.from_mapping(made.draw(0).scene).rig.lights[0].aim_mm == aim
-
-
 def test_a_smaller_count_makes_samples_of_the_same_plan(tmp_path):
     # Subjects and splits are parts of the whole plan, so nothing of a sample may depend on how many are made.
     for changes in ({}, {"subjects": None}):

@@ -152,8 +152,7 @@ def test_what_is_no_dataset_is_refused(copy, tmp_path):
         validate(tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_lines_of_either_version_of_the_record_are_computed_again(version):
+def test_lines_of_a_rendered_folder_are_computed_again():
     scene = load_scene("guestrin2006")
     observed = trace(scene)
     truth = SceneTruth(scene.frames(), observed)
@@ -161,7 +160,8 @@ def test_lines_of_either_version_of_the_record_are_computed_again(version):
     line: dict[str, Any] = {
         "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
         "bit_depth": scene.spec.sensor.bit_depth,
-        "records": list(observed.take([0]).records(version)),
+        "gamma": scene.spec.sensor.gamma,
+        "records": list(observed.take([0]).records()),
         "labels": {"lid_margins_px": None},
         "parameters": {
             "eye_model": scene.eye_spec.name,

@@ -18,7 +18,7 @@ from tests.population.test_scenes import RIG, scene_mapping
 
 
 def plain(model="E4", *, eye=None, **subject):
-    scene = {"format": 1, "name": "x", "rig": RIG, "targets": {"world_mm": [[500, 0, 0]]}}
+    scene = {"format": 2, "name": "x", "rig": RIG, "targets": {"world_mm": [[500, 0, 0]]}}
     return er.Scene.of(er.SceneSpec.from_mapping({**scene, "eye": {"model": model, **(eye or {})}, "subject": subject}))
 
 

@@ -29,13 +29,13 @@ RIG = {
 
 
 def scene_mapping(**more):
-    base = {"format": 1, "name": "x", "rig": RIG, "targets": {"world_mm": [[600, 0, 0]]}}
+    base = {"format": 2, "name": "x", "rig": RIG, "targets": {"world_mm": [[600, 0, 0]]}}
     return {**base, "population": {"preset": "adults", "seed": 3, "subject": 7}, **more}
 
 
 def dataset_mapping(**more):
     scene = {"rig": RIG, "targets": {"world_mm": [[600, {"draw": "uniform", "low": -99, "high": 99}, 0]]}}
-    base = {"format": 1, "kind": "dataset", "name": "d", "count": 6, "subjects": 3, "seed": 3, "scene": scene}
+    base = {"format": 2, "kind": "dataset", "name": "d", "count": 6, "subjects": 3, "seed": 3, "scene": scene}
     return {**base, "population": {"preset": "adults"}, "require": "nothing", **more}
 
 

@@ -179,12 +179,10 @@ def test_a_batch_is_its_members_in_any_order(data, random):
 
 
 @budget(12)
-@given(mappings(), st.sampled_from([1, 2]))
-def test_records_of_any_scene_come_back_through_json(data, version):
+@given(mappings())
+def test_records_of_any_scene_come_back_through_json(data):
     seen = traced(data)
-    if version == 1 and (seen.pupil.status == Status.PARTIAL).any():
-        return  # version 1 knows none
-    text = json.dumps(list(seen.records(version)), allow_nan=False)
+    text = json.dumps(list(seen.records()), allow_nan=False)
     found = Observations.from_records(json.loads(text))
     # A record holds the visible points alone, so those of a partial pupil move up.
     for row in np.flatnonzero(seen.pupil.status == Status.PARTIAL):

@@ -47,14 +47,14 @@ def test_light_axis_points_at_its_aim():
     ],
 )
 def test_a_light_aims_at_the_nearest_eye_and_one_midway_between_the_eyes(place, aim):
-    lights = [{"position_mm": place, "aim_mm": "nearest_eye"}]
+    lights = [{"position_mm": place}]
     lamp = Rig.from_mapping({"cameras": [CAMERA], "lights": lights}).build().lights[0]
     way = np.subtract(aim, place)
     np.testing.assert_allclose(lamp.axis, way / np.linalg.norm(way), atol=1e-12)
 
 
 def test_leds_of_a_ring_keep_their_aims_when_they_become_single_ones():
-    ring = {"ring": {"radius_mm": 40, "count": 5}, "aim_mm": "nearest_eye"}
+    ring = {"ring": {"radius_mm": 40, "count": 5}}
     rig = Rig.from_mapping({"cameras": [{**CAMERA, "position_mm": [30, 3, -15]}], "lights": [ring]})
     single = rig.with_light(0, intensity_mw_sr=3.0)
     assert len(single.lights) == 5

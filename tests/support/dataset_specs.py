@@ -17,7 +17,7 @@ from eyerender.dataset.run import generate
 from eyerender.dataset.spec import DatasetSpec
 
 TINY: dict[str, Any] = {
-    "format": 1,
+    "format": 2,
     "kind": "dataset",
     "name": "tiny",
     "count": 24,
@@ -42,7 +42,8 @@ TINY: dict[str, Any] = {
                 }
             ],
             "lights": [
-                {"position_mm": [615.0, y, 0.0], "radius_mm": 2.5, "intensity_mw_sr": 100.0} for y in (208.5, -208.5)
+                {"position_mm": [615.0, y, 0.0], "radius_mm": 2.5, "aim_mm": [0, 0, 0], "intensity_mw_sr": 100.0}
+                for y in (208.5, -208.5)
             ],
             "screen": {"centre_mm": [650.0, 0.0, 0.0], "size_mm": [377.0, 301.0]},
         },

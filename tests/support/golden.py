@@ -24,7 +24,7 @@ STORED = DATA / f"results_{RESULTS}.json"
 BLOCK = 16  # px
 EYES = ("E1", "E2", "E3", "E4", "E5")
 SCENE = {
-    "format": 1,
+    "format": 2,
     "name": "golden",
     "rig": {
         "cameras": [{"position_mm": [600, 0, -150], "look_at_mm": [0, 0, 0], "focal_length_px": 4000,

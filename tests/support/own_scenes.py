@@ -44,7 +44,7 @@ def drawn(seed, i, subject):
 def objects(seed, i):
     """A scene made of objects."""
     scene, _ = drawn(seed, i, i)
-    return er.Scene.of(er.SceneSpec.from_mapping({"format": 1, "name": "own", **scene}))
+    return er.Scene.of(er.SceneSpec.from_mapping({"format": 2, "name": "own", **scene}))
 
 
 def partly(seed, i):

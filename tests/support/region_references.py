@@ -54,12 +54,12 @@ def rendered(renderer: Renderer, name: str, seeds: range, region: Mapping[str, A
     chosen = SCENES[name]
     azimuth, elevation = chosen["pose"]
     spec = {
-        "format": 1,
+        "format": 2,
         "name": name,
         "subject": {"eyes": ["right"]},
         "rig": {
             "cameras": [{**chosen["camera"], "resolution_px": [640, 480]}],
-            "lights": [{"position_mm": chosen["light"], "radius_mm": 2.0, "intensity_mw_sr": 100}],
+            "lights": [{"position_mm": chosen["light"], "radius_mm": 2.0, "aim_mm": [0, 0, 0], "intensity_mw_sr": 100}],
         },
         "poses": [{"azimuth_deg": azimuth, "elevation_deg": elevation}],
         "image": {"window_px": [80, 60]},

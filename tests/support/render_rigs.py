@@ -66,7 +66,7 @@ def remote_rig(radius_mm: float = 2.5) -> LampRig:
     camera = Camera(
         resolution_px=(1600, 1200), position_mm=(520.0, 0.0, -300.0), tilt_deg=30.0, focal_length_px=3571.43
     ).build()
-    light = Led(position_mm=(560.0, 0.0, -250.0), radius_mm=radius_mm, intensity_mw_sr=450.0)
+    light = Led(position_mm=(560.0, 0.0, -250.0), radius_mm=radius_mm, aim_mm=(0, 0, 0), intensity_mw_sr=450.0)
     return LampRig(camera, light.build((camera,)))
 
 
@@ -77,7 +77,7 @@ def head_rig(radius_mm: float = 0.5, count: int = 6) -> LampRig:
     camera = Camera(
         resolution_px=(640, 480), position_mm=tuple(place), look_at_mm=(0.0, 0.0, 0.0), focal_length_px=600.0
     ).build()
-    light = Led(ring=LedRing(radius_mm=12.0, count=count), radius_mm=radius_mm, intensity_mw_sr=0.3)
+    light = Led(ring=LedRing(radius_mm=12.0, count=count), radius_mm=radius_mm, aim_mm=(0, 0, 0), intensity_mw_sr=0.3)
     return LampRig(camera, light.build((camera,)))
 
 

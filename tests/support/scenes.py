@@ -54,13 +54,13 @@ def mappings(draw: st.DrawFn, models: tuple[str, ...] = MODELS) -> dict[str, Any
     lights = st.lists(points((450.0, 700.0), (-250.0, 250.0), (-300.0, 250.0)), min_size=1, max_size=3)
     targets = st.lists(points((500.0, 900.0), (-250.0, 250.0), (-200.0, 200.0)), min_size=1, max_size=2)
     return {
-        "format": 1,
+        "format": 2,
         "name": "drawn",
         "eye": {"model": draw(st.sampled_from(models)), "pupil_diameter_mm": draw(number(2.0, 7.0))},
         "subject": {"ipd_mm": draw(number(54.0, 72.0)), "head_positions_mm": [draw(points(*[(-20.0, 20.0)] * 3))]},
         "rig": {
             "cameras": [draw(cameras())],
-            "lights": [{"position_mm": place} for place in draw(lights)],
+            "lights": [{"position_mm": place, "aim_mm": [0.0, 0.0, 0.0]} for place in draw(lights)],
             "screen": {"centre_mm": [650.0, 0.0, 0.0], "size_mm": [377.0, 301.0]},
         },
         "targets": {"world_mm": draw(targets)},
@@ -83,7 +83,7 @@ def mapped(data: dict[str, Any], change: Callable[[np.ndarray], np.ndarray]) -> 
     for key in ("position_mm", "look_at_mm"):
         camera[key] = apply(camera[key])
     for light in out["rig"]["lights"]:
-        light["position_mm"], light["aim_mm"] = apply(light["position_mm"]), apply(light.get("aim_mm", [0.0] * 3))
+        light["position_mm"], light["aim_mm"] = apply(light["position_mm"]), apply(light["aim_mm"])
     out["rig"]["screen"]["centre_mm"] = apply(out["rig"]["screen"]["centre_mm"])
     out["targets"]["world_mm"] = [apply(place) for place in out["targets"]["world_mm"]]
     out["subject"]["head_positions_mm"] = [apply(place) for place in out["subject"]["head_positions_mm"]]

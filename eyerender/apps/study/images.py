@@ -179,7 +179,7 @@ def dataset_spec(study: str, scenes: Sequence[Scene], auto_exposure: float | Non
     template["eye"]["model"] = {"draw": "grid", "per": "subject", "values": list(by_model)}
     return DatasetSpec.from_mapping(
         {
-            "format": 1,
+            "format": 2,
             "kind": "dataset",
             "name": f"{study}, images",
             "description": "What the image observer of a study sees. A subject is an eye model; a sample is one eye at "

@@ -94,7 +94,7 @@ def _headset(
     }  # fmt: skip
     led = {"radius_mm": 0.6, "aim_mm": _AIM, "intensity_mw_sr": intensity_mw_sr}
     scene = {
-        "format": 1,
+        "format": 2,
         "name": name,
         "subject": {"eyes": ["right"], "ipd_mm": 63.0},
         "rig": {"cameras": [camera], "lights": [{**led, "position_mm": place} for place in leds_mm]},

@@ -25,7 +25,7 @@ from ...rendering.glints.occlusion import lid_margins_px
 from ...rendering.glints.tracing import GlintScene, glint_table
 from ...rendering.records.job import film_index, globe_of
 from ...scene import Frames, Scene
-from ...scene.observation import EYES, Observations, version_of
+from ...scene.observation import EYES, Observations
 from ...scene.spec import SceneSpec
 from ..done import KINDS, picture_file
 from ..line import image_line, image_name
@@ -147,9 +147,7 @@ class DatasetTruth:
         if row is None:
             return Again((f"sample {number} has no such image",))
         scene, view = frames.scene, EyeInWindow.of(frames, row)
-        _, expected = image_line(
-            found, row, self.frames, view.window, known_labels(scene, observations, view), version_of(record)
-        )
+        _, expected = image_line(found, row, self.frames, view.window, known_labels(scene, observations, view))
         texts = ("scene_json", "eye_json")
         problems = _differences(_open(expected, texts), _open(line, texts))
         problems += [*_spots(scene, view, line), *_lids(scene, observations, view, line)]
@@ -217,8 +215,8 @@ class SceneTruth:
         expected = {
             "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
             "bit_depth": scene.spec.sensor.bit_depth,
-            **({"gamma": scene.spec.sensor.gamma} if "gamma" in line else {}),
-            "records": list(found.take([row]).records(version_of(record))),
+            "gamma": scene.spec.sensor.gamma,
+            "records": list(found.take([row]).records()),
             "parameters": {
                 "eye_model": scene.eye_name,
                 "pupil_diameter_mm": scene.stop_diameter_mm(record["eye"]),

@@ -142,7 +142,7 @@ def test_a_glint_whose_centre_is_off_the_cornea_is_labelled_as_the_picture_shows
     azimuth = float(np.degrees(np.arctan2(job.M[1, 0], job.M[0, 0])))
     spec = SceneSpec.from_mapping(
         {
-            "format": 1,
+            "format": 2,
             "name": "cut",
             "eye": {"model": "E2"},
             "subject": {"eyes": ["right"], "ipd_mm": 1e-6},

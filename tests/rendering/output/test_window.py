@@ -21,7 +21,7 @@ def shot(renderer, **more):
     scene = Scene.of(
         SceneSpec.from_mapping(
             {
-                "format": 1,
+                "format": 2,
                 "name": "imaging",
                 "subject": {"eyes": ["right"], "ipd_mm": 0.001},
                 "rig": {
@@ -29,7 +29,9 @@ def shot(renderer, **more):
                         {"position_mm": [600, 0, 0], "look_at_mm": [0, 0, 0], "focal_length_px": 5000,
                          "resolution_px": [640, 480]}
                     ],
-                    "lights": [{"position_mm": [600, 100, 0], "radius_mm": 0, "intensity_mw_sr": 100}],
+                    "lights": [
+                        {"position_mm": [600, 100, 0], "radius_mm": 0, "aim_mm": [0, 0, 0], "intensity_mw_sr": 100}
+                    ],
                 },
                 "poses": [{"azimuth_deg": 0, "elevation_deg": 0}],
                 "image": {"spp": 8, "window_px": [160, 160]},

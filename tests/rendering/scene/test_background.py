@@ -10,7 +10,7 @@ import pytest
 
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.folders.imagefolder import IMAGE_SCHEMAS, RENDERED_SCHEMA, ImageFolder
+from eyerender.folders.imagefolder import RENDERED_SCHEMA, ImageFolder
 from eyerender.imaging.capture import noiseless, render_job, render_windows
 from eyerender.imaging.folder import render_folder
 from eyerender.imaging.imageobserver import ImageObserver
@@ -29,7 +29,7 @@ def scene(poses=((0.0, 0.0),), **fields):
     return Scene.of(
         SceneSpec.from_mapping(
             {
-                "format": 1,
+                "format": 2,
                 "name": "framed",
                 "subject": {"eyes": ["right"], "ipd_mm": 63.0},
                 "rig": {
@@ -37,8 +37,10 @@ def scene(poses=((0.0, 0.0),), **fields):
                         {"position_mm": [600, -31.5, -60], "look_at_mm": [0, -31.5, 0], "focal_length_px": 3000,
                          "resolution_px": [200, 160]}
                     ],
-                    "lights": [{"position_mm": [600, x, 0], "radius_mm": 2.5, "intensity_mw_sr": 60}
-                               for x in (-331.5, 268.5)],
+                    "lights": [
+                        {"position_mm": [600, x, 0], "radius_mm": 2.5, "aim_mm": [0, 0, 0], "intensity_mw_sr": 60}
+                        for x in (-331.5, 268.5)
+                    ],
                 },
                 "poses": [{"azimuth_deg": a, "elevation_deg": e} for a, e in poses],
                 "image": {"spp": 4},
@@ -131,13 +133,9 @@ def test_a_folder_says_its_classes_and_its_gamma(tmp_path):
     found = ImageObserver().observe_folder(folder, given)
     truth = folder.truth()
     assert np.abs(found.pupil.centre_px - truth.pupil.centre_px).max() < 0.5
-    # Lines of version 1 have no gamma, and are read like before.
     metadata = tmp_path / "out" / "metadata.jsonl"
     line = json.loads(metadata.read_text())
-    del line["gamma"]
-    metadata.write_text(json.dumps({**line, "schema": IMAGE_SCHEMAS[-1]}) + "\n")
-    assert ImageFolder.load(tmp_path / "out").entries[0].gamma == 1.0
-    for wrong in ({"gamma": "2"}, {"gamma": 0.0}, {"schema": "eyerender/image/5"}):
+    for wrong in ({"gamma": "2"}, {"gamma": 0.0}, {"schema": "eyerender/image/2"}, {"schema": "eyerender/image/5"}):
         metadata.write_text(json.dumps({**line, **wrong}) + "\n")
         with pytest.raises(InputError, match=next(iter(wrong))):
             ImageFolder.load(tmp_path / "out")

@@ -78,7 +78,7 @@ def write_obj(path: Path, objects: dict[str, trimesh.Trimesh], uv: bool = False)
 
 def scene_data(head: dict, eyes=("right",), **more) -> dict:
     return {
-        "format": 1,
+        "format": 2,
         "name": "head",
         "subject": {"eyes": list(eyes), "ipd_mm": 63.0},
         "rig": {

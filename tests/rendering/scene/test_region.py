@@ -25,7 +25,7 @@ def scene(eyes=("right",), poses=((0.0, 0.0),), look=None, region=None, spp=4, i
     return Scene.of(
         SceneSpec.from_mapping(
             {
-                "format": 1,
+                "format": 2,
                 "name": "region",
                 "subject": {"eyes": list(eyes), "ipd_mm": 63.0},
                 "rig": {

@@ -26,7 +26,7 @@ def coaxial_job(angle_deg, look, **changes):
         resolution_px=(200, 200), position_mm=tuple(place), look_at_mm=(0.0, 0.0, 0.0), focal_length_px=6000.0
     ).build()
     aside = place + DISTANCE * np.tan(np.radians(angle_deg)) * np.array([0.0, 1.0, 0.0])
-    lights = Led(position_mm=tuple(aside), radius_mm=1.0, intensity_mw_sr=100.0).build((camera,))
+    lights = Led(position_mm=tuple(aside), radius_mm=1.0, aim_mm=(0, 0, 0), intensity_mw_sr=100.0).build((camera,))
     job = job_of(eye_of("E2"), LampRig(camera, lights), (60, 60, 80, 80), look=look)
     return replace(job, **{"interreflection": False, **changes})
 
