@@ -41,9 +41,9 @@ def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -
     except InputError as error:
         raise InputError(error.reason, path=EXTENDS) from None
     below = read_yaml(file)
-    if below.get("format", data["format"]) != data["format"]:
-        reason = f"is {shown(below['format'])}; this version reads format {data['format']}"
-        raise InputError(reason, source=str(file), path="format")
+    known = data.get("format")
+    if known is not None and (found := below.get("format", known)) != known:
+        raise InputError(f"is {shown(found)}; this version reads format {known}", source=str(file), path="format")
     below = extended(below, file_of, folder, depth + 1)
     own = {key: value for key, value in data.items() if key != EXTENDS}
     found: dict[str, Any] = _merged(below, own)
