@@ -1,25 +1,24 @@
 #!/usr/bin/env python3
-"""Fit the weights of the extractor's confidence on drawn and rendered images and print the table of scoring.py.
+"""Fit the weights of the extractor's confidence and covariance on drawn and rendered images and print them.
 
     fit_confidence.py [--rendered DIR] [--count 1200] [--faces 60] [--processes 2] [--write]
 
 It uses development seeds only (below 10,000): `count` mixed images, a sixth as many without an eye, a tenth as many of
 each other condition, and `faces` of each row of hard_eyes.py, which are rendered into DIR where they are not there yet.
 All hypotheses of the search are judged, the likeliest few also by the pixel model. The calibration is that of the
-hypotheses that the search would choose. `--write` replaces the table in scoring.py.
+hypotheses that the search would choose. `--write` replaces the weights in the extractor's weights.json; say there what
+images were used, and what the weights do on others.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import re
-import textwrap
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import Pool
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,18 +27,19 @@ from scipy.optimize import minimize
 
 import hard_eyes
 import make_ideal_images as ideal
+from _weights import write_weights
 from eyerender.extraction import ExtractionSettings, pipeline
 from eyerender.extraction.glints.detection import detect_spots
 from eyerender.extraction.preprocessing import Prepared, prepare
 from eyerender.extraction.pupil import scoring, search
 from eyerender.extraction.pupil.boundary import PupilCandidate
 from eyerender.extraction.pupil.refinement import PixelFit
-from eyerender.extraction.pupil.scoring import FEATURES, TABLE, design, features, goodness_of
+from eyerender.extraction.pupil.scoring import features, goodness_of
 from eyerender.extraction.settings import Shape
+from eyerender.extraction.weights import design
 from eyerender.optics.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]
-METHODS: tuple[Literal["fast", "refined"], ...] = ("fast", "refined")
 PRIOR_VARIANCE = 20.0
 SCALE_VARIANCE, TAILS = 5.0, 8.0  # of the covariance's factor: prior of its weights, degrees of freedom
 LEVELS = (0.68, 0.95)  # of the ellipses of centres
@@ -51,15 +51,15 @@ Task = tuple[str, int]
 
 @dataclass(slots=True)
 class Observed:
-    """All hypotheses of one image: features by each method (n, f), which are right, late, or with a dark core.
+    """All hypotheses of one image: features by each method, which are right, late, or with a dark core.
 
     `row` is what kind of image it is. `refined` are the numbers of those to which the pixel model was fitted.
     `away` is the squared distance from the true centre in standard deviations.
     """
 
     row: str
-    fast: list[Array] = field(default_factory=list)
-    pixel: list[Array] = field(default_factory=list)
+    fast: list[dict[str, float]] = field(default_factory=list)
+    pixel: list[dict[str, float]] = field(default_factory=list)
     refined: list[int] = field(default_factory=list)
     away: list[float] = field(default_factory=list)
     away_refined: list[float] = field(default_factory=list)
@@ -144,15 +144,15 @@ def chosen(observed: Observed, logit: Array) -> int | None:
     return best
 
 
-def fit(rows: Array, right: Array, group: Array, observed: list[Observed] | None) -> tuple[Array, Array, Array, Array]:
-    """(low, high, weights, calibration).
+def fit(rows: Array, right: Array, group: Array, observed: list[Observed] | None) -> tuple[Array, Array, Array]:
+    """(limits, weights, calibration).
 
     The calibration is fitted to the outcomes and the logits of ten-fold cross-validation over images, so that it takes
     out the optimism that the weights bring along; with `observed`, only of the hypotheses that would be chosen. Source:
     Platt (1999), with a bend.
     """
-    low, high = np.percentile(rows, (1.0, 99.0), axis=0)
-    columns = design(rows, low, high)
+    limits = np.percentile(rows, (1.0, 99.0), axis=0)
+    columns = design(rows, limits)
     # An image counts as much as two hypotheses, however many it has.
     weight = np.minimum(2.0 / np.bincount(group)[group], 1.0)
     fold = np.random.default_rng(0).integers(0, FOLDS, int(group.max()) + 1)[group]
@@ -168,7 +168,7 @@ def fit(rows: Array, right: Array, group: Array, observed: list[Observed] | None
     taken = logit[told]
     columns_of_bend = np.stack([np.ones_like(taken), taken, np.minimum(taken, 1.0)], axis=-1)
     bend = _weights(columns_of_bend, right[told], np.ones(told.size), math.inf)
-    return low, high, _weights(columns, right, weight, PRIOR_VARIANCE), bend
+    return limits, _weights(columns, right, weight, PRIOR_VARIANCE), bend
 
 
 def scale_of(columns: Array, away: Array, row: list[str]) -> Array:
@@ -214,33 +214,27 @@ def _weights(columns: Array, right: Array, weight: Array, variance: float) -> Ar
     return np.asarray(found.x)
 
 
-def lines(values: Array) -> str:
-    """A tuple of numbers as lines of the table, a short one on one line."""
-    body = textwrap.fill(", ".join(f"{value:.4g}" for value in values), 106)
-    if "\n" not in body:
-        return " " * 8 + f"({body}),"
-    return textwrap.indent(f"(\n{textwrap.indent(body, '    ')},\n),", " " * 8)
-
-
-def table_of(observed: list[Observed]) -> str:
-    """The table's source."""
-    text = ["TABLE: dict[str, tuple[tuple[float, ...], ...]] = {"]
-    for method in METHODS:
-        fast = method == "fast"
-        rows = np.array([row for one in observed for row in (one.fast if fast else one.pixel)])
-        right = np.array(
-            [ok for one in observed for ok in (one.right if fast else one.right_refined)], dtype=np.float64
-        )
-        group = np.array([k for k, one in enumerate(observed) for _ in (one.fast if fast else one.pixel)])
-        text.append(f'    "{method}": (')
-        fitted = fit(rows, right, group, observed if fast else None)
-        away = np.array([value for one in observed for value in (one.away if fast else one.away_refined)])
-        told = np.flatnonzero(right > 0.5)
-        told = told[np.diff(group[told], prepend=-1) > 0]
-        scale = scale_of(design(rows[told], *fitted[:2]), away[told], [observed[k].row for k in group[told]])
-        text += [lines(values) for values in (*fitted, scale)]
-        text.append(f"    ),  # {right.size} hypotheses, {100 * right.mean():.1f} % of them right")
-    return "\n".join([*text, "}  # fmt: skip", ""])
+def table_of(observed: list[Observed], fast: bool) -> dict[str, Any]:
+    """The table of one method; features that never vary are left out."""
+    found = [(k, row) for k, one in enumerate(observed) for row in (one.fast if fast else one.pixel)]
+    right = np.array([ok for one in observed for ok in (one.right if fast else one.right_refined)], dtype=np.float64)
+    group = np.array([k for k, _ in found])
+    names = tuple(found[0][1])
+    rows = np.array([[row[name] for name in names] for _, row in found])
+    varying = np.ptp(np.percentile(rows, (1.0, 99.0), axis=0), axis=0) > 0.0
+    names, rows = tuple(name for name, kept in zip(names, varying, strict=True) if kept), rows[:, varying]
+    limits, weights, calibration = fit(rows, right, group, observed if fast else None)
+    away = np.array([value for one in observed for value in (one.away if fast else one.away_refined)])
+    told = np.flatnonzero(right > 0.5)
+    told = told[np.diff(group[told], prepend=-1) > 0]
+    scale = scale_of(design(rows[told], limits), away[told], [observed[k].row for k in group[told]])
+    print(f"{right.size} hypotheses, {100 * right.mean():.1f} % of them right")
+    parts = np.concatenate([limits, weights[1:].reshape(3, -1), scale[1:].reshape(3, -1)]).T
+    return {
+        "constant": [weights[0], scale[0]],
+        "calibration": calibration.tolist(),
+        "features": dict(zip(names, parts.tolist(), strict=True)),
+    }
 
 
 def main() -> None:
@@ -254,25 +248,14 @@ def main() -> None:
     if not 0 < options.count <= 10_000:
         raise SystemExit("error: --count: must be between 1 and 10,000 (the seeds for development)")
     options.rendered.mkdir(parents=True, exist_ok=True)
-    # The table decides which hypotheses are likely. One of other features would not fit.
-    size = len(FEATURES)
-    for method in METHODS:
-        if len(TABLE[method][0]) != size:
-            none = (0.0,) * size
-            TABLE[method] = (none, (1.0,) * size, (0.0,) * (1 + 3 * size), (0.0, 1.0, 0.0), (0.0,) * (1 + 3 * size))
     tasks: list[Task] = [("mixed", seed) for seed in range(options.count)]
     tasks += [("no eye", seed) for seed in range(options.count // 6)]
     tasks += [(row, seed) for row in HARD for seed in range(options.count // 10)]
     tasks += [(row, seed) for row in hard_eyes.ROWS for seed in range(options.faces)]
     with Pool(options.processes) as pool:
         observed = pool.map(partial(observe, folder=options.rendered), tasks, chunksize=8)
-    table = table_of([one for one in observed if one.fast])
-    if options.write:
-        path = Path(scoring.__file__)
-        source = re.sub(r"TABLE: dict.*", lambda _: table, path.read_text(), flags=re.DOTALL)
-        path.write_text(source)
-    else:
-        print(table)
+    observed = [one for one in observed if one.fast]
+    write_weights("confidence", {"fast": table_of(observed, True), "refined": table_of(observed, False)}, options.write)
 
 
 if __name__ == "__main__":

@@ -6,14 +6,14 @@
 RENDERED are folders of development images of `hard_eyes.py`. Drawn images of `make_ideal_images.py` and
 `led_images.py` are added. Without RENDERED, the weights that rendered images gave earlier are the prior's means. A spot
 within 2 px of a glint, or within 0.7 of its radius, is one; spots at the flanks of glints, and those near glints that
-are less than half visible, do not count. The lost and false glints of ten-fold cross-validation over faces are printed,
-and `--write` replaces the weights in classification.py.
+are less than half visible, do not count. The lost and false glints of ten-fold cross-validation over faces are printed.
+`--write` replaces the weights in the extractor's weights.json; say there what images were used, and what the weights do
+on others.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,11 +29,12 @@ from scipy.optimize import minimize
 import hard_eyes
 import led_images
 import make_ideal_images as ideal
+from _weights import write_weights
 from extraction_tally import near
 from eyerender.extraction import ExtractionSettings, extract, pipeline
-from eyerender.extraction.glints import classification
 from eyerender.extraction.glints.classification import LEAST_ODDS, classify_spots, compared, features
 from eyerender.extraction.glints.fits import SpotFit
+from eyerender.extraction.weights import glint_features
 from eyerender.optics.ellipse import Ellipse, iou
 
 Array = NDArray[np.float64]
@@ -189,14 +190,9 @@ def main() -> None:
     observed = [found for task in images(options.rendered) if (found := observe(*task)) is not None]
     before = None if options.rendered else RENDERED
     validated(observed, before)
-    path = Path(classification.__file__)
-    text = path.read_text()
-    for name, weights in zip(("FIRST", "SECOND"), fitted(observed, before), strict=True):
-        line = f"{name} = np.array([{', '.join(f'{weight:.3g}' for weight in weights)}])"
-        print(line)
-        text = re.sub(rf"^{name} = .*$", line, text, flags=re.MULTILINE)
-    if options.write:
-        path.write_text(text)
+    steps = zip(("first", "second"), glint_features(), fitted(observed, before), strict=True)
+    table = {step: dict(zip(names, weights.tolist(), strict=True)) for step, names, weights in steps}
+    write_weights("glints", table, options.write)
 
 
 if __name__ == "__main__":

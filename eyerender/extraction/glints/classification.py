@@ -3,7 +3,7 @@
 A spot's features (its surroundings, distance from the pupil, shape and height) give a first logit of the probability
 that it is a glint of the cornea. The others are then compared with the brightest likely one: reflections of one rig's
 lamps are about equally high and wide, and those in the tear menisci are smaller. The weights of both steps are maximum
-a-posteriori estimates (logistic regression) from development images, made by `scripts/fit_glints.py`.
+a-posteriori estimates (logistic regression) from development images; `scripts/fit_glints.py` fits them.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ...optics.ellipse import Ellipse, signed_distance
 from ..preprocessing import DN, Image
 from ..result import GlintResult
 from ..settings import ExtractionSettings
+from ..weights import glint_weights
 from .detection import optics_sigma
 from .fits import SpotFit
 from .prescreening import PIXEL
@@ -52,9 +53,7 @@ USUAL = (0.0, 0.0, SIZES[1], 0.0, math.log(10.0), 1.0, 0.0, 0.0)
 _TURN = np.arange(24) * (np.pi / 12.0)
 _CIRCLE, _LINE = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1), np.linspace(0.0, 1.0, 16)
 
-# Made by scripts/fit_glints.py: weights of the features and 1, and of the comparison.
-FIRST = np.array([-3.49, -2.39, 1.73, -4.45, 1.92, 1.54, -3.03, -1.9, 3.86, 2.95])
-SECOND = np.array([0.77, 0.381, 2.56, -1.42, 0.455, 0.906])
+FIRST, SECOND = glint_weights()  # of the features, and of the comparison
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
