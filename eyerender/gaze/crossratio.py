@@ -17,15 +17,21 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.errors import InputError
+from ..base.spec import Spec
 from ..rig.rig import RigGeometry, RigLike
-from ..scene.observation import EYES, Observations
+from ..scene.observation import Observations
+from .builtin import BuiltIn
 from .estimate import GazePoints
 from .homography import homography, transformed
-from .rays import chosen_lights, glints_of, screen_of
+from .rays import calibrated_eyes, chosen_lights, eyes_of, glints_of, is_none, screen_of
+
+
+class _EyeAlphas(Spec):
+    alpha: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class CrossRatio:
+class CrossRatio(BuiltIn):
     """Cross-ratio estimator.
 
     Args:
@@ -40,6 +46,8 @@ class CrossRatio:
     tolerance: float = 0.05
     alphas: Mapping[int, Floats] = field(default_factory=dict)
 
+    BY_EYE, EYE, ARRAY = "alphas", _EyeAlphas, "alpha"
+
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate alpha_i of each eye on fixations of the four corner lights; average repeated fixations.
 
@@ -52,34 +60,25 @@ class CrossRatio:
         p, u_c = observations.pupil.centre_px, glints[:, 4]
         near = self.tolerance * float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
         found = {}
-        for eye in np.unique(observations.index.eye):
-            usable = (reason == None) & (observations.index.eye == eye)  # noqa: E711
+        for eye, name, usable in eyes_of(observations, is_none(reason)):
             alpha = np.empty(4)
             for i in range(4):
-                rows = usable & (np.linalg.norm(targets - corners[i], axis=1) <= near)
-                if not rows.any():
-                    name = EYES[int(eye)] if eye >= 0 else "unknown"
+                rows = usable[np.linalg.norm(targets[usable] - corners[i], axis=1) <= near]
+                if not len(rows):
                     raise InputError(f"{name} eye: no usable calibration target at the corner light {self.corners[i]}")
                 length = np.linalg.norm(glints[rows, i] - u_c[rows], axis=1)
                 alpha[i] = float(np.mean(np.linalg.norm(p[rows] - u_c[rows], axis=1) / length))
-            found[int(eye)] = alpha
+            found[eye] = alpha
         return replace(self, alphas=found)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Estimate gaze points on the screen's plane."""
-        if not self.alphas:
-            raise InputError("the estimator is not calibrated; call fit first")
         rig = rig.build()
         screen = screen_of(rig)
         flat = screen.flat(self._corners_mm(rig))
         glints, reason = glints_of(observations, (*self.corners, self.at_camera))
         on_screen = np.full((len(observations), 2), np.nan)
-        for eye in np.unique(observations.index.eye):
-            rows = np.flatnonzero((observations.index.eye == eye) & (reason == None))  # noqa: E711
-            alpha = self.alphas.get(int(eye))
-            if alpha is None:
-                reason[rows] = "this eye is not calibrated"
-                continue
+        for rows, alpha in calibrated_eyes(observations, self.alphas, reason):
             u_c = glints[rows, 4:5]
             virtual = u_c + alpha[:, None] * (glints[rows, :4] - u_c)
             H, ok = homography(virtual, np.broadcast_to(flat, virtual.shape), conditioned=True)

@@ -10,25 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 
 from ..base.arrays import Floats, Objects
-from ..base.errors import InputError
 from ..rig.rig import RigLike
 from ..scene.observation import Observations
-from .determined import Terms
+from .builtin import EstimatorOptions, Feature
 from .estimate import GazePoints, GazeRays
-from .rays import camera_of, chosen_lights, glints_of, screen_of, target_directions
+from .rays import camera_of, chosen_lights, eyes_of, glints_of, is_none, screen_of, target_directions
 from .recalibration import angles_of, direction_of
-from .regression import EyeFit, Regression, mapped
-
-Feature = Literal["pupil-glint", "pupil"]
+from .regression import PolynomialEstimator, PolynomialFit, Regression
 
 
 @dataclass(frozen=True, slots=True)
-class DirectionRegression:
+class DirectionRegression(PolynomialEstimator):
     """Polynomial from a feature of one eye in one camera, in pixels, to the direction of gaze.
 
     The rays start at the eye's place, the apex of the unrotated cornea.
@@ -43,12 +40,20 @@ class DirectionRegression:
     function: str | tuple[str, str] = "R3"
     feature: Feature = "pupil-glint"
     lights: tuple[int, ...] | None = None
-    fits: Mapping[int, EyeFit] = field(default_factory=dict, repr=False)
+    fits: Mapping[int, PolynomialFit] = field(default_factory=dict, repr=False)
 
-    @property
-    def terms(self) -> tuple[Terms, Terms]:
-        """Exponents of the terms of azimuth and of elevation."""
-        return self._polynomial.terms
+    @classmethod
+    def of(cls, options: EstimatorOptions) -> Self:
+        """Create the estimator, not calibrated.
+
+        Raises:
+            InputError: there is no such function.
+        """
+        return cls(options.terms or options.function, options.feature).with_eyes({})
+
+    def options(self) -> EstimatorOptions:
+        """Return the options for a file."""
+        return EstimatorOptions(**self.function_option, feature=self.feature)
 
     @property
     def _polynomial(self) -> Regression:
@@ -71,21 +76,18 @@ class DirectionRegression:
         """
         features, reason = self.features(observations, rig)
         wanted = angles_of(np.asarray(direction, dtype=float))
-        usable = (reason == None) & np.isfinite(wanted).all(axis=1)  # noqa: E711
-        fits = {}
-        for eye in np.unique(observations.index.eye):
-            rows = np.asarray(usable & (observations.index.eye == eye), dtype=bool)
-            name = "left" if eye == 1 else "right"
-            fits[int(eye)] = self._polynomial.fit_eye(features[rows], wanted[rows], name)
+        usable = is_none(reason) & np.isfinite(wanted).all(axis=1)
+        fits = {
+            eye: self._polynomial.fit_eye(features[rows], wanted[rows], name)
+            for eye, name, rows in eyes_of(observations, usable)
+        }
         return replace(self, fits=fits)
 
     def predict_rays(self, observations: Observations, rig: RigLike) -> GazeRays:
         """Estimate rays of gaze; no screen is needed."""
-        if not self.fits:
-            raise InputError("the estimator is not calibrated; call fit first")
         index = observations.index
         features, reason = self.features(observations, rig)
-        angles = mapped(self.fits, self.terms, features, index.eye, reason)
+        angles = self.mapped(features, observations, reason)
         return GazeRays.of(index.eye_position_mm + index.head_mm, direction_of(angles), reason)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
@@ -103,9 +105,8 @@ class DirectionRegression:
         _, unknown = camera_of(observations, built)
         lights = () if self.feature == "pupil" else chosen_lights(built, self.lights, 1)
         places, reason = glints_of(observations, lights)
-        reason = np.where(unknown == None, reason, unknown)  # noqa: E711
+        reason = np.where(is_none(unknown), reason, unknown)
         found = observations.pupil.centre_px
         if lights:
             found = found - places.mean(axis=1)
-        good = np.asarray(reason == None)  # noqa: E711
-        return np.where(good[:, None], found, np.nan), reason
+        return np.where(is_none(reason)[:, None], found, np.nan), reason

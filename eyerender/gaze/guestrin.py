@@ -22,11 +22,23 @@ from ..base.arrays import Bools, Floats, Ints, Objects
 from ..base.errors import InputError
 from ..rig.rig import RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
-from ..scene.observation import EYES, Observations
+from ..scene.observation import Observations
+from .builtin import BuiltIn, EstimatorOptions
 from .cornea import CorneaCentres, from_all_glints, from_plane, optic_axis
 from .estimate import GazePoints, GazeRays
 from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds
-from .rays import OFF_PLANE_MM, FeatureRays, feature_rays, nasal_sign, screen_of, targets_on_screen, unit
+from .rays import (
+    OFF_PLANE_MM,
+    FeatureRays,
+    calibrated_eyes,
+    eyes_of,
+    feature_rays,
+    is_none,
+    nasal_sign,
+    screen_of,
+    targets_on_screen,
+    unit,
+)
 from .search import Misses, calibrate
 
 # Chebyshev degree of the centre as a function of sqrt(R); its last terms are below 1e-6 mm over 3 to 20 mm.
@@ -35,7 +47,7 @@ _OFF_SCREEN_MM = 1e4  # miss assigned, in a search, to a visual axis that never 
 
 
 @dataclass(frozen=True, slots=True)
-class GuestrinEizenman:
+class GuestrinEizenman(BuiltIn):
     """Corneal centre from the glints, optic axis from the pupil, visual axis by two angles.
 
     A subclass may define another visual axis (`turned`) or another search (`search`).
@@ -57,6 +69,20 @@ class GuestrinEizenman:
     free_index: bool = False
     tolerance: float = 1e-12
     calibrations: Mapping[int, Calibration] = field(default_factory=dict)
+
+    BY_EYE, EYE = "calibrations", Calibration
+
+    @classmethod
+    def of(cls, options: EstimatorOptions) -> Self:
+        """Create the estimator, not calibrated."""
+        centre: Literal["all_glints", "plane"] = "plane" if options.method == "B" else "all_glints"
+        return cls(centre=centre, start=EyeParameters.with_index(options.index), free_index=options.free_index)
+
+    def options(self) -> EstimatorOptions:
+        """Return the options for a file."""
+        method = "B" if self.centre == "plane" else "A"
+        index = None if self.start == MEAN_EYE else self.start.index
+        return EstimatorOptions(method=method, free_index=self.free_index, index=index)
 
     def with_parameters(self, parameters: Mapping[int, EyeParameters]) -> Self:
         """Create an estimator with known parameters by eye (0 right, 1 left), without a calibration."""
@@ -108,27 +134,19 @@ class GuestrinEizenman:
         """Compute visual axes: rays from the centre of corneal curvature in the direction of gaze."""
         optic = self.optic_axes(observations, rig)
         direction = np.full((len(observations), 3), np.nan)
-        for eye, calibration in self.calibrations.items():
-            rows = observations.index.eye == eye
-            p = calibration.parameters.vector()
+        for rows, calibration in calibrated_eyes(observations, self.calibrations, optic.reason.copy()):
+            *_, alpha, beta = np.radians(calibration.parameters.vector())
             sign = nasal_sign(observations.index.eye[rows])
-            direction[rows] = self.turned(optic.direction[rows], np.radians(p[3]) * sign, np.radians(p[4]))
+            direction[rows] = self.turned(optic.direction[rows], alpha * sign, beta)
         return GazeRays.of(optic.origin_mm, direction, optic.reason)
 
     def optic_axes(self, observations: Observations, rig: RigGeometry) -> GazeRays:
         """Compute optic axes: rays from the centre of corneal curvature through the pupil centre."""
-        if not self.calibrations:
-            raise InputError("the estimator is not calibrated; call fit first")
         rays = feature_rays(observations, rig, self.lights, least=2)
         reason = rays.reason.copy()
         n = len(observations)
         centre, axis = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-        for eye in np.unique(observations.index.eye):
-            rows = np.flatnonzero((observations.index.eye == eye) & (reason == None))  # noqa: E711
-            calibration = self.calibrations.get(int(eye))
-            if calibration is None:
-                reason[rows] = "this eye is not calibrated"
-                continue
+        for rows, calibration in calibrated_eyes(observations, self.calibrations, reason):
             R, K, index, _, _ = calibration.parameters.vector()
             found = self._centres(rays, rows, np.full(len(rows), R))
             w, meets, inside = optic_axis(
@@ -166,19 +184,17 @@ class GuestrinEizenman:
         goals = _Goals.of(observations, rig.screen)
         targets = observations.index.target_mm
         rays = feature_rays(observations, rig, self.lights, least=2)
-        usable = (rays.reason == None) & goals.known  # noqa: E711
+        usable = is_none(rays.reason) & goals.known
         count = int(self.free.sum())
         need = -(-count // 2)  # each target gives two numbers
         out = {}
-        for eye in np.unique(observations.index.eye):
-            rows = np.flatnonzero(usable & (observations.index.eye == eye))
+        for eye, name, rows in eyes_of(observations, usable):
             if len(np.unique(np.round(targets[rows], 6), axis=0)) < need:
-                name = EYES[int(eye)] if eye >= 0 else "unknown"
                 raise InputError(
                     f"{name} eye: {len(rows)} usable calibration targets, "
                     f"but {count} parameters need {need} distinct ones"
                 )
-            out[int(eye)] = _Model(self, rays, rows, goals.take(rows), float(nasal_sign(np.array(eye))))
+            out[eye] = _Model(self, rays, rows, goals.take(rows), float(nasal_sign(np.array(eye))))
         return out
 
 
@@ -283,7 +299,7 @@ class _Model:
 
     def calibrate(self, start: EyeParameters) -> Calibration:
         if not self.estimator.free_index:
-            start = replace(start, index=self.estimator.start.index)
+            start = start.model_copy(update={"index": self.estimator.start.index})
         return self.estimator.search(self.misses, start)
 
 

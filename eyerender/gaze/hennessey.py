@@ -15,10 +15,11 @@ import numpy as np
 
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import Observations
+from .builtin import EstimatorOptions, RecalibrationKind
 from .estimate import GazeRays
 from .guestrin import GuestrinEizenman
 from .parameters import MEAN_EYE, EyeParameters
-from .recalibration import Recalibrated, Recalibration, RecalibrationKind
+from .recalibration import Recalibrated, Recalibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,16 @@ class Hennessey(Recalibrated):
     recalibration: RecalibrationKind = "angle"
     lights: tuple[int, ...] | None = None
     correction: Recalibration | None = field(default=None, repr=False)
+
+    @classmethod
+    def of(cls, options: EstimatorOptions) -> Self:
+        """Create the estimator, not calibrated."""
+        return cls(EyeParameters.with_index(options.index), options.recalibration)
+
+    def options(self) -> EstimatorOptions:
+        """Return the options for a file."""
+        index = None if self.parameters == MEAN_EYE else self.parameters.index
+        return EstimatorOptions(index=index, recalibration=self.recalibration)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate the correction of each eye.

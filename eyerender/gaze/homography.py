@@ -19,18 +19,24 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Objects
 from ..base.errors import InputError
+from ..base.spec import Spec
 from ..rig.rig import RigGeometry, RigLike
-from ..scene.observation import EYES, Observations
+from ..scene.observation import Observations
+from .builtin import BuiltIn
 from .estimate import GazePoints
-from .rays import chosen_lights, glints_of, screen_of, targets_on_screen
+from .rays import calibrated_eyes, chosen_lights, eyes_of, glints_of, is_none, screen_of, targets_on_screen
 
 # Corners of the square for the four lights: top left, top right, bottom right, bottom left, u to the right and v up.
 SQUARE = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
 _DEGENERATE = 1e-10  # ratio of singular values below which points determine no homography
 
 
+class _EyeHomography(Spec):
+    homography: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
 @dataclass(frozen=True, slots=True)
-class Homography:
+class Homography(BuiltIn):
     """Map the pupil centre to the screen after normalising it by four glints.
 
     Args:
@@ -44,6 +50,8 @@ class Homography:
     conditioned: bool = True
     homographies: Mapping[int, Floats] = field(default_factory=dict)
 
+    BY_EYE, EYE, ARRAY = "homographies", _EyeHomography, "homography"
+
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate H_c of each eye.
 
@@ -53,37 +61,25 @@ class Homography:
         rig = rig.build()
         wanted = targets_on_screen(observations, screen_of(rig))
         s, reason = self.normalised(observations, rig)
-        usable = (reason == None) & np.isfinite(wanted).all(axis=1)  # noqa: E711
+        usable = is_none(reason) & np.isfinite(wanted).all(axis=1)
         found = {}
-        for eye in np.unique(observations.index.eye):
-            rows = usable & (observations.index.eye == eye)
-            name = EYES[int(eye)] if eye >= 0 else "unknown"
-            if rows.sum() < 4:
-                raise InputError(f"{name} eye: {rows.sum()} usable calibration targets, but a homography needs 4")
-            H, ok = homography(s[rows], wanted[rows], conditioned=self.conditioned)
+        for eye, name, rows in eyes_of(observations, usable):
+            if len(rows) < 4:
+                raise InputError(f"{name} eye: {len(rows)} usable calibration targets, but a homography needs 4")
+            found[eye], ok = homography(s[rows], wanted[rows], conditioned=self.conditioned)
             if not ok:
                 raise InputError(f"{name} eye: the calibration targets do not determine a homography")
-            found[int(eye)] = H
         return replace(self, homographies=found)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Estimate gaze points on the screen's plane."""
-        if not self.homographies:
-            raise InputError("the estimator is not calibrated; call fit first")
         rig = rig.build()
         screen = screen_of(rig)
         s, reason = self.normalised(observations, rig)
         on_screen = np.full((len(observations), 2), np.nan)
-        for eye in np.unique(observations.index.eye):
-            rows = observations.index.eye == eye
-            H = self.homographies.get(int(eye))
-            if H is None:
-                reason[rows & (reason == None)] = "this eye is not calibrated"  # noqa: E711
-                continue
+        for rows, H in calibrated_eyes(observations, self.homographies, reason):
             on_screen[rows], finite = transformed(H, s[rows])
-            at_infinity = np.zeros(len(observations), dtype=bool)
-            at_infinity[rows] = ~finite
-            reason[at_infinity & (reason == None)] = "the gaze point lies at infinity"  # noqa: E711
+            reason[rows[~finite]] = "the gaze point lies at infinity"
         return GazePoints.of(screen.world(on_screen), reason)
 
     def normalised(self, observations: Observations, rig: RigGeometry) -> tuple[Floats, Objects]:
@@ -91,11 +87,10 @@ class Homography:
         chosen_lights(rig, self.lights, 4)
         glints, reason = glints_of(observations, self.lights)
         H, ok = homography(glints, np.broadcast_to(SQUARE, glints.shape))
-        reason[~ok & (reason == None)] = "three of the glints lie on a line"  # noqa: E711
+        reason[is_none(reason) & ~ok] = "three of the glints lie on a line"
         s, finite = transformed(H, observations.pupil.centre_px)
-        reason[~finite & (reason == None)] = "the normalised pupil centre lies at infinity"  # noqa: E711
-        good = np.asarray(reason == None)  # noqa: E711
-        return np.where(good[:, None], s, np.nan), reason
+        reason[is_none(reason) & ~finite] = "the normalised pupil centre lies at infinity"
+        return np.where(is_none(reason)[:, None], s, np.nan), reason
 
 
 def homography(source: ArrayLike, target: ArrayLike, *, conditioned: bool = False) -> tuple[Floats, Bools]:

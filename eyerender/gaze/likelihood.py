@@ -10,16 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
+from pydantic import Field
 
 from ..base.arrays import Floats, frozen
 from ..base.errors import InputError
+from ..base.spec import Spec
 from ..rig.rig import RigLike
 from ..scene.observation import EYES, Observations
+from .builtin import BuiltIn
 from .estimate import GazePoints, GazeRays
-from .rays import screen_of
+from .rays import is_none, screen_of
 
 if TYPE_CHECKING:
     from ..design.fit import EyeFit
@@ -29,8 +32,12 @@ OUTLINE_PX, GLINT_PX = 0.2, 0.1
 """Deviations of features without a covariance (chosen): a sensor's noise, and what eyes still differ from the model."""
 
 
+class _EyePerson(Spec):
+    person: Annotated[tuple[float, ...], Field(min_length=PERSON_NUMBERS, max_length=PERSON_NUMBERS)]
+
+
 @dataclass(frozen=True, slots=True)
-class MaximumLikelihood:
+class MaximumLikelihood(BuiltIn):
     """Estimate gaze by fitting an eye model to the features of every frame.
 
     Args:
@@ -42,6 +49,9 @@ class MaximumLikelihood:
     eye: str = "E2"
     slippage_mm: float = 3.0
     persons: Mapping[int, Floats] = field(default_factory=dict, repr=False)
+
+    OPTIONS = ("eye", "slippage_mm")
+    BY_EYE, EYE, ARRAY = "persons", _EyePerson, "person"
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Fit each eye's person to calibration targets.
@@ -72,8 +82,8 @@ class MaximumLikelihood:
         n = len(observations)
         reason = np.full(n, None, dtype=object)
         reason[~np.isin(observations.index.eye, list(self.persons))] = "this eye is not calibrated"
-        reason[(reason == None) & ~observations.pupil.ok] = "no pupil"  # noqa: E711
-        usable = np.flatnonzero(reason == None)  # noqa: E711
+        reason[is_none(reason) & ~observations.pupil.ok] = "no pupil"
+        usable = np.flatnonzero(is_none(reason))
         origin, direction = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
         if len(usable):
             unknowns = Unknowns(slippage_mm=self._slippage)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 from ..base.errors import EyerenderError, InputError
-from ..base.references import load_reference
+from ..base.references import is_reference, load_reference
 from ..rig.rig import RigLike
 from ..scene.observation import Observations
 from .estimate import GazeEstimator, GazePoints, StoredEstimator
@@ -36,9 +36,15 @@ class OwnEstimator:
         with _calling(reference, "making one without arguments"):
             return cls(reference, kind())
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the name of the class, as stored in calibration files."""
-        return {"reference": self.reference}
+    @classmethod
+    def of(cls, estimator: GazeEstimator) -> OwnEstimator:
+        """Wrap an object, under the name of its class, unless it is wrapped already."""
+        kind = type(estimator)
+        return (
+            estimator
+            if isinstance(estimator, OwnEstimator)
+            else cls(f"{kind.__module__}:{kind.__qualname__}", estimator)
+        )
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate; see `GazeEstimator.fit`."""
@@ -71,20 +77,22 @@ class OwnEstimator:
             )
             raise InputError(reason, source=self.reference)
 
-    def state(self) -> dict[str, Any]:
-        """Return the calibration as JSON values.
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the name of the class and its calibration, as stored in files.
 
         Raises:
             InputError: it cannot be stored.
         """
         self.check_storable()
         assert isinstance(self.estimator, StoredEstimator)
+        if not is_reference(self.reference):
+            raise InputError("cannot be imported again; define the class in a module", source=self.reference)
         with _calling(self.reference, "to_mapping"):
             state = self.estimator.to_mapping()
             if not isinstance(state, dict):
                 raise TypeError(f"must be a dict, not a {type(state).__name__}")
             json.dumps(state, allow_nan=False)
-        return state
+        return {"estimator": {"reference": self.reference}, "state": state}
 
     def restored(self, state: Any) -> Self:
         """Restore the estimator from the calibration in a file.

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from ..base.arrays import Floats
 from ..base.errors import InputError
+from ..base.spec import Positive, Spec
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EyeParameters:
+class EyeParameters(Spec):
     """Parameters of the model eye.
 
     Defaults are population means (Guestrin & Eizenman 2006, after Gullstrand's eye).
@@ -26,28 +27,29 @@ class EyeParameters:
         beta_deg: the same angle upwards.
     """
 
-    cornea_radius_mm: float = 7.8
-    pupil_distance_mm: float = 4.2
-    index: float = 1.3375
-    alpha_deg: float = 5.0
-    beta_deg: float = 1.5
+    cornea_radius_mm: Positive = 7.8
+    pupil_distance_mm: Positive = 4.2
+    index: Annotated[float, Field(ge=1, le=2)] = 1.3375
+    alpha_deg: Annotated[float, Field(ge=-90, le=90)] = 5.0
+    beta_deg: Annotated[float, Field(ge=-90, le=90)] = 1.5
 
     def vector(self) -> Floats:
         """Return the five numbers in the order of the fields."""
-        return np.array([getattr(self, f.name) for f in fields(self)], dtype=float)
+        return np.array([getattr(self, name) for name in NAMES], dtype=float)
+
+    @classmethod
+    def with_index(cls, index: float | None) -> EyeParameters:
+        """Create the mean eye with another refractive index; None keeps it."""
+        return MEAN_EYE if index is None else cls(index=index)
 
     @classmethod
     def of(cls, values: Sequence[float] | Floats) -> EyeParameters:
         """Create parameters from five numbers in the order of the fields."""
-        return cls(**{f.name: float(v) for f, v in zip(fields(cls), values, strict=True)})
-
-    def to_mapping(self) -> dict[str, float]:
-        """Convert to a mapping for JSON."""
-        return asdict(self)
+        return cls(**dict(zip(NAMES, map(float, values), strict=True)))
 
 
 MEAN_EYE = EyeParameters()
-NAMES = tuple(f.name for f in fields(EyeParameters))
+NAMES = tuple(EyeParameters.model_fields)
 
 
 _LOWER, _UPPER = (
@@ -65,10 +67,8 @@ class ParameterBounds:
 
     def __post_init__(self) -> None:
         low, high = self.lower.vector(), self.upper.vector()
-        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        if not (low < high).all():
             raise InputError("each lower bound must be less than its upper bound")
-        if low[0] <= 0 or low[1] <= 0 or low[2] < 1:
-            raise InputError("radii must be > 0 and the index >= 1")
 
     def draw(self, count: int, seed: int) -> list[EyeParameters]:
         """Draw `count` random parameters, uniform between the bounds; equal seeds give equal draws."""
@@ -79,8 +79,7 @@ class ParameterBounds:
 HUMAN_BOUNDS = ParameterBounds()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
+class Calibration(Spec):
     """Calibrated parameters of one eye, and how the search ended.
 
     Attributes:
@@ -97,12 +96,8 @@ class Calibration:
     parameters: EyeParameters
     start: EyeParameters
     objective: str
-    cost: float
-    evaluations: int
+    cost: Annotated[float, Field(ge=0)]
+    evaluations: Annotated[int, Field(ge=0, lt=2**53)]
     converged: bool
     message: str
-    at_bound: tuple[str, ...]
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Convert to a mapping for JSON."""
-        return {**asdict(self), "at_bound": list(self.at_bound)}
+    at_bound: Annotated[tuple[str, ...], Field(max_length=5)]

@@ -5,16 +5,19 @@ u = direction in which the camera sees a feature;  O = its nodal point;  L = a l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
-from ..base.arrays import ArrayValue, Floats, Ints, Objects, frozen
+from ..base.arrays import ArrayValue, Bools, Floats, Ints, Objects, frozen
 from ..base.errors import InputError
 from ..rig.rig import RigGeometry
 from ..rig.screen import ScreenPlane
-from ..scene.observation import Observations
+from ..scene.observation import EYES, Observations
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -78,7 +81,7 @@ def glints_of(observations: Observations, lights: tuple[int, ...]) -> tuple[Floa
     places = np.full((len(observations), len(lights), 2), np.nan)
     for j, light in enumerate(lights):
         places[:, j], found = observations.glints.of_light(light)
-        reason[(reason == None) & ~found] = f"no glint of light {light}"  # noqa: E711  (element by element)
+        reason[is_none(reason) & ~found] = f"no glint of light {light}"
     return places, reason
 
 
@@ -151,6 +154,39 @@ def target_directions(observations: Observations) -> Floats:
     """Compute unit directions (n, 3) from each eye's position to its target; NaN where one is unknown."""
     index = observations.index
     return unit(index.target_mm - index.eye_position_mm - index.head_mm)
+
+
+def eye_name(eye: int) -> str:
+    """Return the name of an eye by its number in observations: right, left, or unknown for -1."""
+    return EYES[eye] if eye >= 0 else "unknown"
+
+
+def eyes_of(observations: Observations, usable: Bools) -> Iterator[tuple[int, str, Ints]]:
+    """Yield the number and name of each observed eye, and its usable rows."""
+    for eye in np.unique(observations.index.eye):
+        yield int(eye), eye_name(int(eye)), np.flatnonzero(usable & (observations.index.eye == eye))
+
+
+def calibrated_eyes(
+    observations: Observations, calibrations: Mapping[int, T], reason: Objects
+) -> Iterator[tuple[Ints, T]]:
+    """Yield the rows without a reason of each calibrated eye, with its calibration; set the reason of other eyes.
+
+    Raises:
+        InputError: no eye is calibrated.
+    """
+    if not calibrations:
+        raise InputError("the estimator is not calibrated; call fit first")
+    for eye, _, rows in eyes_of(observations, is_none(reason)):
+        if eye in calibrations:
+            yield rows, calibrations[eye]
+        else:
+            reason[rows] = "this eye is not calibrated"
+
+
+def is_none(reason: Objects) -> Bools:
+    """Return which reasons (n,) are None, so that nothing is missing."""
+    return np.asarray(reason == None, dtype=bool)  # noqa: E711  (element by element)
 
 
 def unit(v: Floats) -> Floats:

@@ -9,22 +9,23 @@ fitted by least squares for each eye.
 from __future__ import annotations
 
 import warnings
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
-from ..base.arrays import Floats
+from ..base.arrays import Floats, frozen
 from ..base.errors import InputError
+from ..base.spec import Spec
 from ..rig.rig import RigGeometry, RigLike
-from ..scene.observation import EYES, Observations
+from ..scene.observation import Observations
+from .builtin import BuiltIn, RecalibrationKind
 from .determined import UndeterminedWarning, shortfall
 from .estimate import GazePoints, GazeRays
-from .rays import screen_of, targets_on_screen, unit
+from .rays import calibrated_eyes, eyes_of, is_none, screen_of, targets_on_screen, unit
 
-RecalibrationKind = Literal["none", "screen", "angle"]
 EXPONENTS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 TERMS = len(EXPONENTS)
 _ANGLE = "use recalibration='angle' without one"
@@ -46,7 +47,7 @@ class Recalibration:
         if self.kind == "none":
             return self
         targets_mm = observations.index.target_mm
-        usable = np.array([r is None for r in rays.reason]) & np.isfinite(targets_mm).all(axis=1)
+        usable = is_none(rays.reason) & np.isfinite(targets_mm).all(axis=1)
         if self.kind == "angle":
             measured, wanted = angles_of(rays.direction), angles_of(targets_mm - rays.origin_mm)
         else:
@@ -55,12 +56,10 @@ class Recalibration:
             usable &= hits
             wanted = targets_on_screen(observations, screen)
         out = {}
-        for eye in np.unique(observations.index.eye):
-            rows = usable & (observations.index.eye == eye)
-            name = EYES[int(eye)] if eye >= 0 else "unknown"
-            if rows.sum() < TERMS:
+        for eye, name, rows in eyes_of(observations, usable):
+            if len(rows) < TERMS:
                 raise InputError(
-                    f"{name} eye: {rows.sum()} usable calibration targets, but the correction has {TERMS} terms"
+                    f"{name} eye: {len(rows)} usable calibration targets, but the correction has {TERMS} terms"
                 )
             # The columns are scaled so that the rank does not depend on the unit.
             design = monomials(measured[rows])
@@ -71,7 +70,7 @@ class Recalibration:
             why = shortfall(measured[rows], [EXPONENTS], "the correction")
             if why is not None:
                 warnings.warn(f"{name} eye: {why}; calibrate without it (none)", UndeterminedWarning, stacklevel=3)
-            out[int(eye)] = (solution / scale[:, None]).T
+            out[eye] = (solution / scale[:, None]).T
         return Recalibration(self.kind, out)
 
     def apply(self, observations: Observations, rays: GazeRays, rig: RigLike) -> GazePoints:
@@ -80,7 +79,7 @@ class Recalibration:
         corrected = self._on_angles(observations, rays)
         reason = corrected.reason.copy()
         on_screen, hits = screen.intersect(corrected.origin_mm, corrected.direction)
-        reason[(reason == None) & ~hits] = "the gaze ray does not meet the screen"  # noqa: E711
+        reason[is_none(reason) & ~hits] = "the gaze ray does not meet the screen"
         if self.kind == "screen":
             for eye, A in self.coefficients.items():
                 rows = observations.index.eye == eye
@@ -99,25 +98,37 @@ class Recalibration:
         """Return the rays with corrected angles; unchanged if the correction acts on the screen."""
         if self.kind == "none":
             return rays
-        if not self.coefficients:
-            raise InputError("the estimator is not calibrated; call fit first")
         reason, direction = rays.reason.copy(), rays.direction.copy()
-        for eye in np.unique(observations.index.eye):
-            rows = observations.index.eye == eye
-            A = self.coefficients.get(int(eye))
-            if A is None:
-                reason[rows & (reason == None)] = "this eye is not calibrated"  # noqa: E711
-            elif self.kind == "angle":
+        for rows, A in calibrated_eyes(observations, self.coefficients, reason):
+            if self.kind == "angle":
                 direction[rows] = direction_of(monomials(angles_of(direction[rows])) @ A.T)
         return GazeRays.of(rays.origin_mm, direction, reason)
 
 
-class Recalibrated(ABC):
+_Six = tuple[float, float, float, float, float, float]
+
+
+class _EyeCorrection(Spec):
+    coefficients: tuple[_Six, _Six]
+
+
+class Recalibrated(BuiltIn):
     """An estimator of optic axes whose estimates a polynomial corrects."""
 
     __slots__ = ()
+    EYE = _EyeCorrection
     recalibration: RecalibrationKind
     correction: Recalibration | None
+
+    def eyes(self) -> Mapping[int, _EyeCorrection]:
+        """Return the correction of each eye."""
+        found = self.correction.coefficients if self.correction else {}
+        return {eye: _EyeCorrection.from_mapping({"coefficients": A}) for eye, A in found.items()}
+
+    def with_eyes(self, eyes: Mapping[int, _EyeCorrection]) -> Self:
+        """Return a copy with these corrections."""
+        found = {eye: frozen(one.coefficients) for eye, one in eyes.items()}
+        return replace(self, correction=Recalibration(self.recalibration, found) if found else None)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Estimate gaze points on the screen's plane."""

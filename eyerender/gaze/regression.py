@@ -11,17 +11,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Annotated, Any, Self
 
 import numpy as np
+from pydantic import Field
 
-from ..base.arrays import Bools, Floats, Ints, Objects
+from ..base.arrays import Floats, Ints, Objects
 from ..base.errors import InputError
+from ..base.spec import Spec
 from ..rig.rig import RigLike
-from ..scene.observation import EYES, Observations
+from ..scene.observation import Observations
+from .builtin import BuiltIn, EstimatorOptions
 from .determined import Terms, UndeterminedWarning, is_determined, monomials, shortfall
 from .estimate import GazePoints
-from .rays import glints_of, screen_of, targets_on_screen
+from .rays import calibrated_eyes, eye_name, eyes_of, glints_of, is_none, screen_of, targets_on_screen
 
 
 def _terms(text: str) -> Terms:
@@ -67,34 +70,68 @@ FUNCTIONS: dict[str, tuple[str, str]] = {
 _TABLE = {name: (_terms(x), _terms(y)) for name, (x, y) in FUNCTIONS.items()}
 
 
+class PolynomialFit(Spec):
+    """Coefficients of one eye on the scaled vector (v - origin) / scale: a of the first polynomial, b of the second."""
+
+    origin: tuple[float, float]
+    scale: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
+    a: tuple[float, ...]
+    b: tuple[float, ...]
+
+
+class PolynomialEstimator(BuiltIn):
+    """An estimator with two polynomials of a vector for each eye."""
+
+    __slots__ = ()
+    BY_EYE, EYE = "fits", PolynomialFit
+    function: str | tuple[str, str]
+    fits: Mapping[int, PolynomialFit]
+
+    @property
+    def terms(self) -> tuple[Terms, Terms]:
+        """Exponents of the terms of both polynomials.
+
+        Raises:
+            InputError: there is no such function.
+        """
+        if isinstance(self.function, str):
+            if self.function not in FUNCTIONS:
+                raise InputError(f"{self.function!r} is not a regression function (R1 to R12)")
+            x, y = FUNCTIONS[self.function]
+        else:
+            x, y = self.function
+        return _terms(x), _terms(y)
+
+    @property
+    def function_option(self) -> dict[str, Any]:
+        """The option that states the function, or its terms."""
+        return {("function" if isinstance(self.function, str) else "terms"): self.function}
+
+    def with_eyes(self, eyes: Mapping[int, PolynomialFit]) -> Self:
+        """Return a copy with these coefficients.
+
+        Raises:
+            InputError: they are not as many as the terms; a wrong function is an error here, too.
+        """
+        for key, terms in zip("ab", self.terms, strict=True):
+            for eye, fit in eyes.items():
+                if len(getattr(fit, key)) != len(terms):
+                    path = f"eyes.{eye_name(eye)}.{key}"
+                    raise InputError(f"must be {len(terms)} numbers, one for each term", path=path)
+        return replace(self, fits=eyes)
+
+    def mapped(self, vectors: Floats, observations: Observations, reason: Objects) -> Floats:
+        """Evaluate the polynomials at vectors (n, 2), (n, 2); eyes without a fit get NaN and a reason."""
+        out = np.full(vectors.shape, np.nan)
+        x_terms, y_terms = self.terms
+        for rows, fit in calibrated_eyes(observations, self.fits, reason):
+            u = (vectors[rows] - fit.origin) / fit.scale
+            out[rows] = np.stack([monomials(u, x_terms) @ fit.a, monomials(u, y_terms) @ fit.b], axis=-1)
+        return out
+
+
 @dataclass(frozen=True, slots=True)
-class EyeFit:
-    """Coefficients of one eye on the scaled vector (v - origin) / scale."""
-
-    origin: Floats
-    scale: Floats
-    a: Floats
-    b: Floats
-
-
-def mapped(
-    fits: Mapping[int, EyeFit], terms: tuple[Terms, Terms], vectors: Floats, eyes: Ints, reason: Objects
-) -> Floats:
-    """Evaluate the polynomials of each eye at vectors (n, 2), (n, 2); eyes without a fit get NaN and a reason."""
-    out = np.full(vectors.shape, np.nan)
-    for eye in np.unique(eyes):
-        rows = np.flatnonzero(eyes == eye)
-        fit = fits.get(int(eye))
-        if fit is None:
-            reason[rows] = "this eye is not calibrated"
-            continue
-        u = (vectors[rows] - fit.origin) / fit.scale
-        out[rows] = np.stack([monomials(u, terms[0]) @ fit.a, monomials(u, terms[1]) @ fit.b], axis=-1)
-    return out
-
-
-@dataclass(frozen=True, slots=True)
-class Regression:
+class Regression(PolynomialEstimator):
     """Polynomial regression on the vector from one light's glint to the pupil.
 
     Args:
@@ -110,18 +147,20 @@ class Regression:
     light: int = 0
     normalised: bool = True
     centred: bool = False
-    fits: Mapping[int, EyeFit] = field(default_factory=dict, repr=False)
+    fits: Mapping[int, PolynomialFit] = field(default_factory=dict, repr=False)
 
-    @property
-    def terms(self) -> tuple[Terms, Terms]:
-        """Exponents of the terms of x and of y."""
-        if isinstance(self.function, str):
-            if self.function not in FUNCTIONS:
-                raise InputError(f"{self.function!r} is not a regression function (R1 to R12)")
-            x, y = FUNCTIONS[self.function]
-        else:
-            x, y = self.function
-        return _terms(x), _terms(y)
+    @classmethod
+    def of(cls, options: EstimatorOptions) -> Self:
+        """Create the estimator, not calibrated.
+
+        Raises:
+            InputError: there is no such function.
+        """
+        return cls(options.terms or options.function, normalised=options.normalised).with_eyes({})
+
+    def options(self) -> EstimatorOptions:
+        """Return the options for a file."""
+        return EstimatorOptions(**self.function_option, normalised=self.normalised)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate each eye.
@@ -136,15 +175,11 @@ class Regression:
                 "no frame has both a right and a left eye, whose distance is the unit of the pupil-glint vector; "
                 "for one eye give --monocular (in Python: Regression(normalised=False))"
             )
-        usable = np.array([r is None for r in reason], dtype=bool) & np.isfinite(wanted).all(axis=1)
-        fits = {}
-        for eye in np.unique(observations.index.eye):
-            rows = usable & (observations.index.eye == eye)
-            name = EYES[int(eye)] if eye >= 0 else "unknown"
-            fits[int(eye)] = self.fit_eye(v[rows], wanted[rows], name)
+        usable = is_none(reason) & np.isfinite(wanted).all(axis=1)
+        fits = {eye: self.fit_eye(v[rows], wanted[rows], name) for eye, name, rows in eyes_of(observations, usable)}
         return replace(self, fits=fits)
 
-    def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> EyeFit:
+    def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> PolynomialFit:
         """Fit the coefficients of one eye, from vectors (n, 2) to points on the screen (n, 2) mm.
 
         The vectors are scaled first, which does not change the function. A subclass may solve differently. Warns with
@@ -166,15 +201,13 @@ class Regression:
         why = shortfall(vectors - origin, self.terms, str(self.function))
         if why is not None:
             warnings.warn(f"{name} eye: {why}{_instead(vectors - origin)}", UndeterminedWarning, stacklevel=3)
-        return EyeFit(origin, scale, a, b)
+        return PolynomialFit.from_mapping({"origin": origin, "scale": scale, "a": a, "b": b})
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Estimate gaze points on the screen's plane."""
-        if not self.fits:
-            raise InputError("the estimator is not calibrated; call fit first")
         screen = screen_of(rig.build())
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
-        return GazePoints.of(screen.world(mapped(self.fits, self.terms, v, observations.index.eye, reason)), reason)
+        return GazePoints.of(screen.world(self.mapped(v, observations, reason)), reason)
 
     def _solve(self, design: Floats, wanted: Floats, eye: str) -> Floats:
         solution, _, rank, _ = np.linalg.lstsq(design, wanted, rcond=None)
@@ -205,19 +238,16 @@ def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: 
     index, pupil = observations.index, observations.pupil
     glints, reason = glints_of(observations, (light,))
     vectors = pupil.centre_px - glints[:, 0]
-    if not normalised:
-        good = np.asarray(reason == None)  # noqa: E711  (element by element)
-        return np.where(good[:, None], vectors, np.nan), reason
-    partner = _partners(index.frame, index.eye)
-    lone = (partner < 0) & (reason == None)  # noqa: E711
-    reason[lone] = "the frame shows one eye; the vector is normalised by the distance of two pupils"
-    unit: Bools = (partner >= 0) & ~pupil.ok[partner]
-    reason[unit & (reason == None)] = "no pupil of the other eye"  # noqa: E711
-    with np.errstate(invalid="ignore"):
-        distance = np.linalg.norm(pupil.centre_px - pupil.centre_px[partner], axis=1)
-        v = vectors / np.where(distance > 0, distance, np.nan)[:, None]
-    good = np.asarray(reason == None)  # noqa: E711
-    return np.where(good[:, None], v, np.nan), reason
+    if normalised:
+        partner = _partners(index.frame, index.eye)
+        reason[is_none(reason) & (partner < 0)] = (
+            "the frame shows one eye; the vector is normalised by the distance of two pupils"
+        )
+        reason[is_none(reason) & ~pupil.ok[partner]] = "no pupil of the other eye"
+        with np.errstate(invalid="ignore"):
+            distance = np.linalg.norm(pupil.centre_px - pupil.centre_px[partner], axis=1)
+            vectors = vectors / np.where(distance > 0, distance, np.nan)[:, None]
+    return np.where(is_none(reason)[:, None], vectors, np.nan), reason
 
 
 def _partners(frame: Ints, eye: Ints) -> Ints:

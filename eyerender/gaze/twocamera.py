@@ -17,10 +17,11 @@ from ..base.arrays import Bools, Floats, Ints, Objects
 from ..base.errors import InputError
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import Observations
+from .builtin import RecalibrationKind
 from .cornea import line_to_centre
 from .estimate import GazeRays
-from .rays import FeatureRays, feature_rays, unit
-from .recalibration import Recalibrated, Recalibration, RecalibrationKind
+from .rays import FeatureRays, feature_rays, is_none, unit
+from .recalibration import Recalibrated, Recalibration
 
 # Below this sine two lines or planes count as parallel, because rounding would determine where they meet.
 _PARALLEL = 1e-7
@@ -44,6 +45,8 @@ class ShihWuLiu(Recalibrated):
     lights: tuple[int, ...] | None = None
     correction: Recalibration | None = field(default=None, repr=False)
 
+    OPTIONS = ("recalibration",)
+
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate the correction of each eye.
 
@@ -64,7 +67,7 @@ class ShihWuLiu(Recalibrated):
         rays = feature_rays(observations, rig, self.lights, least=2)
         lines, good = line_to_centre(rays.origin_mm, rays.glints, rays.light_mm)
         own: Objects = rays.reason.copy()
-        own[(own == None) & ~good] = "the glints determine no line to the centre of corneal curvature"  # noqa: E711
+        own[is_none(own) & ~good] = "the glints determine no line to the centre of corneal curvature"
         first, second = self._pairs(observations)
         n = len(observations)
         centre, axis = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
@@ -76,7 +79,7 @@ class ShihWuLiu(Recalibrated):
             reason[rows[~d_ok]] = "both cameras see the optic axis in the same plane"
             reason[rows[~c_ok]] = "the two cameras' lines to the cornea are parallel"
             for part in (first, second):
-                bad = np.asarray(own[part] != None)  # noqa: E711
+                bad = ~is_none(own[part])
                 reason[rows[bad]] = own[part][bad]
         return GazeRays.of(centre, axis, reason)
 

@@ -78,7 +78,7 @@ def _write_bad_things():
     Path("exits.py").write_text("raise SystemExit(3)", encoding="utf-8")
     records: dict[str, Any] = {"records": [], "rig": None}
     Path("f.json").write_text(json.dumps(records), encoding="utf-8")
-    own = {"schema": "eyerender/gaze-calibration/3", "estimator": {"reference": "exits:Mine"}, "rig": None, "state": {}}
+    own = {"schema": "eyerender/gaze-calibration/4", "estimator": {"reference": "exits:Mine"}, "rig": None, "state": {}}
     Path("own.json").write_text(json.dumps(own), encoding="utf-8")
     Path("t.csv").write_text("time,pupil_x,pupil_y,target_x,target_y\n0,1,x,0,0\n1,y,2,0,0\n", encoding="utf-8")
     Path("good.csv").write_text("pupil_x,pupil_y\n1,2\n", encoding="utf-8")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -98,16 +97,3 @@ def test_it_has_the_smallest_error_on_exact_features_of_drawn_people(rig):
     e95 = {one.name: float(np.median(np.nanquantile(one.error_deg, 0.95, axis=1))) for one in found}
     assert min(e95, key=lambda name: e95[name]) == "maximum-likelihood"
     assert e95["maximum-likelihood"] < 0.08
-
-
-def test_a_calibration_without_shapes_of_cornea_and_pupil_is_still_read(seen, tmp_path):
-    scene, _ = seen
-    person = np.zeros(17)
-    person[:9] = [0.1, 0.02, -0.1, 0.01, -0.02, 0.3, 0, 0, 0]
-    save_estimator(tmp_path / "new.json", er.gaze.MaximumLikelihood(persons={0: person}), scene.rig)
-    data = json.loads((tmp_path / "new.json").read_text())
-    data["eyes"]["right"]["person"] = data["eyes"]["right"]["person"][:9]
-    (tmp_path / "old.json").write_text(json.dumps(data))
-    found = load_estimator(tmp_path / "old.json")
-    assert isinstance(found, er.gaze.MaximumLikelihood)
-    assert found.persons[0] == pytest.approx(person)

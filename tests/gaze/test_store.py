@@ -12,7 +12,7 @@ from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.gaze.predictions import predictions
 from eyerender.gaze.records import load_observations, rig_from_mapping
-from eyerender.gaze.regression import EyeFit, Regression
+from eyerender.gaze.regression import PolynomialFit, Regression
 from eyerender.gaze.store import (
     choose_estimator,
     fit_estimator,
@@ -236,7 +236,7 @@ def test_a_rig_other_than_the_calibrations_is_told(guestrin, tmp_path, monkeypat
         assert capsys.readouterr().err == f"error: {words} (--strict)\n"
 
 
-def test_calibrations_without_a_rig_are_still_read(guestrin, tmp_path, capsys):
+def test_calibrations_without_a_rig_are_read_and_older_files_get_one_line(guestrin, tmp_path, capsys):
     seen, rig = load_observations(guestrin)
     estimator = choose_estimator("regression")
     fitted, _ = fit_estimator(estimator, seen, rig)
@@ -244,8 +244,11 @@ def test_calibrations_without_a_rig_are_still_read(guestrin, tmp_path, capsys):
     data = json.loads((tmp_path / "c.json").read_text())
     assert data["schema"] == "eyerender/gaze-calibration/4"
     assert data["rig"] == json.loads(guestrin.read_text())["rig"]
-    del data["rig"]
-    (tmp_path / "c.json").write_text(json.dumps({**data, "schema": "eyerender/gaze-calibration/1"}))
+    (tmp_path / "c.json").write_text(json.dumps({**data, "schema": "eyerender/gaze-calibration/3"}))
+    assert run(["gaze", "predict", str(guestrin), "-c", str(tmp_path / "c.json")]) == 2
+    words = "schema: is 'eyerender/gaze-calibration/3'; this version reads 'eyerender/gaze-calibration/4'"
+    assert capsys.readouterr().err == f"error: {tmp_path / 'c.json'}: {words}\n"
+    (tmp_path / "c.json").write_text(json.dumps({**data, "rig": None}))
     again, calibrated = load_calibration(tmp_path / "c.json")
     assert calibrated is None
     np.testing.assert_array_equal(again.predict(seen, rig).point_mm, fitted.predict(seen, rig).point_mm)
@@ -299,7 +302,7 @@ def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
     (tmp_path / "badrig.json").write_text(json.dumps(bad))
     (tmp_path / "empty.jsonl").write_text("\n")
     (tmp_path / "text.txt").write_text("dear diary")
-    hollow = {"schema": "eyerender/gaze-calibration/1", "estimator": {"name": "regression"}, "eyes": {"right": {}}}
+    hollow = {"schema": "eyerender/gaze-calibration/4", "estimator": {"name": "regression"}, "eyes": {"right": {}}}
     (tmp_path / "hollow.json").write_text(json.dumps(hollow))
     assert run(argv) == 2
     out, err = capsys.readouterr()
@@ -396,7 +399,7 @@ def test_json_that_is_no_file_of_records(tmp_path, text, words):
 def test_estimates_that_overflow_are_missing(guestrin):
     """Coefficients of 1e300 give no number; that is a reason, not an infinity in the output."""
     seen, rig = load_observations(guestrin)
-    fit = EyeFit(np.zeros(2), np.full(2, 1e-100), np.full(6, 1e300), np.full(6, -1e300))
+    fit = PolynomialFit(origin=(0.0, 0.0), scale=(1e-100, 1e-100), a=(1e300,) * 6, b=(-1e300,) * 6)
     gaze = predictions(Regression(fits={0: fit, 1: fit}), seen, rig)
     assert {g["reason"] for g in gaze["gaze"]} == {"the estimate is not finite"}
     json.dumps(gaze, allow_nan=False)

@@ -14,7 +14,7 @@ from ...base.errors import InputError
 from ...gaze.determined import monomials
 from ...gaze.guestrin import GuestrinEizenman
 from ...gaze.parameters import Calibration, EyeParameters
-from ...gaze.regression import EyeFit, Regression
+from ...gaze.regression import PolynomialFit, Regression
 from ...gaze.search import MOST_ITERATIONS, FreeParameters, Misses
 
 # A slots dataclass is a new class, which super() without arguments does not find, so base classes are named.
@@ -71,7 +71,7 @@ class AuthorsGuestrinEizenman(GuestrinEizenman):
 class MinimumNormRegression(Regression):
     """Regression with the minimum-norm solution if the targets do not determine the coefficients."""
 
-    def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> EyeFit:
+    def fit_eye(self, vectors: Floats, wanted: Floats, name: str) -> PolynomialFit:
         """Fit the coefficients of one eye.
 
         Their norm depends on the vectors' scale; the software does not scale them.
@@ -84,4 +84,4 @@ class MinimumNormRegression(Regression):
             np.asarray(np.linalg.lstsq(monomials(u, terms), wanted[:, k], rcond=None)[0], dtype=np.float64)
             for k, terms in enumerate(self.terms)
         )
-        return EyeFit(origin, scale, a, b)
+        return PolynomialFit.from_mapping({"origin": origin, "scale": scale, "a": a, "b": b})

@@ -162,7 +162,7 @@ def estimator(departures: Collection[str], *, free_index: bool = False) -> Autho
     software = "objective" in departures
     return AuthorsGuestrinEizenman(
         centre="plane" if "centre" in departures else "all_glints",
-        start=replace(SOFTWARE_START if software else EyeParameters(), index=index),
+        start=(SOFTWARE_START if software else EyeParameters()).model_copy(update={"index": index}),
         bounds=SOFTWARE_BOUNDS if software else ParameterBounds(),
         free_index=free_index and "index" not in departures,
         visual_axis="rotation" if "visual_axis" in departures else "angles",
