@@ -80,9 +80,8 @@ class GuestrinEizenman(BuiltIn):
 
     def options(self) -> EstimatorOptions:
         """Return the options for a file."""
-        method = "B" if self.centre == "plane" else "A"
         index = None if self.start == MEAN_EYE else self.start.index
-        return EstimatorOptions(method=method, free_index=self.free_index, index=index)
+        return EstimatorOptions(method="B" if self.centre == "plane" else "A", free_index=self.free_index, index=index)
 
     def with_parameters(self, parameters: Mapping[int, EyeParameters]) -> Self:
         """Create an estimator with known parameters by eye (0 right, 1 left), without a calibration."""
