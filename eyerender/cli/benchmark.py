@@ -7,9 +7,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from ..apps.benchmark.options import BenchOptions
 from ..base.storage.files import read_json
 from .app import app
-from .options import Overwrite, Result, at_least_one
+from .options import Result
 from .output import emit, progress, say
 
 
@@ -20,16 +21,7 @@ def bench_extractors(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     extractor: tuple[str, ...] = (),
-    jobs: Annotated[int, Parameter(validator=at_least_one)] = 1,
-    gamma: float | None = None,
-    eye_error: float = 5.0,
-    pupil_class: int | None = None,
-    against: Path | None = None,
-    require: tuple[str, ...] = (),
-    timeout: float = 30.0,
-    quick: bool = False,
-    fresh: bool = False,
-    overwrite: Overwrite = False,
+    options: Annotated[BenchOptions, Parameter(name="*")] = BenchOptions(),
     json: Result = None,
 ) -> int:
     """Measure pupil and glint extractors against the labels of a folder of images.
@@ -49,32 +41,9 @@ def bench_extractors(
         extractor: The name of an installed extractor (own-fast, own-refined, opencv-contour, pupil-detectors, or a
             plug-in), a Python module:callable, or a command that speaks the protocol. NAME=... names it in the report.
             Repeat the option for several extractors (default: all installed ones).
-        jobs: The number of extractor processes that run at the same time.
-        gamma: The encoding gamma of images whose folder states none (default: 1, linear).
-        eye_error: Standard deviation, per axis and in mm, of the error of the eye position given to extractors.
-        pupil_class: The value of the pupil in masks of several classes.
-        against: The results.json of an earlier bench to compare with.
-        require: A result that must be reached, such as right>=.95 or own-fast:centre_px<.1. Repeat the option for
-            several.
-        timeout: Seconds that an extractor may take for one image.
-        quick: Use a tenth of the images, with hard conditions in the same proportion.
-        fresh: Ignore stored answers and run on every image again.
     """
-    from ..apps.benchmark.options import BenchOptions
     from ..apps.benchmark.run import REPORT, TIMES, bench_extractors
 
-    options = BenchOptions(
-        jobs=jobs,
-        timeout_s=timeout,
-        gamma=gamma,
-        eye_error_mm=eye_error,
-        pupil_class=pupil_class,
-        quick=quick,
-        fresh=fresh,
-        against=against,
-        require=require,
-        overwrite=overwrite,
-    )
     with progress("benching") as steps:
         data = bench_extractors(folder, output, extractor or None, options, progress=steps)
     for entry in data["gamma"]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from ..base.errors import InputError
 from .app import app
-from .options import AtLeastOne, Backend, EyeModel, Result, Strict, Threads
+from .options import AtLeastOne, Backend, EstimatorFlags, EstimatorName, EyeModel, Result, Strict, Threads
 from .output import Heed, emit, progress
 
 
@@ -17,15 +17,9 @@ def budget(
     scene: str,
     /,
     *,
-    estimator: Annotated[str, Parameter(name="--estimator")],
+    estimator: EstimatorName,
     eye: EyeModel = None,
-    function: str = "R3",
-    monocular: bool = False,
-    feature: Literal["pupil-glint", "pupil"] = "pupil-glint",
-    method: Literal["A", "B"] = "A",
-    index: float | None = None,
-    recalibration: Literal["angle", "screen", "none"] = "angle",
-    fixations: str | None = None,
+    options: Annotated[EstimatorFlags, Parameter(name="*")] = EstimatorFlags(),
     binocular: bool = False,
     reference: str = "E1",
     seeds: AtLeastOne = None,
@@ -37,22 +31,11 @@ def budget(
 ) -> int:
     """Split the gaze error of a scene by cause: eye model, features, image, noise, estimator.
 
-    The images are rendered once and exposed again for each seed of the noise.
+    The images are rendered once and exposed again for each seed of the noise. With --fixations the remaining ones are
+    tested; otherwise each fixation is tested with a calibration on all others.
 
     Args:
         scene: A scene file or the name of a shipped one, with targets.
-        estimator: regression, direction-regression, homography, cross-ratio, hennessey, shih-wu-liu or
-            guestrin-eizenman (see `gaze fit`), or module:Class, a class of your own.
-        function: regressions: the function, R1 to R12.
-        monocular: regression: use the vector of one eye in pixels, without dividing it by the distance between the
-            pupils.
-        feature: direction-regression: the vector from the mean of all glints to the pupil, or the pupil's centre alone.
-        method: guestrin-eizenman: locate the corneal centre from all glints (A), or on the common line of the planes
-            (B).
-        index: guestrin-eizenman, hennessey: the assumed refractive index.
-        recalibration: hennessey, shih-wu-liu: the quantity that the correction polynomial acts on.
-        fixations: Calibrate on these fixations and test on the others, counted from 0, such as '0,4,8' (default: each
-            fixation is tested with a calibration on all others).
         binocular: Use the mean of both eyes' gaze points. It hides horizontal errors of eyes that are mirror images of
             each other.
         reference: Eye model that gives the estimator's own error.
@@ -60,16 +43,10 @@ def budget(
         images: Render images; without them only eye model and optics are separated.
     """
     from ..gaze.budget import budget as split
-    from ..gaze.store import choose_estimator
     from ..imaging.causes import SEEDS, budget_steps
     from ..scene import load_scene
-    from .gaze import fixation_list
 
-    chosen = choose_estimator(
-        estimator, function=function, normalised=not monocular, feature=feature, method=method, index=index,
-        recalibration=recalibration,
-    )  # fmt: skip
-    calibration = fixation_list(fixations)
+    chosen, calibration = options.choose(estimator), options.fixation_list()
     heed = Heed(strict)
     loaded = load_scene(scene, eye=eye)
     heed(loaded.warnings())

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
-from ..base.errors import InputError
 from .app import app
-from .options import Result, Strict
+from .options import EstimatorFlags, EstimatorName, Result, Strict
 from .output import Heed, emit
 
 if TYPE_CHECKING:
@@ -37,21 +36,12 @@ def fit(
     records: Path,
     /,
     *,
-    estimator: Annotated[str, Parameter(name="--estimator")],
+    estimator: EstimatorName,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     scene: str | None = None,
     rig: str | None = None,
     columns: Path | None = None,
-    function: str = "R3",
-    terms_x: str | None = None,
-    terms_y: str | None = None,
-    monocular: bool = False,
-    feature: Literal["pupil-glint", "pupil"] = "pupil-glint",
-    method: Literal["A", "B"] = "A",
-    free_index: bool = False,
-    index: float | None = None,
-    recalibration: Literal["angle", "screen", "none"] = "angle",
-    fixations: str | None = None,
+    options: Annotated[EstimatorFlags, Parameter(name="*")] = EstimatorFlags(),
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -60,46 +50,15 @@ def fit(
     Args:
         records: Records as `features` or `extract` write them (JSON), one record per line (JSONL), or a table (CSV).
             Each needs its target.
-        estimator: regression (polynomials of the pupil-glint vector; one light), direction-regression (polynomials of a
-            feature in pixels to directions; no screen needed), homography (normalisation by four lights), cross-ratio
-            (four lights at the screen's corners and one at the camera), hennessey (one camera, two lights), shih-wu-liu
-            (two cameras, two lights), guestrin-eizenman (one camera, two lights), or maximum-likelihood (fits of a
-            traced eye; any cameras and lights, rough positions of the eye); or module:Class, a class of your own that
-            can be made without arguments.
         output: The calibration file to write.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
         rig: A rig file or a scene file, for its rig.
         columns: A YAML file with the meaning of a table's columns (default: recognised from their names).
-        function: regression, direction-regression: the function, R1 to R12.
-        terms_x: regression: your own terms of x instead of a function, such as 'x + xy + 1'.
-        terms_y: regression: your own terms of y.
-        monocular: regression: use the vector of one eye in pixels, without dividing it by the distance between the
-            pupils.
-        feature: direction-regression: the vector from the mean of all glints to the pupil, or the pupil's centre alone.
-        method: guestrin-eizenman: locate the corneal centre from all glints (A), or on the common line of the planes
-            (B).
-        free_index: guestrin-eizenman: also calibrate the refractive index.
-        index: guestrin-eizenman, hennessey: the assumed refractive index.
-        recalibration: hennessey, shih-wu-liu: the quantity that the correction polynomial acts on.
-        fixations: Calibrate on these fixations only, counted from 0, such as '0,4,8'.
     """
     from ..gaze.records import load_observations
-    from ..gaze.store import choose_estimator, fit_estimator, save_estimator
+    from ..gaze.store import fit_estimator, save_estimator
 
-    if (terms_x is None) != (terms_y is None):
-        raise InputError("give both --terms-x and --terms-y", source="--terms-x")
-    chosen = choose_estimator(
-        estimator,
-        function=function,
-        terms=[terms_x, terms_y] if terms_x is not None else None,
-        normalised=not monocular,
-        feature=feature,
-        method=method,
-        free_index=free_index,
-        index=index,
-        recalibration=recalibration,
-    )
-    targets = fixation_list(fixations)
+    chosen, targets = options.choose(estimator), options.fixation_list()
     heed = Heed(strict)
     observations, built = load_observations(records, _scene(scene, heed), rig=rig, columns=columns)
     fitted, summary = fit_estimator(chosen, observations, built, targets, source=str(records), warn=heed)
@@ -168,20 +127,6 @@ def _scene(name: str | None, heed: Heed) -> Scene | None:
     scene = load_scene(name)
     heed(scene.warnings())
     return scene
-
-
-def fixation_list(text: str | None) -> list[int] | None:
-    """Parse fixations such as '0,4,8'; None for none.
-
-    Raises:
-        InputError: they are not whole numbers.
-    """
-    if text is None:
-        return None
-    try:
-        return [int(part) for part in text.split(",") if part.strip()]
-    except ValueError:
-        raise InputError(f"{text!r} is not a list of whole numbers", source="--fixations") from None
 
 
 def _gaze_table(data: dict[str, Any]) -> str:

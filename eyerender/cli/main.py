@@ -84,7 +84,7 @@ def _called(tokens: Sequence[str]) -> Any:
     try:
         command, given, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
     except InputError as error:  # a record of options rejects one of its fields
-        raise InputError(error.reason, source=f"--{option_name(error.path)}") from None
+        raise InputError(error.reason, source=error.source or f"--{option_name(error.path)}") from None
     check_outputs(given.arguments)
     return command(*given.args, **given.kwargs)
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from ..backends.choose import BackendChoice
+from ..base.errors import InputError
+from ..gaze.estimators import ESTIMATORS
+
+if TYPE_CHECKING:
+    from ..gaze.estimate import GazeEstimator
 
 
 def at_least_one(_type: Any, value: float | None) -> None:
@@ -31,4 +37,72 @@ Result = Annotated[
         name="--json", allow_leading_hyphen=True, help="Write the result as JSON to a file, or to stdout with -."
     ),
 ]
+EstimatorName = Annotated[
+    str,
+    Parameter(
+        name="--estimator",
+        help=", ".join(f"{name} ({listed.summary})" for name, listed in ESTIMATORS.items())
+        + "; or module:Class, a class of your own that can be made without arguments.",
+    ),
+]
 AtLeastOne = Annotated[int | None, Parameter(validator=at_least_one)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimatorFlags:
+    """Options of estimators, and the fixations of their calibration.
+
+    Attributes:
+        function: regression, direction-regression: the function, R1 to R12.
+        terms_x: regression: your own terms of x instead of a function, such as 'x + xy + 1'.
+        terms_y: regression: your own terms of y.
+        monocular: regression: use the vector of one eye in pixels, without dividing it by the distance between the
+            pupils.
+        feature: direction-regression: the vector from the mean of all glints to the pupil, or the pupil's centre alone.
+        method: guestrin-eizenman: locate the corneal centre from all glints (A), or on the common line of the planes
+            (B).
+        free_index: guestrin-eizenman: also calibrate the refractive index.
+        index: guestrin-eizenman, hennessey: the assumed refractive index.
+        recalibration: hennessey, shih-wu-liu: the quantity that the correction polynomial acts on.
+        fixations: Calibrate on these fixations only, counted from 0, such as '0,4,8'.
+    """
+
+    function: str = "R3"
+    terms_x: str | None = None
+    terms_y: str | None = None
+    monocular: bool = False
+    feature: Literal["pupil-glint", "pupil"] = "pupil-glint"
+    method: Literal["A", "B"] = "A"
+    free_index: bool = False
+    index: float | None = None
+    recalibration: Literal["angle", "screen", "none"] = "angle"
+    fixations: str | None = None
+
+    def choose(self, name: str) -> GazeEstimator:
+        """Create the estimator, not calibrated.
+
+        Raises:
+            InputError: there is no such estimator, or an option is wrong.
+        """
+        from ..gaze.store import choose_estimator
+
+        if (self.terms_x is None) != (self.terms_y is None):
+            raise InputError("give both --terms-x and --terms-y", source="--terms-x")
+        options = asdict(self)
+        terms = options.pop("terms_x"), options.pop("terms_y")
+        del options["fixations"]
+        options["normalised"] = not options.pop("monocular")
+        return choose_estimator(name, terms=None if None in terms else terms, **options)
+
+    def fixation_list(self) -> list[int] | None:
+        """Parse the fixations; None for all.
+
+        Raises:
+            InputError: they are not whole numbers.
+        """
+        if self.fixations is None:
+            return None
+        try:
+            return [int(part) for part in self.fixations.split(",") if part.strip()]
+        except ValueError:
+            raise InputError(f"{self.fixations!r} is not a list of whole numbers", source="--fixations") from None

@@ -11,6 +11,7 @@ from pydantic import Field
 from ..base.arrays import frozen
 from ..base.errors import InputError
 from ..base.spec import Spec
+from .estimate import StoredEstimator
 from .rays import eye_name
 
 Feature = Literal["pupil-glint", "pupil"]
@@ -34,7 +35,7 @@ class EstimatorOptions(Spec):
     slippage_mm: Annotated[float, Field(ge=0, le=50)] = 3.0
 
 
-class BuiltIn:
+class BuiltIn(StoredEstimator):
     """Base of the package's estimators: dataclasses that are stored as the protocol `StoredEstimator` asks for.
 
     Attributes:

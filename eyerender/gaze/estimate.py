@@ -90,6 +90,8 @@ class GazeEstimator(Protocol):
     computed `RigGeometry`; `rig.build()` converts both to the latter.
     """
 
+    __slots__ = ()
+
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate on observations of known targets (n, 3) mm.
 
@@ -118,6 +120,8 @@ class StoredEstimator(GazeEstimator, Protocol):
 
     `from_mapping(to_mapping())` predicts the same.
     """
+
+    __slots__ = ()
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the calibration as JSON values: mappings, lists, texts, finite numbers, booleans and None."""
