@@ -29,6 +29,7 @@ from ..folders.outfolder import staged
 from ..gaze.estimate import ray_errors_deg
 from ..gaze.store import choose_estimator
 from ..imaging.imageobserver import ImageObserver
+from ..optics.transforms import direction_of
 from ..population.people import Person
 from ..report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
 from ..report.style import figure, svg
@@ -209,9 +210,7 @@ def _scene_of(survey: Survey, subject: int, cells: Ints) -> Scene:
     half = person.apex_distance_mm / 2.0
     head = place - np.array([0.0, half if side == "left" else -half, 0.0])
     azimuth, elevation = np.radians(survey.directions_deg[cells]).T
-    way = np.stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
-    )
+    way = direction_of(azimuth, elevation)
     own = Subject.of(
         person, eyes=(side,), head_positions_mm=(tuple(head.tolist()),), luminance_cd_m2=survey.luminance_cd_m2
     )

@@ -19,7 +19,7 @@ from ..base.arrays import ArrayValue, Floats, Ints
 from ..base.errors import InputError
 from ..rig.rig import RigLike
 from ..scene import Frames, Scene
-from .information import case_of, outline_normals
+from .information import case_of, whitened_slopes
 from .noise import FeatureNoise, sensor_noise
 from .unknowns import COUNT, Unknowns
 from .varied import Slopes, slopes_of
@@ -83,11 +83,8 @@ def noise_of_some(scene: Scene, count: int) -> FeatureNoise:
 
 def site_matrices(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
     """Compute information in each of n views: (n, 23, 23) of the outline and (m, n, 23, 23) of each LED's glint."""
-    normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
-    size = np.sqrt(length) / noise.outline_px[camera][:, None]
-    across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * size[..., None]
-    weight = np.where(slopes.glint_ok, 1.0 / noise.glint_px[camera], 0.0)
-    glints = np.moveaxis(slopes.glints * weight[..., None, None], 1, 0)
+    across, glints = whitened_slopes(slopes, noise, camera)
+    glints = np.moveaxis(glints, 1, 0)
     return np.swapaxes(across, -1, -2) @ across, np.swapaxes(glints, -1, -2) @ glints
 
 

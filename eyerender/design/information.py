@@ -95,13 +95,18 @@ def outline_normals(points_px: Floats, ok: Bools) -> tuple[Floats, Floats]:
     return np.where(usable[..., None], normal, 0.0), np.where(usable, speed * spacing, 0.0)
 
 
+def whitened_slopes(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
+    """Compute derivatives over noise in n views: (n, k, 23) across the outline and (n, m, 2, 23) of glints."""
+    normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
+    size = np.sqrt(length) / noise.outline_px[camera][:, None]
+    across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * size[..., None]
+    weight = np.where(slopes.glint_ok, 1.0 / noise.glint_px[camera], 0.0)
+    return across, slopes.glints * weight[..., None, None]
+
+
 def information_of_views(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> Floats:
     """Compute the information (n, 23, 23) of outline and glints in each view, the first two sums of equation (3)."""
-    normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
-    weight = length / noise.outline_px[camera][:, None] ** 2
-    across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * np.sqrt(weight)[..., None]
-    size = np.where(slopes.glint_ok, 1.0 / noise.glint_px[camera], 0.0)
-    glints = slopes.glints * size[..., None, None]
+    across, glints = whitened_slopes(slopes, noise, camera)
     rows = np.concatenate([across, glints.reshape(len(camera), -1, COUNT)], axis=1)
     return np.asarray(np.swapaxes(rows, 1, 2) @ rows)
 

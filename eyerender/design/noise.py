@@ -90,7 +90,7 @@ def sensor_noise(
     side = scene.spec.subject.eyes[0]
     eye_mm = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
     # Lamps light a cornea that faces them with I / d^2.
-    irradiance = sum(intensity / distance**2 for intensity, distance in (_towards(lamp, eye_mm) for lamp in lights))
+    irradiance = sum(intensity / distance**2 for intensity, _, distance in (lamp.towards(eye_mm) for lamp in lights))
     radiance = scene.spec.look.iris_albedo / np.pi * irradiance * _CORNEAL_TRANSMITTANCE**2
     blur = float(np.hypot(sensor.psf_sigma_px, 1.0 / np.sqrt(12.0)))
     read = read_noise_e(sensor)
@@ -159,7 +159,7 @@ def glint_energy(
     The mirror image is m = f / (d + f) times as large (f = R / 2), so it has m^2 F of the lamp's intensity, with
     Fresnel's reflectance F.
     """
-    intensity, distance = _towards(lamp, eye_mm)
+    intensity, _, distance = lamp.towards(eye_mm)
     focal = CORNEAL_RADIUS_MM / 2.0
     scale = focal / (distance + focal)
     reflectance = ((CORNEAL_INDEX - 1.0) / (CORNEAL_INDEX + 1.0)) ** 2
@@ -171,12 +171,3 @@ def glint_energy(
     irradiance = power_w / (pitch_mm * 1e-3) ** 2
     radius_px = lamp.radius_mm * scale * focal_px / away
     return float(electrons(sensor, np.asarray(irradiance), wavelength_nm)), radius_px / 2.0
-
-
-def _towards(lamp: Lamp, point_mm: Floats) -> tuple[float, float]:
-    """Compute the radiant intensity (mW/sr) of a lamp towards a point, and the distance (mm)."""
-    gap = point_mm - lamp.position_mm
-    distance = float(np.linalg.norm(gap))
-    cosine = max(float(gap @ lamp.axis) / distance, 0.0)
-    lobe = 1.0 if lamp.lobe_exponent == 0 else cosine**lamp.lobe_exponent
-    return lamp.intensity_mw_sr * lobe, distance

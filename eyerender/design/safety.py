@@ -136,13 +136,10 @@ def _of_lamp(
 ) -> tuple[float, float, float, float]:
     """Compute distance, irradiance, weighted radiance and its limit for one LED at the nearest point of the box."""
     place = eye_mm + np.clip(lamp.position_mm - eye_mm, -box_mm, box_mm)
-    gap = place - lamp.position_mm
-    distance = float(np.linalg.norm(gap))
+    intensity, cosine, distance = lamp.towards(place)
     if distance == 0.0:
         raise InputError("lies inside the eye box", path=path)
-    cosine = max(float(gap @ lamp.axis) / distance, 0.0)
-    lobe = 1.0 if lamp.lobe_exponent == 0 else cosine**lamp.lobe_exponent
-    watts = 1e-3 * lamp.intensity_mw_sr * lamp.duty_cycle * lobe
+    watts = 1e-3 * intensity * lamp.duty_cycle
     cornea = watts / (distance * 1e-3) ** 2
     limit = _RETINA / float(np.clip(2.0 * lamp.radius_mm / distance, _LEAST_RAD, _MOST_RAD))
     area = np.pi * (lamp.radius_mm**2 - lamp.inner_radius_mm**2) * 1e-6 * cosine

@@ -23,7 +23,7 @@ from ..eye.pose import Poses, rigid_motion
 from ..optics.surfaces import Surface
 from ..optics.surfaces_biconic import Biconic
 from ..optics.surfaces_quadric import Quadric
-from ..optics.transforms import normalize
+from ..optics.transforms import direction_of, normalize
 from ..rig.rig import RigGeometry
 from .unknowns import (
     ASPHERICITY,
@@ -294,8 +294,9 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | N
         out = np.zeros((*points.shape[1:], COUNT))
         out[..., traced_columns] = np.moveaxis(central, 0, -1)
         out[..., POSITION] = out[..., SLIPPAGE]
-        # The motion of a turned eye per depth of its rotation centre is that of x' = M (x - c) + c.
-        by_rotation = turned(theta)[:, :, 0] - np.array([1.0, 0.0, 0.0])
+        # The motion of a turned eye per depth of its rotation centre is that of x' = M (x - c) + c, and M e_x is the
+        # optic axis.
+        by_rotation = direction_of(theta[:, AZIMUTH], theta[:, ELEVATION]) - np.array([1.0, 0.0, 0.0])
         out[..., ROTATION] = np.einsum("nkax,nx->nka", out[..., SLIPPAGE], by_rotation)
         out[..., SHIFT] = out[..., CENTRE] * widening[:, None, None, None]
         exists: Bools = np.asarray(np.isfinite(out).all(axis=(2, 3)))
@@ -310,18 +311,6 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | N
         glint_ok=traced.glint_ok[:n],
     )
     return Slopes(images=first, outline=outline, glints=glints, outline_ok=outline_ok, glint_ok=glint_ok)
-
-
-def turned(theta: Floats) -> Floats:
-    """Compute rotations M (n, 3, 3) of the eyes by Listing's law."""
-    azimuth, elevation = theta[:, AZIMUTH], theta[:, ELEVATION]
-    tau = np.array(Poses.listing(azimuth, elevation).torsion_rad)
-    (ca, sa), (ce, se), (ct, st) = ((np.cos(a), np.sin(a)) for a in (azimuth, elevation, tau))
-    zero, one = np.zeros_like(ca), np.ones_like(ca)
-    about_z = np.array([[ca, -sa, zero], [sa, ca, zero], [zero, zero, one]])
-    about_y = np.array([[ce, zero, -se], [zero, one, zero], [se, zero, ce]])
-    about_x = np.array([[one, zero, zero], [zero, ct, -st], [zero, st, ct]])
-    return np.asarray(np.einsum("ijn,jkn,kln->nil", about_z, about_y, about_x))
 
 
 def lines_of_sight(views: Views, theta: Floats) -> tuple[Floats, Floats]:

@@ -15,12 +15,13 @@ from typing import Self
 import numpy as np
 
 from ..base.arrays import Floats, Objects
+from ..optics.transforms import direction_of
 from ..rig.rig import RigLike
 from ..scene.observation import Observations
 from .builtin import EstimatorOptions, Feature
 from .estimate import GazePoints, GazeRays
 from .rays import camera_of, chosen_lights, eyes_of, glints_of, is_none, screen_of, target_directions
-from .recalibration import angles_of, direction_of
+from .recalibration import angles_of
 from .regression import PolynomialEstimator, PolynomialFit, Regression
 
 
@@ -88,7 +89,7 @@ class DirectionRegression(PolynomialEstimator):
         index = observations.index
         features, reason = self.features(observations, rig)
         angles = self.mapped(features, observations, reason)
-        return GazeRays.of(index.eye_position_mm + index.head_mm, direction_of(angles), reason)
+        return GazeRays.of(index.eye_position_mm + index.head_mm, direction_of(*angles.T), reason)
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Estimate gaze points on the screen's plane.

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Ints, Objects
 from ..base.errors import InputError
+from ..optics.transforms import direction_of
 from ..rig.rig import RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
 from ..scene.observation import Observations
@@ -168,7 +169,7 @@ class GuestrinEizenman(BuiltIn):
         """Turn optic axes w (..., 3) to visual axes (..., 3): by alpha towards +y and by beta upwards, in radians."""
         theta = np.arctan2(w[..., 1], w[..., 0]) + alpha
         phi = np.arcsin(np.clip(w[..., 2], -1.0, 1.0)) + beta
-        return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
+        return direction_of(theta, phi)
 
     def search(self, misses: Misses, start: EyeParameters) -> Calibration:
         """Minimise the sum of squared misses over one eye's parameters, from `start`."""

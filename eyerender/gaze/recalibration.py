@@ -19,10 +19,11 @@ import numpy as np
 from ..base.arrays import Floats, frozen
 from ..base.errors import InputError
 from ..base.spec import Spec
+from ..optics.transforms import direction_of
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import Observations
 from .builtin import BuiltIn, RecalibrationKind
-from .determined import UndeterminedWarning, shortfall
+from .determined import UndeterminedWarning, monomials, shortfall
 from .estimate import GazePoints, GazeRays
 from .rays import calibrated_eyes, eyes_of, is_none, screen_of, targets_on_screen, unit
 
@@ -62,7 +63,7 @@ class Recalibration:
                     f"{name} eye: {len(rows)} usable calibration targets, but the correction has {TERMS} terms"
                 )
             # The columns are scaled so that the rank does not depend on the unit.
-            design = monomials(measured[rows])
+            design = monomials(measured[rows], EXPONENTS)
             scale = np.abs(design).max(axis=0)
             solution, _, rank, _ = np.linalg.lstsq(design / scale, wanted[rows], rcond=1e-10)
             if rank < TERMS:
@@ -83,7 +84,7 @@ class Recalibration:
         if self.kind == "screen":
             for eye, A in self.coefficients.items():
                 rows = observations.index.eye == eye
-                on_screen[rows] = monomials(on_screen[rows]) @ A.T
+                on_screen[rows] = monomials(on_screen[rows], EXPONENTS) @ A.T
         return GazePoints.of(screen.world(on_screen), reason)
 
     def apply_to_rays(self, observations: Observations, rays: GazeRays, rig: RigLike) -> GazeRays:
@@ -101,7 +102,8 @@ class Recalibration:
         reason, direction = rays.reason.copy(), rays.direction.copy()
         for rows, A in calibrated_eyes(observations, self.coefficients, reason):
             if self.kind == "angle":
-                direction[rows] = direction_of(monomials(angles_of(direction[rows])) @ A.T)
+                corrected = monomials(angles_of(direction[rows]), EXPONENTS) @ A.T
+                direction[rows] = direction_of(*corrected.T)
         return GazeRays.of(rays.origin_mm, direction, reason)
 
 
@@ -154,15 +156,3 @@ def angles_of(direction: Floats) -> Floats:
         return np.stack(
             [np.arctan2(direction[..., 1], direction[..., 0]), np.arcsin(direction[..., 2] / size)], axis=-1
         )
-
-
-def direction_of(angles: Floats) -> Floats:
-    """Compute unit directions (..., 3) of azimuth and elevation (..., 2) rad."""
-    theta, phi = angles[..., 0], angles[..., 1]
-    return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
-
-
-def monomials(v: Floats) -> Floats:
-    """Compute the monomials 1, a, b, ab, a^2, b^2 of (a, b) along the last axis, (..., 2) to (..., 6)."""
-    a, b = v[..., 0], v[..., 1]
-    return np.stack([np.ones_like(a), a, b, a * b, a * a, b * b], axis=-1)

@@ -72,6 +72,13 @@ def normalize(vectors: npt.ArrayLike) -> Floats:
     return unit
 
 
+def direction_of(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Floats:
+    """Compute unit vectors (..., 3) at azimuths and elevations: (cos el cos az, cos el sin az, sin el)."""
+    cos_elevation = np.cos(elevation_rad)
+    parts = cos_elevation * np.cos(azimuth_rad), cos_elevation * np.sin(azimuth_rad), np.sin(elevation_rad)
+    return np.stack(parts, axis=-1)
+
+
 def _plane_rotation(angle_rad: npt.ArrayLike, first: int, second: int) -> Floats:
     angle = np.asarray(angle_rad, dtype=np.float64)
     cosine, sine = np.cos(angle), np.sin(angle)

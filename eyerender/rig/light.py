@@ -136,3 +136,10 @@ class Lamp(ArrayValue):
     lobe_exponent: float
     inner_radius_mm: float = 0.0
     duty_cycle: float = 1.0
+
+    def towards(self, point_mm: Floats) -> tuple[float, float, float]:
+        """Compute the radiant intensity I cos^m (mW/sr) towards a point (3,), this cosine, and the distance (mm)."""
+        gap = point_mm - self.position_mm
+        distance = float(np.linalg.norm(gap))
+        cosine = max(float(gap @ self.axis) / distance, 0.0) if distance else 0.0
+        return self.intensity_mw_sr * cosine**self.lobe_exponent, cosine, distance
