@@ -180,7 +180,7 @@ def test_kernels_of_drjit_are_kept_in_the_private_folder(tmp_path):
     from eyerender.backends.libraries import runtime_store
     from eyerender.backends.llvm import find_llvm
 
-    if find_llvm() is None:
+    if find_llvm()[0] is None:
         pytest.skip("no libLLVM renders here")
     fetched = runtime_store()
     if fetched is not None and fetched.is_dir():  # on a bare system, only there is what Dr.Jit is linked with
@@ -190,7 +190,7 @@ def test_kernels_of_drjit_are_kept_in_the_private_folder(tmp_path):
         "import drjit as dr, mitsuba as mi; dr.eval(dr.arange(mi.Float, 64) * 1.5)"
     )
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "HOME": str(tmp_path / "home")}
-    environment |= {"DRJIT_LIBLLVM_PATH": str(find_llvm().path)}
+    environment |= {"DRJIT_LIBLLVM_PATH": str(find_llvm()[0].path)}
     environment.pop("DRJIT_CACHE_DIR", None)
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
     assert list((tmp_path / "eyerender" / "drjit").glob("*.bin"))

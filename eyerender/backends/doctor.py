@@ -10,7 +10,7 @@ from ..base.processes import usable_cpus
 from ..base.storage.cachefolder import cache_folder
 from ..base.versions import package_version
 from .choose import BackendName, BackendState, cuda_state
-from .llvm import examine
+from .llvm import find_llvm
 from .probe import cpu_name
 from .remedies import llvm_fix
 
@@ -51,9 +51,7 @@ def doctor_report() -> DoctorReport:
 
 
 def _llvm_state() -> BackendState:
-    refused: list[str] = []
-    for examined in examine(refresh=True):
-        if examined.verdict.ok:
-            return BackendState("llvm", True, f"{examined.verdict.detail}, {examined.path}")
-        refused.append(f"{examined.path}: {examined.verdict.detail}")
+    found, refused = find_llvm(refresh=True)
+    if found is not None:
+        return BackendState("llvm", True, f"LLVM {found.version}, {found.path}")
     return BackendState("llvm", False, "; ".join(refused) or "no libLLVM on this machine", llvm_fix())

@@ -70,12 +70,14 @@ def examine(*, refresh: bool = False) -> Iterator[Examined]:
         yield Examined(path, verdict)
 
 
-def find_llvm() -> LibLlvm | None:
-    """Return the first candidate that renders."""
-    for examined in examine():
+def find_llvm(*, refresh: bool = False) -> tuple[LibLlvm | None, list[str]]:
+    """Return the first candidate that renders (None if there is none), and what is wrong with those before it."""
+    refused = []
+    for examined in examine(refresh=refresh):
         if examined.verdict.ok:
-            return LibLlvm.probed(examined.path, examined.verdict)
-    return None
+            return LibLlvm.probed(examined.path, examined.verdict), refused
+        refused.append(f"{examined.path}: {examined.verdict.detail}")
+    return None, refused
 
 
 def ensure_llvm() -> LibLlvm:
@@ -137,7 +139,7 @@ def _loaded() -> LibLlvm:
 
 
 def _too_late() -> str:
-    found = find_llvm()
+    found, _ = find_llvm()
     if found is None:
         return llvm_fix()
     return (

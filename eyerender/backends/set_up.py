@@ -11,8 +11,8 @@ from ..base.errors import BackendError
 from ..base.progress import Say
 from .apt import fetch_library
 from .libraries import RUNTIME, load_runtime, runtime_store
-from .llvm import LibLlvm, examine
-from .remedies import has_archive, llvm_fix, runtime_command
+from .llvm import LibLlvm, find_llvm
+from .remedies import has_archive, llvm_fix
 
 
 def _silent(line: str) -> None:
@@ -35,17 +35,15 @@ def setup_llvm(*, say: Say = _silent) -> LibLlvm:
         load_runtime()
     except OSError as error:
         _fetch_runtime(str(error), say)
-    refused = ""
-    for examined in examine(refresh=True):
-        if examined.verdict.ok:
-            return LibLlvm.probed(examined.path, examined.verdict)
-        refused = refused or f" ({examined.path}: {examined.verdict.detail})"
-    raise BackendError(f"no libLLVM here can render{refused}; {llvm_fix()}")
+    found, refused = find_llvm(refresh=True)
+    if found is None:
+        raise BackendError(f"no libLLVM here can render{f' ({refused[0]})' if refused else ''}; {llvm_fix()}")
+    return found
 
 
 def _fetch_runtime(reason: str, say: Say) -> None:
     if not has_archive():
-        raise BackendError(f"{reason}; {runtime_command()}")
+        raise BackendError(reason)
     store = runtime_store()
     if store is None:
         raise BackendError(
@@ -57,7 +55,7 @@ def _fetch_runtime(reason: str, say: Say) -> None:
             fetch_library(package, name, store)
         load_runtime()
     except BackendError as error:
-        raise BackendError(f"{error}; try again, or {runtime_command()}") from error
+        raise BackendError(f"{error}; try again, or install it: {reason}") from error
     except OSError as error:
         raise BackendError(f"cannot fetch into {store}: {error.strerror or error}") from error
 

@@ -16,7 +16,7 @@ from eyerender.backends.doctor import backend_states, doctor_report
 from eyerender.backends.llvm import find_llvm
 from eyerender.base.errors import BackendError, InputError
 
-needs_llvm = pytest.mark.skipif(find_llvm() is None, reason="no libLLVM here can render")
+needs_llvm = pytest.mark.skipif(find_llvm()[0] is None, reason="no libLLVM here can render")
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_another_variant_that_the_user_set_is_replaced() -> None:
 
 
 def test_auto_takes_the_gpu_only_where_it_renders(cuda: BackendState) -> None:
-    if not cuda.ok and find_llvm() is None:
+    if not cuda.ok and find_llvm()[0] is None:
         with pytest.raises(BackendError):
             choose_backend()
     else:

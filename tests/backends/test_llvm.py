@@ -23,7 +23,7 @@ from eyerender.backends.apt import fetch_library
 from eyerender.backends.libraries import WHEEL, load_llvm, load_runtime, runtime_store
 from eyerender.backends.llvm import ENVIRONMENT, VARIANT, candidates, find_llvm, version_of
 from eyerender.backends.probe import REFUSAL_AGE_S, Verdict, probe, run_probe
-from eyerender.backends.remedies import has_archive, llvm_command, runtime_command
+from eyerender.backends.remedies import has_archive, llvm_command
 from eyerender.backends.set_up import setup_llvm
 from eyerender.base.errors import BackendError
 from eyerender.base.storage.cachefolder import cache_folder
@@ -36,7 +36,7 @@ needs_archive = pytest.mark.skipif(not has_archive(), reason="no apt here")
 @pytest.fixture(scope="module")
 def good() -> Path:
     """A libLLVM that renders."""
-    found = find_llvm()
+    found = find_llvm()[0]
     if found is None or found.path is None:
         pytest.skip("no libLLVM here can render")
     return found.path
@@ -365,12 +365,6 @@ def test_refused_library_is_told_with_its_reason(cache: Path, monkeypatch: pytes
         setup_llvm()
 
 
-def test_conda_users_are_told_condas_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("platform.machine", lambda: "aarch64")  # for x86_64 there is a wheel
-    monkeypatch.setenv("CONDA_PREFIX", str(tmp_path))
-    assert llvm_command() == "run: conda install -c conda-forge libllvm19"
-
-
 ABSENT = "libeyerenderabsent.so.1"
 
 
@@ -446,7 +440,7 @@ def test_package_that_cannot_be_fetched_is_one_line(archive: Path, absent: Path)
     (archive / "libeyerenderabsent1_1.0.deb").unlink()
     with pytest.raises(BackendError, match=r"libeyerenderabsent1 cannot be downloaded .*; try again, or ") as caught:
         setup_llvm()
-    assert runtime_command() in str(caught.value)
+    assert "package libeyerenderabsent1 on Debian" in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not list(absent.iterdir())
 
@@ -463,9 +457,8 @@ def test_archive_that_does_not_answer_is_one_line(
 
 def test_without_an_archive_the_package_is_named(absent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(BackendError, match=f"{ABSENT} is missing") as caught:
+    with pytest.raises(BackendError, match=rf"{ABSENT} is missing \(package libeyerenderabsent1 on Debian"):
         setup_llvm()
-    assert runtime_command() in str(caught.value)
 
 
 def _mapped_files() -> list[str]:
