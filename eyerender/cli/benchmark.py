@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from ..apps.benchmark.options import BenchOptions
 from ..base.storage.files import read_json
 from .app import app
-from .options import Result
+from .options import OutputFolder, Result
 from .output import emit, progress, say
 
 
@@ -19,7 +19,7 @@ def bench_extractors(
     folder: Annotated[Path, Parameter(name="DIR")],
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     extractor: tuple[str, ...] = (),
     options: Annotated[BenchOptions, Parameter(name="*")] = BenchOptions(),
     json: Result = None,
@@ -37,7 +37,6 @@ def bench_extractors(
     Args:
         folder: A folder of labelled images: written by quickstart, render or generate, your own with labels.csv or
             masks, or in the layout of OpenEDS, TEyeD, COCO, LPW or ExCuSe.
-        output: The folder to write.
         extractor: The name of an installed extractor (own-fast, own-refined, opencv-contour, pupil-detectors, or a
             plug-in), a Python module:callable, or a command that speaks the protocol. NAME=... names it in the report.
             Repeat the option for several extractors (default: all installed ones).

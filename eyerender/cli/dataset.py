@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from ..base.errors import EyerenderError, InputError
 from ..dataset.options import PlanOptions, RunOptions
 from .app import app
-from .options import AtLeastOne, Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads
+from .options import AtLeastOne, Backend, EyeModel, OutputFile, OutputFolder, Overwrite, Result, Seed, Strict, Threads
 from .output import Heed, emit, progress, say
 
 
@@ -118,7 +118,7 @@ def preview(
     spec: Annotated[str, Parameter(name="SCENE_OR_SPEC")],
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFile,
     eye: EyeModel = None,
     seed: Seed = None,
     backend: Backend = "auto",
@@ -197,7 +197,7 @@ def status(folder: Annotated[Path, Parameter(name="DIR")], /, *, watch: bool = F
 
 
 @app.command(name="merge")
-def merge(*folders: Path, output: Annotated[Path, Parameter(name=["--output", "-o"])], json: Result = None) -> int:
+def merge(*folders: Path, output: OutputFile, json: Result = None) -> int:
     """Join the parts of a dataset that machines without a shared file system made with `generate --shard K/N`.
 
     Args:
@@ -218,7 +218,7 @@ def merge(*folders: Path, output: Annotated[Path, Parameter(name=["--output", "-
 def export_dataset(
     folder: Annotated[Path, Parameter(name="DIR")],
     /,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     *,
     format: Literal[
         "webdataset",
@@ -245,7 +245,6 @@ def export_dataset(
 
     Args:
         folder: A folder written by generate.
-        output: The folder to write.
         format: The layout.
         bits: Bits per pixel of the images: 8, or 16 for webdataset, imagefolder, coco, csv and parquet.
         encoding: Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16 bits).

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from .app import app
-from .options import EyeModel, Overwrite, Result, Strict, at_least_one
+from .options import EyeModel, OutputFolder, Overwrite, Result, SceneName, Strict, at_least_one
 from .output import Heed, emit
 
 
 @app.command(name="export-scene")
 def export_scene(
-    scene: str,
+    scene: SceneName,
     /,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     *,
     eye: EyeModel = None,
     frame: int = 0,
@@ -29,8 +28,6 @@ def export_scene(
     """Write one frame as PLY meshes and a Mitsuba XML file for the stock renderer.
 
     Args:
-        scene: A scene file, or the name of a shipped scene.
-        output: The folder to write.
         frame: The frame of the scene, counted from 0.
         side: The eye, right or left (default: the first one that the frame shows).
         spp: Samples per pixel requested in the file; the stock path integrator needs many.

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
-
-from cyclopts import Parameter
+from typing import Literal
 
 from ..base.errors import InputError
 from ..base.storage.files import written
 from .app import app
-from .options import Result, Strict
+from .options import OutputFile, Result, Strict
 from .output import Heed, emit
 
 _FORMATS = (".svg", ".pdf", ".png")
@@ -46,7 +43,7 @@ def view(
     name: str,
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFile,
     eye: str | None = None,
     strict: Strict = False,
 ) -> int:

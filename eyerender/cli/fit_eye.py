@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import Any, Literal
 
 from .app import app
-from .options import Overwrite, Result
+from .options import OutputFolder, Overwrite, Result
 from .output import emit
 
 
@@ -17,7 +15,7 @@ def fit_eye(
     recording: Path,
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     rig: str | None = None,
     unknowns: Path | None = None,
     eye: str = "E2",
@@ -37,7 +35,6 @@ def fit_eye(
 
     Args:
         recording: Records as `features` or `extract` write them (JSON, JSONL), or a table (CSV).
-        output: The folder to write.
         rig: A rig file or a scene for its rig (default: the rig in the recording).
         unknowns: A YAML file with the keys of `er.Unknowns` (default: the priors of a population, 3 mm of slippage).
         eye: Start of the fit and mean of its priors: a catalogue name or an eye file.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import App, Parameter
 
 from .app import app
-from .options import EstimatorFlags, EstimatorName, Result, Strict
+from .options import EstimatorFlags, EstimatorName, OutputFile, Result, Strict
 from .output import Heed, emit
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def fit(
     /,
     *,
     estimator: EstimatorName,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFile,
     scene: str | None = None,
     rig: str | None = None,
     columns: Path | None = None,

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
-
-from cyclopts import Parameter
+from typing import Literal
 
 from .app import app
-from .options import Backend, EyeModel, Overwrite, Result, Seed, Strict, Threads
+from .options import Backend, EyeModel, OutputFolder, Overwrite, Result, SceneName, Seed, Strict, Threads
 from .output import Heed, emit, progress, say
 
 
 @app.command(name="render")
 def render(
-    scene: str,
+    scene: SceneName,
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     eye: EyeModel = None,
     spp: int | None = None,
     seed: Seed = None,
@@ -33,8 +30,6 @@ def render(
     """Render a scene into a folder of labelled near-infrared images.
 
     Args:
-        scene: A scene file, or the name of a shipped scene.
-        output: The folder to write.
         spp: Replace the scene's samples per pixel.
         surfaces: Render the cornea as exact surfaces or as triangles (image.surfaces).
         exr: Also write the noise-free linear irradiance as EXR.
@@ -63,7 +58,7 @@ def render(
 
 @app.command(name="quickstart")
 def quickstart(
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     *,
     eye: EyeModel = None,
     backend: Backend = "auto",
@@ -72,11 +67,7 @@ def quickstart(
     strict: Strict = False,
     json: Result = None,
 ) -> int:
-    """Render a small scene, extract its features, estimate gaze, and write a report.
-
-    Args:
-        output: The folder to write.
-    """
+    """Render a small scene, extract its features, estimate gaze, and write a report."""
     from ..apps.quickstart import run_quickstart
 
     heed = Heed(strict)

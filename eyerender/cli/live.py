@@ -9,13 +9,13 @@ from cyclopts import Parameter
 
 from ..base.errors import InputError
 from .app import app
-from .options import Backend, EyeModel, Strict, Threads
+from .options import Backend, EyeModel, SceneName, Strict, Threads
 from .output import Heed
 
 
 @app.command(name="live")
 def live(
-    scene: str,
+    scene: SceneName,
     /,
     *,
     port: Annotated[int, Parameter(help="The port on 127.0.0.1 (default: a free one).")] = 0,
@@ -28,9 +28,6 @@ def live(
     """Show a scene on a local web page: its rig in 3-D, and its image, which follows your changes.
 
     The command prints the page's address, which holds a random token, and runs until Ctrl-C. It needs the extra `live`.
-
-    Args:
-        scene: A scene file, or the name of a shipped scene.
     """
     if find_spec("nicegui") is None:
         raise InputError("needs NiceGUI (the extra 'live'); run: pip install nicegui", source="live")

@@ -14,13 +14,13 @@ from ..base.processes import usable_cpus
 from ..base.status import Status
 from ..scene.observation import EYES, MAX_BOUNDARY_POINTS, Observations
 from .app import app
-from .options import AtLeastOne, EyeModel, Result, Strict
+from .options import AtLeastOne, EyeModel, Result, SceneName, Strict
 from .output import Heed, emit, progress
 
 
 @app.command(name="features")
 def features(
-    scene: str,
+    scene: SceneName,
     /,
     *,
     eye: EyeModel = None,
@@ -34,7 +34,6 @@ def features(
     This needs no renderer.
 
     Args:
-        scene: A scene file, or the name of a shipped scene.
         points: Number of boundary points of the pupil.
         purkinje: Add these Purkinje images (1 to 4) and the deviation of the pupil from an ellipse to the JSON.
     """

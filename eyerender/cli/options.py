@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
@@ -25,6 +26,9 @@ def at_least_one(_type: Any, value: float | None) -> None:
         raise ValueError(f"must be >= 1, not {value}")
 
 
+SceneName = Annotated[str, Parameter(help="A scene file, or the name of a shipped scene.")]
+OutputFolder = Annotated[Path, Parameter(name=["--output", "-o"], help="The folder to write.")]
+OutputFile = Annotated[Path, Parameter(name=["--output", "-o"])]
 EyeModel = Annotated[str | None, Parameter(help="Replace the eye model by a catalogue name or an eye file.")]
 Seed = Annotated[int | None, Parameter(help="Replace the seed.")]
 Backend = Annotated[BackendChoice, Parameter(help="The render backend.")]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from ..base.errors import InputError
 from .app import app
-from .options import Backend, Overwrite, Result, Threads
+from .options import Backend, OutputFolder, Overwrite, Result, Threads
 from .output import emit, progress
 
 if TYPE_CHECKING:
@@ -43,7 +40,7 @@ def population(
     preset: str = "adults",
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     count: int = 10_000,
     check: int = 200,
     faces: int = 16,
@@ -61,7 +58,6 @@ def population(
 
     Args:
         preset: adults, emmetropic_adults, myopes, children or elderly, or a YAML file with the keys of `population`.
-        output: The folder to write.
         count: Number of people in the statistics and in people.csv.
         check: Number of people whose eyes are built, to count the impossible ones.
         faces: Number of people whose eyes are rendered (0: none).

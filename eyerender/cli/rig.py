@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from .app import app
-from .options import Backend, Overwrite, Result
+from .options import Backend, OutputFolder, Overwrite, Result
 from .output import emit, progress
 from .population import read_population
 
@@ -18,7 +16,7 @@ def rig(
     scene: str,
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     population: str = "adults",
     people: int = 200,
     sample: int = 5,
@@ -41,7 +39,6 @@ def rig(
 
     Args:
         scene: A scene file or the name of a shipped one: its rig, sensor, first eye and first head position.
-        output: The folder to write.
         population: adults, emmetropic_adults, myopes, children or elderly, or a YAML file with the keys of
             `population`.
         people: Number of people.

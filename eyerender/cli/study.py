@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from ..apps.study.options import StudyOptions
 from ..base.errors import InputError
 from .app import app
-from .options import Result
+from .options import OutputFolder, Result
 from .output import emit, progress, say
 
 
@@ -19,7 +19,7 @@ def study(
     name: Annotated[str, Parameter(name="NAME")],
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     eyes: str | None = None,
     people: int | None = None,
     options: Annotated[StudyOptions, Parameter(name="*")] = StudyOptions(),
@@ -35,7 +35,6 @@ def study(
             image-derived features on the head-mounted rig), conditions (analytic errors over the screen, head
             positions, pupil sizes and eye parameters), or rigs (six known layouts over a population: for whom each
             fails where, and the effect of each LED).
-        output: The folder to write.
         eyes: Eye models separated by commas, as catalogue names or eye files (default: E1 to E5).
         people: rigs: Number of people (default: 100).
     """

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from .app import app
 from .dataset import part_of
-from .options import Overwrite, Result
+from .options import OutputFolder, Overwrite, Result
 from .output import emit, progress, say
 
 
@@ -18,7 +16,7 @@ def sweep(
     spec: Path,
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: OutputFolder,
     people: int | None = None,
     workers: int | None = None,
     shard: str | None = None,
@@ -32,7 +30,6 @@ def sweep(
 
     Args:
         spec: A YAML file that names a scene and has the key `sweep`.
-        output: The folder to write.
         people: Number of people (default: that of the file).
         workers: Number of processes (default: one per processor). Results do not depend on it.
         shard: K/N: evaluate only every N-th layout, starting with the K-th (1 <= K <= N), for array jobs that write to
