@@ -16,10 +16,9 @@ from eyerender.analytic.observer import trace
 from eyerender.gaze.predictions import predictions
 from eyerender.gaze.records import load_observations, rig_from_mapping
 from eyerender.gaze.store import choose_estimator, fit_estimator, load_estimator, save_estimator
-from eyerender.scene import Scene, load_scene
 from eyerender.scene.observation import Observations
-from eyerender.scene.spec import SceneSpec
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
+from tests.support.gaze import guestrin
 
 NAMES = ("regression", "homography", "cross-ratio", "hennessey", "shih-wu-liu", "guestrin-eizenman")
 
@@ -30,18 +29,7 @@ def features(name: str = "regression") -> dict[str, Any]:
 
     Homographies and cross ratios need lights at the screen's corners and one at the camera, stereo a second camera.
     """
-    data = load_scene("guestrin2006").spec.to_mapping()
-    data["subject"]["head_positions_mm"] = [[0.0, 0.0, 0.0]]
-    data["targets"] = {"grid": [3, 3]}
-    camera, light, screen = data["rig"]["cameras"][0], data["rig"]["lights"][0], data["rig"]["screen"]
-    if name == "shih-wu-liu":
-        data["rig"]["cameras"].append({**camera, "name": "b", "position_mm": [600, 150, -120]})
-    if name in ("homography", "cross-ratio"):
-        (x, y, z), (w, h) = screen["centre_mm"], screen["size_mm"]
-        corners = [(y + w / 2, z + h / 2), (y - w / 2, z + h / 2), (y - w / 2, z - h / 2), (y + w / 2, z - h / 2)]
-        places = [[x, *corner] for corner in corners] + [camera["position_mm"]]
-        data["rig"]["lights"] = [{**light, "position_mm": place} for place in places]
-    scene = Scene.of(SceneSpec.from_mapping(data))
+    scene = guestrin(corners=name in ("homography", "cross-ratio"), second_camera=name == "shih-wu-liu", grid=[3, 3])
     found = trace(scene, boundary_points=8)
     return {"schema": "eyerender/features/1", "rig": scene.rig.to_mapping(), "records": list(found.records())}
 

@@ -194,20 +194,8 @@ def test_steps_of_other_frames_are_refused():
 
 
 def test_the_command_without_images(capsys, tmp_path):
-    assert (
-        run(
-            [
-                "budget",
-                "guestrin2006",
-                "--estimator",
-                "guestrin-eizenman",
-                "--no-images",
-                "--json",
-                str(tmp_path / "b.json"),
-            ]
-        )
-        == 0
-    )
+    argv = ["budget", "guestrin2006", "--estimator", "guestrin-eizenman", "--no-images"]
+    assert run([*argv, "--json", str(tmp_path / "b.json")]) == 0
     data = json.loads((tmp_path / "b.json").read_text())
     assert data["schema"] == "eyerender/gaze-budget/1"
     assert [c["name"] for c in data["causes"]] == ["estimator", "eye model", "optics"]

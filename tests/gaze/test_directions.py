@@ -12,7 +12,8 @@ import eyerender as er
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.gaze.budget import error_vectors_deg
-from eyerender.gaze.recalibration import angles_of, direction_of
+from eyerender.gaze.recalibration import angles_of
+from eyerender.optics.transforms import direction_of
 from eyerender.scene import load_scene
 from eyerender.scene.observation import Observations
 
@@ -22,7 +23,7 @@ ANGLES_DEG = [(a, e) for e in (-8, -2, 4) for a in (-12, -6, 0, 6, 12)]
 
 def targets_mm(depths=DEPTHS_MM):
     """Directions from the right eye of the head-mounted rig, each at another depth than its neighbours."""
-    directions = direction_of(np.radians(np.array(ANGLES_DEG, dtype=float)))
+    directions = direction_of(*np.radians(ANGLES_DEG).T)
     depth = np.array(depths)[np.arange(len(directions)) % len(depths)]
     return np.array([0, -31.5, 0]) + depth[:, None] * directions
 
@@ -44,7 +45,7 @@ def test_a_polynomial_is_recovered_exactly(head_mounted):
     rng = np.random.default_rng(7)
     x, y = rng.uniform(-1, 1, (2, len(seen)))
     azimuth, elevation = 3 + 9 * x - 2 * y + x * x - 0.5 * x * y + 0.1 * y * y, 1 + x + 8 * y - 0.4 * x * y
-    truth = direction_of(np.radians(np.stack([azimuth, elevation], axis=-1)))
+    truth = direction_of(np.radians(azimuth), np.radians(elevation))
     centre = np.stack([320 + 40 * x, 240 + 40 * y], axis=-1)
     seen = replace(seen, pupil=replace(seen.pupil, centre_px=centre))
     fitted = er.gaze.DirectionRegression("R3", "pupil").fit_directions(seen.take(slice(0, 9)), scene.rig, truth[:9])
@@ -120,7 +121,7 @@ def test_directions_on_a_screen_are_the_same_as_its_points(head_mounted):
 
 def test_angles_and_directions_are_inverse():
     angles = np.radians([[12.0, -7.0], [-80.0, 40.0]])
-    np.testing.assert_allclose(angles_of(direction_of(angles)), angles, atol=1e-15)
+    np.testing.assert_allclose(angles_of(direction_of(*angles.T)), angles, atol=1e-15)
 
 
 def test_the_commands_work_without_a_screen(head_mounted, tmp_path, monkeypatch, capsys):

@@ -45,6 +45,10 @@ class Mean:
         return cls({int(e): m for e, m in data["means"].items()})
 
 
+class Own(er.gaze.Regression):
+    pass
+
+
 class Unstored:
     def fit(self, observations, rig):
         return self
@@ -224,6 +228,10 @@ def test_the_api_stores_a_class_of_a_module_and_no_other(place, tmp_path):
     er.gaze.save_estimator("c.json", mean.fit(seen, rig), rig)
     again = er.gaze.load_estimator("c.json", f"{place}:Mean")
     assert again.predict(seen, rig) == mean.fit(seen, rig).predict(seen, rig)
+
+    own = classes.Own().fit(seen, rig)  # a subclass of the package's own
+    er.gaze.save_estimator("own.json", own, rig)
+    assert er.gaze.load_estimator("own.json", f"{place}:Own").predict(seen, rig) == own.predict(seen, rig)
 
     with pytest.raises(er.InputError, match="cannot be imported again; define the class in a module"):
         er.gaze.save_estimator("d.json", type("<local>", (classes.Mean,), {})(), rig)

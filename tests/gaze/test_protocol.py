@@ -8,7 +8,11 @@ import pytest
 import eyerender as er
 from eyerender.analytic.observer import trace
 from eyerender.base.status import Status
+from eyerender.gaze.builtin import BuiltIn
+from eyerender.gaze.estimators import ESTIMATORS, estimator_class
+from eyerender.gaze.store import choose_estimator
 from eyerender.rig.rig import RigGeometry
+from tests.support.gaze import guestrin
 
 ONE_CAMERA = [
     er.gaze.Regression("R3"),
@@ -19,26 +23,19 @@ ONE_CAMERA = [
 
 @pytest.fixture(scope="module")
 def scene():
-    spec = er.load_scene("guestrin2006").spec.to_mapping()
-    spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
-    return er.Scene.of(er.SceneSpec.from_mapping(spec))
+    return guestrin()
 
 
 @pytest.fixture(scope="module")
 def five_lights():
-    """Four lights at the corners of the screen, one at the camera, and targets at the corners among others."""
-    spec = er.load_scene("guestrin2006").spec.to_mapping()
-    spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
-    screen, camera = spec["rig"]["screen"], spec["rig"]["cameras"][0]
-    (x, y, z), (w, h) = screen["centre_mm"], screen["size_mm"]
-    corners = [
-        [x, y + w / 2, z + h / 2],
-        [x, y - w / 2, z + h / 2],
-        [x, y - w / 2, z - h / 2],
-        [x, y + w / 2, z - h / 2],
-    ]
-    spec["rig"]["lights"] = [{"position_mm": p} for p in [*corners, camera["position_mm"]]]
-    return er.Scene.of(er.SceneSpec.from_mapping(spec))
+    """Targets at the corners among others."""
+    return guestrin(corners=True)
+
+
+def test_every_estimator_of_the_list_can_be_stored():
+    for name in ESTIMATORS:
+        assert issubclass(estimator_class(name), BuiltIn)
+        assert isinstance(choose_estimator(name), er.gaze.StoredEstimator)
 
 
 def check(estimator, seen, authored):
@@ -67,10 +64,8 @@ def test_projective(five_lights, estimator):
     check(estimator, trace(five_lights), five_lights.spec.rig)
 
 
-def test_two_cameras(scene):
-    spec = scene.spec.to_mapping()
-    spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
-    two = er.Scene.of(er.SceneSpec.from_mapping(spec))
+def test_two_cameras():
+    two = guestrin(second_camera=True)
     check(er.gaze.ShihWuLiu(), trace(two), two.spec.rig)
 
 

@@ -22,6 +22,7 @@ from eyerender.gaze.store import (
 )  # fmt: skip
 from eyerender.scene import load_scene
 from tests.support.gaze import ets_observations, ets_rig
+from tests.support.gaze import guestrin as guestrin_scene
 from tests.support.paths import load
 
 
@@ -91,15 +92,7 @@ def test_calibrations_survive_their_file(tmp_path, name, vectors):
         data = load(f"estimator_{vectors}.json")
         seen, rig = ets_observations(data["calibration"]), ets_rig(data)
     else:
-        scene = load_scene("guestrin2006")
-        if name == "shih-wu-liu":
-            spec = scene.spec.to_mapping()
-            spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
-            spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
-            from eyerender.scene import Scene
-            from eyerender.scene.spec import SceneSpec
-
-            scene = Scene.of(SceneSpec.from_mapping(spec))
+        scene = guestrin_scene(second_camera=name == "shih-wu-liu")
         seen, rig = trace(scene), scene.rig
     fitted, _ = fit_estimator(choose_estimator(name), seen, rig)
     save_estimator(tmp_path / "c.json", fitted)
@@ -109,13 +102,7 @@ def test_calibrations_survive_their_file(tmp_path, name, vectors):
 
 def test_two_cameras_on_an_aspheric_eye(tmp_path):
     """Two cameras need no eye parameters, but a spherical cornea: E1 comes out to some thousandths of a degree."""
-    from eyerender.scene import Scene
-    from eyerender.scene.spec import SceneSpec
-
-    spec = load_scene("guestrin2006", eye="E1").spec.to_mapping()
-    spec["rig"]["cameras"].append({**spec["rig"]["cameras"][0], "name": "b", "position_mm": [600, 150, -120]})
-    spec["subject"]["head_positions_mm"] = [[0, 0, 0]]
-    scene = Scene.of(SceneSpec.from_mapping(spec), eye="E1")
+    scene = guestrin_scene(second_camera=True, eye="E1")
     seen = trace(scene)
     _, summary = fit_estimator(choose_estimator("shih-wu-liu"), seen, scene.rig)
     assert summary["calibration_error_deg"]["n"] == 36

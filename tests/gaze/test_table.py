@@ -24,14 +24,13 @@ from eyerender.gaze.store import choose_estimator, fit_estimator
 from eyerender.gaze.table import observations_from_csv
 from eyerender.scene.observation import EYES, Observations
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
+from tests.support.gaze import guestrin
 
 
 @cache
 def recording() -> tuple[Observations, Any]:
     """Features of a scene with two eyes, two lights and nine targets."""
-    data = er.load_scene("guestrin2006").spec.to_mapping()
-    data["subject"]["head_positions_mm"] = [[0.0, 0.0, 0.0]]
-    scene = er.Scene.of(er.SceneSpec.from_mapping(data))
+    scene = guestrin()
     return er.trace(scene), scene.rig
 
 

@@ -16,7 +16,30 @@ from eyerender.rig.camera import PinholeCamera
 from eyerender.rig.light import Lamp
 from eyerender.rig.rig import RigGeometry
 from eyerender.rig.screen import ScreenPlane
+from eyerender.scene import Scene, load_scene
 from eyerender.scene.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
+from eyerender.scene.spec import SceneSpec
+
+
+def guestrin(*, corners=False, second_camera=False, eye=None, grid=None):
+    """The shipped scene guestrin2006 with the head at rest, and what some estimators need.
+
+    `corners`: four lights at the corners of the screen and one at the camera, instead of its two lights.
+    """
+    spec = load_scene("guestrin2006", eye=eye).spec.to_mapping()
+    spec["subject"]["head_positions_mm"] = [[0.0, 0.0, 0.0]]
+    if grid is not None:
+        spec["targets"] = {"grid": grid}
+    camera, light, screen = spec["rig"]["cameras"][0], spec["rig"]["lights"][0], spec["rig"]["screen"]
+    if second_camera:
+        spec["rig"]["cameras"].append({**camera, "name": "b", "position_mm": [600, 150, -120]})
+    if corners:
+        (x, y, z), (w, h) = screen["centre_mm"], screen["size_mm"]
+        sides = [(y + w / 2, z + h / 2), (y - w / 2, z + h / 2), (y - w / 2, z - h / 2), (y + w / 2, z - h / 2)]
+        places = [[x, *side] for side in sides] + [camera["position_mm"]]
+        spec["rig"]["lights"] = [{**light, "position_mm": place} for place in places]
+    return Scene.of(SceneSpec.from_mapping(spec), eye=eye)
+
 
 ETS_TO_WORLD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # (z away from the user, x to the user's right, y up), the user at z = +658: the one-camera vectors.

@@ -20,7 +20,7 @@ from ...base.arrays import Bools, Floats
 from ...base.errors import InputError
 from ...gaze.budget import error_vectors_deg
 from ...gaze.directions import DirectionRegression, Feature
-from ...gaze.recalibration import direction_of
+from ...optics.transforms import direction_of
 from ...rig.rig import RigGeometry
 from ...scene import Scene, load_scene
 from ...scene.observation import Observations
@@ -90,7 +90,7 @@ def direction_errors_deg(seen: Observations, rig: RigGeometry, name: str) -> Flo
         name: the feature, one of `FEATURES`.
     """
     learnt = calibration_rows()
-    truth = direction_of(np.radians(directions_deg()))
+    truth = direction_of(*np.radians(directions_deg()).T)
     out = np.full((len(seen), 2), np.nan)
     estimator = DirectionRegression("R3", FEATURES[name])
     try:
