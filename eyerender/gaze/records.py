@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
 import numpy as np
+from pydantic import ConfigDict, Field, model_validator
 
-from ..base.arrays import Floats, frozen
+from ..base.arrays import frozen
 from ..base.errors import InputError, Problems
-from ..base.spec import LARGEST, FileSpec, read_yaml
+from ..base.spec import FileSpec, Positive, Spec, Vec3, read_yaml
 from ..base.storage.files import parse_json, read_text
 from ..rig.camera import CameraCalibration, PinholeCamera
 from ..rig.light import MAX_LIGHTS, Lamp
@@ -22,9 +23,6 @@ from ..scene import Scene, load_scene
 from ..scene.observation import Observations
 from .columns import CsvColumns
 from .table import observations_from_csv
-
-ReadArray = Callable[[Any, tuple[int, ...], str], Floats]
-"""Function that converts a value to an array of a shape; raises `InputError` with the path."""
 
 TABLES = (".csv", ".tsv")
 """Suffixes of files that are read as tables."""
@@ -113,80 +111,73 @@ def _read(text: str, source: str) -> tuple[list[Any], Any]:
     return data["records"], data.get("rig")
 
 
+_Pixels = Annotated[int, Field(strict=False, gt=0, le=65536)]  # JSON may have them as 640.0
+
+
+class _CameraData(CameraCalibration):
+    """A camera in JSON."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    t_mm: Vec3 = Field(alias="t")
+    resolution_px: tuple[_Pixels, _Pixels]
+    mirrored: bool = False
+
+    def build(self) -> PinholeCamera:
+        camera = PinholeCamera.of(self.K, self.R, self.t_mm, self.resolution_px, self.distortion)
+        return replace(camera, mirrored=self.mirrored)
+
+
+class _ScreenData(Spec):
+    """A screen in JSON."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    centre_mm: Vec3
+    size_mm: tuple[Positive, Positive]
+    right: Vec3 = (0, -1, 0)
+    up: Vec3 = (0, 0, 1)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        axes = np.array([self.right, self.up])
+        if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
+            raise ValueError("right and up must be unit vectors at a right angle")
+        return self
+
+    def build(self) -> ScreenPlane:
+        return ScreenPlane(frozen(self.centre_mm), frozen(self.right), frozen(self.up), self.size_mm)
+
+
+class _RigData(Spec):
+    """A rig in JSON."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    cameras: Annotated[tuple[_CameraData, ...], Field(max_length=MAX_CAMERAS)]
+    lights_mm: Annotated[tuple[Vec3, ...], Field(max_length=MAX_LIGHTS)] | None = None
+    screen: _ScreenData | None = None
+
+    def build(self) -> RigGeometry:
+        axis = frozen([1.0, 0.0, 0.0])
+        lights = [
+            Lamp(position_mm=frozen(place), axis=axis, radius_mm=0.0, intensity_mw_sr=1.0, lobe_exponent=0.0)
+            for place in self.lights_mm or ()
+        ]
+        screen = None if self.screen is None else self.screen.build()
+        return RigGeometry(tuple(camera.build() for camera in self.cameras), tuple(lights), screen)
+
+
 def rig_from_mapping(data: Any, *, source: str = "") -> RigGeometry:
-    """Read a rig as `features --json` writes it.
+    """Read a rig as `features --json` writes it; unknown keys are ignored.
 
     Raises:
         InputError: naming the part that is wrong.
     """
-
-    def array(value: Any, shape: tuple[int, ...], path: str) -> Floats:
-        try:
-            out = np.asarray(value)
-        except (ValueError, OverflowError):  # rows of unequal length
-            out = np.zeros(0)
-        if out.shape != shape or out.dtype.kind not in "iuf" or not (np.abs(out) <= LARGEST).all():
-            raise InputError(f"must be {' x '.join(map(str, shape))} numbers", source=source, path=path)
-        return frozen(out)
-
-    if not isinstance(data, dict) or not isinstance(data.get("cameras"), list):
-        raise InputError("must hold cameras", source=source, path="rig")
-    if len(data["cameras"]) > MAX_CAMERAS:
-        raise InputError(f"are more than {MAX_CAMERAS}", source=source, path="rig.cameras")
-    places = data.get("lights_mm") or []
-    if not isinstance(places, list) or len(places) > MAX_LIGHTS:
-        raise InputError(f"must be a list of at most {MAX_LIGHTS} points", source=source, path="rig.lights_mm")
-    problems = Problems(source)
-    cameras = [
-        problems.attempt(partial(_camera, c, array, source, f"rig.cameras.{k}")) for k, c in enumerate(data["cameras"])
-    ]
-    lights = [problems.attempt(partial(_light, array, p, f"rig.lights_mm.{k}")) for k, p in enumerate(places)]
-    screen = problems.attempt(lambda: _screen(data.get("screen"), array, source))
-    problems.check()
-    return RigGeometry(tuple(cameras), tuple(lights), screen)
-
-
-def _light(array: ReadArray, place: Any, at: str) -> Lamp:
-    axis = frozen([1.0, 0.0, 0.0])
-    return Lamp(position_mm=array(place, (3,), at), axis=axis, radius_mm=0.0, intensity_mw_sr=1.0, lobe_exponent=0.0)
-
-
-def _camera(data: Any, array: ReadArray, source: str, at: str) -> PinholeCamera:
-    if not isinstance(data, dict):
-        raise InputError("must be a camera", source=source, path=at)
-    size = array(data.get("resolution_px"), (2,), f"{at}.resolution_px")
-    if not ((size >= 1) & (size <= 65536) & (size == np.floor(size))).all():
-        raise InputError("must be whole numbers from 1 to 65536", source=source, path=f"{at}.resolution_px")
-    K, R, t = (array(data.get(key), (3, 3)[: 1 + (key != "t")], f"{at}.{key}") for key in ("K", "R", "t"))
-    distortion = array(data.get("distortion", [0.0] * 5), (5,), f"{at}.distortion")
-    # The rules are those of a camera in a scene.
-    calibration = {"K": K.tolist(), "R": R.tolist(), "t_mm": t.tolist(), "distortion": distortion.tolist()}
     try:
-        CameraCalibration.from_mapping(calibration)
+        return _RigData.from_mapping(data).build()
     except InputError as error:
-        raise InputError(error.reason, source=source, path=at) from None
-    mirrored = data.get("mirrored", False)
-    if not isinstance(mirrored, bool):
-        raise InputError("must be true or false", source=source, path=f"{at}.mirrored")
-    camera = PinholeCamera.of(K, R, t, (int(size[0]), int(size[1])), distortion)
-    return replace(camera, mirrored=mirrored)
-
-
-def _screen(data: Any, array: ReadArray, source: str) -> ScreenPlane | None:
-    if data is None:
-        return None
-    if not isinstance(data, dict):
-        raise InputError("must be null or a screen", source=source, path="rig.screen")
-    w, h = array(data.get("size_mm"), (2,), "rig.screen.size_mm")
-    if not (w > 0 and h > 0):
-        raise InputError("must be > 0", source=source, path="rig.screen.size_mm")
-    right = array(data.get("right", [0, -1, 0]), (3,), "rig.screen.right")
-    up = array(data.get("up", [0, 0, 1]), (3,), "rig.screen.up")
-    axes = np.stack([right, up])
-    if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
-        raise InputError("right and up must be unit vectors at a right angle", source=source, path="rig.screen")
-    centre = array(data.get("centre_mm"), (3,), "rig.screen.centre_mm")
-    return ScreenPlane(centre, right, up, (float(w), float(h)))
+        raise error.placed(source=source, under="rig") from None
 
 
 def _is_image_line(line: Any) -> bool:
