@@ -297,7 +297,8 @@ def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
     first, *others = err.splitlines()
     assert all(line.startswith("error: ") for line in (first, *others))
     assert words in first
-    assert len(others) == (3 if "hollow.json" in argv else 0)  # a line for each key of the hollow calibration
+    # A line for each key of the hollow calibration, and for each row of the camera matrix.
+    assert len(others) == (3 if "hollow.json" in argv else 2 if "badrig.json" in argv else 0)
     assert not (tmp_path / "c.json").exists()
 
 
