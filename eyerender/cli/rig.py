@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from cyclopts import Parameter
+
+from ..apps.rigs.options import RigSize
 from .app import app
 from .options import Backend, OutputFolder, Overwrite, Result
 from .output import emit, progress
@@ -18,15 +21,7 @@ def rig(
     *,
     output: OutputFolder,
     population: str = "adults",
-    people: int = 200,
-    sample: int = 5,
-    images: int = 0,
-    workers: int | None = None,
-    seed: int = 0,
-    slippage_mm: float = 1.5,
-    relief_mm: float = 0.0,
-    azimuth_deg: float = 20.0,
-    elevation_deg: float = 15.0,
+    size: Annotated[RigSize, Parameter(name="*")] = RigSize(),
     unknowns: Path | None = None,
     backend: Backend = "auto",
     overwrite: Overwrite = False,
@@ -41,33 +36,13 @@ def rig(
         scene: A scene file or the name of a shipped one: its rig, sensor, first eye and first head position.
         population: adults, emmetropic_adults, myopes, children or elderly, or a YAML file with the keys of
             `population`.
-        people: Number of people.
-        sample: Number of people for the errors of estimators on exact features.
-        images: Number of people for errors on rendered images, 25 each (a few seconds per image).
-        workers: Number of processes (default: one per processor). Results do not depend on it.
-        seed: The seed of the people.
-        slippage_mm: Standard deviation of the eyes' positions about the scene's, along each axis.
-        relief_mm: Additional standard deviation along x, for the eye relief of a headset (3 is a good choice).
-        azimuth_deg: Half range of the directions of gaze, horizontally.
-        elevation_deg: Half range of the directions of gaze, vertically.
         unknowns: A YAML file with the keys of `er.Unknowns` (default: priors of a population, 3 mm of slippage).
     """
-    from ..apps.rigs import REPORT, RigSize, run_rig
+    from ..apps.rigs.report import REPORT, run_rig
     from ..base.spec import read_yaml
     from ..design.unknowns import Unknowns
     from ..scene import load_scene
 
-    size = RigSize(
-        people=people,
-        sample=sample,
-        images=images,
-        workers=workers,
-        seed=seed,
-        slippage_mm=slippage_mm,
-        relief_mm=relief_mm,
-        azimuth_deg=azimuth_deg,
-        elevation_deg=elevation_deg,
-    )
     given = None if unknowns is None else Unknowns.from_mapping(read_yaml(unknowns), source=str(unknowns))
     everyone = read_population(population, "--population")
     with progress("rig") as steps:

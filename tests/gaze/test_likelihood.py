@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.apps.rigs import estimator_errors
+from eyerender.apps.rigs.report import estimator_errors
 from eyerender.design.people import Survey
 from eyerender.design.unknowns import Unknowns
 from eyerender.gaze.store import choose_estimator, load_estimator, save_estimator

@@ -242,7 +242,7 @@ def test_calibrations_without_a_rig_are_read_and_older_files_get_one_line(guestr
     assert run(["gaze", "predict", str(guestrin), "-c", str(tmp_path / "c.json"), "--strict"]) == 0
     data["rig"] = {"cameras": 1}
     (tmp_path / "c.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match="rig.cameras: must be a valid array"):
+    with pytest.raises(InputError, match=r"rig\.cameras: must be a valid array"):
         load_calibration(tmp_path / "c.json")
 
 
@@ -270,7 +270,7 @@ BAD = [
     (["gaze", "fit", "empty.jsonl", "--estimator", "regression", "-o", "c.json"], "holds no records"),
     (["gaze", "fit", "text.txt", "--estimator", "regression", "-o", "c.json"], "line 1: is not valid JSON"),
     (["gaze", "fit", "norig.json", "--estimator", "regression", "-o", "c.json"], "holds no rig"),
-    (["gaze", "fit", "badrig.json", "--estimator", "regression", "-o", "c.json"], "rig.cameras.0.K.0: must be a valid array"),
+    (["gaze", "fit", "badrig.json", "--estimator", "regression", "-o", "c.json"], "rig.cameras.0.K.0: must be"),
     (["gaze", "predict", "features.json", "-c", "none.json"], "none.json: no such file"),
     (["gaze", "predict", "features.json", "-c", "features.json"], "features.json: schema: is 'eyerender/features/1'"),
     (["gaze", "predict", "features.json", "-c", "hollow.json"], "hollow.json: eyes.right.origin: missing"),

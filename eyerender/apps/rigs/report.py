@@ -14,29 +14,30 @@ from typing import Any
 
 import numpy as np
 
-from ..analytic.observer import trace
-from ..backends.choose import BackendChoice
-from ..base.arrays import Floats, Ints, finite_or_none
-from ..base.errors import InputError
-from ..base.progress import Progress, notify
-from ..base.storage.files import write_json
-from ..design.crowd import OUTLINE, SHIFTS_MM, coverage_of, figures_of_people, figures_of_shifts, users_of
-from ..design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
-from ..design.people import CALIBRATION_CELLS, GRID, LOST, Figures, Survey, place_of
-from ..design.safety import NOTE, eye_exposure
-from ..design.unknowns import Unknowns
-from ..folders.outfolder import staged
-from ..gaze.estimate import ray_errors_deg
-from ..gaze.store import choose_estimator
-from ..imaging.imageobserver import ImageObserver
-from ..optics.transforms import direction_of
-from ..population.people import Person
-from ..report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
-from ..report.style import figure, svg
-from ..scene import Scene
-from ..scene.people import Population
-from ..scene.spec import SceneSpec, Targets
-from ..scene.subject import Subject
+from ...analytic.observer import trace
+from ...backends.choose import BackendChoice
+from ...base.arrays import Floats, Ints, finite_or_none
+from ...base.errors import InputError
+from ...base.progress import Progress, notify
+from ...base.storage.files import write_json
+from ...design.crowd import OUTLINE, SHIFTS_MM, coverage_of, figures_of_people, figures_of_shifts, users_of
+from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
+from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, Survey, place_of
+from ...design.safety import NOTE, eye_exposure
+from ...design.unknowns import Unknowns
+from ...folders.outfolder import staged
+from ...gaze.estimate import ray_errors_deg
+from ...gaze.store import choose_estimator
+from ...imaging.imageobserver import ImageObserver
+from ...optics.transforms import direction_of
+from ...population.people import Person
+from ...report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
+from ...report.style import figure, svg
+from ...scene import Scene
+from ...scene.people import Population
+from ...scene.spec import SceneSpec, Targets
+from ...scene.subject import Subject
+from .options import RigSize
 
 SCHEMA = "eyerender/rig/1"
 REPORT, PEOPLE, GAZE, SUMMARY = "report.html", "people.csv", "gaze.csv", "summary.json"
@@ -45,44 +46,6 @@ NOISE_ONLY = "noise only"
 TRAITS = ("age", "lids open (mm)", "fissure wide (mm)", "pupils apart (mm)")
 _TARGET_MM = 1000.0
 _SLIPPING = 4
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RigSize:
-    """Size of the computation.
-
-    Attributes:
-        people: number of people.
-        sample: number of people whose gaze is estimated on exact features.
-        images: number of people whose gaze is estimated on rendered images, 25 each.
-        workers: processes; None: one for each processor.
-        seed: seed of the people.
-        slippage_mm: standard deviation of the eyes' positions along each axis.
-        relief_mm: additional standard deviation of the eyes' distance from the rig.
-        azimuth_deg: half range of gaze, horizontally.
-        elevation_deg: half range of gaze, vertically.
-    """
-
-    people: int = 200
-    sample: int = 5
-    images: int = 0
-    workers: int | None = None
-    seed: int = 0
-    slippage_mm: float = 1.5
-    relief_mm: float = 0.0
-    azimuth_deg: float = 20.0
-    elevation_deg: float = 15.0
-
-    def __post_init__(self) -> None:
-        """Raise an error for numbers out of range, naming the command's option."""
-        for name, low, high in (
-            ("people", 1, 10**6), ("sample", 0, 1000), ("images", 0, 1000), ("seed", 0, 2**63 - 1),
-            ("slippage_mm", 0, 20), ("relief_mm", 0, 20),
-            ("azimuth_deg", 1, 60), ("elevation_deg", 1, 60), ("workers", 1, 1024),
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InputError(f"must be {low} to {high}, not {value:g}", source=f"--{name.replace('_', '-')}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
