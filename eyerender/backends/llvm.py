@@ -39,14 +39,6 @@ class LibLlvm:
         return cls(path, verdict.detail.removeprefix("LLVM "))
 
 
-@dataclass(frozen=True, slots=True)
-class Examined:
-    """A candidate and the result of its probe."""
-
-    path: Path
-    verdict: Verdict
-
-
 _active: LibLlvm | None = None
 
 
@@ -61,22 +53,22 @@ def candidates() -> Iterator[Path]:
                 yield real
 
 
-def examine(*, refresh: bool = False) -> Iterator[Examined]:
-    """Probe the candidates one by one, lazily; `refresh` ignores earlier failures (never successes)."""
+def examine(*, refresh: bool = False) -> Iterator[tuple[Path, Verdict]]:
+    """Probe the candidates one by one, lazily, and yield each with its verdict; `refresh` ignores earlier failures (never successes)."""
     for path in candidates():
         verdict = probe(VARIANT, path)
         if refresh and not verdict.ok:
             verdict = probe(VARIANT, path, refresh=True)
-        yield Examined(path, verdict)
+        yield path, verdict
 
 
 def find_llvm(*, refresh: bool = False) -> tuple[LibLlvm | None, list[str]]:
     """Return the first candidate that renders (None if there is none), and what is wrong with those before it."""
     refused = []
-    for examined in examine(refresh=refresh):
-        if examined.verdict.ok:
-            return LibLlvm.probed(examined.path, examined.verdict), refused
-        refused.append(f"{examined.path}: {examined.verdict.detail}")
+    for path, verdict in examine(refresh=refresh):
+        if verdict.ok:
+            return LibLlvm.probed(path, verdict), refused
+        refused.append(f"{path}: {verdict.detail}")
     return None, refused
 
 
@@ -101,23 +93,23 @@ def version_of(path: Path) -> tuple[int, ...]:
 
 def _activate() -> LibLlvm:
     before = os.environ.get(ENVIRONMENT)
-    for examined in examine():
-        if not examined.verdict.ok:
+    for path, verdict in examine():
+        if not verdict.ok:
             continue
         try:
-            load_llvm(examined.path)
+            load_llvm(path)
         except OSError:
             # It is cached as good, but something that it needs has been removed since.
-            probe(VARIANT, examined.path, refresh=True)
+            probe(VARIANT, path, refresh=True)
             continue
-        os.environ[ENVIRONMENT] = str(examined.path)
+        os.environ[ENVIRONMENT] = str(path)
         import drjit as dr
 
         if dr.has_backend(dr.JitBackend.LLVM):
-            return LibLlvm.probed(examined.path, examined.verdict)
+            return LibLlvm.probed(path, verdict)
         if before is not None:
             os.environ[ENVIRONMENT] = before
-        raise BackendError(f"Dr.Jit cannot load {examined.path}, although a separate process could")
+        raise BackendError(f"Dr.Jit cannot load {path}, although a separate process could")
     raise BackendError(f"no libLLVM here can render, and the llvm backend needs one; {llvm_fix()}")
 
 

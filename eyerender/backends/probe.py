@@ -19,14 +19,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import InputError
+from ..base.errors import EyerenderError, InputError
 from ..base.storage.cachefolder import cache_folder
-from ..base.storage.files import read_json
+from ..base.storage.files import read_json, write_json
 from ..base.versions import package_version
 from .libraries import load_llvm, load_runtime
 
@@ -89,7 +89,9 @@ def probe(variant: str, library: Path | None = None, *, context: str = "", refre
             return known
     verdict = run_probe(variant, library)
     if file is not None and verdict.lasting:
-        _write_verdict(file, key, verdict)
+        with contextlib.suppress(OSError, EyerenderError):  # a cache that cannot be written is done without
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_json(file, {"key": key, "verdict": asdict(verdict)}, sync=False)
     return verdict
 
 
@@ -151,18 +153,6 @@ def _read_verdict(file: Path) -> Verdict | None:
         return verdict if verdict.ok or time.time() - file.stat().st_mtime < REFUSAL_AGE_S else None
     except (InputError, OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _write_verdict(file: Path, key: Mapping[str, Any], verdict: Verdict) -> None:
-    """Write a verdict atomically, so that no reader finds half a file; ignore a cache that cannot be written."""
-    beside = file.with_suffix(f".{os.getpid()}")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_text(json.dumps({"key": key, "verdict": asdict(verdict)}, indent=1), encoding="utf-8")
-        beside.replace(file)
-    except OSError:
-        with contextlib.suppress(OSError):
-            beside.unlink()
 
 
 def _work(variant: str) -> str:
