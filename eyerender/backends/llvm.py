@@ -54,7 +54,7 @@ def candidates() -> Iterator[Path]:
 
 
 def examine(*, refresh: bool = False) -> Iterator[tuple[Path, Verdict]]:
-    """Probe the candidates one by one, lazily, and yield each with its verdict; `refresh` ignores earlier failures (never successes)."""
+    """Probe the candidates one by one and yield each with its verdict; `refresh` ignores earlier failures only."""
     for path in candidates():
         verdict = probe(VARIANT, path)
         if refresh and not verdict.ok:
