@@ -21,6 +21,7 @@ from ..base.status import Status
 from ..rig.rig import RigLike
 from ..rig.screen import ScreenPlane
 from ..scene.observation import Observations
+from .rays import is_none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,8 +40,8 @@ class GazePoints(ArrayValue):
         """
         points = np.asarray(point_mm, dtype=float)
         reasons = np.full(len(points), None, dtype=object) if reason is None else reason.copy()
-        reasons[(reasons == None) & ~np.isfinite(points).all(axis=-1)] = "the estimate is not finite"  # noqa: E711
-        ok = np.array([r is None for r in reasons], dtype=bool)
+        reasons[is_none(reasons) & ~np.isfinite(points).all(axis=-1)] = "the estimate is not finite"
+        ok = is_none(reasons)
         status = np.where(ok, Status.OK, Status.NO_ESTIMATE)
         return cls(frozen(np.where(ok[:, None], points, np.nan)), frozen(status, np.int8), frozen(reasons, object))
 
@@ -64,12 +65,12 @@ class GazeRays(ArrayValue):
     @property
     def ok(self) -> Bools:
         """Whether there is a ray, (n,)."""
-        return np.array([reason is None for reason in self.reason], dtype=bool)
+        return is_none(self.reason)
 
     @classmethod
     def of(cls, origin_mm: Floats, direction: Floats, reason: Objects) -> GazeRays:
         """Create rays, set to NaN wherever there is a reason."""
-        ok = np.array([r is None for r in reason], dtype=bool)[:, None]
+        ok = is_none(reason)[:, None]
         return cls(
             frozen(np.where(ok, origin_mm, np.nan)), frozen(np.where(ok, direction, np.nan)), frozen(reason, object)
         )
@@ -78,7 +79,7 @@ class GazeRays(ArrayValue):
         """Intersect the rays with the screen's plane; `name` describes the rays in reasons."""
         points, hits = screen.intersect(self.origin_mm, self.direction)
         reason = self.reason.copy()
-        reason[(reason == None) & ~hits] = f"{name} does not meet the screen"  # noqa: E711
+        reason[is_none(reason) & ~hits] = f"{name} does not meet the screen"
         return GazePoints.of(screen.world(points), reason)
 
 

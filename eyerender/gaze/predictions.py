@@ -21,7 +21,7 @@ from ..scene.observation import EYES, Observations
 from .cornea import from_all_glints
 from .estimate import GazeEstimator, RayEstimator, angular_error_deg, binocular_average, ray_errors_deg
 from .parameters import MEAN_EYE
-from .rays import feature_rays, targets_on_screen
+from .rays import feature_rays, is_none, targets_on_screen
 
 POINTS_SCHEMA, RAYS_SCHEMA = "eyerender/gaze/3", "eyerender/gaze/4"
 """Schemas of gaze points on a screen, and of gaze rays of a rig without one."""
@@ -134,7 +134,7 @@ def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGe
     place = np.array(index.eye_position_mm + index.head_mm)
     source = np.array([GIVEN if np.isfinite(one).all() else None for one in place], dtype=object)
     for name in (RAYS, GLINTS):
-        rows = np.flatnonzero(source == None)  # noqa: E711  (element by element)
+        rows = np.flatnonzero(is_none(source))
         if not len(rows):
             break
         some = observations.take(rows)
@@ -155,7 +155,7 @@ def _corneal_centres(observations: Observations, rig: RigGeometry) -> Floats:
     if len(rig.lights) < 2:
         return centre
     rays = feature_rays(observations, rig, None, least=2)
-    rows = np.flatnonzero(rays.reason == None)  # noqa: E711
+    rows = np.flatnonzero(is_none(rays.reason))
     if len(rows):
         radius = np.full(len(rows), MEAN_EYE.cornea_radius_mm)
         centre[rows] = from_all_glints(

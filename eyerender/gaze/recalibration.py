@@ -77,15 +77,14 @@ class Recalibration:
     def apply(self, observations: Observations, rays: GazeRays, rig: RigLike) -> GazePoints:
         """Correct gaze points on the screen's plane."""
         screen = screen_of(rig.build(), "predict_rays gives rays without one")
-        corrected = self._on_angles(observations, rays)
-        reason = corrected.reason.copy()
-        on_screen, hits = screen.intersect(corrected.origin_mm, corrected.direction)
-        reason[is_none(reason) & ~hits] = "the gaze ray does not meet the screen"
-        if self.kind == "screen":
-            for eye, A in self.coefficients.items():
-                rows = observations.index.eye == eye
-                on_screen[rows] = monomials(on_screen[rows], EXPONENTS) @ A.T
-        return GazePoints.of(screen.world(on_screen), reason)
+        gaze = self._on_angles(observations, rays).on_screen(screen)
+        if self.kind != "screen":
+            return gaze
+        on_screen = screen.flat(gaze.point_mm)
+        for eye, A in self.coefficients.items():
+            rows = observations.index.eye == eye
+            on_screen[rows] = monomials(on_screen[rows], EXPONENTS) @ A.T
+        return GazePoints.of(screen.world(on_screen), gaze.reason)
 
     def apply_to_rays(self, observations: Observations, rays: GazeRays, rig: RigLike) -> GazeRays:
         """Correct gaze rays; a correction on the screen turns them to the corrected points."""
