@@ -19,7 +19,8 @@ import numpy as np
 from ...base.arrays import Bools, Floats
 from ...base.errors import InputError
 from ...gaze.budget import error_vectors_deg
-from ...gaze.directions import DirectionRegression, Feature
+from ...gaze.builtin import Feature
+from ...gaze.directions import DirectionRegression
 from ...optics.transforms import direction_of
 from ...rig.rig import RigGeometry
 from ...scene import Scene, load_scene
