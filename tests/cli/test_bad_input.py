@@ -110,6 +110,7 @@ def _write_bad_things():
 
 
 FIT = ["gaze", "fit", "--estimator", "regression", "-o", "c.json"]
+BY = ["gaze", "fit", "f.json", "-o", "c.json", "--estimator"]
 
 TABLE = [
     # command, exit code, words on stderr
@@ -142,34 +143,14 @@ TABLE = [
     (["extract", "pipe.yaml"], 2, "pipe.yaml: is a pipe, not a file"),
     (["generate", "pipe.yaml", "out"], 2, "pipe.yaml: is a pipe, not a file"),
     (["gaze", "predict", "pipe.yaml", "-c", "pipe.yaml"], 2, "pipe.yaml: is a pipe, not a file"),
-    (
-        ["gaze", "fit", "f.json", "--estimator", "magic", "-o", "c.json"],
-        2,
-        "--estimator: must be one of regression, direction-regression, homog",
-    ),
-    (["gaze", "fit", "f.json", "--estimator", "a:b:c", "-o", "c.json"], 2, "or module:Class, not 'a:b:c'"),
-    (
-        ["gaze", "fit", "f.json", "--estimator", "no_such.x:C", "-o", "c.json"],
-        2,
-        "--estimator: there is no module 'no_",
-    ),
-    (["gaze", "fit", "f.json", "--estimator", "json:Nothing", "-o", "c.json"], 2, "--estimator: json has no Nothing"),
-    (
-        ["gaze", "fit", "f.json", "--estimator", "json:loads", "-o", "c.json"],
-        2,
-        "--estimator: json:loads is not a class",
-    ),
-    (
-        ["gaze", "fit", "f.json", "--estimator", "json:JSONDecoder", "-o", "c.json"],
-        2,
-        "json:JSONDecoder has no method fit",
-    ),
-    (
-        ["gaze", "fit", "f.json", "--estimator", "broken:Mine", "-o", "c.json"],
-        2,
-        "broken cannot be imported (SyntaxError",
-    ),
-    (["gaze", "fit", "f.json", "--estimator", "exits:Mine", "-o", "c.json"], 2, "exits cannot be imported (SystemExit"),
+    ([*BY, "magic"], 2, "--estimator: must be one of regression, direction-regression, homog"),
+    ([*BY, "a:b:c"], 2, "or module:Class, not 'a:b:c'"),
+    ([*BY, "no_such.x:C"], 2, "--estimator: there is no module 'no_"),
+    ([*BY, "json:Nothing"], 2, "--estimator: json has no Nothing"),
+    ([*BY, "json:loads"], 2, "--estimator: json:loads is not a class"),
+    ([*BY, "json:JSONDecoder"], 2, "json:JSONDecoder has no method fit"),
+    ([*BY, "broken:Mine"], 2, "broken cannot be imported (SyntaxError"),
+    ([*BY, "exits:Mine"], 2, "exits cannot be imported (SystemExit"),
     (["gaze", "predict", "f.json", "-c", "own.json"], 2, "own.json: estimator.reference: was made by 'exits:Mine'"),
     (
         ["gaze", "predict", "f.json", "-c", "own.json", "--estimator", "json:X"],
