@@ -200,8 +200,8 @@ def anchor(record: type[Spec]) -> str:
 
 
 def plain_doc(record: type[Spec]) -> str:
-    """The docstring of a record as text; Markdown marks outside its code are escaped."""
-    parts = " ".join((record.__doc__ or "").split()).split("`")
+    """The docstring of a record as text, without its example; Markdown marks outside its code are escaped."""
+    parts = " ".join((record.__doc__ or "").partition(">>>")[0].split()).split("`")
     return "`".join(part if i % 2 else re.sub(r"([<*_])", r"\\\1", part) for i, part in enumerate(parts))
 
 

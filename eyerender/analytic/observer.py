@@ -28,6 +28,9 @@ ARC_GAP_DEG = 120.0
 class AnalyticObserver:
     """Observer by ray optics: exact apparent pupil and glints.
 
+    >>> int(er.AnalyticObserver().observe(er.load_scene("headset").frames()).pupil.ok.sum())
+    9
+
     Args:
         boundary_points: number of traced points of each pupil boundary.
     """
@@ -80,6 +83,9 @@ class AnalyticObserver:
 
 def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points: int = 30) -> Observations:
     """Compute the apparent pupils and glints of frames, or of all frames of a scene, by ray optics.
+
+    >>> er.trace(er.load_scene("headset")).pupil.centre_px.round(1)[0].tolist()
+    [364.5, 209.1]
 
     Args:
         frames: frames, or a scene for all of its frames.

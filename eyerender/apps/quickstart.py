@@ -39,6 +39,8 @@ def run_quickstart(
 
     Images in the folder that have the same scene, seed and versions are reused.
 
+    >>> er.apps.run_quickstart("out/quickstart")  # doctest: +SKIP
+
     Args:
         folder: the folder.
         scene: a scene file, or the name of a shipped scene.
@@ -95,6 +97,8 @@ def compare_folder(
     path: str | Path, *, estimator: GazeEstimator | None = None, name: str = "", progress: Progress | None = None
 ) -> Comparison:
     """Extract the features of a folder's images and compare them with the exact ones, in pixels and in gaze error.
+
+    >>> er.apps.compare_folder("out/quickstart")  # doctest: +SKIP
 
     Args:
         path: a folder that `render`, `quickstart` or `generate` wrote.

@@ -25,6 +25,9 @@ class EyerenderError(Exception):
     """Base of every error that this package raises on purpose: the run failed (disk, worker, backend).
 
     The message is one line of printable characters with a limited length, even if it quotes other text.
+
+    >>> issubclass(er.InputError, er.EyerenderError)
+    True
     """
 
     exit_code = 1
@@ -35,6 +38,12 @@ class EyerenderError(Exception):
 
 class InputError(EyerenderError):
     """The user's input cannot be used.
+
+    >>> try:
+    ...     er.Led((600, 120, 0), radius_mm=-1)
+    ... except er.InputError as error:
+    ...     print(error)
+    radius_mm: must be >= 0, not -1
 
     Attributes:
         reason: what is wrong, in words.
@@ -153,7 +162,11 @@ Warn = Callable[[Iterable[InputWarning]], None]
 
 
 class BackendError(EyerenderError):
-    """No backend can render; the message says how to fix it."""
+    """No backend can render; the message says how to fix it.
+
+    >>> issubclass(er.BackendError, er.EyerenderError)
+    True
+    """
 
     exit_code = 3
 

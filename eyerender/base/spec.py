@@ -183,6 +183,9 @@ class Spec(BaseModel):
     def json_schema(cls) -> dict[str, Any]:
         """Return the JSON Schema (2020-12) for editors."""
         schema = cls.model_json_schema()
+        for record in (schema, *schema.get("$defs", {}).values()):
+            if "description" in record:  # pydantic's is the whole docstring
+                record["description"] = record["description"].partition(">>>")[0].strip()
         return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 

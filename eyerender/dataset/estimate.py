@@ -40,6 +40,8 @@ def estimate(
 
     The rate is the last one of this spec on this machine, for any seed and number of samples.
 
+    >>> er.estimate("dataset_quick")["images"]  # doctest: +SKIP
+
     Args:
         spec: as for `generate`.
         options: as for `generate`.

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 class RunOptions:
     """Options of a dataset run; none of them changes a byte of the result.
 
+    >>> er.dataset.RunOptions(workers=2, timeout_s=60).workers
+    2
+
     Attributes:
         workers: Number of worker processes (default: one per processor, as far as memory allows).
         engine: Processes on this machine (local), or actors on a Ray cluster (ray).

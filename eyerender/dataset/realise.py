@@ -96,6 +96,9 @@ def sample(
 ) -> Realised:
     """Draw sample `index` of a dataset as `generate` does: values, scene and analytic observations.
 
+    >>> er.sample("dataset_quick", 0).scene.spec.image.spp
+    4
+
     Args:
         spec: as for `generate`.
         index: index of the sample, counted from 0.

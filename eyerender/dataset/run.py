@@ -62,6 +62,8 @@ def generate(
 
     The bytes of the dataset depend on the spec or function, `eye`, `seed` and `count` alone.
 
+    >>> er.generate("dataset_quick", "out", count=20, workers=2)  # doctest: +SKIP
+
     Args:
         spec: a dataset file, the name of a shipped one, a spec built in Python, or a plan; not needed beside `scenes`.
         path: the folder to write.

@@ -42,6 +42,8 @@ def preview(
 ) -> int:
     """Render a contact sheet of up to sixteen images into an image file, for viewing rather than measuring.
 
+    >>> er.preview("people_openeds", "sheet.png")  # doctest: +SKIP
+
     Args:
         given: a scene or a dataset: a file, the name of a shipped one, or an object.
         path: the image file; its suffix is one of `FORMATS`.

@@ -69,7 +69,11 @@ class LabelsSpec(Spec):
 
 
 class DatasetSpec(FileSpec):
-    """Content of a dataset file. Draws may replace any value of `scene`; see the documentation."""
+    """Content of a dataset file. Draws may replace any value of `scene`; see the documentation.
+
+    >>> er.DatasetSpec.load(er.dataset.find_dataset("people_openeds")).count
+    240
+    """
 
     FORMAT: ClassVar[int] = 2
 
@@ -225,12 +229,19 @@ class DatasetSpec(FileSpec):
 
 
 def shipped_datasets() -> dict[str, Path]:
-    """Return the dataset specs that come with the package, as a mapping from name to file."""
+    """Return the dataset specs that come with the package, as a mapping from name to file.
+
+    >>> "people_openeds" in er.dataset.shipped_datasets()
+    True
+    """
     return {name: path for name, path in shipped_files().items() if is_shipped_dataset(path)}
 
 
 def find_dataset(spec: str | Path) -> Path:
     """Return the file of a dataset spec, given its path or the name of a shipped one.
+
+    >>> er.dataset.find_dataset("people_openeds").name
+    'people_openeds.yaml'
 
     Raises:
         InputError: there is no such spec.

@@ -41,6 +41,8 @@ def validate(
 ) -> dict[str, Any]:
     """Validate a folder and return a report (schema eyerender/validation/1).
 
+    >>> er.validate("out")["ok"]  # doctest: +SKIP
+
     Args:
         path: the folder.
         quick: do not open or hash images; changed bytes and wrong masks are then not found.

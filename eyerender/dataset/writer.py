@@ -37,9 +37,9 @@ class DatasetWriter:
     arguments: `in` says which samples are stored. The folder is assembled when all samples are there. In the main
     thread, SIGTERM ends the block with SystemExit (unless the program handles it), so that no stored sample is lost.
 
-        with er.DatasetWriter("out", 1000) as writer:
-            for i in writer.missing():
-                writer.add(i, my_scene(i), subject=i // 10, split="train")
+    >>> with er.DatasetWriter("out", 1000) as writer:  # doctest: +SKIP
+    ...     for i in writer.missing():
+    ...         writer.add(i, my_scene(i), subject=i // 10, split="train")
 
     Attributes:
         summary: what the run did (schema eyerender/generate/1); None until the block has ended.

@@ -56,6 +56,10 @@ def site_information(
     """Compute the information that each LED of a rig adds in each frame; see `er.information` for the arguments.
 
     Each frame is treated separately, with the priors of its person; all cameras of an instant count.
+
+    >>> scene = er.load_scene("headset")
+    >>> er.design.site_information(scene.frames()).sites.shape[0]
+    8
     """
     case, _ = case_of(frames, rig)
     scene = frames.scene if rig is None else frames.seen_by(rig).scene
@@ -72,7 +76,11 @@ def site_information(
 
 
 def noise_of_some(scene: Scene, count: int) -> FeatureNoise:
-    """Compute the feature noise with only `count` of a scene's LEDs on: less light on the iris, the same glints."""
+    """Compute the feature noise with only `count` of a scene's LEDs on: less light on the iris, the same glints.
+
+    >>> er.design.noise_of_some(er.load_scene("headset"), 4).glint_px.shape
+    (1, 8)
+    """
     dimmer = [
         replace(light, intensity_mw_sr=light.intensity_mw_sr * count / len(scene.rig.lights))
         for light in scene.rig.lights
@@ -104,6 +112,10 @@ def joined(parts: list[SiteInformation]) -> SiteInformation:
 
 def choose_lights(known: SiteInformation, count: int) -> tuple[int, ...]:
     """Choose LEDs: add the best one repeatedly, then exchange single LEDs while that improves the choice.
+
+    >>> known = er.design.site_information(er.load_scene("headset").frames())
+    >>> er.design.choose_lights(known, 4)
+    (0, 2, 5, 7)
 
     Args:
         known: information that each LED adds.

@@ -180,6 +180,11 @@ def fit_eye(
 ) -> tuple[EyeFit, ...]:
     """Fit the gaze of every frame, and the eye, to features; one fit for each observed eye.
 
+    >>> scene = er.load_scene("guestrin2006")
+    >>> right, left = er.fit_eye(er.trace(scene), scene.rig, er.Unknowns(corneal_radius_mm=0.25))
+    >>> right.eye, right.dof > 0
+    ('right', True)
+
     Args:
         observations: observations of any observer, or of a table, each with the approximate position of its eye.
         rig: the rig that observed them.

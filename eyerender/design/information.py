@@ -207,6 +207,9 @@ def information(
 ) -> Information:
     """Compute the Fisher information of a rig about gaze and eye, and its inverse, equation (3).
 
+    >>> er.information(er.load_scene("guestrin2006").frames())["right"].gaze_deg.shape
+    (45,)
+
     Args:
         frames: the frames; all cameras at one fixation and head position are one instant.
         rig: replaces the rig of the frames.

@@ -80,6 +80,9 @@ def sensor_noise(
 
     The levels are those of the first eye at its reference position, looking straight ahead.
 
+    >>> (er.sensor_noise(er.load_scene("headset")).outline_px < 1).tolist()
+    [True]
+
     Args:
         scene: the scene.
         fixation_deg: noise of fixation.

@@ -104,6 +104,9 @@ def eye_exposure(
 
     Intensities are taken from the rig, so give those of an LED's brightest bin.
 
+    >>> er.design.eye_exposure(er.load_scene("headset").rig, [0, -31.5, 0]).cornea_share < 0.1
+    True
+
     Args:
         rig: the rig, with the duty cycles of its LEDs.
         eye_mm: (3,) corneal apex.

@@ -45,6 +45,9 @@ class Unknowns(Spec):
 
     A prior of a position or of a pair of angles holds for each component. The priors of `Unknowns.population` are
     rounded standard deviations of adults (docs/population.md).
+
+    >>> er.Unknowns.population(kappa_deg="known").kappa_deg
+    'known'
     """
 
     gaze_deg: Knowledge = Field(default="unknown", description="direction of the optic axis, in every frame")

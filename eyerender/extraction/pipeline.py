@@ -49,6 +49,11 @@ def extract(
 ) -> Extraction:
     """Extract the pupil ellipse and the glints from an image.
 
+    >>> y, x = np.mgrid[:240, :320]
+    >>> image = np.where(np.hypot(x - 160, y - 120) < 30, 20, 120).astype(np.uint8)
+    >>> er.extract(image).pupil.ellipse.centre_px.round(1).tolist()
+    [160.0, 120.0]
+
     Args:
         image: (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats. A colour
             image (h, w, 3 or 4; red first) is converted to luminance, with a warning.

@@ -18,6 +18,9 @@ class ExtractionSettings(Spec):
     """Settings of `extract`.
 
     No setting is tuned to a data set: thresholds adapt to the noise and contrast of the image.
+
+    >>> er.ExtractionSettings(method="fast").method
+    'fast'
     """
 
     method: Literal["fast", "refined"] = Field(

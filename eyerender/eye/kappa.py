@@ -42,6 +42,9 @@ def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
 def kappa_deg(eye: EyeModel) -> tuple[float, float]:
     """Compute the angles (horizontal, vertical) from the pupillary axis to the line of sight, nasal and up, in degrees.
 
+    >>> np.round(er.eye.kappa_deg(er.load_eye("E4").build()), 2).tolist()
+    [5.45, 2.5]
+
     Raises:
         InputError: the cornea has no pupillary axis.
     """
@@ -78,6 +81,9 @@ def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
 
 def with_kappa(spec: EyeSpec, wanted_deg: tuple[float, float], *, wavelength_nm: float = 850.0) -> EyeSpec:
     """Copy an eye file with the fovea moved so that the eye has a given angle kappa (see `kappa_deg`).
+
+    >>> er.eye.with_kappa(er.load_eye("E2"), (5.0, 1.0)).name
+    'E2'
 
     Args:
         spec: the eye.

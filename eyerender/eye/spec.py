@@ -17,7 +17,11 @@ from .topography import with_topographies
 
 
 class EyeSpec(EyeParts):
-    """A right eye whose geometry is possible."""
+    """A right eye whose geometry is possible.
+
+    >>> er.load_eye("E4").build().name
+    'E4'
+    """
 
     @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -337,6 +337,9 @@ class ImageFolder:
 
     Metadata is read when an entry is requested. In an unfinished run, only the images of finished shards are included;
     `unfinished` then describes how many, and is empty otherwise.
+
+    >>> folder = er.ImageFolder.load("out")  # doctest: +SKIP
+    >>> [entry.image().mean() for entry in folder]  # doctest: +SKIP
     """
 
     path: Path

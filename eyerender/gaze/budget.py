@@ -132,6 +132,11 @@ def budget(
 ) -> ErrorBudget:
     """Split the gaze error by cause.
 
+    >>> scene = er.load_scene("guestrin2006")
+    >>> steps = er.budget_steps(scene.frames()[:18], images=False)
+    >>> len(er.gaze.budget(steps, scene.rig, er.gaze.Regression("R3")).causes)
+    3
+
     Args:
         steps: cause -> observations of the same frames with this cause and all earlier ones, or several observations
             that differ by random noise alone. The first step's name is that of its features; its cause is the

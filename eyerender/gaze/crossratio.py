@@ -34,6 +34,9 @@ class _EyeAlphas(Spec):
 class CrossRatio(BuiltIn):
     """Cross-ratio estimator.
 
+    >>> er.gaze.CrossRatio(corners=(0, 1, 2, 3), at_camera=4).at_camera
+    4
+
     Args:
         corners: the four lights at the screen's corners, in order around it.
         at_camera: the light at the camera.

@@ -31,6 +31,12 @@ class DirectionRegression(PolynomialEstimator):
 
     The rays start at the eye's place, the apex of the unrotated cornea.
 
+    >>> scene = er.load_scene("guestrin2006")
+    >>> seen = er.trace(scene)
+    >>> fitted = er.gaze.DirectionRegression().fit(seen, scene.rig)
+    >>> fitted.predict_rays(seen, scene.rig).direction.shape
+    (90, 3)
+
     Args:
         function: R1 to R12 of Table 2, or the terms of azimuth and of elevation.
         feature: "pupil-glint", the vector from the mean of the glints to the pupil, or "pupil", its centre alone.

@@ -26,7 +26,11 @@ from .rays import is_none
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GazePoints(ArrayValue):
-    """Estimated gaze points (n, 3) mm in the world, NaN where `status` (n,) is not OK; `reason` explains why."""
+    """Estimated gaze points (n, 3) mm in the world, NaN where `status` (n,) is not OK; `reason` explains why.
+
+    >>> er.gaze.GazePoints.of([[650, 10, 20]]).point_mm.tolist()
+    [[650.0, 10.0, 20.0]]
+    """
 
     point_mm: Floats
     status: Statuses
@@ -138,6 +142,13 @@ def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Obs
     """Average both eyes' gaze points of each frame; also return the row of each frame's first observation.
 
     A frame in which either eye is missing has no binocular estimate: the mean of one eye would be biased towards it.
+
+    >>> scene = er.load_scene("guestrin2006")
+    >>> seen = er.trace(scene)
+    >>> fitted = er.gaze.GuestrinEizenman().fit(seen, scene.rig)
+    >>> frames, both = er.gaze.binocular_average(seen, fitted.predict(seen, scene.rig))
+    >>> len(seen), len(both.point_mm)
+    (90, 45)
     """
     frames, first, which = np.unique(observations.index.frame, return_index=True, return_inverse=True)
     reason = np.full(len(frames), None, dtype=object)
@@ -152,7 +163,14 @@ def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Obs
 
 
 def ray_errors_deg(observations: Observations, rays: GazeRays) -> Floats:
-    """Compute the angle (n,), degrees, between each ray and the line from its origin to the target; NaN if unknown."""
+    """Compute the angle (n,), degrees, between each ray and the line from its origin to the target; NaN if unknown.
+
+    >>> scene = er.load_scene("guestrin2006")
+    >>> seen = er.trace(scene)
+    >>> rays = er.gaze.GuestrinEizenman().fit(seen, scene.rig).predict_rays(seen, scene.rig)
+    >>> bool(er.gaze.ray_errors_deg(seen, rays).max() < 1)
+    True
+    """
     return angular_error_deg(rays.origin_mm + rays.direction, observations.index.target_mm, rays.origin_mm)
 
 
@@ -160,6 +178,9 @@ def angular_error_deg(point_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayL
     """Compute the angle (n,) in degrees, seen from `from_mm`, between estimate and target; arguments (n, 3) or (3,) mm.
 
     It uses atan2 of cross and dot product, which is accurate at small angles where arccos is not.
+
+    >>> float(er.gaze.angular_error_deg([0, 0, 0], [0, 10, 0], [600, 0, 0]).round(3))
+    0.955
     """
     a = np.asarray(point_mm, dtype=float) - np.asarray(from_mm, dtype=float)
     b = np.asarray(target_mm, dtype=float) - np.asarray(from_mm, dtype=float)

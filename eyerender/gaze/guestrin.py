@@ -53,6 +53,12 @@ class GuestrinEizenman(BuiltIn):
 
     A subclass may define another visual axis (`turned`) or another search (`search`).
 
+    >>> scene = er.load_scene("guestrin2006")
+    >>> seen = er.trace(scene)
+    >>> fitted = er.gaze.GuestrinEizenman().fit(seen, scene.rig)
+    >>> fitted.predict(seen, scene.rig).point_mm.shape
+    (90, 3)
+
     Args:
         lights: lights whose glints are used; None: all of the rig's.
         centre: "all_glints" (method A, the source's own) or "plane" (method B, the first light's mirror condition).

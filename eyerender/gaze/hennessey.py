@@ -26,6 +26,12 @@ from .recalibration import Recalibrated, Recalibration
 class Hennessey(Recalibrated):
     """Optic axis of an assumed eye, corrected by a polynomial.
 
+    >>> scene = er.load_scene("guestrin2006")
+    >>> seen = er.trace(scene)
+    >>> fitted = er.gaze.Hennessey().fit(seen, scene.rig)
+    >>> fitted.predict(seen, scene.rig).point_mm.shape
+    (90, 3)
+
     Args:
         parameters: the assumed eye; its alpha and beta are not used.
         recalibration: "angle", "screen" or "none".

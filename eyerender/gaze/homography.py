@@ -39,6 +39,9 @@ class _EyeHomography(Spec):
 class Homography(BuiltIn):
     """Map the pupil centre to the screen after normalising it by four glints.
 
+    >>> er.gaze.Homography(lights=(0, 1, 2, 3)).lights
+    (0, 1, 2, 3)
+
     Args:
         lights: the four lights in the order top left, top right, bottom right, bottom left.
         conditioned: scale and centre the points before the calibration's transform is solved (Hartley 1997). False is

@@ -40,6 +40,12 @@ class _EyePerson(Spec):
 class MaximumLikelihood(BuiltIn):
     """Estimate gaze by fitting an eye model to the features of every frame.
 
+    >>> scene = er.load_scene("guestrin2006")
+    >>> seen = er.trace(scene.frames()[:6])
+    >>> fitted = er.gaze.MaximumLikelihood().fit(seen, scene.rig)
+    >>> fitted.predict(seen, scene.rig).point_mm.shape
+    (6, 3)
+
     Args:
         eye: name of the eye model from which the fits start.
         slippage_mm: standard deviation of the eye's position in a frame about the one in the record; 0: it is exact.

@@ -40,6 +40,8 @@ def load_observations(
 ) -> tuple[Observations, RigGeometry]:
     """Load observations and their rig from a file of records, or from a table.
 
+    >>> seen, rig = er.gaze.load_observations("recording.csv", rig="rig.yaml")  # doctest: +SKIP
+
     Args:
         path: JSON as `features` writes it, which includes the rig; JSONL with one record a line; or a table (.csv or
             .tsv, see `observations_from_csv`).
@@ -80,6 +82,8 @@ class RigFile(FileSpec, Rig):
 
 def load_rig(path: str | Path) -> RigGeometry:
     """Read the rig of a scene (a file, or the name of a shipped one) or of a rig file.
+
+    >>> rig = er.gaze.load_rig("rig.yaml")  # doctest: +SKIP
 
     Raises:
         InputError: naming the file and the key.

@@ -134,6 +134,12 @@ class PolynomialEstimator(BuiltIn):
 class Regression(PolynomialEstimator):
     """Polynomial regression on the vector from one light's glint to the pupil.
 
+    >>> scene = er.load_scene("blignaut2014")
+    >>> seen = er.trace(scene)
+    >>> fitted = er.gaze.Regression("R3").fit(seen, scene.rig)
+    >>> fitted.predict(seen, scene.rig).point_mm.shape
+    (270, 3)
+
     Args:
         function: R1 to R12 of Table 2, or the terms of x and y, as ("x + y + 1", "x + y2 + 1").
         light: the light whose glint is used.

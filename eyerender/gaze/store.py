@@ -108,6 +108,8 @@ def save_estimator(path: str | Path, estimator: GazeEstimator, rig: RigLike | No
 
     A user's own class must follow `StoredEstimator` and be importable, because the file names it as `module:Class`.
 
+    >>> er.gaze.save_estimator("me.json", fitted, scene.rig)  # doctest: +SKIP
+
     Raises:
         InputError: the estimator has options that a file cannot store, or its class cannot be stored.
         EyerenderError: the file cannot be written.
@@ -128,7 +130,10 @@ def _stored(estimator: GazeEstimator) -> dict[str, Any]:
 
 
 def load_estimator(path: str | Path, own: str | None = None) -> GazeEstimator:
-    """Read a calibration file and return its estimator; see `load_calibration`."""
+    """Read a calibration file and return its estimator; see `load_calibration`.
+
+    >>> fitted = er.gaze.load_estimator("me.json")  # doctest: +SKIP
+    """
     return load_calibration(path, own)[0]
 
 

@@ -52,6 +52,8 @@ def observations_from_csv(
 ) -> Observations:
     """Read a table of pupils, glints and targets.
 
+    >>> seen = er.gaze.observations_from_csv("recording.csv", rig=rig)  # doctest: +SKIP
+
     Args:
         path: the table (CSV with a header; commas, semicolons or tabs). An empty cell is a missing value.
         columns: meaning of columns that are not recognised by name: `CsvColumns`, a mapping of its keys or its YAML

@@ -33,6 +33,9 @@ class ShihWuLiu(Recalibrated):
 
     Observations of the two cameras are paired by head position, fixation and eye; both get the same estimate.
 
+    >>> er.gaze.ShihWuLiu(cameras=(0, 1)).cameras
+    (0, 1)
+
     Args:
         recalibration: "angle", "screen" or "none".
         cameras: the two cameras.

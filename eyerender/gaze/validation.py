@@ -54,6 +54,10 @@ def leave_one_target_out(estimator: GazeEstimator, observations: Observations, r
 
     Residuals at the calibration targets themselves would favour estimators with many terms.
 
+    >>> scene = er.load_scene("blignaut2014")
+    >>> er.gaze.leave_one_target_out(er.gaze.Regression("R3"), er.trace(scene), scene.rig).mean_deg < 1
+    True
+
     Raises:
         InputError: there are no targets, or too few to calibrate on.
     """
@@ -82,7 +86,14 @@ def leave_one_target_out(estimator: GazeEstimator, observations: Observations, r
 
 
 def gaze_errors(observations: Observations, gaze: GazePoints) -> GazeErrors:
-    """Compute binocular errors of gaze points (n) of observations (n): the mean of both eyes against the target."""
+    """Compute binocular errors of gaze points (n) of observations (n): the mean of both eyes against the target.
+
+    >>> scene = er.load_scene("guestrin2006")
+    >>> seen = er.trace(scene)
+    >>> fitted = er.gaze.GuestrinEizenman().fit(seen, scene.rig)
+    >>> er.gaze.gaze_errors(seen, fitted.predict(seen, scene.rig)).mean_deg < 1
+    True
+    """
     frames, both = binocular_average(observations, gaze)
     index = frames.index
     error = angular_error_deg(both.point_mm, index.target_mm, index.head_mm)

@@ -36,6 +36,9 @@ MAX_SAMPLES = 10**12
 class EyeImage:
     """A rendered image of one eye: a window of a camera's sensor.
 
+    >>> image = er.render(er.load_scene("headset").frames()[0])  # doctest: +SKIP
+    >>> image.counts.shape  # doctest: +SKIP
+
     Attributes:
         frame: the row of `Frames` that it shows.
         row: index of that row among the rendered frames.
@@ -86,6 +89,8 @@ def render_windows(
     progress: Progress | None = None,
 ) -> Iterator[EyeImage]:
     """Render every row of `frames` in its own window, in order.
+
+    >>> windows = list(er.render_windows(er.load_scene("headset")))  # doctest: +SKIP
 
     Args:
         frames: n rows, one eye in one frame each, or a scene for all of its frames.

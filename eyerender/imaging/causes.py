@@ -51,6 +51,10 @@ def budget_steps(
 
     Every image is rendered once and exposed again for each seed.
 
+    >>> steps = er.budget_steps(er.load_scene("guestrin2006").frames(), images=False)
+    >>> list(steps)
+    ['estimator', 'eye model', 'optics']
+
     Args:
         frames: frames with targets.
         reference: eye model with whose features the estimator's own error is computed.

@@ -59,6 +59,11 @@ class Comparison:
     The gaze errors are None if the scene allows none, for the reason `gaze_reason`. With several subjects, each is
     calibrated separately: `subjects` are their numbers, `subject_errors` the errors of each, by observer, and
     `gaze_truth` and `gaze_found` those of all who can be calibrated.
+
+    >>> frames = er.load_scene("guestrin2006").frames()[:18]
+    >>> seen = er.trace(frames)
+    >>> er.compare(seen, seen, frames.scene.rig, er.gaze.Regression("R3")).gaze_found.mean_deg < 1
+    True
     """
 
     truth: Observations
@@ -187,6 +192,11 @@ def compare(
     subjects: Ints | None = None,
 ) -> Comparison:
     """Compare two observers on the same frames, in features and in gaze.
+
+    >>> frames = er.load_scene("guestrin2006").frames()[:18]
+    >>> seen = er.trace(frames)
+    >>> er.compare(seen, seen, frames.scene.rig, er.gaze.Regression("R3")).gaze_truth.mean_deg < 1
+    True
 
     Args:
         truth: the reference, such as observations of the analytic observer.

@@ -32,6 +32,8 @@ def render_folder(
 ) -> dict[str, Any]:
     """Render a scene into a folder of labelled images (docs/formats.md); on an error, nothing is left.
 
+    >>> er.render_folder(er.load_scene("headset"), "out")  # doctest: +SKIP
+
     Args:
         scene: the scene.
         path: the folder to write.
@@ -101,6 +103,8 @@ def export_scene(
     scene: Scene, path: str | Path, *, frame: int = 0, side: str | None = None, spp: int = 64, overwrite: bool = False
 ) -> dict[str, Any]:
     """Write one frame as PLY meshes and a Mitsuba XML file, which the stock `mitsuba` command renders directly.
+
+    >>> er.export_scene(er.load_scene("headset"), "exported")  # doctest: +SKIP
 
     Args:
         scene: the scene.

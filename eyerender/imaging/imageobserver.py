@@ -45,6 +45,8 @@ LEAST_FOR_POOL = 128
 class ImageObserver:
     """Observer of pixels: extracts pupil ellipse and glints; it never uses the truth.
 
+    >>> er.ImageObserver(spp=16).observe(er.load_scene("headset")).pupil.ok.all()  # doctest: +SKIP
+
     Args:
         settings: settings of the extractor; if the rig is known, the range of pupil sizes is narrowed.
         gamma: encoding gamma of the images; 1 is linear.
@@ -285,6 +287,9 @@ def detect(
     images: EyeImage | Iterable[EyeImage], rig: RigLike | None = None, *, settings: ExtractionSettings | None = None
 ) -> Observations:
     """Extract pupils and glints from rendered images, one row for each.
+
+    >>> scene = er.load_scene("headset")  # doctest: +SKIP
+    >>> er.detect(er.render(scene), scene.rig).pupil.ok  # doctest: +SKIP
 
     Args:
         images: images from `render`; their labels are not used.

@@ -34,6 +34,9 @@ _renderer = lru_cache(maxsize=1)(make_renderer)
 class LabelledImage(EyeImage):
     """A rendered image of one eye with its labels.
 
+    >>> image = er.render(er.load_scene("headset").frames()[0])  # doctest: +SKIP
+    >>> image.irradiance.max()  # doctest: +SKIP
+
     Attributes:
         labels: labels as in a dataset (docs/formats.md): pupil, iris, glints, lids, points in space.
     """
@@ -66,6 +69,8 @@ def render(
     **picture: Any,
 ) -> LabelledImage | list[LabelledImage]:
     """Render frames in memory, one window per eye.
+
+    >>> image = er.render(er.load_scene("headset").frames()[0], spp=64)  # doctest: +SKIP
 
     Args:
         frames: one frame (`frames[0]`), several, or a scene for all of its frames.
@@ -115,6 +120,8 @@ def auto_exposed(
     The exposure time is chosen so that the share `share` of pixels is at most `level` of full scale (linear, black
     level included). It is measured on a few evenly chosen frames, rendered with few samples. Frames around the view do
     not count.
+
+    >>> er.auto_exposed(er.load_scene("headset"), level=0.7).spec.sensor.exposure_s  # doctest: +SKIP
 
     Args:
         scene: the scene.

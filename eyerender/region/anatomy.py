@@ -169,7 +169,11 @@ class TearFilm(Spec):
 
 
 class Region(Spec):
-    """The eye region of one subject. Without this key, a scene shows the bare eye in front of a matte background."""
+    """The eye region of one subject. Without this key, a scene shows the bare eye in front of a matte background.
+
+    >>> er.Region(blink=0.3).blink
+    0.3
+    """
 
     fissure: Fissure = Field(default=Fissure(), description="the opening between the lids")
     lids: Lid = Field(default=Lid(), description="shape and movement of the lids")

@@ -69,7 +69,11 @@ class Scattering(Spec):
 
 
 class Look(Spec):
-    """Albedos (diffuse reflectance, 0 to 1) and textures; contrast 0 is a uniform surface, 1 the natural texture."""
+    """Albedos (diffuse reflectance, 0 to 1) and textures; contrast 0 is a uniform surface, 1 the natural texture.
+
+    >>> er.Look(iris_albedo=0.2).iris_albedo
+    0.2
+    """
 
     iris_albedo: Albedo = Field(
         default=0.36,

@@ -29,7 +29,10 @@ class Timing:
 def write_report(
     path: Path, scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry], timings: Sequence[Timing] = ()
 ) -> None:
-    """Write one self-contained HTML file."""
+    """Write one self-contained HTML file.
+
+    >>> er.write_report("report.html", scene, er.apps.compare_folder("out")[0], [])  # doctest: +SKIP
+    """
     values = {
         "scene": scene.spec,
         "scene_yaml": scene.spec.to_yaml(),

@@ -104,7 +104,12 @@ class Mirror(Spec):
 
 
 class Camera(Spec):
-    """A camera, given by position, direction and focal length, or by `calibration`."""
+    """A camera, given by position, direction and focal length, or by `calibration`.
+
+    >>> camera = er.Camera.looking_at((0, 0, 0), position_mm=(600, 0, -150), focal_length_px=4000, size_px=(640, 480))
+    >>> camera.build().project([0.0, 0.0, 0.0])
+    (array([319.5, 239.5]), np.True_)
+    """
 
     name: str = Field(default="camera", description="name of the camera, for records and reports")
     resolution_px: tuple[Pixels, Pixels] = Field(description="sensor width and height")

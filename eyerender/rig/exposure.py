@@ -31,7 +31,11 @@ def radiance_to_irradiance(sensor: Sensor) -> float:
 
 
 def electrons(sensor: Sensor, irradiance: Floats, wavelength_nm: float) -> Floats:
-    """Compute the mean number of photo-electrons of a pixel: eta E A t lambda / (h c)."""
+    """Compute the mean number of photo-electrons of a pixel: eta E A t lambda / (h c).
+
+    >>> er.rig.electrons(er.Sensor(), np.full((1, 1), 0.01), 850.0).shape
+    (1, 1)
+    """
     energy_j = (sensor.pixel_pitch_um * 1e-6) ** 2 * sensor.exposure_ms * 1e-3
     photon_j = _PLANCK_J_S * _LIGHT_M_S / (wavelength_nm * 1e-9)
     return np.asarray(irradiance * (sensor.quantum_efficiency * energy_j / photon_j))
@@ -45,6 +49,9 @@ def expose(
     The noise of a pixel is a pure function of `seed`, position and mean. So two scenes have the same noise wherever
     their irradiance agrees, and a rounding difference in one pixel does not change the noise of others. The fixed
     pattern belongs to the sensor's pixels, so it stays where it is while a window moves.
+
+    >>> er.rig.expose(er.Sensor(), np.full((2, 2), 0.01), 850.0, seed=1).dtype
+    dtype('uint16')
 
     Args:
         sensor: the sensor.

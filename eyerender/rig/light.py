@@ -33,7 +33,11 @@ Aim = Annotated[
 
 
 class LedRing(Spec):
-    """LEDs evenly spaced on a circle about a camera's axis, in the plane of its nodal point."""
+    """LEDs evenly spaced on a circle about a camera's axis, in the plane of its nodal point.
+
+    >>> er.Led(ring=er.rig.LedRing(radius_mm=20, count=6)).ring.count
+    6
+    """
 
     camera: Annotated[int, Field(ge=0)] = Field(default=0, description="the camera that the ring surrounds")
     radius_mm: Positive = Field(description="radius of the circle")
@@ -44,7 +48,11 @@ class LedRing(Spec):
 
 
 class Led(Spec):
-    """One LED at `position_mm`, or a `ring` of equal LEDs."""
+    """One LED at `position_mm`, or a `ring` of equal LEDs.
+
+    >>> er.Led((600, 120, 0)).radius_mm
+    0.0
+    """
 
     POSITIONAL: ClassVar[tuple[str, ...]] = ("position_mm",)
     if TYPE_CHECKING:

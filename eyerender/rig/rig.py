@@ -23,7 +23,12 @@ MAX_CAMERAS = 100
 
 
 class Rig(Spec):
-    """The hardware in front of the subject; it does not move with the head."""
+    """The hardware in front of the subject; it does not move with the head.
+
+    >>> camera = er.Camera.looking_at((0, 0, 0), position_mm=(600, 0, -150), focal_length_px=4000, size_px=(640, 480))
+    >>> er.Rig(cameras=[camera], lights=[er.Led((600, 120, 0))]).build().cameras[0].resolution_px
+    (640, 480)
+    """
 
     cameras: Annotated[tuple[Camera, ...], Field(min_length=1, max_length=MAX_CAMERAS)] = Field(
         description="the cameras; each takes frames of its own"

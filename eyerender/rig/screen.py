@@ -14,7 +14,11 @@ from ..base.spec import Positive, Spec, Vec3
 
 
 class Screen(Spec):
-    """A screen, given by its centre and size."""
+    """A screen, given by its centre and size.
+
+    >>> er.Screen((650, 0, 0), (377, 301)).grid(3, 3).shape
+    (9, 3)
+    """
 
     POSITIONAL: ClassVar[tuple[str, ...]] = ("centre_mm", "size_mm")
     if TYPE_CHECKING:

@@ -26,7 +26,11 @@ Border = Annotated[int, Field(ge=0, le=4096)]
 
 
 class Sensor(Spec):
-    """Sensor, exposure and lens aperture of a camera; `gain_dn_per_e` defaults to full scale at 98 % of the well."""
+    """Sensor, exposure and lens aperture of a camera; `gain_dn_per_e` defaults to full scale at 98 % of the well.
+
+    >>> er.Sensor(bit_depth=12).bit_depth
+    12
+    """
 
     f_number: Positive = Field(default=2.0, description="working f-number: image distance over aperture diameter")
     pixel_pitch_um: Positive = Field(default=2.8, description="side of a square pixel")

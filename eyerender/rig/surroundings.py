@@ -25,6 +25,9 @@ def paint(place: str, seed: int, rows: int = 256) -> Floats:
 
     The first row is up, +x is in the middle of a row, and the row continues to the subject's right.
 
+    >>> er.rig.paint("office", 1, rows=16).shape
+    (16, 32)
+
     Args:
         place: office, car or outdoors.
         seed: selects windows, buildings, trees and clouds.

@@ -148,7 +148,12 @@ class GlintFeatures(Columns):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Observations(ArrayValue):
-    """A batch of observations, in frame order and with the right eye first within a frame."""
+    """A batch of observations, in frame order and with the right eye first within a frame.
+
+    >>> seen = er.trace(er.load_scene("headset"))
+    >>> len(seen), next(seen.records())["pupil"]["status"]
+    (9, 'ok')
+    """
 
     index: Index
     pose: PoseTruth

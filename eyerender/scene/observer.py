@@ -10,7 +10,11 @@ from .scene import Frames
 
 
 class Observer(Protocol):
-    """A class that reports the pupils and glints of frames: `AnalyticObserver`, `ImageObserver`, or your own."""
+    """A class that reports the pupils and glints of frames: `AnalyticObserver`, `ImageObserver`, or your own.
+
+    >>> hasattr(er.AnalyticObserver(), "observe")
+    True
+    """
 
     def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
         """Report one observation for each row of `frames`; `rig` replaces the rig of the frames."""

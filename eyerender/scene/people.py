@@ -19,7 +19,11 @@ CHUNK = 4096
 
 
 class Population(PopulationSpec):
-    """A population: one of the table's presets, with changed distributions and conditions."""
+    """A population: one of the table's presets, with changed distributions and conditions.
+
+    >>> len(er.Population("myopes").draw(3, seed=1))
+    3
+    """
 
     POSITIONAL: ClassVar[tuple[str, ...]] = ("preset",)
     if TYPE_CHECKING:

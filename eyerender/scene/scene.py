@@ -63,6 +63,10 @@ class Frames(ArrayValue):
 
     A row is one eye in one frame (an exposure of one camera). `index` (n rows) gives its eye, camera and target, and
     `pose` (n rows) the pose of the eye.
+
+    >>> frames = er.load_scene("guestrin2006").frames()
+    >>> len(frames), len(frames[:4])
+    (90, 4)
     """
 
     scene: Scene
@@ -124,7 +128,11 @@ def as_frames(frames: Frames | Scene) -> Frames:
 
 
 class Frame(Frames):
-    """One row of `Frames`: one eye in one frame."""
+    """One row of `Frames`: one eye in one frame.
+
+    >>> er.load_scene("headset").frames()[0].pose.azimuth_rad.round(3).tolist()
+    [0.349]
+    """
 
     __slots__ = ()
 
@@ -132,6 +140,10 @@ class Frame(Frames):
 @dataclass(frozen=True, slots=True, init=False)
 class Scene:
     """A scene ready to be observed: what the scene's file says, the eye's spec and the numeric rig.
+
+    >>> scene = er.load_scene("headset").with_(pupil_diameter_mm=3)
+    >>> len(scene.frames())
+    9
 
     Attributes:
         spec: what a scene file says.

@@ -13,7 +13,11 @@ from .spec import DATASET_KIND, NOT_A_SCENE, SceneSpec, Surfaces
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Return the scenes that come with the package, as a mapping from name to file."""
+    """Return the scenes that come with the package, as a mapping from name to file.
+
+    >>> "headset" in er.shipped_scenes()
+    True
+    """
     return {name: path for name, path in shipped_files().items() if not is_shipped_dataset(path)}
 
 
@@ -61,6 +65,9 @@ def load_scene(
     surfaces: Surfaces | None = None,
 ) -> Scene:
     """Load a scene from a file, or by the bare name of a shipped one.
+
+    >>> len(er.load_scene("headset").rig.lights)
+    8
 
     Args:
         scene: path of a YAML file, or a shipped scene's name.

@@ -39,7 +39,11 @@ Model = Annotated[
 
 
 class Eye(Spec):
-    """The eye model and its settings."""
+    """The eye model and its settings.
+
+    >>> er.Eye.load("E4", pupil_diameter_mm=4.0).build("left").side
+    'left'
+    """
 
     POSITIONAL: ClassVar[tuple[str, ...]] = ("model",)
     if TYPE_CHECKING:
@@ -138,7 +142,11 @@ class SubjectSpec(Spec):
 
 
 class Targets(Spec):
-    """Fixation targets: a grid up to the screen's edges, points on the screen, or points in the world."""
+    """Fixation targets: a grid up to the screen's edges, points on the screen, or points in the world.
+
+    >>> er.Targets(grid=(3, 3)).grid
+    (3, 3)
+    """
 
     grid: tuple[Count, Count] | None = Field(default=None, description="columns and rows")
     screen_mm: Annotated[tuple[Vec2, ...], Field(min_length=1)] | None = Field(
@@ -161,7 +169,11 @@ class Targets(Spec):
 
 
 class EyeDirection(Spec):
-    """Direction of an eye's optic axis, without a target; torsion follows Listing's law."""
+    """Direction of an eye's optic axis, without a target; torsion follows Listing's law.
+
+    >>> er.EyeDirection.listed([[10, -5], [0, 0]])[0].azimuth_deg
+    10.0
+    """
 
     azimuth_deg: Annotated[float, Field(gt=-90, lt=90)] = Field(
         description="azimuth of the optic axis, from +x to the subject's left"
@@ -181,7 +193,11 @@ Surfaces = Literal["exact", "mesh"]
 
 
 class Picture(Spec):
-    """The rendered part of the sensor, and the number of samples."""
+    """The rendered part of the sensor, and the number of samples.
+
+    >>> er.Picture(window_px=(320, 240), spp=32).spp
+    32
+    """
 
     window_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = Field(
         default=None, description="width and height of one window per eye, centred on it; default: the whole sensor"
@@ -216,7 +232,11 @@ LIFTED = ("eye", "person", "look", "region")
 
 
 class SceneSpec(FileSpec):
-    """Content of a scene file."""
+    """Content of a scene file.
+
+    >>> er.load_scene("headset").spec.format
+    2
+    """
 
     FORMAT: ClassVar[int] = 2
 

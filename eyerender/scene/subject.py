@@ -17,7 +17,11 @@ from .spec import Eye, EyeDirection, SubjectSpec, Targets
 
 
 class Subject(SubjectSpec):
-    """The subject with its eye model. In a scene file, the eye has its own key."""
+    """The subject with its eye model. In a scene file, the eye has its own key.
+
+    >>> er.Subject(er.Eye.load("E2"), ipd_mm=63).ipd_mm
+    63.0
+    """
 
     POSITIONAL: ClassVar[tuple[str, ...]] = ("eye",)
     if TYPE_CHECKING:

@@ -18,6 +18,9 @@ LONGEST_S = 86400.0
 class BenchOptions:
     """Options of a benchmark.
 
+    >>> er.apps.BenchOptions(jobs=2).jobs
+    2
+
     Attributes:
         jobs: Number of extractor processes that run at the same time.
         timeout_s: Seconds that an extractor may take for one image.

@@ -47,6 +47,8 @@ def bench_extractors(
 ) -> dict[str, Any]:
     """Run extractors on a labelled folder; write report.html, results.json, results.csv and times.json.
 
+    >>> er.apps.bench_extractors("out", "bench", ["own-fast"])  # doctest: +SKIP
+
     Args:
         folder: the labelled images.
         output: the folder that receives the results.

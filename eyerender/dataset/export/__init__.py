@@ -65,6 +65,8 @@ def export(
 ) -> dict[str, Any]:
     """Write a generated dataset in another layout; on an error, nothing is left behind.
 
+    >>> er.export("out", "coco", "out_coco")  # doctest: +SKIP
+
     Args:
         path: the dataset's folder.
         format: one of `FORMATS`.

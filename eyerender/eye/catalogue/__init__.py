@@ -32,6 +32,9 @@ def catalogue_files() -> Mapping[str, Path]:
 def load_eye(name_or_path: str | Path) -> EyeSpec:
     """Load an eye of the catalogue by its name, or an eye file.
 
+    >>> er.load_eye("E3").name
+    'E3'
+
     Raises:
         InputError: there is no such name and no such file.
     """
