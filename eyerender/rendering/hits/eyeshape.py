@@ -16,6 +16,7 @@ import numpy as np
 from ..materials.albedo import limbal_radius, opacity, stop_coordinates
 from ..records.frame import Frame
 from ..records.recording import syntax
+from ..records.surfaces import DEVICE
 from .interaction import EPSILON_MM, SurfaceInteraction
 
 _NEAR_MM = 20.0
@@ -122,11 +123,10 @@ class EyeShape:
 def _refract(frame: Frame, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3f) -> None:
     """Refract rays at the cornea and record what they meet; see `EyeShape._through_cornea`."""
     front = frame.surfaces[0]
-    c = -dr.dot(facing, dl)
-    c2 = dr.sqrt(dr.maximum(1 - front.eta * front.eta * (1 - c * c), 0))
-    mirrored = front.mirrored(c, c2)
+    bend = DEVICE.refract(dl, facing, front.eta)
+    mirrored = front.mirrored(bend)
     passed = 1 - mirrored
-    w = front.vector_out(front.eta * dl + (front.eta * c - c2) * facing)
+    w = front.vector_out(mi.Vector3f(*bend.way))
     inside = mi.Vector3f(x)
     reached = mi.Bool(True)
     for surface in frame.surfaces[1:]:

@@ -17,6 +17,7 @@ import mitsuba as mi
 from ...optics.media import TEARS
 from ..records.frame import Frame
 from ..records.recording import syntax
+from ..records.surfaces import DEVICE
 from .eyeshape import EyeShape
 from .interaction import SurfaceInteraction
 from .primary import TriangleHit, region_interaction, segment
@@ -90,7 +91,5 @@ def _refracted(d: mi.Vector3f, normal: mi.Vector3f, eta: mi.Float) -> tuple[mi.V
 
     `eta` is the refractive index in front of the surface over that behind it.
     """
-    c = -dr.dot(normal, d)
-    rest = 1 - eta * eta * (1 - c * c)
-    way = dr.normalize(eta * d + (eta * c - dr.sqrt(dr.maximum(rest, 0))) * normal)
-    return way, (rest > 0) & (c > _LEAST)
+    bend = DEVICE.refract(d, normal, eta)
+    return dr.normalize(mi.Vector3f(*bend.way)), bend.passes & (bend.cosine > _LEAST)

@@ -25,7 +25,9 @@ import numpy as np
 from ...base.arrays import Bools, Floats, Ints
 from ...eye.meshes import Patch, cornea_patches
 from ...eye.model import EyeModel
+from ...optics.formulas import NUMPY
 from ...optics.surfaces import Surface as ExactSurface
+from ...optics.surfaces import components, join
 from ...optics.transforms import normalize
 from ..records.frame import aligned_copy, upload_array
 from ..records.surfaces import Bundle, NormalForm, Surface
@@ -298,16 +300,14 @@ def _unevenness(
 def _tube(out: Floats, x: Floats, N: Floats, n: Floats, normal_slope: Floats, lamp: Floats, node: Floats) -> Floats:
     """Compute the cross section, at the lamp, of a ray tube from the viewpoint per solid angle there, (n,)."""
     s, rest = np.linalg.norm(x - node, axis=1), np.linalg.norm(lamp - x, axis=1)
-    c = -np.sum(N * out, axis=1)
-    w = out + 2 * c[:, None] * N
+    way, normal, inverse = components(out), components(N), 1 / np.linalg.norm(n, axis=1)
+    bend = NUMPY.reflect(way, normal)
     helper = np.where(np.abs(out[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     e1 = normalize(np.cross(out, helper))
     ends = []
     for e in (e1, np.cross(out, e1)):
-        v = s[:, None] * e
-        dy = v + out * (np.sum(N * v, axis=1) / c)[:, None]
-        dn = np.einsum("nij,nj->ni", normal_slope, dy[:, 1:])
-        dN = (dn - N * np.sum(N * dn, axis=1)[:, None]) / np.linalg.norm(n, axis=1)[:, None]
-        dc = -(np.sum(e * N, axis=1) + np.sum(out * dN, axis=1))
-        ends.append(dy + rest[:, None] * (e + 2 * (dc[:, None] * N + c[:, None] * dN)))
-    return np.asarray(np.abs(np.sum(w * np.cross(*ends), axis=1)))
+        dy = NUMPY.slide(components(s[:, None] * e), way, normal, bend.cosine)
+        dn = components(np.einsum("nij,jn->ni", normal_slope, np.stack(dy[1:])))
+        dw = NUMPY.bend_differential(bend, way, normal, inverse, dn, components(e))
+        ends.append(join(dy) + rest[:, None] * join(dw))
+    return np.asarray(np.abs(np.sum(join(bend.way) * np.cross(*ends), axis=1)))

@@ -28,7 +28,7 @@ class Lattice(NamedTuple):
 
     Attributes:
         shape: (R, 1 + Q, cells per mm, cells in a row, 0).
-        table: (n * n * 16,) depth relative to the paraboloid of R: sum_pq a_pq s^p t^q in each cell, with s and t in
+        table: (n * n * 16,) height above the paraboloid of R: sum_pq a_pq s^p t^q in each cell, with s and t in
             [0, 1] along y and z. Cells are stored row by row along z, each as a_00, a_01, ...
     """
 
@@ -58,8 +58,8 @@ def lattice(surface: Measured, limbus_mm: float) -> Lattice:
     inside = np.minimum(rho, reach) / rho
     sag = surface.slopes(inside * y, inside * z)
     beyond: Floats = (1.0 - inside) * (sag.y * y + sag.z * z)
-    depth = -(sag.x + beyond) - 0.5 * curvature * (y * y + z * z)
-    near = np.lib.stride_tricks.sliding_window_view(spline_coefficients(depth), (4, 4))
+    height = sag.x + beyond + 0.5 * curvature * (y * y + z * z)
+    near = np.lib.stride_tricks.sliding_window_view(spline_coefficients(height), (4, 4))
     table = np.einsum("pa,ijab,qb->ijpq", _POWERS, near, _POWERS, optimize=True)
     numbers = (1.0 / curvature, shape, 1.0 / SPACING_MM, float(len(table)), 0.0)
     return Lattice(numbers, table.astype(np.float32).ravel())

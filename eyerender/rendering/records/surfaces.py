@@ -3,12 +3,12 @@
 A surface is given in its own frame, +x outward:
 
     quadric   a.x x^2 + a.y y^2 + a.z z^2 + 2 b x + c = 0, half gradient (a.x x + b, a.y y, a.z z) outward
-    biconic   x + g(y, z) = 0,  g = e / (1 + r),  e = cy y^2 + cz z^2,  r = sqrt(1 - py cy^2 y^2 - pz cz^2 z^2)
-    measured  x + g(y, z) = 0,  g = (y^2 + z^2) / (2 R) + sum_pq a_pq s^p t^q,  a bicubic in each cell
+    biconic   x = h(y, z) as in `optics.formulas`, with k = p / R^2 and p = 1 + Q in both meridians
+    measured  x = h(y, z) = sum_pq a_pq s^p t^q - (y^2 + z^2) / (2 R),  a bicubic in each cell
 
-with c = 1/R > 0 and p = 1 + Q for the biconic's two meridians. A conic has a = (1 + Q, 1, 1), b = R, c = 0. The
-coefficients of a measured surface are data (see `lattice`), so a new surface needs no new kernel. Lengths are in mm.
-The differentials follow Igehy (1999), 'Tracing ray differentials', equations 10-18.
+A conic has a = (1 + Q, 1, 1), b = R, c = 0. The coefficients of a measured surface are data (see `lattice`), so a new
+surface needs no new kernel. Lengths are in mm. Heights, refraction, ray differentials and Fresnel's reflectances are
+the formulas of `optics.formulas`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,22 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from ...optics.formulas import Bend, Jet, Ops, formulas
 from .parameters import Kind
 
 _SETTLED_MM = 0.1
+
+DEVICE = formulas(
+    Ops(
+        sqrt=dr.sqrt,
+        # Beyond the end of a biconic, Newton's method can come back.
+        root=lambda square: dr.sqrt(dr.maximum(square, 1e-4)),
+        maximum=dr.maximum,
+        copysign=lambda size, sign: size,  # normals face the light
+        select=dr.select,
+    )
+)
+"""The formulas of ray optics for Dr.Jit, for normals that face the light."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,9 +85,9 @@ class Surface:
     table: mi.Float | None = None
     film: mi.Float | None = None
 
-    def mirrored(self, c1: mi.Float, c2: mi.Float) -> mi.Float:
-        """Compute the reflectance from the cosines in front of and behind the surface."""
-        return fresnel(c1, c2, self.eta, self.film)
+    def mirrored(self, bend: Bend) -> mi.Float:
+        """Compute the reflectance for a ray that the surface refracts."""
+        return fresnel(bend.cosine, bend.behind, self.eta, self.film)
 
     def point_in(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the eye frame to the surface's frame."""
@@ -130,74 +143,50 @@ class Surface:
         if self.kind == "quadric":
             return t, ok, self.normal(o + t * d)
         t, ok, jet = self._refined(o, d, t, ok, 2 if self.kind == "biconic" else 1)
-        return t, ok, dr.normalize(mi.Vector3f(1, jet[1], jet[2]))
+        return t, ok, dr.normalize(mi.Vector3f(1, -jet.y, -jet.z))
 
     def _refined(
         self, o: mi.Vector3f, d: mi.Vector3f, t: mi.Float, ok: mi.Bool, order: int
-    ) -> tuple[mi.Float, mi.Bool, tuple[mi.Float, ...]]:
-        """Refine the hit on a biconic or measured surface by two Newton steps; return the sag where the second began.
+    ) -> tuple[mi.Float, mi.Bool, Jet]:
+        """Refine the hit on a biconic or measured surface by two Newton steps; return the height where the last began.
 
         The conic of a measured surface lies within 0.1 mm and the first step within 1 um, where the slopes are
         practically exact. For order 2, the slopes are extrapolated to the hit with the second derivatives.
         """
-        value, slope = self._sag_form(o + t * d)
-        t -= value / dr.dot(slope, d)
         x = o + t * d
-        jet = self._sag(x.y, x.z, order)
-        step = (x.x + jet[0]) / (d.x + jet[1] * d.y + jet[2] * d.z)
+        jet = self._height(x.y, x.z)
+        t -= (x.x - jet.x) / (d.x - jet.y * d.y - jet.z * d.z)
+        x = o + t * d
+        jet = self._height(x.y, x.z)
+        step = (x.x - jet.x) / (d.x - jet.y * d.y - jet.z * d.z)
         if order == 2:
-            g, gy, gz, gyy, gyz, gzz = jet
             y, z = step * d.y, step * d.z
-            jet = (g, gy - gyy * y - gyz * z, gz - gyz * y - gzz * z, gyy, gyz, gzz)
+            jet = jet._replace(y=jet.y - jet.yy * y - jet.yz * z, z=jet.z - jet.yz * y - jet.zz * z)
         # A ray that meets the quadric but just misses the surface jumps by centimetres.
         return t - step, ok & (dr.abs(step) < _SETTLED_MM), jet
 
-    def _sag_form(self, x: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
-        """Compute F = x + g(y, z) of a biconic or a measured surface, and its gradient."""
-        g, gy, gz, *_ = self._sag(x.y, x.z, 1)
-        return x.x + g, mi.Vector3f(1, gy, gz)
-
-    def _sag(self, y: mi.Float, z: mi.Float, order: int = 2) -> tuple[mi.Float, ...]:
-        """Compute the sag g and its derivatives by y and z: two first and three second ones, at least up to `order`."""
-        if self.table is not None:
-            return self._spline(self.table, y, z, order)
-        Ry, Rz, py, pz, _ = self.shape
-        cy, cz = 1 / Ry, 1 / Rz
-        e = cy * y * y + cz * z * z
-        by, bz = py * cy * cy * y, pz * cz * cz * z  # half the derivatives of 1 - r^2
-        r = dr.sqrt(dr.maximum(1 - by * y - bz * z, 1e-4))
-        k = 1 / (1 + r)
-        g = e * k
-        ry, rz = -by / r, -bz / r
-        gy, gz = (2 * cy * y - g * ry) * k, (2 * cz * z - g * rz) * k
-        ryy, rzz = -(py * cy * cy + ry * ry) / r, -(pz * cz * cz + rz * rz) / r
-        ryz = -ry * rz / r
-        gyy = (2 * cy - 2 * gy * ry - g * ryy) * k
-        gzz = (2 * cz - 2 * gz * rz - g * rzz) * k
-        gyz = (-gz * ry - gy * rz - g * ryz) * k
-        return g, gy, gz, gyy, gyz, gzz
-
-    def _spline(self, table: mi.Float, y: mi.Float, z: mi.Float, order: int) -> tuple[mi.Float, ...]:
-        """Compute the sag of a measured surface as in `_sag`."""
+    def _height(self, y: mi.Float, z: mi.Float) -> Jet:
+        """Compute the height h(y, z) of a biconic or a measured surface."""
+        if self.table is None:
+            Ry, Rz, py, pz, _ = self.shape
+            cy, cz = 1 / Ry, 1 / Rz
+            jet: Jet = DEVICE.biconic_jet((cy, cz, py * cy * cy, pz * cz * cz), y, z)
+            return jet
         radius, _, density, count, _ = self.shape
         u, v = y * density + 0.5 * count, z * density + 0.5 * count
         i, j = (dr.clip(dr.floor(place), 0, count - 1) for place in (u, v))
-        s, t = u - i, v - j
         cell = 4 * (mi.UInt32(i) * mi.UInt32(count) + mi.UInt32(j))
-        rows = [dr.gather(mi.Vector4f, table, cell + p) for p in range(4)]
-        values = [((c.w * t + c.z) * t + c.y) * t + c.x for c in rows]
+        rows = [dr.gather(mi.Vector4f, self.table, cell + p) for p in range(4)]
+        rise = DEVICE.bicubic_jet(rows, DEVICE.monomials(u - i), DEVICE.monomials(v - j), density)
         bend = 1 / radius
-        g = 0.5 * bend * (y * y + z * z) + _cubic(values, s)
-        if order == 0:
-            return (g,)
-        slopes = [(3 * c.w * t + 2 * c.z) * t + c.y for c in rows]
-        gy, gz = bend * y + density * _slope(values, s), bend * z + density * _cubic(slopes, s)
-        if order == 1:
-            return g, gy, gz
-        bends = [6 * c.w * t + 2 * c.z for c in rows]
-        square = density * density
-        gyy = bend + square * (6 * values[3] * s + 2 * values[2])
-        return g, gy, gz, gyy, square * _slope(slopes, s), bend + square * _cubic(bends, s)
+        return Jet(
+            rise.x - 0.5 * bend * (y * y + z * z),
+            rise.y - bend * y,
+            rise.z - bend * z,
+            rise.yy - bend,
+            rise.yz,
+            rise.zz - bend,
+        )
 
     def normal(self, x: mi.Vector3f) -> mi.Vector3f:
         """Compute the outward unit normal at a point of the surface, in the surface's frame."""
@@ -205,14 +194,15 @@ class Surface:
 
     def _gradient(self, x: mi.Vector3f) -> mi.Vector3f:
         if self.kind != "quadric":
-            return self._sag_form(x)[1]
+            jet = self._height(x.y, x.z)
+            return mi.Vector3f(1, -jet.y, -jet.z)
         ax, ay, az, b, _ = self.shape
         return mi.Vector3f(ax * x.x + b, ay * x.y, az * x.z)
 
     def _normal_form(self, x: mi.Vector3f) -> NormalForm:
         """Compute the normal form at a point of the surface."""
         if self.kind != "quadric":
-            return _form_of(self._sag(x.y, x.z))
+            return _form_of(self._height(x.y, x.z))
         ax, ay, az, *_ = self.shape
         G = self._gradient(x)
         inv = dr.rsqrt(dr.squared_norm(G))
@@ -222,25 +212,23 @@ class Surface:
         """Refract a ray of the eye frame into the eye: hit point, direction behind, transmittance 1 - F, success."""
         ol, dl = self.point_in(o), self.vector_in(d)
         t, ok, N = self.meet(ol, dl)
-        c = -dr.dot(N, dl)
-        c2 = dr.sqrt(dr.maximum(1 - self.eta * self.eta * (1 - c * c), 0))
-        w = self.eta * dl + (self.eta * c - c2) * N
-        return o + t * d, self.vector_out(w), 1 - self.mirrored(c, c2), ok & (c > 0)
+        bend = DEVICE.refract(dl, N, self.eta)
+        return o + t * d, self.vector_out(mi.Vector3f(*bend.way)), 1 - self.mirrored(bend), ok & (bend.cosine > 0)
 
     def on_surface(self, x: mi.Vector3f) -> tuple[mi.Vector3f, NormalForm]:
         """Return the surface point (eye frame) at the local (y, z) of a nearby point, and its form for `bend`."""
         l = self.point_in(x)
         form: NormalForm | None = None
         if self.kind != "quadric":
-            jet = self._sag(l.y, l.z)
-            sag, form = -jet[0], _form_of(jet)
+            jet = self._height(l.y, l.z)
+            height, form = jet.x, _form_of(jet)
         else:
             ax, ay, az, b, c = self.shape
             C = ay * l.y * l.y + az * l.z * l.z + c
-            sag = -C / (b + dr.sqrt(dr.maximum(b * b - ax * C, 1e-3)))
+            height = -C / (b + dr.sqrt(dr.maximum(b * b - ax * C, 1e-3)))
         # In single precision the change must be computed apart from the point, because it is much smaller than the
         # point.
-        point = x + self.vector_out(mi.Vector3f(sag - l.x, 0, 0))
+        point = x + self.vector_out(mi.Vector3f(height - l.x, 0, 0))
         return point, self._normal_form(self.point_in(point)) if form is None else form
 
     def refract_bundle(self, b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
@@ -259,66 +247,36 @@ class Surface:
         """Refract or mirror a bundle whose ray is on the surface: the bundle, its share, cosine of incidence."""
         d = self.vector_in(b.w)
         N, inv, hessian = form
-        c = -dr.dot(N, d)
-        c2 = dr.sqrt(dr.maximum(1 - self.eta * self.eta * (1 - c * c), 1e-6))
-        mirrored = self.mirrored(c, c2)
-        # A mirror is a surface of one index behind which the cosine is the opposite.
-        eta, after = (1.0, -c) if mirror else (self.eta, c2)
-        k = eta * c - after
-        w = eta * d + k * N
-        slope = 2.0 if mirror else eta - eta * eta * c / after
+        refracted = DEVICE.refract(d, N, self.eta, 1e-6)
+        share = self.mirrored(refracted)
+        bend = DEVICE.reflect(d, N) if mirror else refracted
         moved, turned = [], []
-        for v0, e0 in ((b.da, b.wa), (b.db, b.wb)):
-            e, v = self.vector_in(e0), self.vector_in(v0)
-            dy = v + d * (dr.dot(N, v) / c)
-            h = hessian(dy) * inv
-            dN = h - N * dr.dot(N, h)
-            dc = -(dr.dot(e, N) + dr.dot(d, dN))
+        for v, e in ((b.da, b.wa), (b.db, b.wb)):
+            dy = mi.Vector3f(*DEVICE.slide(self.vector_in(v), d, N, bend.cosine))
+            dw = DEVICE.bend_differential(bend, d, N, inv, hessian(dy), self.vector_in(e))
             moved.append(self.vector_out(dy))
-            turned.append(self.vector_out(eta * e + dc * slope * N + k * dN))
-        out = Bundle(y=b.y, w=self.vector_out(w), da=moved[0], db=moved[1], wa=turned[0], wb=turned[1])
-        return out, mirrored if mirror else 1 - mirrored, c
+            turned.append(self.vector_out(mi.Vector3f(*dw)))
+        way = self.vector_out(mi.Vector3f(*bend.way))
+        out = Bundle(y=b.y, w=way, da=moved[0], db=moved[1], wa=turned[0], wb=turned[1])
+        return out, share if mirror else 1 - share, bend.cosine
 
 
-def _form_of(jet: tuple[mi.Float, ...]) -> NormalForm:
-    """Compute the normal form of a graph x + g(y, z) = 0 from g and its derivatives."""
-    _, gy, gz, gyy, gyz, gzz = jet
-    G = mi.Vector3f(1, gy, gz)
+def _form_of(jet: Jet) -> NormalForm:
+    """Compute the normal form of the graph x - h(y, z) = 0 of a height h."""
+    G = mi.Vector3f(1, -jet.y, -jet.z)
     inv = dr.rsqrt(dr.squared_norm(G))
-    return NormalForm(G * inv, inv, lambda v: mi.Vector3f(0, gyy * v.y + gyz * v.z, gyz * v.y + gzz * v.z))
 
+    def hessian(v: mi.Vector3f) -> mi.Vector3f:
+        return mi.Vector3f(0, -jet.yy * v.y - jet.yz * v.z, -jet.yz * v.y - jet.zz * v.z)
 
-def _cubic(c: list[mi.Float], s: mi.Float) -> mi.Float:
-    """Compute cubic c_0 + c_1 s + c_2 s^2 + c_3 s^3."""
-    return ((c[3] * s + c[2]) * s + c[1]) * s + c[0]
-
-
-def _slope(c: list[mi.Float], s: mi.Float) -> mi.Float:
-    """Compute the derivative of `_cubic`."""
-    return (3 * c[3] * s + 2 * c[2]) * s + c[1]
+    return NormalForm(G * inv, inv, hessian)
 
 
 def fresnel(c1: mi.Float, c2: mi.Float, eta: mi.Float, film: mi.Float | None = None) -> mi.Float:
-    """Compute the unpolarised Fresnel reflectance of a dielectric surface, optionally with a film.
+    """Compute the unpolarized reflectance of a surface, optionally with a film (n_before / n_film).
 
-    c1 and c2 are the cosines in front and behind, eta = n_before / n_behind:
-
-    F = (rs^2 + rp^2) / 2,  rs = (eta c1 - c2) / (eta c1 + c2),  rp = (c1 - eta c2) / (c1 + eta c2)   (Born & Wolf 1.5)
-
-    A film (n_before / n_film) has two such interfaces, whose intensities add up as in `optics.interface.fresnel`.
+    c1 and c2 are the cosines in front and behind, eta = n_before / n_behind. Rounding may start a grazing ray behind
+    the surface; a film then mirrors all of it.
     """
-    if film is None:
-        s, p = _polarized(c1, c2, eta)
-        return 0.5 * (s + p)
-    # Rounding may start a grazing ray behind the surface, where two shares above 1 would have a huge sum.
-    c1 = dr.maximum(c1, 0)
-    inside = dr.sqrt(dr.maximum(1 - film * film * (1 - c1 * c1), 0))
-    shares = zip(_polarized(c1, inside, film), _polarized(inside, c2, eta / film), strict=True)
-    s, p = ((a + b - 2 * a * b) / dr.maximum(1 - a * b, 1e-9) for a, b in shares)
+    s, p = DEVICE.fresnel(c1, c2, eta) if film is None else DEVICE.fresnel_film(c1, c2, eta, film)
     return 0.5 * (s + p)
-
-
-def _polarized(c1: mi.Float, c2: mi.Float, eta: mi.Float) -> tuple[mi.Float, mi.Float]:
-    rs = (eta * c1 - c2) / (eta * c1 + c2)
-    rp = (c1 - eta * c2) / (c1 + eta * c2)
-    return rs * rs, rp * rp

@@ -9,9 +9,10 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats, Ints
 from ...eye.meshes import chamber_rim
+from ...optics.formulas import NUMPY
 from ...optics.graphs import distances
 from ...optics.interface import fresnel
-from ...optics.surfaces import Surface, components
+from ...optics.surfaces import Surface, components, join
 from ...optics.surfaces_graph import GraphSurface
 from ...optics.vectors import dots, lengths
 
@@ -255,7 +256,5 @@ def _cross(walls: Walls, rays: _Rays, k: int, *, outwards: bool) -> tuple[_Rays,
 
 def _refract(d: Floats, n: Floats, eta: float) -> Floats:
     """Refract directions at normals that face them; beyond total reflection, return grazing directions."""
-    c = -dots(n, d)
-    c2 = np.sqrt(np.maximum(1 - eta * eta * (1 - c * c), 0))
-    w = eta * d + (eta * c - c2)[:, None] * n
+    w = join(NUMPY.refract(components(d), components(n), eta).way)
     return np.asarray(w / lengths(w)[:, None])
