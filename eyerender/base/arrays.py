@@ -7,10 +7,10 @@ the hash that the dataclass machinery cannot provide (arrays compare element by 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from operator import is_
-from typing import Any, ClassVar, ParamSpec, Self, TypeVar
+from typing import Any, ClassVar, Generic, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -78,6 +78,37 @@ def remembered(function: Callable[_Values, _Result]) -> Callable[_Values, _Resul
     return found  # type: ignore[return-value]
 
 
+class Cache(Generic[_Result]):
+    """Cache of the last `size` results by their keys; by default, for two eyes of a person and those of the next."""
+
+    def __init__(self, size: int = 4) -> None:
+        self._size = size
+        self._known: list[tuple[Any, _Result]] = []
+
+    def get(self, key: Any, make: Callable[[], _Result]) -> _Result:
+        """Return the result for a key; call `make` if it is not cached."""
+        for known, result in self._known:
+            if known == key:
+                return result
+        result = make()
+        self._known = [*self._known, (key, result)][-self._size :]
+        return result
+
+
+_Rows = TypeVar("_Rows")
+
+
+def take_rows(value: _Rows, rows: Any) -> _Rows:
+    """Select rows (indices, a slice or a mask) of every array of a dataclass."""
+    return dataclasses.replace(value, **{f.name: getattr(value, f.name)[rows] for f in dataclasses.fields(value)})  # type: ignore[type-var,arg-type]
+
+
+def join_rows(parts: Sequence[_Rows]) -> _Rows:
+    """Join dataclasses of arrays row by row."""
+    names = [f.name for f in dataclasses.fields(parts[0])]  # type: ignore[arg-type]
+    return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
 class ArrayValue:
     """Mixin for frozen, slotted dataclasses (`eq=False`) that hold arrays: NaN equals NaN, dtype and shape count."""
 
@@ -122,7 +153,7 @@ class Columns(ArrayValue):
 
     def take(self, rows: Any) -> Self:
         """Select rows (indices, a slice or a mask) of every column."""
-        return dataclasses.replace(self, **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})  # type: ignore[type-var,arg-type]
+        return take_rows(self, rows)
 
 
 def column(*axes: int) -> Any:

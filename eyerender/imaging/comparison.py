@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ..base.arrays import ArrayValue, Bools, Floats, Ints, frozen
+from ..base.arrays import ArrayValue, Bools, Floats, Ints, frozen, join_rows
 from ..base.errors import InputError
 from ..gaze.estimate import GazeEstimator
 from ..gaze.regression import Regression
@@ -256,9 +256,7 @@ def _with_fixations(observations: Observations) -> Observations:
 def _joined(errors: Sequence[GazeErrors | None]) -> GazeErrors | None:
     """Join the errors of several subjects, skipping those that have none."""
     known = [one for one in errors if one is not None]
-    if len(known) < 2:
-        return known[0] if known else None
-    return GazeErrors(**{f.name: np.concatenate([getattr(one, f.name) for one in known]) for f in fields(GazeErrors)})
+    return join_rows(known) if known else None
 
 
 def _distances(errors: Floats) -> dict[str, Any]:

@@ -11,11 +11,9 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Singles
 from .glints.splatting import MirrorImages, Shine
-from .integrator.coarsesensor import CoarseSensor
-from .integrator.film import mean_radiance, start
+from .integrator.film import coarse_sensor, mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
-from .integrator.hostdata import HostData
-from .integrator.request import BoundFrame
+from .integrator.hostdata import BoundFrame, HostData
 from .output.geometry import Hits, window_hits
 from .output.labels import PartLabels, highlights, part_labels
 from .output.window import Exposed, RawFrame, RenderedWindow
@@ -95,19 +93,19 @@ class Renderer:
         failed = 0
         glints: list[Sequence[Shine]] = []
         marks: tuple[Any, ...] | None = None
-        around: CoarseSensor | None = None
+        around: Callable[[], Singles] | None = None
         for shot in shots:
             bound, surroundings = self._builder.set(shot, after=None if moments else after)
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
-            film = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
+            means = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
             if shot is shots[len(shots) // 2]:
-                around = CoarseSensor.begin(bound)
+                around = coarse_sensor(bound)
             # The device works until something is read, so host work comes first.
             found = _marks(bound, job, surroundings) if shot.M is job.M and shot.t is job.t else None
             self._builder.prepare()
             mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / count)
             glints.append(shines)
-            mean, missed = film.means()
+            mean, missed = means()
             pictures.append(mean)
             failed += missed
             if found is not None:
@@ -126,7 +124,7 @@ class Renderer:
         )
         return RawFrame(
             job=job, exposed=exposed, blur=blur, mirrored=mirrored, labels=labels, failed=failed,
-            lid_margins_px=margins, highlights=bright, hits=hits, around=None if around is None else around.picture(),
+            lid_margins_px=margins, highlights=bright, hits=hits, around=None if around is None else around(),
         )  # fmt: skip
 
     def _mirror_images(self, host: HostData) -> MirrorImages:

@@ -21,9 +21,9 @@ from ...base.storage.files import parse_json, shown
 from ...folders.imagefolder import DATASET, RESULTS, ImageFolder, shard_name, versions
 from ...imaging.labels import EyeInWindow, known_labels, limbus_px
 from ...region.mesh import lid_margins
-from ...rendering.glints.occlusion import lid_margins_px
 from ...rendering.glints.tracing import GlintScene, glint_table
 from ...rendering.records.job import film_index, globe_of
+from ...rendering.scene.pixels import lid_margins_px
 from ...scene import Frames, Scene
 from ...scene.observation import EYES, Observations
 from ...scene.spec import SceneSpec

@@ -27,48 +27,33 @@ from ...optics.surfaces import Surface, components, join
 from ...optics.trace import Crossing, Traced, trace
 from ...rig.light import Lamp
 from .cutdiscs import Nodes
-from .tracing import GlintScene, Image, disc_points
+from .tracing import Emitters, GlintScene, Image, LightPaths
 
 
 def purkinje_images(
     scene: GlintScene, eye: EyeModel, order: int, lights: Sequence[Lamp], nodes: Sequence[Nodes]
 ) -> list[Image]:
     """Compute the mirror images of order `order` of the lamps, through given points of their discs."""
-    camera, M, t = scene.camera, scene.M, scene.t
-    images = []
     surfaces, indices, rims, passing, gradient = stack(eye, order)
     path = purkinje_path(surfaces, indices, rims, passing, gradient)
-    eyepoint = M.T @ (camera.nodal_point_mm - t)
-    for lamp, node in zip(lights, nodes, strict=True):
-        points = disc_points(lamp, node.point)
-        sources = (points - t) @ M
-        found = purkinje_points(surfaces, indices, rims, passing, sources, eyepoint, gradient)
-        ok = np.asarray(found.status) == Status.OK
-        out = np.where(ok[:, None], -np.asarray(found.directions), np.array([-1.0, 0.0, 0.0]))
-        traced = trace(path, 1.0, np.broadcast_to(eyepoint, out.shape), out)
-        ok &= np.asarray(traced.status) == Status.OK
-        if order > 2:
-            ok &= _through_pupil(eye, traced.points_mm, len(eye.front))
-        rays = ray_tube(path, 1.0, components(eyepoint), components(out), components(sources))
-        tube, towards = rays.cross_section_mm2_sr, join(rays.end)
-        passed = transmittance(path, traced, indices[-1], scene.film_index)
-        leaving = np.maximum(np.einsum("ij,ij->i", -towards, np.broadcast_to(M.T @ lamp.axis, towards.shape)), 0)
-        lobe = leaving ** float(lamp.lobe_exponent) if lamp.lobe_exponent else np.ones_like(leaving)
-        cam = out @ M.T @ camera.R.T
-        ok &= cam[:, 2] > 0
-        z = np.where(ok, cam[:, 2], 1.0)
-        x, y = cam[:, 0] / z, cam[:, 1] / z
-        ok &= camera.is_imaged(x, y)
-        scale = camera.K[0, 0] * camera.K[1, 1] / z**3
-        energy = node.weight * float(lamp.intensity_mw_sr) * lobe * passed * scale / np.where(ok, tube, 1.0)
-        entry, leave = traced.points_mm[-1] @ M.T + t, traced.points_mm[1] @ M.T + t
-        images.append(
-            Image(
-                source_mm=points, entry_mm=entry, exit_mm=leave, xy_px=camera.pixels_of(x, y),
-                energy=np.where(ok, energy, 0.0), there=ok, found=ok,
-            )
-        )  # fmt: skip
-    return images
+    emitters, eyepoint = Emitters.of(lights, nodes), scene.eyepoint
+    sources = (emitters.points - scene.t) @ scene.M
+    points = purkinje_points(surfaces, indices, rims, passing, sources, eyepoint, gradient)
+    ok = np.asarray(points.status) == Status.OK
+    out = np.where(ok[:, None], -np.asarray(points.directions), np.array([-1.0, 0.0, 0.0]))
+    traced = trace(path, 1.0, np.broadcast_to(eyepoint, out.shape), out)
+    ok &= np.asarray(traced.status) == Status.OK
+    if order > 2:
+        ok &= _through_pupil(eye, traced.points_mm, len(eye.front))
+    rays = ray_tube(path, 1.0, components(eyepoint), components(out), components(sources))
+    return scene.pictured(
+        emitters,
+        LightPaths(
+            entry=traced.points_mm[-1], exit=traced.points_mm[1], arrives=-join(rays.end), leaves=-out,
+            passed=transmittance(path, traced, indices[-1], scene.film_index), cross_section=rays.cross_section_mm2_sr,
+            found=ok, there=ok,
+        ),
+    )  # fmt: skip
 
 
 def transmittance(path: Sequence[Crossing], traced: Traced, behind: float, film: float) -> Floats:

@@ -17,11 +17,11 @@ from ..scene.background import Background
 from ..scene.blur import Blur
 from ..scene.region import RegionScene, blockers
 from .cutdiscs import POINT, quadrature
-from .occlusion import glint_reason
 from .purkinje import purkinje_images
 from .tracing import Glint, GlintScene, GlintTable, Image, Images, Spots, glint_table
 
 _FRAMED = "occluded by frame"
+_BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,3 +138,22 @@ def _reason(job: RenderJob, place: Background | RegionScene, glint: Glint) -> st
         to_camera = blockers(place, node - anchor, image.exit_mm - anchor)
         names = [c if c is not None else a for a, c in zip(to_lamp, to_camera, strict=True)]
     return glint_reason(image.there, open_, names)
+
+
+def glint_reason(there: Bools, open_: Bools, blockers: Sequence[str | None]) -> str:
+    """Describe a lamp's mirror image: visible, partly or fully occluded (and mostly by what), or off the cornea.
+
+    Args:
+        there: (k,) whether the cornea mirrors the points of the lamp to the camera.
+        open_: (k,) whether nothing of the scene blocks the point.
+        blockers: (k,) name of the blocking part, None if there is none.
+    """
+    if not np.any(there):
+        return "off the cornea"
+    if np.all(open_[there]):
+        return "visible" if np.all(there) else "partly off the cornea"
+    names = [
+        _BY.get(b, "head") for b, t, o in zip(blockers, there, open_, strict=True) if t and not o and b is not None
+    ]
+    by = max(sorted(set(names)), key=names.count) if names else "head"
+    return f"occluded by {by}" if not np.any(open_[there]) else f"partly occluded by {by}"

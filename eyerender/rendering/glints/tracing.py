@@ -16,15 +16,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import accumulate
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...base.arrays import ArrayValue, Bools, Floats, frozen, remembered
+from ...base.arrays import ArrayValue, Bools, Floats, frozen, join_rows, remembered, take_rows
 from ...base.status import Status
 from ...eye.model import EyeModel
 from ...optics.fermat_kernels import RESIDUAL_LIMIT_MM
@@ -100,19 +99,6 @@ class Image:
         """Return the points that the eye mirrors to the camera."""
         return Spots(frozen(self.xy_px[self.there]), frozen(self.energy[self.there]))
 
-    def join(self, other: Image) -> Image:
-        """Join the points of both images."""
-        return Image(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
-
-    def parts(self, counts: Sequence[int]) -> list[Image]:
-        """Split the image into parts with the given number of points."""
-        columns = {f.name: _split(getattr(self, f.name), counts) for f in fields(self)}
-        return [Image(**{name: part[k] for name, part in columns.items()}) for k in range(len(counts))]
-
-    def last(self, count: int) -> Image:
-        """Return the last points of the image."""
-        return Image(**{f.name: getattr(self, f.name)[-count:] for f in fields(self)})
-
 
 @dataclass(frozen=True, slots=True)
 class Glint:
@@ -176,7 +162,7 @@ class GlintScene:
         if more := [k for k, count in counts.items() if count != _LEAST]:
             finely = self._images_at([lights[k] for k in more], [quadrature(*counts[k]) for k in more])
             for k, image in zip(more, finely, strict=True):
-                images[k] = image.join(images[k].last(_ON_RIM))
+                images[k] = join_rows([image, take_rows(images[k], slice(-_ON_RIM, None))])
         return Images(images, counts)
 
     def glints(self, lights: Sequence[Lamp], images: Images, clear: Visibility) -> list[Glint]:
@@ -196,7 +182,7 @@ class GlintScene:
         R, n = self.camera.R, len(lights)
         steps = _PARALLAX_MM * np.array([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
         sources = (np.stack([lamp.position_mm for lamp in lights]) - self.t) @ self.M
-        reflected = self._reflect(np.tile(sources, (4, 1)), np.repeat(self._eyepoint + steps @ R @ self.M, n, axis=0))
+        reflected = self._reflect(np.tile(sources, (4, 1)), np.repeat(self.eyepoint + steps @ R @ self.M, n, axis=0))
         cam = (-(reflected.leaves @ self.M.T) @ R.T).reshape(2, 2, n, 3)
         found = reflected.found.reshape(2, 2, n) & (cam[..., 2] > 0)
         xy = np.where(found[..., None], cam[..., :2] / np.where(found, cam[..., 2], 1.0)[..., None], np.nan)
@@ -205,9 +191,10 @@ class GlintScene:
     def seen(self, images: Sequence[Image], clear: Visibility) -> list[Glint]:
         """Select the points of images that the camera sees, as glints."""
         out = []
-        ways = (np.concatenate([getattr(i, k) for i in images]) for k in ("source_mm", "entry_mm", "exit_mm"))
-        free = _split(self._clear(clear, *ways), [len(i.energy) for i in images])
-        for image, open_ in zip(images, free, strict=True):
+        whole = join_rows(images)
+        free = self._clear(clear, whole.source_mm, whole.entry_mm, whole.exit_mm)
+        for image, rows in zip(images, _parts([len(i.energy) for i in images]), strict=True):
+            open_ = free[rows]
             lit = open_ & image.there & (image.energy > 0)
             out.append(Glint(image, open_, Spots(frozen(image.xy_px[lit]), frozen(image.energy[lit]))))
         return out
@@ -225,7 +212,7 @@ class GlintScene:
             source, y = disc_points(lamp, points), mirror(points)
             at = y @ self.M.T + self.t
             there = self.surface.axis_distance(components(y)) <= self.limbus_radius_mm
-            there &= ~self._behind_globe(y, (source - self.t) @ self.M - y) & ~self._behind_globe(y, self._eyepoint - y)
+            there &= ~self._behind_globe(y, (source - self.t) @ self.M - y) & ~self._behind_globe(y, self.eyepoint - y)
             return np.asarray(there & self._clear(clear, source, at, at))
 
         nodes = cut_nodes(visible if mirror is None else nearly_visible, *counts)
@@ -249,7 +236,7 @@ class GlintScene:
         return lambda points: np.asarray(_terms(points) @ fit)
 
     @property
-    def _eyepoint(self) -> Floats:
+    def eyepoint(self) -> Floats:
         """The camera's nodal point in the eye frame."""
         return np.asarray(self.M.T @ (self.camera.nodal_point_mm - self.t))
 
@@ -261,32 +248,44 @@ class GlintScene:
 
     def _images_at(self, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> list[Image]:
         """Compute images of lamps through the given points of their discs; all lamps in one batch."""
-        return self._images_of(_Emitters.of(lights, nodes))
+        return self._images_of(Emitters.of(lights, nodes))
 
-    def _images_of(self, emitters: _Emitters) -> list[Image]:
+    def _images_of(self, emitters: Emitters) -> list[Image]:
         """Compute images of lamps through points of them."""
-        camera, which = self.camera, emitters.which
         sources = (emitters.points - self.t) @ self.M
-        r = self._reflect(sources, np.broadcast_to(self._eyepoint, sources.shape))
+        r = self._reflect(sources, np.broadcast_to(self.eyepoint, sources.shape))
         F = fresnel(np.clip(-_dot(r.normal, r.arrives), 0, 1), 1.0, self.index, self.film_index).unpolarized
-        leaving = np.maximum(_dot(r.arrives, (emitters.axes @ self.M)[which]), 0)
+        there = r.there & ~self._behind_globe(r.point, sources - r.point)
+        there &= ~self._behind_globe(r.point, self.eyepoint - r.point)
+        return self.pictured(
+            emitters,
+            LightPaths(
+                entry=r.point, exit=r.point, arrives=r.arrives, leaves=r.leaves, passed=F,
+                cross_section=r.cross_section, found=r.found, there=there,
+            ),
+        )  # fmt: skip
+
+    def pictured(self, emitters: Emitters, paths: LightPaths) -> list[Image]:
+        """Compute the images of lamps from the paths of light of their points: places in the picture, and energies."""
+        camera, which = self.camera, emitters.which
+        leaving = np.maximum(_dot(paths.arrives, (emitters.axes @ self.M)[which]), 0)
         power = emitters.exponent[which]
         lobe = np.where(power == 0, 1.0, np.where(leaving > 0, leaving ** np.where(power == 0, 1.0, power), 0.0))
-        cam = -(r.leaves @ self.M.T) @ camera.R.T
-        found = r.found & (cam[:, 2] > 0)
+        cam = -(paths.leaves @ self.M.T) @ camera.R.T
+        found = paths.found & (cam[:, 2] > 0)
         z = np.where(found, cam[:, 2], 1.0)
         x, v = cam[:, 0] / z, cam[:, 1] / z
         found &= camera.is_imaged(x, v)
         scale = camera.K[0, 0] * camera.K[1, 1] / z**3
-        y, strength = r.point, emitters.weights * emitters.strength[which]
-        there = r.there & found & ~self._behind_globe(y, sources - y) & ~self._behind_globe(y, self._eyepoint - y)
-        energy = np.where(found, strength * lobe * F / np.where(found, r.cross_section, 1.0) * scale, 0.0)
-        mirrors, xy = y @ self.M.T + self.t, camera.pixels_of(x, v)
+        strength = emitters.weights * emitters.strength[which]
+        tube = np.where(found, paths.cross_section, 1.0)
+        energy = np.where(found, strength * lobe * paths.passed / tube * scale, 0.0)
+        entry, leave = (point @ self.M.T + self.t for point in (paths.entry, paths.exit))
         whole = Image(
-            source_mm=emitters.points, entry_mm=mirrors, exit_mm=mirrors, xy_px=xy, energy=energy, there=there,
-            found=found,
+            source_mm=emitters.points, entry_mm=entry, exit_mm=leave, xy_px=camera.pixels_of(x, v), energy=energy,
+            there=paths.there & found, found=found,
         )  # fmt: skip
-        return whole.parts(emitters.counts)
+        return [take_rows(whole, rows) for rows in _parts(emitters.counts)]
 
     def _reflect(self, sources: Floats, viewpoints: Floats) -> _Reflections:
         """Solve for the points that mirror sources (k, 3) to viewpoints (k, 3); eye frame."""
@@ -335,7 +334,32 @@ class _Reflections(MirrorPoints):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Emitters:
+class LightPaths:
+    """Light from points of lamps to the camera by way of a mirror, one row per point, in the eye frame.
+
+    Attributes:
+        entry: (k, 3) where the light enters the eye, mm.
+        exit: (k, 3) where it leaves the eye, mm.
+        arrives: (k, 3) unit direction in which it leaves the lamp.
+        leaves: (k, 3) unit direction in which it arrives at the camera.
+        passed: (k,) share of the light that is mirrored, and not lost at other surfaces.
+        cross_section: (k,) cross section of the ray tube at the lamp per solid angle at the camera, mm^2/sr.
+        found: (k,) whether there is a path, also through a larger cornea.
+        there: (k,) whether there is one through the eye.
+    """
+
+    entry: Floats
+    exit: Floats
+    arrives: Floats
+    leaves: Floats
+    passed: Floats
+    cross_section: Floats
+    found: Bools
+    there: Bools
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Emitters:
     """Points of lamps.
 
     Attributes:
@@ -357,7 +381,7 @@ class _Emitters:
     exponent: Floats
 
     @classmethod
-    def of(cls, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> _Emitters:
+    def of(cls, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> Emitters:
         """Compute the given points of the discs of lamps."""
         counts = [len(n.weight) for n in nodes]
         return cls(
@@ -372,9 +396,9 @@ class _Emitters:
 
 
 @remembered  # lamps do not change between frames
-def _roughly(*lights: Lamp) -> _Emitters:
+def _roughly(*lights: Lamp) -> Emitters:
     """Return a coarse quadrature of lamps, with points of their rims."""
-    return _Emitters.of(lights, [_ROUGH if lamp.radius_mm > 0 else POINT for lamp in lights])
+    return Emitters.of(lights, [_ROUGH if lamp.radius_mm > 0 else POINT for lamp in lights])
 
 
 def glint_table(glints: Sequence[Glint]) -> GlintTable:
@@ -391,10 +415,9 @@ def glint_table(glints: Sequence[Glint]) -> GlintTable:
     )
 
 
-def _split(array: NDArray[Any], counts: Sequence[int]) -> list[NDArray[Any]]:
-    """Split an array into parts with the given number of rows."""
-    ends = list(accumulate(counts))
-    return [array[end - count : end] for end, count in zip(ends, counts, strict=True)]
+def _parts(counts: Sequence[int]) -> list[slice]:
+    """Return the rows of consecutive parts with the given number of rows."""
+    return [slice(end - count, end) for end, count in zip(accumulate(counts), counts, strict=True)]
 
 
 def _node_counts(xy: Floats, sigma_px: float) -> tuple[int, int]:

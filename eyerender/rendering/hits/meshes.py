@@ -16,13 +16,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Ints
+from ...base.arrays import Bools, Cache, Floats, Ints
 from ...eye.meshes import Patch, cornea_patches
 from ...eye.model import EyeModel
 from ...optics.formulas import NUMPY
@@ -239,20 +238,19 @@ class MeshedSurface(Surface):
 class Meshes:
     """Cache of the last eyes' corneas as meshes."""
 
-    def __init__(self, kept: int = 4) -> None:
-        self._kept = kept
-        self._made: dict[Any, tuple[SurfaceMesh, ...]] = {}
+    def __init__(self) -> None:
+        self._made: Cache[tuple[SurfaceMesh, ...]] = Cache()
 
     def of(self, eye: EyeModel, edge_mm: float) -> tuple[SurfaceMesh, ...]:
         """Return meshes of an eye's refracting surfaces in front of the iris, with edges of at most about `edge_mm`."""
         stop = np.concatenate([eye.stop.centre_mm, eye.stop.normal])
         key = (eye.front, float(eye.limbus_radius_mm), stop.tobytes(), edge_mm)
-        if key not in self._made:
-            if len(self._made) >= self._kept:
-                self._made.pop(next(iter(self._made)))
+
+        def make() -> tuple[SurfaceMesh, ...]:
             patches = cornea_patches(eye, *resolution(float(eye.limbus_radius_mm), edge_mm))
-            self._made[key] = tuple(SurfaceMesh(p, s) for p, s in zip(patches, eye.front, strict=True))
-        return self._made[key]
+            return tuple(SurfaceMesh(p, s) for p, s in zip(patches, eye.front, strict=True))
+
+        return self._made.get(key, make)
 
 
 def resolution(radius_mm: float, edge_mm: float) -> tuple[int, int]:

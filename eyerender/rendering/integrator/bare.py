@@ -16,8 +16,7 @@ from ...base.arrays import Ints, frozen
 from ..hits.primary import intersect
 from ..records.frame import Frame, aligned_copy
 from ..records.recording import recorded
-from .request import FilmRequest
-from .sampling import Pattern, Pixels, Samples, lattice_generator
+from .sampling import FilmRequest, Pattern, Pixels, Samples, lattice_generator
 from .shading import shade
 
 _MANY = 8  # samples, of which even pixels need the first four alone

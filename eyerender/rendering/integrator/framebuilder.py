@@ -12,12 +12,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...base.arrays import Cache
 from ...base.errors import InputError
 from ...region.mesh import RegionMesh, region_mesh
 from ...rig.imaging import Ambient
 from ..hits.meshes import Meshes, meshed
 from ..materials.albedo import Textures
-from ..records.eyecache import EyeCache
 from ..records.frame import Frame, Lights, Structure, upload_array
 from ..records.job import LampTable, RenderJob, boundary_waves, kinds, panel_lamps, panel_table, tables
 from ..records.recording import forget, recorded
@@ -33,8 +33,7 @@ from ..transport.irisirradiance import IrisIrradiance
 from ..transport.radiosity import PendingField
 from ..transport.reliefmapping import IrisRelief, ReliefShape, ReliefSize, relief_shape
 from ..transport.shadowmaps import ShadowMaps
-from .hostdata import HostData
-from .request import BoundFrame
+from .hostdata import BoundFrame, HostData
 
 _REGIONS, _TEXTURES = 4, 8  # cached
 _SUBJECTS = 32  # then recordings are forgotten, because those of sizes that never come back take 3 MB each
@@ -77,14 +76,14 @@ class FrameBuilder:
     def __init__(self, beside: Executor, obstacles: Sequence[Obstacle] = ()) -> None:
         self._beside = beside
         self._background = Background(obstacles)
-        self._textures: dict[Any, Textures] = {}
+        self._textures: Cache[Textures] = Cache(_TEXTURES)
         self._regions: dict[Any, RegionScene] = {}  # least recently used first
         self._filled = 0
         self._replaced: deque[Any] = deque(maxlen=_REGIONS)  # subjects whose scenes were reused for others
         self._maps = Maps()
         self.meshes = Meshes()
         self._patches = Patches()
-        self._shapes: EyeCache[ReliefShape] = EyeCache()
+        self._shapes: Cache[ReliefShape] = Cache()
         self._next: _Next | None = None
 
     def _expect(self, job: RenderJob) -> None:
@@ -116,7 +115,8 @@ class FrameBuilder:
         """
         host, surroundings = self._host_data(job)
         region = surroundings if isinstance(surroundings, RegionScene) else None
-        textures = self._textures_of(job)
+        look = job.look
+        textures = self._textures.get((look.iris_seed, look.iris), lambda: Textures.of(look))
         # Large kernels that need few inputs are launched first, so that the device is busy while NumPy prepares the
         # rest.
         shadow_maps = None if region is None else ShadowMaps.build(region, host.shadow_map_table)
@@ -172,8 +172,7 @@ class FrameBuilder:
         side, shape = dr.opaque(mi.UInt32, size.side), None
         if frame.textures.raised:
             shape = self._shapes.get(
-                job.eye,
-                (size.side, job.look.iris_seed, job.look.iris),
+                (job.eye, size.side, job.look.iris_seed, job.look.iris),
                 lambda: relief_shape(frame.bare(), heights, side, dr.opaque(mi.UInt32, size.about), size),
             )
         gridded = not surroundings.obstructed or (isinstance(surroundings, RegionScene) and surroundings.skin.is_sheet)
@@ -239,11 +238,3 @@ class FrameBuilder:
                 surroundings.fill(spec, globe, known)
         self._regions[key] = surroundings
         return surroundings
-
-    def _textures_of(self, job: RenderJob) -> Textures:
-        key = (job.look.iris_seed, job.look.iris)
-        if key not in self._textures:
-            if len(self._textures) >= _TEXTURES:
-                self._textures.pop(next(iter(self._textures)))
-            self._textures[key] = Textures.of(job.look)
-        return self._textures[key]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,13 +12,13 @@ from ...base.arrays import Singles
 from ...eye.fundus import FundusLight
 from ...region.mesh import RegionMesh
 from ...rig.camera import Window
-from ..glints.occlusion import lid_margins_px
 from ..glints.splatting import MirrorImages
+from ..records.frame import Frame
 from ..records.job import LampTable, RenderJob, parameters_of, returned_light, sun_lamps
 from ..records.parameters import Parameters
 from ..scene.blur import Blur
 from ..scene.diffusiongrids import DiffusionGrids
-from ..scene.pixels import skin_only_tiles, supersampled_pixels
+from ..scene.pixels import lid_margins_px, skin_only_tiles, supersampled_pixels
 from ..transport.patches import GlobePatches, globe_patches
 from ..transport.shadowmaps import shadow_map_table
 
@@ -131,3 +131,11 @@ class HostData:
                 plain = tiles.repeat(size, 0).repeat(size, 1)[: window[3], : window[2]] & ~fine
             self._marks[window] = (fine * FINE + wet * WET + plain * PLAIN).astype(np.uint8).ravel()
         return self._marks[window]
+
+
+@dataclass(frozen=True, slots=True)
+class BoundFrame:
+    """A frame on the device, ready to be rendered, and the host data of its job."""
+
+    frame: Frame
+    host: HostData

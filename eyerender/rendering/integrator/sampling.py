@@ -22,10 +22,53 @@ import numpy as np
 
 from ...rig.camera import Window, distort, distorted_area, is_imaged, newton_step
 from ..records.frame import Frame, sequence
+from .hostdata import BoundFrame
 
 _UNDISTORT_STEPS = 6
 _UNDISTORTED = 1e-4  # largest accepted residual of Newton's method, in units of the focal length
 _CALLS = 3  # pairs of further numbers of a sample
+_LARGEST_GROUP = 4
+_LEAST_GROUPS = 4  # a pixel
+_TIMES, _ENOUGH = 3, 32  # times as many samples at hairs, unless a pixel has more than enough
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmRequest:
+    """A window of a frame and its samples.
+
+    Attributes:
+        bound: the frame.
+        window: (x0, y0, width, height) in full-sensor pixels.
+        spp: samples per pixel.
+        seed: seed of the samples.
+        layered: whether to render the parts of the scene separately, with their depths.
+    """
+
+    bound: BoundFrame
+    window: Window
+    spp: int
+    seed: int
+    layered: bool
+
+    @property
+    def group_size(self) -> int:
+        """Samples per group; larger with subsurface scattering, which leaves no fine shadows in skin."""
+        if self.bound.frame.structure.scattering and self.spp == _LARGEST_GROUP:
+            return self.spp
+        size = _LARGEST_GROUP
+        while size > 1 and (self.spp % size or self.spp // size < min(_LEAST_GROUPS, self.spp // 2)):
+            size //= 2
+        return size
+
+    @property
+    def groups(self) -> int:
+        """Groups per pixel."""
+        return self.spp // self.group_size
+
+    @property
+    def times(self) -> int:
+        """Factor by which supersampled pixels have more samples."""
+        return _TIMES if self.spp <= _ENOUGH else 1
 
 
 @lru_cache(maxsize=64)

@@ -17,13 +17,14 @@ from ..hits.primary import TriangleHit, region_hit
 from ..records.frame import Frame, aligned_copy
 from ..records.recording import recorded
 from .hostdata import FINE, PLAIN
-from .request import FilmRequest
-from .sampling import Pattern, Pixels, Samples
+from .sampling import FilmRequest, Pattern, Pixels, Samples
+
+TILE = 4  # pixels across and down of a tile, whose groups are shaded together
 
 
 @dataclass(kw_only=True)
 class GroupPass:
-    """Sample groups that one pass takes of each pixel.
+    """Sample groups that one pass takes of each pixel of a window.
 
     Attributes:
         first: number of the first group.
@@ -31,6 +32,10 @@ class GroupPass:
         total: number of groups of a pixel in all passes.
         size: samples of a group.
         times: factor for the size in supersampled pixels.
+        pixels: the window.
+        height: its height.
+        tiles: number of tiles across.
+        own_shadows: as in `PixelGroup`.
     """
 
     first: mi.UInt32
@@ -38,13 +43,21 @@ class GroupPass:
     total: mi.UInt32
     size: mi.UInt32
     times: mi.UInt32
+    pixels: Pixels
+    height: mi.UInt32
+    tiles: mi.UInt32
+    own_shadows: mi.Bool
 
     @classmethod
-    def upload(cls, request: FilmRequest, first: int, count: int) -> GroupPass:
+    def upload(cls, request: FilmRequest, first: int, count: int, *, own_shadows: bool) -> GroupPass:
         """Upload the numbers of a pass."""
-        numbers = (first, count, request.groups, request.group_size, request.times)
-        first, count, total, size, times = (dr.opaque(mi.UInt32, n) for n in numbers)
-        return cls(first=first, count=count, total=total, size=size, times=times)
+        width, height = request.window[2:]
+        numbers = (first, count, request.groups, request.group_size, request.times, height, -(-width // TILE))
+        first, count, total, size, times, height, tiles = (dr.opaque(mi.UInt32, n) for n in numbers)
+        return cls(
+            first=first, count=count, total=total, size=size, times=times, pixels=Pixels.of(request.window),
+            height=height, tiles=tiles, own_shadows=dr.opaque(mi.Bool, own_shadows),
+        )  # fmt: skip
 
 
 @dataclass(kw_only=True)
@@ -98,14 +111,14 @@ class _Lanes:
         return pixel, dr.select(plain, middle, groups.first * size + k), fine
 
 
-def trace_region(request: FilmRequest, pattern: Pattern, first: int, count: int, *, every: bool) -> HitTable:
+def trace_region(request: FilmRequest, pattern: Pattern, groups: GroupPass, count: int, *, every: bool) -> HitTable:
     """Trace the samples of some groups of each pixel to the region.
 
     Args:
         request: the window and its samples.
         pattern: the samples.
-        first: number of the first group.
-        count: number of groups.
+        groups: the groups.
+        count: number of groups of each pixel.
         every: trace every sample, even in pixels that show only skin.
     """
     marks = request.bound.host.marks(request.window)
@@ -125,16 +138,15 @@ def trace_region(request: FilmRequest, pattern: Pattern, first: int, count: int,
     (a, b), (c, d) = ((dr.opaque(mi.UInt32, int(end)) for end in ends[:2]) for ends in (pixel_ends, lane_ends))
     order = mi.UInt32(aligned_copy(np.concatenate(classes).astype(np.uint32)))
     lanes = _Lanes(lane=lane, order=order, pixel_ends=(a, b), lane_ends=(c, d))
-    groups = GroupPass.upload(request, first, count)
-    hits = _trace(request.bound.frame, Pixels.of(request.window), pattern, lanes, groups)
+    hits = _trace(request.bound.frame, pattern, lanes, groups)
     return HitTable(marks=mi.UInt8(aligned_copy(marks)), first=mi.UInt32(aligned_copy(starts)), hits=hits)
 
 
 @recorded
-def _trace(frame: Frame, pixels: Pixels, pattern: Pattern, lanes: _Lanes, groups: GroupPass) -> TriangleHit:
+def _trace(frame: Frame, pattern: Pattern, lanes: _Lanes, groups: GroupPass) -> TriangleHit:
     """Trace one sample per lane."""
     pixel, k, fine = lanes.samples(groups)
-    samples = Samples.of(*pixels.at(pixel), pattern, fine)
+    samples = Samples.of(*groups.pixels.at(pixel), pattern, fine)
     o, d, _ = samples.ray(frame, k)
     hit = region_hit(frame, o, d)
     dr.eval(hit)

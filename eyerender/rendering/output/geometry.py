@@ -16,14 +16,14 @@ import mitsuba as mi
 import numpy as np
 
 from ...base.arrays import ArrayValue, Bools, Bytes, Floats, Indices, Singles, frozen, sealed
-from ...eye.model import EyeModel
 from ...optics.interface import dot
 from ...optics.surfaces import Surface, Xyz
+from ...optics.surfaces_quadric import Quadric
 from ...region.mesh import sheet_codes
 from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..hits.eyeshape import EyeShape
 from ..hits.primary import behind, facing, hit_before
-from ..integrator.request import BoundFrame
+from ..integrator.hostdata import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
 from ..records.frame import Frame, aligned_copy
 from ..records.job import RenderJob
@@ -203,9 +203,11 @@ def _on_eye(job: RenderJob, hits: Hits, axes: Floats) -> list[tuple[Indices, Flo
     """
     assert hits.point is not None
     assert hits.normal is not None
-    sclera = (hits.instance == SCLERA) & ~hits.cornea
+    sclera, radius = job.eye.sclera, float(job.eye.sclera.radius_mm)
+    sphere = Quadric.conic(radius, origin_mm=sclera.centre_mm + np.array([radius, 0.0, 0.0]))
+    on_sclera = (hits.instance == SCLERA) & ~hits.cornea
     found = []
-    for met, surface in ((hits.cornea, job.eye.front[0]), (sclera, _Sphere.of(job.eye))):
+    for met, surface in ((hits.cornea, job.eye.front[0]), (on_sclera, sphere)):
         rows = np.flatnonzero(met)
         rays = _rays(job, axes, rows)
         start = rays.to_planes(hits.point[:, rows], hits.normal[:, rows])
@@ -237,29 +239,7 @@ class _Rays:
         return reach
 
 
-class _Sphere:
-    """The sphere of the sclera, with the methods of a `Surface`."""
-
-    def __init__(self, centre: Floats, radius: float) -> None:
-        self._centre, self._radius = centre, radius
-
-    @classmethod
-    def of(cls, eye: EyeModel) -> _Sphere:
-        """Take that of an eye."""
-        return cls(np.asarray(eye.sclera.centre_mm), float(eye.sclera.radius_mm))
-
-    def value_at(self, point: Xyz) -> Floats:
-        """Like `Surface.value_at`."""
-        g = self.gradient_at(point)
-        return np.asarray(dot(g, g) - self._radius**2)
-
-    def gradient_at(self, point: Xyz) -> Xyz:
-        """Like `Surface.gradient_at`: half of the gradient."""
-        x, y, z = (p - c for p, c in zip(point, self._centre, strict=True))
-        return x, y, z
-
-
-def _refined(rays: _Rays, reach: Floats, surface: Surface | _Sphere) -> tuple[Floats, Floats]:
+def _refined(rays: _Rays, reach: Floats, surface: Surface) -> tuple[Floats, Floats]:
     """Improve distances to a surface by Newton's method; return them and the unit normals (3, k) toward the camera."""
     for _ in range(_STEPS):
         point = rays.at(reach)

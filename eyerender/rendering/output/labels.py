@@ -16,7 +16,7 @@ from ..hits.eyeshape import EyeShape
 from ..hits.interaction import SurfaceInteraction, outer_albedo, tear_film
 from ..hits.meniscus import on_water
 from ..hits.primary import first_hit, hidden
-from ..integrator.request import BoundFrame
+from ..integrator.hostdata import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
 from ..records.frame import Frame
 from ..records.recording import recorded, syntax

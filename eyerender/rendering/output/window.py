@@ -81,7 +81,7 @@ class RawFrame(ArrayValue):
         lid_margins_px: landmarks along the lids, where there are any.
         highlights: (height, width) highlights of wet and oily surfaces, if they were requested.
         hits: hits of the rays through the centres of pixels, if geometry was requested.
-        around: mean radiance of the whole sensor in blocks (`CoarseSensor`), where light from there strays into the
+        around: mean radiance of the whole sensor in blocks (`coarse_sensor`), where light from there strays into the
             window; else None.
     """
 

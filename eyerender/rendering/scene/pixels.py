@@ -1,4 +1,4 @@
-"""Classes of pixels: skin-only tiles, and pixels at thin hairs and menisci, which are supersampled.
+"""What a region's projection tells: skin-only tiles, pixels at thin hairs and menisci, and where the lid margins are.
 
 The skin is a sheet with a hole, the fissure, that ends at a border. A ray whose pixel lies inside the border's outline
 but outside the hole's outline crosses the sheet, because the number of crossings is the difference of the two winding
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...base.arrays import Bools, Floats
-from ...region.mesh import HAIRS, RegionMesh
+from ...region.mesh import HAIRS, LID_MARKS, LidMargins, RegionMesh
 from ...rig.camera import PinholeCamera, Window
 
 _TILE_PX = 8
@@ -188,3 +188,19 @@ def _winding(xy: Floats, shape: tuple[int, int]) -> Floats:
     steps = np.zeros((rows, columns + 1), dtype=int)
     np.add.at(steps, (row, column), turn[edge, row])
     return np.cumsum(steps[:, :-1], axis=1)
+
+
+def lid_margins_px(
+    region: RegionMesh | LidMargins, camera: PinholeCamera, anchor_mm: Floats
+) -> dict[str, list[list[float]]] | None:
+    """Compute landmarks along the inner edges of both lid margins, in full-sensor pixels.
+
+    They run from canthus to canthus, from temple to nose. None if the mesh's margins are unknown, or a landmark lies
+    behind the camera.
+    """
+    if len(region.upper_margin) == 0:
+        return None
+    both = region.upper_margin, region.lower_margin
+    marks = [margin[np.linspace(0, len(margin) - 1, LID_MARKS).round().astype(int)] for margin in both]
+    xy, front = camera.project(np.stack(marks) + anchor_mm)
+    return dict(zip(("upper", "lower"), np.round(xy, 4).tolist(), strict=True)) if np.all(front) else None

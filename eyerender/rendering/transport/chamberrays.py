@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Ints
+from ...base.arrays import Bools, Floats, Ints, join_rows, take_rows
 from ...eye.meshes import chamber_rim
 from ...optics.formulas import NUMPY
 from ...optics.graphs import distances
@@ -132,14 +132,6 @@ class _Rays:
     o: Floats
     d: Floats
 
-    def only(self, some: Bools) -> _Rays:
-        rows = np.flatnonzero(some)
-        return _Rays(**{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)})
-
-    @staticmethod
-    def join(parts: list[_Rays]) -> _Rays:
-        return _Rays(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(_Rays)})
-
 
 def trace_inside(walls: Walls, o: Floats, d: Floats, layer: Ints) -> Arrivals:
     """Trace rays until they arrive at the plane or the wall; record those that leave through the front first.
@@ -148,7 +140,7 @@ def trace_inside(walls: Walls, o: Floats, d: Floats, layer: Ints) -> Arrivals:
     front of the medium in which each starts.
     """
     whole, media = _Rays(number=np.arange(len(o)), weight=np.ones(len(o)), o=o, d=d), range(1, len(walls.front) + 1)
-    rays = {k: whole.only(layer == k) for k in media}
+    rays = {k: take_rows(whole, layer == k) for k in media}
     first = np.ones(len(o), dtype=bool)
     ends, left = [], []
     for _ in range(_STEPS):
@@ -168,7 +160,7 @@ def trace_inside(walls: Walls, o: Floats, d: Floats, layer: Ints) -> Arrivals:
                 passed, mirrored = _cross(walls, at_inner, k, outwards=False)
                 further[k + 1].append(passed)
                 further[k].append(mirrored)
-        rays = {k: _Rays.join(parts) for k, parts in further.items()}
+        rays = {k: join_rows(parts) for k, parts in further.items()}
         if not any(len(some.number) for some in rays.values()):
             break
     columns = [np.concatenate(column) for part in (left, ends) for column in zip(*part, strict=True)]
@@ -198,10 +190,10 @@ def _advance(walls: Walls, rays: _Rays, k: int) -> tuple[_Rays, _Rays, tuple[Int
     # Where the rim of a tilted cornea is above the wall's edge, rays pass between them: they meet the wall there.
     arrives = ~known | (nearest == end)
     rays.o = rays.o + np.where(known, nearest, 0)[:, None] * rays.d
-    at = rays.only(arrives)
+    at = take_rows(rays, arrives)
     outwards = nearest == outer
     ended = (at.number, at.weight, at.o, (~known | (wall < plane))[arrives])
-    return rays.only(~arrives & outwards), rays.only(~arrives & ~outwards), ended
+    return take_rows(rays, ~arrives & outwards), take_rows(rays, ~arrives & ~outwards), ended
 
 
 def _distance(surface: Surface, rays: _Rays, far: Floats, *, inward: bool) -> Floats:
@@ -228,7 +220,7 @@ def _mirror_at_front(walls: Walls, rays: _Rays, first: Bools) -> tuple[_Rays, tu
     weak = mirrored < _WEAK
     rays.weight = rays.weight * np.where(weak, _FEW * mirrored, mirrored)
     on = (rays.weight > 1e-3) & (~weak | (rays.number % _FEW == 0))
-    rays = rays.only(on)
+    rays = take_rows(rays, on)
     rays.d = rays.d - 2 * cosine[on, None] * n[on]
     return rays, gone
 
@@ -246,9 +238,9 @@ def _cross(walls: Walls, rays: _Rays, k: int, *, outwards: bool) -> tuple[_Rays,
     eta = before / after
     cosine = -dots(n, rays.d)
     passes = 1 - eta * eta * (1 - cosine * cosine) > 0
-    mirrored = rays.only(~passes)
+    mirrored = take_rows(rays, ~passes)
     mirrored.d = mirrored.d + 2 * cosine[~passes, None] * n[~passes]
-    passed = rays.only(passes)
+    passed = take_rows(rays, passes)
     passed.d = _refract(passed.d, n[passes], eta)
     passed.weight = passed.weight * (eta * eta)
     return passed, mirrored

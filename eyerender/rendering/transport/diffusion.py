@@ -24,8 +24,17 @@ from ..records.job import LampTable, RenderJob
 from ..records.recording import recorded, syntax
 from ..scene.diffusiongrids import SIDE, WIDTH, DiffusionGrids
 from ..scene.region import SHEET_COLUMNS, RegionScene, SkinGeometry
-from .pyramid import Pyramid, level_of
-from .tissuegrids import GlobeGrid, SheetGrid, SheetMetric, SheetSize, globe_cells, globe_direction, globe_place
+from .tissuegrids import (
+    GlobeGrid,
+    Pyramid,
+    SheetGrid,
+    SheetMetric,
+    SheetSize,
+    globe_cells,
+    globe_direction,
+    globe_place,
+    level_of,
+)
 from .tissuelight import TissueScene, light_on_globe, light_on_skin
 
 _RINGS, _TURNS = 6, 6

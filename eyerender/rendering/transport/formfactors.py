@@ -20,9 +20,8 @@ from ..materials.albedo import iris_albedo
 from ..records.frame import Frame, sequence
 from .chamber import IRIS_RINGS
 from .chamber import TURNS as IRIS_TURNS
-from .framepatches import RAYS, FramePatches
+from .framepatches import RAYS, FramePatches, PatchTables, gather_rows
 from .patches import RINGS, TURNS
-from .patchtables import PatchTables, gather_rows
 from .radiosityfield import RadiosityField
 
 START_MM = 0.02  # above a surface, where rays begin

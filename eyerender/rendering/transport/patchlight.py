@@ -14,14 +14,12 @@ import mitsuba as mi
 import numpy as np
 
 from ...base.arrays import Floats
-from ..records.caches import Caches
-from ..records.frame import Frame, Lights, sequence
+from ..records.frame import Caches, Frame, Lights, sequence
 from ..records.recording import recorded, syntax
 from .chamber import IRIS, PATCHES
 from .directlight import irradiance, irradiance_at, irradiance_off_cornea, irradiance_through_cornea
 from .formfactors import SHUFFLED, START_MM, PatchRays, RayHits, trace_rays
-from .framepatches import RAYS, FramePatches
-from .patchtables import Lanes, PatchTables, gather_rows
+from .framepatches import RAYS, FramePatches, Lanes, PatchTables, gather_rows
 from .radiosityfield import RadiosityField
 
 

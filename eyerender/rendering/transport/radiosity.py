@@ -25,10 +25,9 @@ from ..scene.region import RegionScene
 from .chamber import IRIS, IRIS_RINGS, PATCHES
 from .chamber import TURNS as IRIS_TURNS
 from .formfactors import share_of
-from .framepatches import FramePatches, Patches
+from .framepatches import FramePatches, Lanes, Patches, PatchTables
 from .patches import GlobePatches, fill_gaps
 from .patchlight import Gathered, PatchLight, gather_light
-from .patchtables import Lanes, PatchTables
 from .radiosityfield import RadiosityField
 
 _ROUNDS = 6

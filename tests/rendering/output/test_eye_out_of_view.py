@@ -15,7 +15,7 @@ from eyerender.folders.imagefolder import ImageFolder
 from eyerender.imaging.capture import check_windows
 from eyerender.region.globe import Globe
 from eyerender.region.mesh import region_mesh
-from eyerender.rendering.glints.occlusion import lid_margins_px
+from eyerender.rendering.scene.pixels import lid_margins_px
 from eyerender.scene import Scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 

@@ -55,7 +55,7 @@ def headset_job(focus_mm: float, window: tuple[int, int, int, int]) -> RenderJob
 
 def mean_parts(shown, window, spp, seed):
     """Parts of the scene (parts, 3, height, width), and the number of failed light paths."""
-    return start(shown, window, spp, seed, layered=True).means()
+    return start(shown, window, spp, seed, layered=True)()
 
 
 def blurred(renderer, job: RenderJob, spp: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,8 +11,8 @@ from scipy import ndimage
 from eyerender.imaging.capture import make_renderer, render_job, render_windows
 from eyerender.imaging.labels import visible_arcs_deg
 from eyerender.region.anatomy import Region
-from eyerender.rendering.glints.occlusion import glint_reason
-from eyerender.rendering.integrator import request
+from eyerender.rendering.glints.splatting import glint_reason
+from eyerender.rendering.integrator import sampling
 from eyerender.rendering.integrator.hostdata import FINE, PLAIN, WET
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
@@ -243,7 +243,7 @@ def test_hairs_are_sampled_more_finely(renderer, monkeypatch):
     spec = {"skin": {"relief_mm": 0.0, "sheen": 0.0, "pores": 0.0}}
     (many,) = images(renderer, region=spec, spp=256)
     (few,) = images(renderer, region=spec, spp=8)
-    monkeypatch.setattr(request, "_TIMES", 1)
+    monkeypatch.setattr(sampling, "_TIMES", 1)
     (plain,) = images(renderer, region=spec, spp=8)
     job = render_job(scene(region=spec).frames(), 0)
     fine = (renderer.bind(job)[0].host.marks(job.window).reshape(few.irradiance.shape) & FINE) > 0
