@@ -5,7 +5,8 @@
     index.npy                     one row per image of the finished dataset
 
 The tables hold the values shared by all lines of the shard, and by the lines of one eye of a subject. A line holds the
-remaining values as a list; its keys are one of the shapes in the first member.
+remaining values as a list; its keys are one of the shapes in the first member. A list of objects counts as a mapping
+from "[0]", "[1]", ...
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -27,7 +29,6 @@ from ..base.arrays import Ints
 from ..base.errors import InputError
 from ..base.storage.files import inside, opened, parse_json
 from ..base.storage.jsonlines import MAX_LINE_BYTES
-from ..base.storage.sharing import common, lists, merged, places, rest
 from .imagefile import MAX_IMAGE_BYTES
 
 TAR, LINES_GZ, INDEX = "images.tar", "lines.jsonl.gz", "index.npy"
@@ -38,6 +39,9 @@ MEMBERS = "tar_members"  # key of a packed line: key of a file's name -> first b
 _MAX_TABLE_BYTES = 256 * 2**20
 _GZIP = 31  # zlib's `wbits` for a gzip member
 _TEXTS = ("scene_json", "eye_json")  # JSON as text, whose numbers stay exact
+_PLACE = re.compile(r"\[\d+\]")
+Leaves = dict[tuple[str, ...], Any]
+"""Values of a JSON tree by the keys that lead to them."""
 INDEX_TYPE = np.dtype(
     [("sample", "<i8"), ("subject", "<i8"), ("split", "<u2"), ("shard", "<u4"), ("row", "<u4"), ("block", "<u8")]
 )
@@ -59,74 +63,93 @@ def pack_lines(lines: Sequence[Mapping[str, Any]]) -> tuple[bytes, list[int]]:
 
     The bytes do not depend on the order of keys, nor on digits beyond `DIGITS`.
     """
-    opened_lines = [_opened(line) for line in lines]
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for line in opened_lines:
-        groups.setdefault(_group(line), []).append(line)
-    tables = {group: common(own) for group, own in groups.items()}
-    shared = common(tables.values()) if tables else {}
-    rests = [dict(_leaves(rest(line, tables[_group(line)]), ())) for line in opened_lines]
+    groups = [f"{line['subject']} {line['records'][0]['eye']}" for line in lines]  # the eye of a subject
+    leaves = [_opened(line) for line in lines]
+    tables = {
+        group: _common(own for own, its in zip(leaves, groups, strict=True) if its == group) for group in set(groups)
+    }
+    shared = _common(tables.values())
+    rests = [_rest(own, tables[group]) for own, group in zip(leaves, groups, strict=True)]
     paths = sorted({path for own in rests for path in own})
     number = {path: k for k, path in enumerate(paths)}
     keys = [tuple(sorted(number[path] for path in own)) for own in rests]
     shapes = sorted(set(keys))
     head = {
         "schema": LINES_SCHEMA,
-        "shared": shared,
-        "tables": {group: rest(table, shared) for group, table in tables.items()},
+        "shared": _tree(shared),
+        "tables": {group: _tree(_rest(table, shared)) for group, table in tables.items()},
         "paths": paths,
         "shapes": shapes,
     }
     out = io.BytesIO()
     out.write(_member([_text(head)]))
     blocks: list[int] = []
-    for first in range(0, len(opened_lines), BLOCK):
-        part = range(first, min(first + BLOCK, len(opened_lines)))
+    for first in range(0, len(lines), BLOCK):
+        part = range(first, min(first + BLOCK, len(lines)))
         blocks += [out.tell()] * len(part)
-        texts = (
-            [_group(opened_lines[k]), shapes.index(keys[k]), *(rests[k][paths[at]] for at in keys[k])] for k in part
-        )
+        texts = ([groups[k], shapes.index(keys[k]), *(rests[k][paths[at]] for at in keys[k])] for k in part)
         out.write(_member(list(map(_text, texts))))
     return out.getvalue(), blocks
 
 
-def _leaves(node: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield the values of a tree of mappings, with the keys that lead to them."""
-    for key, value in node.items():
-        if isinstance(value, dict) and value:
+def _leaves(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield the values of a JSON tree, with the keys that lead to them."""
+    if isinstance(node, list) and any(isinstance(value, dict) for value in node):
+        node = {f"[{k}]": value for k, value in enumerate(node)}
+    if isinstance(node, dict) and (node or not path):
+        for key, value in node.items():
             yield from _leaves(value, (*path, key))
-        else:
-            yield (*path, key), value
+    else:
+        yield path, node
 
 
-def _tree(paths: Sequence[Sequence[str]], values: Sequence[Any]) -> dict[str, Any]:
+def _tree(leaves: Leaves) -> dict[str, Any]:
     """Rebuild a tree of mappings from its leaves."""
     out: dict[str, Any] = {}
-    for path, value in zip(paths, values, strict=True):
+    for path, value in leaves.items():
         node = out
         for key in path[:-1]:
             node = node.setdefault(key, {})
-        node[path[-1]] = value
+        node[path[-1]] = {} if value == {} else value
     return out
 
 
-def _opened(line: Mapping[str, Any]) -> dict[str, Any]:
+def _lists(node: dict[str, Any]) -> Any:
+    """Convert the mappings of a tree that stand for lists of objects to lists."""
+    own = {key: _lists(value) if isinstance(value, dict) else value for key, value in node.items()}
+    if own and all(map(_PLACE.fullmatch, own)):
+        return [own[key] for key in sorted(own, key=lambda key: int(key[1:-1]))]
+    return own
+
+
+def _common(parts: Iterable[Leaves]) -> Leaves:
+    """Return the values that all parts hold."""
+    first, *others = [*parts] or [{}]
+    return {
+        path: value for path, value in first.items() if all(path in own and _same(own[path], value) for own in others)
+    }
+
+
+def _rest(whole: Leaves, shared: Leaves) -> Leaves:
+    return {path: value for path, value in whole.items() if path not in shared}
+
+
+def _same(x: Any, y: Any) -> bool:
+    """Return whether two values are written identically; 1 equals 1.0, but is written differently."""
+    return type(x) is type(y) and x == y and (not isinstance(x, list) or json.dumps(x) == json.dumps(y))
+
+
+def _opened(line: Mapping[str, Any]) -> Leaves:
     parameters = dict(line["parameters"])
     texts = {key: parse_json(parameters.pop(key)) for key in _TEXTS}
-    found: dict[str, Any] = places({**rounded({**line, "parameters": parameters}), **texts})
-    return found
+    return dict(_leaves({**rounded({**line, "parameters": parameters}), **texts}))
 
 
-def _closed(node: dict[str, Any]) -> dict[str, Any]:
-    line: dict[str, Any] = lists(node)
+def _closed(leaves: Leaves) -> dict[str, Any]:
+    line: dict[str, Any] = _lists(_tree(leaves))
     for key in _TEXTS:
         line["parameters"][key] = json.dumps(line.pop(key), sort_keys=True)
     return line
-
-
-def _group(line: Mapping[str, Any]) -> str:
-    """Return the group whose table a line uses: the eye of a subject."""
-    return f"{line['subject']} {line['records']['[0]']['eye']}"
 
 
 def _text(value: Any) -> bytes:
@@ -143,8 +166,8 @@ def _member(texts: Sequence[bytes]) -> bytes:
 class _Head:
     """Values shared by the lines of each group of a shard, and the paths of the values in each shape."""
 
-    tables: dict[str, dict[str, Any]]
-    shapes: list[list[list[str]]]
+    tables: dict[str, Leaves]
+    shapes: list[list[tuple[str, ...]]]
 
 
 @lru_cache(maxsize=128)
@@ -154,8 +177,8 @@ def _head(path: str, state: tuple[int, ...]) -> _Head:
     head = parse_json(text, source=path)
     if not isinstance(head, dict) or head.get("schema") != LINES_SCHEMA:
         raise InputError(f"must begin with {LINES_SCHEMA!r}", source=path)
-    shared, paths = head["shared"], head["paths"]
-    tables = {group: merged(shared, table) for group, table in head["tables"].items()}
+    shared, paths = dict(_leaves(head["shared"])), [tuple(path) for path in head["paths"]]
+    tables = {group: shared | dict(_leaves(table)) for group, table in head["tables"].items()}
     return _Head(tables, [[paths[k] for k in shape] for shape in head["shapes"]])
 
 
@@ -202,7 +225,7 @@ def read_line(path: Path, row: int, block: int) -> dict[str, Any]:
             raise InputError(f"is too long (at most {MAX_LINE_BYTES} bytes are read)", source=name, path=where)
         group, shape, *values = parse_json(text, source=name, path=where)
         head = _head(name, state)
-        return _closed(merged(head.tables[group], _tree(head.shapes[shape], values)))
+        return _closed(head.tables[group] | dict(zip(head.shapes[shape], values, strict=True)))
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", source=name) from None
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
