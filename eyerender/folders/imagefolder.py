@@ -10,8 +10,8 @@ import platform
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NoReturn, TypeGuard, overload
@@ -55,28 +55,38 @@ CONVENTIONS = {
 }
 
 
+# Kind of picture, which names its folder -> key of its file in a line of metadata.
+KINDS = {
+    "images": "file_name",
+    "masks": "mask_file_name",
+    "amodal_masks": "amodal_mask_file_name",
+    "noiseless": "noiseless_file_name",
+    "highlights": "highlight_mask_file_name",
+    "depth": "depth_file_name",
+    "normals": "normals_file_name",
+    "iris_coordinates": "iris_coordinates_file_name",
+    "instances": "instance_mask_file_name",
+}
 # Keys of a line that name arrays of real numbers, with the number of channels of each (0: none).
 ARRAY_KEYS = {"depth_file_name": 0, "normals_file_name": 3, "iris_coordinates_file_name": 2}
 # Keys of a line that name files of the folder.
-FILE_KEYS = (
-    *("file_name", "mask_file_name", "amodal_mask_file_name", "noiseless_file_name", "highlight_mask_file_name"),
-    *("lens_reflections_mask_file_name", "instance_mask_file_name"),
-    *ARRAY_KEYS,
-)
+FILE_KEYS = (*KINDS.values(), "lens_reflections_mask_file_name")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ImageEntry:
     """One image of a folder: its files, its window (x0, y0, width, height) and its metadata.
 
     `number` is the line number in the file `listed`, from 1; 0 if unknown. `listed` is metadata.jsonl by default; in an
-    unfinished run and in a packed folder it is the file of a shard.
+    unfinished run and in a packed folder it is the file of a shard. In a packed folder, `members` are the positions of
+    the image's files in the tar of the shard, by the keys of their names.
     """
 
     folder: Path
     line: dict[str, Any]
     number: int = 0
     listed: Path | None = None
+    members: Mapping[str, Any] | None = None
 
     @property
     def source(self) -> Path:
@@ -104,6 +114,8 @@ class ImageEntry:
     def file(self, key: str) -> Path | None:
         """Return the path of the file that one of `FILE_KEYS` names; None if the metadata names none.
 
+        A file in a tar is copied to a temporary one, which is removed when this process ends.
+
         Raises:
             InputError: the path leads out of the folder, or the file is missing or not regular (a link, a pipe, a
                 folder).
@@ -111,14 +123,26 @@ class ImageEntry:
         name = self.line.get(key)
         if name is None:
             return None
-        return inside(self.folder, name, source=str(self.source), path=self._where(key))
+        if self.members is None:
+            return inside(self.folder, name, source=str(self.source), path=self._where(key))
+        # The name in the line is not to be trusted as one of a file.
+        own = hashlib.sha256(f"{self.folder.resolve()}/{name}".encode()).hexdigest()[:16]
+        path = Path(_scratch()) / f"{own}.png"
+        write_bytes(path, self.data(key) or b"", sync=False)
+        return path
 
     def check(self, key: str) -> None:
         """Check that the file that one of `FILE_KEYS` names exists; raise like `file`."""
-        self.file(key)
+        _ = self.file(key) if self.members is None else self.data(key)
 
     def data(self, key: str) -> bytes | None:
         """Read the file that one of `FILE_KEYS` names; None if the metadata names none. Raises like `file`."""
+        if self.line.get(key) is None:
+            return None
+        if self.members is not None:
+            shard = self.source.parent.relative_to(self.folder).as_posix()
+            where = self._where(f"{MEMBERS}.{key}")
+            return read_member(self.folder, shard, self.members.get(key), source=str(self.source), path=where)
         path = self.file(key)
         return None if path is None else read_bytes(path, limit=MAX_IMAGE_BYTES, follow=False)
 
@@ -148,7 +172,7 @@ class ImageEntry:
         Raises:
             InputError: as for `file`; the file is not a greyscale image, or its size differs from the window's.
         """
-        image = self._picture("file_name")
+        image = self.pixels("file_name")
         assert image is not None
         return image
 
@@ -161,19 +185,19 @@ class ImageEntry:
         Raises:
             InputError: as for `image`; the file does not have 8 bits.
         """
-        return self._parts("mask_file_name")
+        return self.pixels("mask_file_name")
 
     def amodal_mask(self) -> Bytes | None:
         """Read the mask of the eye without occluders; like `mask`."""
-        return self._parts("amodal_mask_file_name")
+        return self.pixels("amodal_mask_file_name")
 
     def highlight_mask(self) -> Bytes | None:
         """Read the mask of lamp highlights on wet and oily surfaces (1, else 0); like `mask`."""
-        return self._parts("highlight_mask_file_name")
+        return self.pixels("highlight_mask_file_name")
 
     def instance_mask(self) -> Bytes | None:
         """Read what each pixel shows, with lids, lashes, brow and skin apart (docs/formats.md); like `mask`."""
-        return self._parts("instance_mask_file_name")
+        return self.pixels("instance_mask_file_name")
 
     def depth(self) -> Singles | None:
         """Read the depth (h, w), mm along the camera's axis to the first surface, NaN where there is none.
@@ -184,29 +208,19 @@ class ImageEntry:
         Raises:
             InputError: as for `file`; the file is no array of the window's size.
         """
-        return self.array("depth_file_name")
+        return self.pixels("depth_file_name")
 
     def normals(self) -> Singles | None:
         """Read the unit normals of the first surface (h, w, 3) in the camera's frame; like `depth`."""
-        return self.array("normals_file_name")
+        return self.pixels("normals_file_name")
 
     def iris_coordinates(self) -> Singles | None:
         """Read places in the plane of the iris (h, w, 2), mm toward the nose and up; like `depth`."""
-        return self.array("iris_coordinates_file_name")
-
-    def array(self, key: str) -> Singles | None:
-        """Read the array that one of `ARRAY_KEYS` names; like `depth`."""
-        data = self.data(key)
-        if data is None:
-            return None
-        width, height = self.window[2:]
-        channels = ARRAY_KEYS[key]
-        shape = (height, width, channels) if channels else (height, width)
-        return array_of(data, shape, str(self.folder / self.line[key]))
+        return self.pixels("iris_coordinates_file_name")
 
     def noiseless(self) -> NDArray[Any] | None:
         """Read the counts without the sensor's noise, like `image`; None if the metadata names no such file."""
-        return self._picture("noiseless_file_name")
+        return self.pixels("noiseless_file_name")
 
     @property
     def records(self) -> list[dict[str, Any]]:
@@ -228,22 +242,26 @@ class ImageEntry:
             raise InputError("must be a mapping", source=str(self.source), path=self._where("labels"))
         return found
 
-    def _picture(self, key: str) -> NDArray[Any] | None:
-        found = self.picture(key)
-        if found is None:
+    def pixels(self, key: str) -> NDArray[Any] | None:
+        """Read the file that one of `FILE_KEYS` names as an array of the window's size; None if there is none.
+
+        Raises:
+            InputError: as for `file`; the file does not hold such an array.
+        """
+        data = self.data(key)
+        if data is None:
             return None
-        image, (width, height) = found[0], self.window[2:]
+        (width, height), source = self.window[2:], str(self.folder / self.line[key])
+        if key in ARRAY_KEYS:
+            channels = ARRAY_KEYS[key]
+            return array_of(data, (height, width, channels) if channels else (height, width), source)
+        image = image_of(data, source)[0]
         if image.shape != (height, width):
             reason = f"is {image.shape[1]} x {image.shape[0]} px, but its window is {width} x {height}"
-            raise InputError(reason, source=str(self.folder / self.line[key]))
+            raise InputError(reason, source=source)
+        if "mask" in key and image.dtype != np.uint8:
+            raise InputError(f"holds {image.dtype.name} values; a mask has 8 bits", source=source)
         return image
-
-    def _parts(self, key: str) -> Bytes | None:
-        mask = self._picture(key)
-        if mask is not None and mask.dtype != np.uint8:
-            source = str(self.folder / self.line[key])
-            raise InputError(f"holds {mask.dtype.name} values; a mask has 8 bits", source=source)
-        return mask
 
     def truth(self) -> Observations:
         """Read the records of the analytic observer for this image.
@@ -259,36 +277,6 @@ class ImageEntry:
 
     def _where(self, key: str) -> str:
         return f"line {self.number}.{key}" if self.number else key
-
-
-@dataclass(frozen=True, slots=True)
-class PackedEntry(ImageEntry):
-    """One image of a packed shard; `members` are the positions of its files in the tar, by the keys of their names."""
-
-    members: Mapping[str, Any] = field(default_factory=dict)
-
-    def file(self, key: str) -> Path | None:
-        """Copy the file to a temporary one, removed when this process ends; otherwise like `ImageEntry.file`."""
-        data = self.data(key)
-        if data is None:
-            return None
-        # The name in the line is not to be trusted as one of a file.
-        name = hashlib.sha256(f"{self.folder.resolve()}/{self.line[key]}".encode()).hexdigest()[:16]
-        path = Path(_scratch()) / f"{name}.png"
-        write_bytes(path, data, sync=False)
-        return path
-
-    def check(self, key: str) -> None:
-        """Like `ImageEntry.check`."""
-        self.data(key)
-
-    def data(self, key: str) -> bytes | None:
-        """Like `ImageEntry.data`."""
-        if self.line.get(key) is None:
-            return None
-        shard = self.source.parent.relative_to(self.folder).as_posix()
-        where = self._where(f"{MEMBERS}.{key}")
-        return read_member(self.folder, shard, self.members.get(key), source=str(self.source), path=where)
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,13 +310,10 @@ class Entries(Sequence[ImageEntry]):
         packed = isinstance(self.lines, PackedLines)
         for path, number, line in self.lines.read(self.rows):
             _check_line(line, str(path), f"line {number}")
-            if not packed:
-                yield ImageEntry(self.folder, line, number, path)
-                continue
-            members = line.pop(MEMBERS, None)
-            if not isinstance(members, dict):
+            members = line.pop(MEMBERS, None) if packed else None
+            if packed and not isinstance(members, dict):
                 raise InputError("must be a mapping", source=str(path), path=f"line {number}.{MEMBERS}")
-            yield PackedEntry(self.folder, line, number, path, members)
+            yield ImageEntry(folder=self.folder, line=line, number=number, listed=path, members=members)
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,44 +347,23 @@ class ImageFolder:
             raise InputError("no such folder", source=str(path))
         if (folder / RUN).is_file() and not (folder / DATASET).is_file():
             return cls._of_run(folder)
-        if (folder / INDEX).exists() and (folder / DATASET).exists():
-            return cls._packed(folder)
-        if not (folder / METADATA).exists():
+        packed = (folder / INDEX).exists() and (folder / DATASET).exists()
+        if not packed and not (folder / METADATA).exists():
             raise InputError(
                 f"holds no {METADATA}, so it is not a folder of images written by this package", source=str(path)
             )
-        dataset = read_json(folder / DATASET, follow=False)
-        if dataset.get("schema") != DATASET_SCHEMA:
-            raise InputError(
-                f"is {shown(dataset.get('schema'))}; this version reads {DATASET_SCHEMA!r}",
-                source=str(folder / DATASET),
-                path="schema",
-            )
-        entries = _entries(folder, [folder / METADATA])
-        if not len(entries):
-            raise InputError("holds no images", source=str(folder / METADATA))
-        _ = entries[0]
-        return cls(folder, dataset, entries)
-
-    @classmethod
-    def _packed(cls, folder: Path) -> ImageFolder:
-        """Open the folder of a finished run with packed shards."""
+        schema, source = PACKED_SCHEMA if packed else DATASET_SCHEMA, str(folder / DATASET)
         dataset = read_json(folder / DATASET, limit=MAX_FILE_BYTES, follow=False)
-        if dataset.get("schema") != PACKED_SCHEMA:
-            raise InputError(
-                f"is {shown(dataset.get('schema'))}; this version reads {PACKED_SCHEMA!r}",
-                source=str(folder / DATASET),
-                path="schema",
-            )
+        if dataset.get("schema") != schema:
+            reason = f"is {shown(dataset.get('schema'))}; this version reads {schema!r}"
+            raise InputError(reason, source=source, path="schema")
+        if not packed:
+            return cls(folder, dataset, _entries(folder, _line_files([folder / METADATA]), folder / METADATA))
         splits = dataset.get("splits")
         if not isinstance(splits, list) or not all(isinstance(name, str) for name in splits):
-            raise InputError("must be a list of names", source=str(folder / DATASET), path="splits")
+            raise InputError("must be a list of names", source=source, path="splits")
         lines = PackedLines(folder=folder, splits=tuple(splits), file=folder / INDEX)
-        if not len(lines):
-            raise InputError("holds no images", source=str(folder / INDEX))
-        entries = Entries(folder, lines, range(len(lines)))
-        _ = entries[0]
-        return cls(folder, dataset, entries)
+        return cls(folder, dataset, _entries(folder, lines, folder / INDEX))
 
     @classmethod
     def _of_run(cls, folder: Path) -> ImageFolder:
@@ -407,18 +371,10 @@ class ImageFolder:
         run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
         if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
             raise InputError("does not describe a run of this version", source=str(folder / RUN))
-        shards = sorted(finished(folder))
-        if run["schema"] == PACKED_RUN_SCHEMA:
-            lines = packed_lines(folder, shards)
-            entries = Entries(folder, lines, range(len(lines)))
-        else:
-            entries = _entries(folder, [folder / SHARDS / shard_name(shard) / LINES for shard in shards])
-        if not len(entries):
-            raise InputError(
-                "holds an unfinished run without a finished shard; start generate again on the folder",
-                source=str(folder),
-            )
-        _ = entries[0]
+        shards, packed = sorted(finished(folder)), run["schema"] == PACKED_RUN_SCHEMA
+        lines = packed_lines(folder, shards) if packed else _line_files(_shard_file(folder, s, LINES) for s in shards)
+        nothing = "holds an unfinished run without a finished shard; start generate again on the folder"
+        entries = _entries(folder, lines, folder, nothing)
         spec = run.get("spec")
         planned = spec.get("count") if isinstance(spec, dict) else None
         text = (
@@ -426,7 +382,7 @@ class ImageFolder:
             f"{shown(planned)} samples are planned"
         )
         warnings.warn(f"{folder}: {text}", UnfinishedRunWarning, stacklevel=3)
-        schema = DATASET_SCHEMA if run["schema"] == RUN_SCHEMA else PACKED_SCHEMA
+        schema = PACKED_SCHEMA if packed else DATASET_SCHEMA
         dataset = {**run, "schema": schema, "kind": "dataset", "conventions": CONVENTIONS}
         return cls(folder, dataset, entries, text)
 
@@ -526,16 +482,16 @@ def packed_index(done: Mapping[str, Any], shard: int, splits: Sequence[str], sou
 
 def packed_lines(folder: Path, shards: Sequence[int]) -> PackedLines:
     """Return the metadata of some packed shards, located by their done.json."""
-    dones = []
-    for shard in shards:
-        dones.append(read_json(folder / SHARDS / shard_name(shard) / DONE, limit=MAX_FILE_BYTES, follow=False))
-    splits = tuple(sorted({str(name) for done in dones for name in done.get("splits") or ()}))
-    parts = [
-        packed_index(done, shard, splits, str(folder / SHARDS / shard_name(shard) / DONE))
-        for shard, done in zip(shards, dones, strict=True)
-    ]
-    rows = np.concatenate(parts) if parts else np.zeros(0, dtype=INDEX_TYPE)
+    files = {shard: _shard_file(folder, shard, DONE) for shard in shards}
+    dones = {shard: read_json(file, limit=MAX_FILE_BYTES, follow=False) for shard, file in files.items()}
+    splits = tuple(sorted({str(name) for done in dones.values() for name in done.get("splits") or ()}))
+    parts = [packed_index(done, shard, splits, str(files[shard])) for shard, done in dones.items()]
+    rows = np.concatenate([np.zeros(0, dtype=INDEX_TYPE), *parts])
     return PackedLines(folder=folder, splits=splits, given=rows)
+
+
+def _shard_file(folder: Path, shard: int, name: str) -> Path:
+    return folder / SHARDS / shard_name(shard) / name
 
 
 @cache
@@ -546,9 +502,21 @@ def _scratch() -> str:
     return folder
 
 
-def _entries(folder: Path, files: list[Path]) -> Entries:
-    lines = LineFiles.of(JsonLines.index(file) for file in files)
-    return Entries(folder, lines, range(len(lines)))
+def _line_files(files: Iterable[Path]) -> LineFiles:
+    return LineFiles.of(JsonLines.index(file) for file in files)
+
+
+def _entries(folder: Path, lines: LineFiles | PackedLines, source: Path, nothing: str = "holds no images") -> Entries:
+    """Return the images that lines describe, of which the first is read.
+
+    Raises:
+        InputError: there are none (`source` and `nothing` say so), or the first line is wrong.
+    """
+    entries = Entries(folder, lines, range(len(lines)))
+    if not len(entries):
+        raise InputError(nothing, source=str(source))
+    _ = entries[0]
+    return entries
 
 
 def _check_line(line: dict[str, Any], source: str, where: str) -> None:

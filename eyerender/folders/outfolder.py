@@ -30,7 +30,7 @@ from ..base.storage.files import (
     write_json,
 )
 from ..base.storage.lock import LOCK, writer_lock
-from .imagefolder import DATASET, RUN, STAGE
+from .imagefolder import DATASET, KINDS, RUN, STAGE
 
 FOLDER_SCHEMA = "eyerender/folder/1"
 MARKER = ".eyerender.json"
@@ -45,7 +45,7 @@ _SIGNS = {
 }
 _SIGN_BYTES = 2**30
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp", ".exr", ".hdr")
-_KINDS = "images|masks|amodal_masks|noiseless|highlights|depth|normals|iris_coordinates|instances"
+_KINDS = "|".join(KINDS)
 _FOLDERS = re.compile(rf"(images/)?(({_KINDS}|shards)(/[0-9]+)?)|images|layouts")
 _FILES = re.compile(
     r"(images/)?("  # a study's images are a dataset in their own folder

@@ -27,7 +27,7 @@ def item_of(mask, **labels):
         "labels": {"pupil": {"amodal": missing}, "glints": [], "lid_margins_px": None, **labels},
         "parameters": {"camera": 1, "scene_json": json.dumps({"rig": {"cameras": [{}, {"name": "left one"}]}})},
     }
-    found = Item(ImageEntry(Path(), line))
+    found = Item(ImageEntry(folder=Path(), line=line))
     found.__dict__["mask"] = mask
     return found
 

@@ -57,7 +57,7 @@ def written_gaze(labels):
     }
     for part in ("pupil", "iris"):
         line["labels"][part] = {**labels[part], "visible": {"pixels": 0}}
-    rows = teyed.rows_of(Item(ImageEntry(Path(), line)))
+    rows = teyed.rows_of(Item(ImageEntry(folder=Path(), line=line)))
     return np.array([float(teyed._number(value)) for value in rows["gaze_vec"]])
 
 

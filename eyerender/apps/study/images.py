@@ -225,7 +225,7 @@ def read_images(folder: Path) -> StudyImages | None:
             # Only the keys that extraction needs are kept; a line's labels take many times as much memory.
             kept = {key: line[key] for key in ("window_px", "bit_depth")} | {"records": [{}]}
             for scene, name in _exposures(line):
-                entry = ImageEntry(folder, {"file_name": name, **kept})
+                entry = ImageEntry(folder=folder, line={"file_name": name, **kept})
                 found.setdefault(_digest_of(scene, eye, level is not None), []).append((frame, entry))
     except (InputError, ValueError, KeyError, TypeError, IndexError):
         return None
