@@ -15,9 +15,9 @@ import pytest
 from eyerender.apps.study import run as study
 from eyerender.base.errors import EyerenderError, InputError
 from eyerender.base.storage.lock import LOCK, run_lock, writer_lock
-from eyerender.dataset import assemble, croissant, done
+from eyerender.dataset import assemble, croissant
 from eyerender.folders.imagefile import write_png
-from eyerender.folders.imagefolder import DONE, LINES, LOG, SHARDS, write_dataset
+from eyerender.folders.imagefolder import DONE, KINDS, LINES, LOG, SHARDS, write_dataset
 from eyerender.folders.outfolder import MARKER, clear, refuse_non_empty, staged
 from eyerender.imaging.folder import render_folder
 from eyerender.scene import load_scene
@@ -159,7 +159,7 @@ def test_a_damaged_sign_is_no_sign(tmp_path, text):
 
 def test_what_the_rooms_write_can_be_replaced(tmp_path):
     """The names that the rooms above give their files are the known ones."""
-    kinds = [f"{kind}/00000/s0.png" for kind in done.KINDS]
+    kinds = [f"{kind}/00000/s0.png" for kind in KINDS]
     shards = [f"{SHARDS}/00000/{name}" for name in (LINES, DONE)]
     whole = [LOG, assemble.FAILURES, assemble.CARD, croissant.CROISSANT, "run.json", "metadata.jsonl"]
     dataset = [*kinds, *shards, *whole, f"{assemble.FAILURES}.part", f".{assemble.CARD}.0123abcd.part"]

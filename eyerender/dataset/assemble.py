@@ -5,13 +5,12 @@ This writes metadata.jsonl, failures.jsonl, the data card and, last, dataset.jso
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +20,9 @@ from ..base.storage.files import MAX_FILE_BYTES, read_json, remove_parts, write_
 from ..folders.imagefolder import (
     CONVENTIONS,
     DATASET,
-    DATASET_SCHEMA,
     DONE,
     LINES,
     METADATA,
-    PACKED_SCHEMA,
     SHARDS,
     finished,
     packed_index,
@@ -33,12 +30,12 @@ from ..folders.imagefolder import (
 )
 from ..folders.packed import INDEX
 from .card import data_card
-from .columns import type_first
 from .croissant import CROISSANT, croissant
-from .done import checksum, compare_sums, is_sums, read_done, run_versions, sum_of
+from .done import FILES, PACKED, checksum, compare_sums, is_sums, layout_of, read_done, run_versions, sum_of
+from .packing import counts_of
 from .plan import Plan
 from .shard import verify
-from .spec import MAX_COUNT, DatasetSpec
+from .spec import DatasetSpec
 
 FAILURES, CARD = "failures.jsonl", "README.md"
 
@@ -54,56 +51,21 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
     """
     for name in (FAILURES, METADATA, INDEX, CROISSANT, CARD, DATASET):
         remove_parts(folder / name)
-    if plan.spec.is_packed:
-        return _assemble_packed(plan, folder)
     statistics = Statistics()
+    table = PackedTable(plan, folder, statistics) if plan.spec.is_packed else LineTable(plan, folder, statistics)
     with written(folder / FAILURES) as file:
-        for _, done in _finished(plan, folder, file):
+        for shard in plan.spec.shards:
+            done = read_done(folder, shard)
             statistics.take_shard(done)
-    with written(folder / METADATA) as file:
-        for line in _lines(folder, plan.spec.shards, statistics.take_line):
-            file.write(line)
-        found = statistics.to_mapping()
-        if found["images"] == 0:
-            raise EyerenderError(f"{folder}: no sample of this spec can be made; see {FAILURES} for the reasons")
-    sums = {name: sum_of(folder / name) for name in (METADATA, FAILURES)}
-    write_json(folder / CROISSANT, croissant(plan, sums[METADATA]["sha256"]))
-    return _described(plan, folder, DATASET_SCHEMA, {}, statistics, sums)
-
-
-def _assemble_packed(plan: Plan, folder: Path) -> dict[str, Any]:
-    """Merge the summaries of packed shards: image index, failures and statistics. No metadata is read."""
-    statistics, splits, parts = Statistics(), sorted(plan.spec.splits), []
-    with written(folder / FAILURES) as file:
-        for shard, done in _finished(plan, folder, file):
-            statistics.take_packed(done)
-            parts.append(packed_index(done, shard, splits, str(folder / SHARDS / shard_name(shard) / DONE)))
-    rows = np.concatenate(parts)
-    if not len(rows):
+            table.take(shard, done)
+            file.writelines((json.dumps(rejection) + "\n").encode() for rejection in done["rejections"])
+    if not statistics.images:
         raise EyerenderError(f"{folder}: no sample of this spec can be made; see {FAILURES} for the reasons")
-    statistics.take_index(rows, splits)
-    with written(folder / INDEX) as file:
-        np.save(file, rows, allow_pickle=False)
-    sums = {name: sum_of(folder / name) for name in (INDEX, FAILURES)}
-    return _described(plan, folder, PACKED_SCHEMA, {"splits": splits}, statistics, sums)
-
-
-def _finished(plan: Plan, folder: Path, failures: BinaryIO) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield every shard with its summary, and write its rejections to the file of failures."""
-    for shard in plan.spec.shards:
-        done = read_done(folder, shard)
-        yield shard, done
-        failures.writelines((json.dumps(rejection) + "\n").encode() for rejection in done["rejections"])
-
-
-def _described(
-    plan: Plan, folder: Path, schema: str, more: dict[str, Any], statistics: Statistics, sums: dict[str, Any]
-) -> dict[str, Any]:
-    """Write the card and dataset.json of a complete dataset; return its statistics."""
+    more = table.write()
     found = statistics.to_mapping()
     write_text(folder / CARD, data_card(plan, found))
     dataset = {
-        "schema": schema,
+        "schema": table.layout.dataset,
         "kind": "dataset",
         "digest": plan.digest,
         **plan.to_mapping(),
@@ -112,16 +74,79 @@ def _described(
         "backends": sorted(statistics.backends),
         "conventions": CONVENTIONS,
         "statistics": found,
-        "checksums": sums,
+        "checksums": {name: sum_of(folder / name) for name in (table.layout.table, FAILURES)},
     }
     write_json(folder / DATASET, dataset)
     return found
 
 
+class LineTable:
+    """Table of the images of a dataset: metadata.jsonl, with the lines of all shards, and its Croissant description."""
+
+    layout = FILES
+
+    def __init__(self, plan: Plan, folder: Path, statistics: Statistics) -> None:
+        self._plan, self._folder, self._statistics = plan, folder, statistics
+
+    def take(self, shard: int, done: Mapping[str, Any]) -> None:
+        """Take the record of the next shard, which holds nothing that its lines do not."""
+
+    def write(self) -> dict[str, Any]:
+        """Write the table, count its images, and return further keys of dataset.json."""
+        try:
+            with written(self._folder / METADATA) as file:
+                file.writelines(line.encode() for line in type_first(self._lines, self._statistics.take_line))
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise InputError(
+                f"the lines of a shard do not have the format of this version ({type(error).__name__}: {error})",
+                source=str(self._folder),
+            ) from None
+        write_json(self._folder / CROISSANT, croissant(self._plan, checksum(self._folder / METADATA)))
+        return {}
+
+    def _lines(self) -> Iterator[str]:
+        for shard in self._plan.spec.shards:
+            with open(self._folder / SHARDS / shard_name(shard) / LINES, encoding="utf-8") as file:
+                yield from file
+
+
+class PackedTable:
+    """Table of the images of a dataset with packed shards: index.npy, from their records; no metadata is read."""
+
+    layout = PACKED
+
+    def __init__(self, plan: Plan, folder: Path, statistics: Statistics) -> None:
+        self._folder, self._statistics = folder, statistics
+        self._splits, self._parts = sorted(plan.spec.splits), list[NDArray[Any]]()
+
+    def take(self, shard: int, done: Mapping[str, Any]) -> None:
+        """Take the record of the next shard; like `LineTable`.
+
+        Raises:
+            InputError: it has another format than this version's.
+        """
+        source = str(self._folder / SHARDS / shard_name(shard) / DONE)
+        self._parts.append(packed_index(done, shard, self._splits, source))
+        try:
+            self._statistics.take_counts(done["counts"])
+        except (KeyError, TypeError, ValueError) as error:
+            reason = f"is not in the format of this version ({error})"
+            raise InputError(reason, source=source, path="counts") from None
+
+    def write(self) -> dict[str, Any]:
+        """Write the table; like `LineTable`."""
+        rows, statistics = np.concatenate(self._parts), self._statistics
+        for k, name in enumerate(self._splits):
+            own = rows["subject"][rows["split"] == k]
+            if len(own):
+                statistics.splits[name], statistics.subjects[name] = len(own), set(np.unique(own).tolist())
+        with written(self._folder / INDEX) as file:
+            np.save(file, rows, allow_pickle=False)
+        return {"splits": self._splits}
+
+
 def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
     """Describe each damaged file among dataset.json and the assembled files whose checksums it contains.
-
-    If dataset.json is from an older version without checksums, metadata.jsonl is compared with the shards.
 
     Args:
         folder: the dataset.
@@ -133,17 +158,13 @@ def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> I
     except InputError as error:
         yield f"{DATASET}: {error.reason}"
         return
-    packed = dataset.get("schema") == PACKED_SCHEMA
-    if not (packed or dataset.get("schema") == DATASET_SCHEMA) or digest not in (None, dataset.get("digest")):
+    layout, sums = layout_of(dataset.get("schema")), dataset.get("checksums")
+    if layout is None or dataset["schema"] != layout.dataset or digest not in (None, dataset.get("digest")):
         yield f"{DATASET}: is of another spec"
-        return
-    sums = dataset.get("checksums")
-    if sums is None and not quick and not packed:
-        yield from _differs_from_shards(folder)
-    elif (packed or sums is not None) and not (is_sums(sums) and (INDEX if packed else METADATA) in (sums or {})):
+    elif not is_sums(sums) or layout.table not in sums:
         yield f"{DATASET}: checksums: do not have the format of this version"
     else:
-        yield from compare_sums(folder, sums or {}, quick=quick)
+        yield from compare_sums(folder, sums, quick=quick)
 
 
 def verify_finished(folder: Path, digest: str | None) -> Iterator[str]:
@@ -174,41 +195,45 @@ def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
 
 def shards_of(dataset: Mapping[str, Any]) -> Sequence[int] | None:
     """Return the shard numbers of the spec in a dataset.json; None if it contains none."""
-    spec = dataset.get("spec")
-    if isinstance(spec, dict) and (spec.get("choice") == "spread" or spec.get("layout") is not None):
-        with suppress(InputError):
-            return DatasetSpec.from_mapping(spec).shards
-        return None
-    count, size = (spec.get(key) if isinstance(spec, dict) else None for key in ("count", "shard_size"))
-    if isinstance(count, int) and isinstance(size, int) and 0 < count <= MAX_COUNT and size > 0:
-        return range(-(-count // size))
+    with suppress(InputError, KeyError):
+        return DatasetSpec.from_mapping(dataset["spec"]).shards
     return None
 
 
-def _lines(folder: Path, shards: Iterable[int], take: Callable[[dict[str, Any]], None]) -> Iterator[bytes]:
-    """Yield the lines of metadata.jsonl; call `take` with each line, parsed."""
+def type_first(lines: Callable[[], Iterable[str]], take: Callable[[dict[str, Any]], None]) -> Iterator[str]:
+    """Order lines of JSON so that the first lines fill every column.
 
-    def lines() -> Iterator[str]:
-        for shard in shards:
-            with open(folder / SHARDS / shard_name(shard) / LINES, encoding="utf-8") as file:
-                yield from file
+    Loaders determine a column's type from the first lines of the file (Hugging Face from its first 10 MB). A column
+    that is null there gets no type, and loading fails at the first value, such as a reason that occurs once in ten
+    thousand images. So the first line that fills a column comes to the front; all others keep their order.
 
-    try:
-        for line in type_first(lines, take):
-            yield line.encode()
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        reason = f"{type(error).__name__}: {error}"
-        raise InputError(
-            f"the lines of a shard do not have the format of this version ({reason})", source=str(folder)
-        ) from None
+    `lines` is called twice; `take` is called once with each parsed line.
+    """
+    seen: set[str] = set()
+    first: dict[int, str] = {}
+    for number, text in enumerate(lines()):
+        line = json.loads(text)
+        take(line)
+        filled = set(_filled(line, ""))
+        if not filled <= seen:
+            seen |= filled
+            first[number] = text
+    yield from first.values()
+    for number, text in enumerate(lines()):
+        if number not in first:
+            yield text
 
 
-def _differs_from_shards(folder: Path) -> Iterator[str]:
-    digest = hashlib.sha256()
-    for line in _lines(folder, sorted(finished(folder)), lambda _line: None):
-        digest.update(line)
-    if checksum(folder / METADATA) != digest.hexdigest():
-        yield f"{METADATA}: differs from the shards"
+def _filled(node: Any, path: str) -> Iterator[str]:
+    """Return the paths of all values that are neither null nor an empty list."""
+    if isinstance(node, dict):
+        for key, value in node.items():
+            yield from _filled(value, f"{path}.{key}")
+    elif isinstance(node, list):
+        for value in node:
+            yield from _filled(value, f"{path}[]")
+    elif node is not None:
+        yield path
 
 
 class Statistics:
@@ -223,52 +248,29 @@ class Statistics:
         self.visible = 0
         self.glints = 0
 
-    def take_packed(self, done: Mapping[str, Any]) -> None:
-        """Count a packed shard from its done.json, except for what `take_index` counts.
-
-        Raises:
-            InputError: done.json has another format than this version's.
-        """
-        self.take_shard(dict(done))
-        try:
-            counts = done["counts"]
-            self.visible += int(counts["pupils_visible"])
-            self.glints += int(counts["glints_visible"])
-            self.pupil_px += map(float, counts["pupil_semi_axis_px"])
-        except (KeyError, TypeError, ValueError) as error:
-            name = f"{SHARDS}/{shard_name(done['shard'])}/{DONE}"
-            raise InputError(f"is not in the format of this version ({error})", source=name, path="counts") from None
-
-    def take_index(self, rows: NDArray[Any], splits: Sequence[str]) -> None:
-        """Count the images and subjects of each split in an index."""
-        self.images = len(rows)
-        for k, name in enumerate(splits):
-            own = rows["subject"][rows["split"] == k]
-            if len(own):
-                self.splits[name], self.subjects[name] = len(own), set(np.unique(own).tolist())
-
     def take_shard(self, done: dict[str, Any]) -> None:
         """Count a shard from its done.json."""
         backend = done["backend"]
         self.backends.add(f"{backend['name']} ({backend['device']}; {done['cpu']})")
         chosen = done.get("chosen")
         self.samples += done["samples"][1] - done["samples"][0] if chosen is None else len(chosen)
-        self.saturated += done.get("images_saturated") or 0
+        self.images += done["images"]
+        self.saturated += done["images_saturated"]
         self.rejected += len(done["rejections"])
         self.given_up += len(done["given_up"])
         self.bytes += sum(entry["bytes"] for entry in done["files"].values())
 
     def take_line(self, line: dict[str, Any]) -> None:
         """Count one image from its metadata."""
-        self.images += 1
         self.splits[line["split"]] += 1
         self.subjects.setdefault(line["split"], set()).add(line["subject"])
-        labels = line["labels"]
-        axes = labels["pupil"]["amodal"]["semi_axes_px"]
-        if axes is not None:
-            self.pupil_px.append(axes[0])
-        self.visible += labels["pupil"]["visible"]["pixels"] > 0
-        self.glints += sum(g["visible"] for g in labels["glints"])
+        self.take_counts(counts_of([line]))
+
+    def take_counts(self, counts: Mapping[str, Any]) -> None:
+        """Add what `counts_of` returned of some images."""
+        self.visible += int(counts["pupils_visible"])
+        self.glints += int(counts["glints_visible"])
+        self.pupil_px += map(float, counts["pupil_semi_axis_px"])
 
     def to_mapping(self) -> dict[str, Any]:
         """Convert to a mapping for JSON."""

@@ -7,7 +7,6 @@ from typing import Any
 from ..folders.imagefolder import CONVENTIONS
 from .done import run_versions
 from .plan import RANKED_SUBJECTS, Plan
-from .reading import IMAGEFOLDER, WHOLE
 
 _LABELS = """\
 - `records`: the record of the analytic observer: pose, target, apparent pupil (ellipse and boundary points), glints.
@@ -51,6 +50,49 @@ _PACKED = """\
 The pictures are in `shards/*/images.tar`, which `webdataset` and `datasets` read. The lines of metadata are packed in
 `shards/*/lines.jsonl.gz`, with numbers of 9 digits; `eyerender.ImageFolder` and `eyerender.torch.FolderDataset` read
 pictures and labels, and `eyerender export-dataset` converts all of it. A line has these keys:"""
+
+
+# How to read images of 16 bits.
+WHOLE = """\
+Pillow's `convert("L")` and `convert("RGB")` clip at 255, so they turn nearly every pixel of a 16-bit image white.
+OpenCV without `IMREAD_UNCHANGED` drops the low 8 bits, which leaves 2 to 3 values in a pupil. Read the counts:
+
+```python
+import cv2
+import numpy as np
+from PIL import Image
+
+counts = np.asarray(Image.open(path))  # (h, w) uint16
+counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # the same
+```
+"""
+
+IMAGEFOLDER = """\
+Rows of `datasets` hold Pillow images, so `np.asarray(row["image"])` gives the counts; do not cast the column to a mode.
+For 8-bit copies, use `eyerender export-dataset`, or apply one gain for the whole dataset and a curve:
+
+```python
+picture = np.round(255 * np.minimum(1, gain * (counts / 65535)) ** (1 / 2.2)).astype(np.uint8)
+```
+"""
+
+WEBDATASET = """\
+The decoders of webdataset itself ("pil", "rgb8", "l" and so on) also convert to 8 bits and turn these images white. Use
+your own:
+
+```python
+import io
+
+import webdataset as wds
+
+
+def counts_of(data):
+    return np.asarray(Image.open(io.BytesIO(data)))
+
+
+samples = wds.WebDataset(tar, shardshuffle=False).decode(wds.handle_extension("png", counts_of))
+```
+"""
 
 
 def data_card(plan: Plan, statistics: dict[str, Any]) -> str:

@@ -12,7 +12,6 @@ import os
 import signal
 import threading
 import time
-from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -25,7 +24,7 @@ from typing import Any
 from ..base.errors import EyerenderError, InputError
 from ..base.processes import caller_hidden, signals_held
 from .done import cpu_family
-from .pool import RECYCLE_IMAGES, TRIES, Events, end_of
+from .pool import RECYCLE_IMAGES, TRIES, Events, Retries, end_of
 from .shard import Staged, write_shard
 from .worker import FAILURES, Job, failure
 
@@ -131,7 +130,7 @@ def drive(pipe: Connection, driver: _Driver, shards: list[int]) -> None:
     os.dup2(silence, 2)
     threading.Thread(target=_end_with, args=(pipe,), daemon=True).start()
     try:
-        message: tuple[Any, ...] = ("end", driver.run(deque(shards), lambda *event: pipe.send(event)))
+        message: tuple[Any, ...] = ("end", driver.run(Retries(shards), lambda *event: pipe.send(event)))
     except EyerenderError as error:
         message = ("failed", error)
     except Exception as error:
@@ -189,7 +188,7 @@ class _Driver:
     address: str | None
     timeout_s: float
 
-    def run(self, pending: deque[int], send: SendEvent) -> dict[int, str]:
+    def run(self, left: Retries, send: SendEvent) -> dict[int, str]:
         """Make shards and send events; raise the same errors as the engine."""
         ray: Any = import_module("ray")
         variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
@@ -206,11 +205,11 @@ class _Driver:
             raise InputError(f"the cluster cannot be reached ({reason})", source="--address") from None
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray has replaced the handler
         try:
-            return self._run(ray, pending, send)
+            return self._run(ray, left, send)
         finally:
             ray.shutdown()
 
-    def _run(self, ray: Any, pending: deque[int], send: SendEvent) -> dict[int, str]:
+    def _run(self, ray: Any, left: Retries, send: SendEvent) -> dict[int, str]:
         resources = ray.cluster_resources()
         gpus = int(resources.get("GPU", 0)) if self.job.backend != "llvm" else 0
         cpus = int(resources.get("CPU", 1))
@@ -219,13 +218,13 @@ class _Driver:
         remote = ray.remote(ShardActor).options(
             num_cpus=min(self.job.threads, max(1, cpus // size)), max_restarts=-1, max_task_retries=TRIES - 1, **share
         )
-        size = min(size, len(pending))
+        size = min(size, len(left.pending))
         idle = [remote.remote(asdict(self.job)) for _ in range(size)]
         held: dict[Any, _Held] = {}
-        tries, lost, known = Counter[int](), dict[int, str](), set[str]()
-        while pending or held:
-            while pending and idle:
-                actor, shard = idle.pop(), pending.popleft()
+        known = set[str]()
+        while left.pending or held:
+            while left.pending and idle:
+                actor, shard = idle.pop(), left.pending.popleft()
                 held[actor.render.remote(shard, RECYCLE_IMAGES)] = _Held(actor, shard, time.monotonic())
             ready, _ = ray.wait(list(held), num_returns=1, timeout=1.0)
             for task in ready:
@@ -235,7 +234,7 @@ class _Driver:
                     answer = ray.get(task)
                 except ray.exceptions.RayError as error:
                     reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-                    self._again(job.shard, reason, pending, tries, lost, send)
+                    send("retry", job.shard, reason, left.failed(job.shard, reason))
                     continue
                 if not answer["ok"]:
                     raise FAILURES[answer["kind"]](answer["reason"])
@@ -254,19 +253,8 @@ class _Driver:
                     # Ray restarts it together with its task.
                     job.since = time.monotonic()
                     ray.kill(job.actor, no_restart=False)
-        return lost
+        return left.lost
 
     def _limit(self) -> float:
         """Return the time limit for a whole shard in seconds; `timeout_s` is for one sample."""
         return self.timeout_s * max(1, int(self.job.plan["spec"].get("shard_size", 64)) // 8)
-
-    @staticmethod
-    def _again(
-        shard: int, reason: str, pending: deque[int], tries: Counter[int], lost: dict[int, str], send: SendEvent
-    ) -> None:
-        tries[shard] += 1
-        if tries[shard] >= TRIES:
-            lost[shard] = reason
-        else:
-            pending.appendleft(shard)
-        send("retry", shard, reason, tries[shard])

@@ -4,28 +4,62 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from ..base.errors import InputError
 from ..base.storage.files import MAX_FILE_BYTES, inside, read_json
 from ..base.versions import package_version
-from ..folders.imagefolder import ARRAY_KEYS, DONE, SHARDS, shard_name, versions
+from ..folders.imagefolder import (
+    ARRAY_KEYS,
+    DATASET_SCHEMA,
+    DONE,
+    KINDS,
+    LINES,
+    METADATA,
+    PACKED_RUN_SCHEMA,
+    PACKED_SCHEMA,
+    RUN_SCHEMA,
+    SHARDS,
+    shard_name,
+    versions,
+)
+from ..folders.packed import INDEX, LINES_GZ
 
-SHARD_SCHEMA, PACKED_SHARD_SCHEMA = "eyerender/shard/1", "eyerender/shard/2"
-"""Schemas of done.json of a shard whose pictures are files, and of a packed one."""
-# Kind of image -> key of its file in a line of metadata.
-KINDS = {
-    "images": "file_name",
-    "masks": "mask_file_name",
-    "amodal_masks": "amodal_mask_file_name",
-    "noiseless": "noiseless_file_name",
-    "highlights": "highlight_mask_file_name",
-    "depth": "depth_file_name",
-    "normals": "normals_file_name",
-    "iris_coordinates": "iris_coordinates_file_name",
-    "instances": "instance_mask_file_name",
-}
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Names in a dataset's folder: each picture a file, or packed shards.
+
+    Attributes:
+        run: schema of run.json.
+        dataset: schema of dataset.json.
+        shard: schema of a shard's done.json.
+        table: assembled file of all images.
+        lines: file of a shard's metadata.
+        kinds: kinds of pictures whose folders hold files of a shard.
+    """
+
+    run: str
+    dataset: str
+    shard: str
+    table: str
+    lines: str
+    kinds: tuple[str, ...]
+
+
+FILES = Layout(
+    run=RUN_SCHEMA, dataset=DATASET_SCHEMA, shard="eyerender/shard/1", table=METADATA, lines=LINES, kinds=tuple(KINDS)
+)
+PACKED = Layout(
+    run=PACKED_RUN_SCHEMA, dataset=PACKED_SCHEMA, shard="eyerender/shard/2", table=INDEX, lines=LINES_GZ, kinds=()
+)
+
+
+def layout_of(schema: object) -> Layout | None:
+    """Return the layout in which a file of a schema stands; None if it is a file of another version."""
+    return next((one for one in (FILES, PACKED) if schema in (one.run, one.dataset, one.shard)), None)
 
 
 def picture_file(kind: str, name: str) -> str:
@@ -52,7 +86,7 @@ def described(samples: Sequence[int]) -> tuple[list[int], list[int] | None]:
     return [samples[0], samples[-1] + 1], None if whole else list(samples)
 
 
-def is_sums(value: object) -> bool:
+def is_sums(value: object) -> TypeGuard[Mapping[str, Mapping[str, Any]]]:
     """Return whether a value maps file names to sizes and SHA-256, as `compare_sums` requires."""
     return isinstance(value, Mapping) and all(
         isinstance(entry, Mapping) and _is_count(entry.get("bytes")) and isinstance(entry.get("sha256"), str)
@@ -66,7 +100,7 @@ _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
     "samples": lambda v: _are(v, _is_count) and len(v) == 2,
     "chosen": lambda v: v is None or _are(v, _is_count),  # the samples where some between are left out
     "images": _is_count,
-    "images_saturated": lambda v: v is None or _is_count(v),  # older versions did not count saturated images
+    "images_saturated": _is_count,
     "digest": lambda v: isinstance(v, str),
     "versions": lambda v: isinstance(v, Mapping),
     "backend": lambda v: isinstance(v, Mapping) and all(isinstance(v.get(key), str) for key in ("name", "device")),
@@ -89,8 +123,8 @@ def read_done(folder: Path, shard: int) -> dict[str, Any]:
 def read_done_file(path: Path) -> dict[str, Any]:
     """Read a done.json or the checkpoint of a partial shard, checked as in `read_done`."""
     data = read_json(path, limit=MAX_FILE_BYTES, follow=False)
-    if data.get("schema") not in (SHARD_SCHEMA, PACKED_SHARD_SCHEMA):
-        raise InputError(f"must have the schema {SHARD_SCHEMA!r} or {PACKED_SHARD_SCHEMA!r}", source=str(path))
+    if data.get("schema") not in (FILES.shard, PACKED.shard):
+        raise InputError(f"must have the schema {FILES.shard!r} or {PACKED.shard!r}", source=str(path))
     for key, fits in _DONE_KEYS.items():
         if not fits(data.get(key)):
             raise InputError("is missing, or not in the format of this version", source=str(path), path=key)

@@ -1,9 +1,8 @@
-"""Record of what produced a run, so that it can be repeated years later: source, packages, processor, options."""
+"""Record of what produced a run, so that it can be repeated years later: source, packages, processor."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict
 from email.parser import HeaderParser
 from functools import cache
 from importlib.metadata import distributions
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from .done import cpu_family
-from .options import RunOptions
 
 
 @cache
@@ -39,8 +37,3 @@ def packages() -> dict[str, str]:
         if fields["Name"]:
             found[fields["Name"]] = fields["Version"]
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
-
-
-def flags(options: RunOptions) -> dict[str, Any]:
-    """Return the options of a run as its log records them."""
-    return {key: value for key, value in asdict(options).items() if value is not None}

@@ -1,28 +1,152 @@
-"""Estimate the cost of a run, from the last measured rate or from a few samples made in memory."""
+"""Estimate the cost of a run, from the last measured rate or from a few samples made in memory.
+
+The last rate of a spec on this machine is a file in the user's cache folder. If it is missing or damaged, the rate is
+unknown.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import platform
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
-from ..base.errors import Warn
+from ..base.errors import EyerenderError, Warn
+from ..base.spec import Positive, Spec
+from ..base.storage.cachefolder import cache_folder
+from ..base.storage.files import read_json, write_json
 from ..folders.imagefile import picture_bytes
+from .done import cpu_family
 from .maker import Maker
 from .options import RunOptions
 from .plan import Plan
-from .rates import Rate, keep_rate, last_rate, now
 from .realise import frames_of, realise
-from .run import worker_count
+from .shard import Staged
 from .spec import DatasetSpec
 
 _WARM, _MORE = 8, 4  # samples until the kernels of both eyes of a person are recorded, and some more
 _SUBJECTS = 3  # that are measured after these
+ENOUGH_SAMPLES = 200  # more samples do not make a rate more representative
+_BYTES = 2**16
+_Count = Annotated[float, Field(ge=0, le=1e15)]
+
+
+class Rate(Spec):
+    """Time and size of the samples of a spec."""
+
+    format: Literal["eyerender/rate/2"] = "eyerender/rate/2"
+    how: Literal["run", "measured"] = Field(
+        description="whether a run measured it, or a few samples made for this purpose"
+    )
+    time: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z$")]
+    backend: Annotated[str, Field(max_length=20)]
+    samples: Annotated[int, Field(ge=1, le=10**9)] = Field(description="number of measured samples")
+    start_seconds: _Count = Field(
+        description="additional time of a worker until its kernels are loaded and recorded; 0: included in `seconds`"
+    )
+    seconds: Positive = Field(description="time of one worker for a sample")
+    subject_seconds: _Count = Field(
+        description="additional time for the first sample of a subject; 0: included in `seconds`"
+    )
+    images: _Count = Field(description="images per sample")
+    bytes: _Count = Field(description="bytes per sample, including metadata")
+
+
+def now() -> str:
+    """Return the current time in the format of a rate."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+
+
+@dataclass(slots=True)
+class Speed:
+    """Times of the workers of a run, from which the rate of its spec follows."""
+
+    loading_s: float = 0.0  # until the first worker could render
+    firsts: dict[str, tuple[int, float]] = field(default_factory=dict)  # samples and seconds of a worker's first shard
+    samples: int = 0  # samples of the other shards that this run has finished
+    seconds: float = 0.0  # and the time that they took
+    images: int = 0
+    bytes: int = 0
+    backends: set[str] = field(default_factory=set)
+
+    def ready(self, backend: str, seconds: float) -> None:
+        """Take the time at which a worker could render."""
+        self.loading_s = self.loading_s or seconds
+        self.backends.add(backend)
+
+    def take(self, staged: Staged, samples: int, worker: str) -> None:
+        """Take the times of a finished shard."""
+        if worker in self.firsts:
+            self.samples += samples
+            self.seconds += staged.seconds
+        else:
+            self.firsts[worker] = samples, staged.seconds
+        self.images += staged.images
+        self.bytes += staged.bytes
+
+    def rate(self) -> Rate | None:
+        """Return the rate; None if no shard was finished, or several backends made them."""
+        if not self.firsts or len(self.backends) != 1:
+            return None
+        begun, spent = (sum(column) for column in zip(*self.firsts.values(), strict=True))
+        # The first shard of a worker includes its start; a short run has no others.
+        usual = self.seconds / self.samples if self.samples else spent / begun
+        samples = self.samples + int(begun)
+        return Rate(
+            how="run",
+            time=now(),
+            backend=next(iter(self.backends)),
+            samples=samples,
+            start_seconds=self.loading_s + max(spent - begun * usual, 0.0) / len(self.firsts),
+            seconds=usual,
+            subject_seconds=0.0,
+            images=self.images / samples,
+            bytes=self.bytes / samples,
+        )
+
+
+def keep_rate(plan: Plan, rate: Rate) -> None:
+    """Store a rate, unless the stored one of the same backend comes from more than twice as many samples.
+
+    If the cache cannot be written, the rate is discarded.
+    """
+    path = _path(plan)
+    old = last_rate(plan, rate.backend)
+    if path is not None and (old is None or rate.samples >= min(old.samples, ENOUGH_SAMPLES) / 2):
+        with suppress(OSError, EyerenderError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, rate.to_mapping(), sync=False)
+
+
+def last_rate(plan: Plan, backend: str = "auto") -> Rate | None:
+    """Return the rate last measured on this machine with a backend; None if there is none."""
+    path = _path(plan)
+    if path is None:
+        return None
+    try:
+        rate = Rate.from_mapping(read_json(path, limit=_BYTES, follow=False))
+    except EyerenderError:
+        return None
+    return rate if backend in ("auto", rate.backend) else None
+
+
+def _path(plan: Plan) -> Path | None:
+    """Return the path of a plan's rate on this machine; it does not depend on seed and number of samples."""
+    folder = cache_folder()
+    if folder is None:
+        return None
+    data = plan.to_mapping()
+    data["spec"] = {k: v for k, v in data["spec"].items() if k not in ("count", "planned", "choice", "seed")}
+    key = json.dumps([data, platform.node(), cpu_family()], sort_keys=True)
+    return folder / "rates" / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.json"
 
 
 def estimate(
@@ -64,7 +188,7 @@ def estimate(
     if warn is not None:
         warn(plan.warnings())
     samples, shards = plan.spec.count, len(plan.spec.shards)
-    processes, each = worker_count(options, shards)
+    processes, each = options.processes(shards)
     frames = frames_of(plan)
     if measure:
         began = time.perf_counter()

@@ -20,9 +20,8 @@ from ..imaging.capture import BegunImage, EyeImage, begin_each, make_renderer, n
 from ..imaging.images import settled_exposure_ms
 from ..imaging.labels import image_labels
 from ..rig.plausibility import is_saturated
-from .line import image_line
 from .plan import Plan
-from .realise import Realised, Rejection, realise
+from .realise import Realised, Rejection, image_line, realise
 
 if TYPE_CHECKING:
     from ..rendering.renderer import Renderer

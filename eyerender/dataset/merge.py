@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import uuid
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,9 +13,10 @@ from ..base.errors import EyerenderError, InputError
 from ..base.progress import Progress
 from ..base.storage.files import MAX_FILE_BYTES, make_folder, read_json, sync_folder, sync_tree
 from ..base.storage.lock import final_lock, run_lock
-from ..folders.imagefolder import DONE, RUN, SHARDS, STAGE, finished, shard_name
+from ..folders.imagefolder import DONE, RUN, finished
 from .assemble import assemble
-from .done import KINDS, read_done
+from .done import read_done
+from .partial import new_stage, places
 from .plan import Plan
 from .runfile import begin, refuse_taken
 from .shard import Staged, commit, verify
@@ -88,14 +88,12 @@ def _take(folder: Path, places: Sequence[Path], plan: Plan, step: Progress) -> N
 
 def _staged(folder: Path, place: Path, shard: int) -> Staged:
     """Link or copy a shard into a temporary folder, for `commit` to put in place."""
-    name, done = shard_name(shard), read_done(place, shard)
-    stage = folder / f"{STAGE}{name}-{uuid.uuid4().hex[:12]}"
-    for kind, own in ((SHARDS, "shard"), *((kind, kind) for kind in KINDS)):
-        source = place / kind / name
+    stage, done = new_stage(folder, shard), read_done(place, shard)
+    for source, own in places(place, stage, shard):
         if source.is_dir():
-            make_folder(stage / own)
+            make_folder(own)
             for file in source.iterdir():
-                _copied(file, stage / (DONE if file.name == DONE else f"{own}/{file.name}"))
+                _copied(file, stage / DONE if file.name == DONE else own / file.name)
     sync_tree(stage)
     sync_folder(folder)
     return Staged(shard=shard, stage=str(stage), images=done["images"], rejected=0, given_up=0, seconds=0.0, bytes=0)

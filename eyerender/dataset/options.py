@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..backends.choose import BackendChoice
 from ..base.errors import InputError
+from ..base.processes import usable_cpus
 
 if TYPE_CHECKING:
     from .spec import DatasetSpec
+
+MEMORY_A_WORKER = 1.0e9  # bytes, resident size after fourteen subjects, with head-room
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +52,17 @@ class RunOptions:
                 raise InputError(f"must be >= 1, not {value}", path=name)
         if not self.timeout_s > 0:
             raise InputError(f"must be > 0, not {self.timeout_s:g}", path="timeout_s")
+
+    def processes(self, shards: int) -> tuple[int, int]:
+        """Return the number of workers and of threads of each; by default a worker per processor, as memory allows."""
+        cpus = self.threads or usable_cpus()
+        workers = self.workers
+        if workers is None:
+            memory = MEMORY_A_WORKER
+            with suppress(OSError, ValueError, AttributeError):
+                memory = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+            workers = max(1, min(cpus, int(memory / MEMORY_A_WORKER), shards))
+        return workers, max(1, cpus // workers)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,16 +28,16 @@ from ..base.storage.files import (
     write_json,
     written,
 )
-from ..folders.imagefolder import DONE, LINES, SHARDS, shard_name
+from ..folders.imagefolder import DONE, KINDS, LINES, SHARDS, shard_name
 from ..folders.packed import LINES_GZ, MEMBERS, TAR, pack_lines, read_line
-from .done import KINDS, PACKED_SHARD_SCHEMA, SHARD_SCHEMA, sum_of
-from .interleaving import scrambled
+from .done import FILES, PACKED, sum_of
+from .selection import scrambled
 
 ENDINGS = {
     "images": "", "masks": ".mask", "amodal_masks": ".amodal", "noiseless": ".noiseless", "highlights": ".highlights",
     "depth": ".depth", "normals": ".normals", "iris_coordinates": ".iris_coordinates", "instances": ".instances",
 }  # fmt: skip
-_SHARD = "shard"  # folder of the lines of a partial shard
+SHARD = "shard"  # folder of the lines of a partial shard
 
 
 def pack(stage: Path, done: dict[str, Any], seed: int) -> dict[str, Any]:
@@ -49,18 +49,19 @@ def pack(stage: Path, done: dict[str, Any], seed: int) -> dict[str, Any]:
         OSError: the disk is full or not writable.
         EyerenderError: the same.
     """
-    lines = [parse_json(raw) for raw in read_bytes(stage / _SHARD / LINES).splitlines()]
+    lines = [parse_json(raw) for raw in read_bytes(stage / SHARD / LINES).splitlines()]
     samples = np.array([line["sample"] for line in lines], dtype=np.int64)
     lines = [lines[k] for k in np.lexsort((np.arange(len(lines)), scrambled(samples, seed)))]
-    with written(stage / _SHARD / TAR) as file:
+    with written(stage / SHARD / TAR) as file:
         _write_tar(stage, lines, file)
     text, blocks = pack_lines(lines)
-    write_bytes(stage / _SHARD / LINES_GZ, text)
-    name, splits = shard_name(done["shard"]), sorted({line["split"] for line in lines})
+    write_bytes(stage / SHARD / LINES_GZ, text)
+    name, splits, counts = shard_name(done["shard"]), sorted({line["split"] for line in lines}), counts_of(lines)
+    counts["pupil_semi_axis_px"] = [float(f"{size:.6g}") for size in counts["pupil_semi_axis_px"]]
     packed = {
         **done,
-        "schema": PACKED_SHARD_SCHEMA,
-        "files": {f"{SHARDS}/{name}/{own}": sum_of(stage / _SHARD / own) for own in (TAR, LINES_GZ)},
+        "schema": PACKED.shard,
+        "files": {f"{SHARDS}/{name}/{own}": sum_of(stage / SHARD / own) for own in (TAR, LINES_GZ)},
         "splits": splits,
         "columns": {
             "sample": [line["sample"] for line in lines],
@@ -68,10 +69,10 @@ def pack(stage: Path, done: dict[str, Any], seed: int) -> dict[str, Any]:
             "split": [splits.index(line["split"]) for line in lines],
             "block": blocks,
         },
-        "counts": _counts(lines),
+        "counts": counts,
     }
     write_json(stage / DONE, packed)
-    remove_file(stage / _SHARD / LINES)
+    remove_file(stage / SHARD / LINES)
     for kind in KINDS:
         shutil.rmtree(stage / kind, ignore_errors=True)
     sync_folder(stage)
@@ -90,10 +91,10 @@ def unpack(stage: Path, done: dict[str, Any]) -> dict[str, Any]:
     """
     name = shard_name(done["shard"])
     for own in (TAR, LINES_GZ):
-        if sum_of(stage / _SHARD / own) != done["files"][f"{SHARDS}/{name}/{own}"]:
+        if sum_of(stage / SHARD / own) != done["files"][f"{SHARDS}/{name}/{own}"]:
             raise ValueError(f"{own}: its checksum differs")
     files = {}
-    with open(stage / _SHARD / TAR, "rb") as tar:
+    with open(stage / SHARD / TAR, "rb") as tar:
         lines = list(_lines(stage, done))
         for line in lines:
             for key, (first, size) in line.pop(MEMBERS).items():
@@ -104,20 +105,20 @@ def unpack(stage: Path, done: dict[str, Any]) -> dict[str, Any]:
                 write_bytes(stage / kind / own, data, sync=False)
                 files[f"{kind}/{name}/{own}"] = {"bytes": size, "sha256": hashlib.sha256(data).hexdigest()}
     text = "".join(json.dumps(line) + "\n" for line in sorted(lines, key=lambda line: int(line["sample"]))).encode()
-    write_bytes(stage / _SHARD / LINES, text)
+    write_bytes(stage / SHARD / LINES, text)
     files[f"{SHARDS}/{name}/{LINES}"] = {"bytes": len(text), "sha256": hashlib.sha256(text).hexdigest()}
     kept = {key: value for key, value in done.items() if key not in ("splits", "columns", "counts")}
-    partial = {**kept, "schema": SHARD_SCHEMA, "files": files}
+    partial = {**kept, "schema": FILES.shard, "files": files}
     sync_tree(stage)
     write_json(stage / DONE, partial)
     for own in (TAR, LINES_GZ):
-        remove_file(stage / _SHARD / own)
+        remove_file(stage / SHARD / own)
     return partial
 
 
 def _lines(stage: Path, done: dict[str, Any]) -> Iterator[dict[str, Any]]:
     for row, block in enumerate(done["columns"]["block"]):
-        yield read_line(stage / _SHARD / LINES_GZ, row, block)
+        yield read_line(stage / SHARD / LINES_GZ, row, block)
 
 
 def _write_tar(stage: Path, lines: list[dict[str, Any]], file: Any) -> None:
@@ -126,23 +127,27 @@ def _write_tar(stage: Path, lines: list[dict[str, Any]], file: Any) -> None:
         for line in lines:
             own = line[MEMBERS] = {}
             for kind, key in KINDS.items():
-                if line.get(key) is None:
-                    continue
-                path = PurePosixPath(line[key])
-                data = read_bytes(stage / kind / path.name)
-                member = tarfile.TarInfo(f"{path.stem}{ENDINGS[kind]}{path.suffix}")  # no times or owners
-                member.size = len(data)
-                own[key] = [tar.offset + tarfile.BLOCKSIZE, len(data)]  # behind the header
-                tar.addfile(member, io.BytesIO(data))
-                tar.members.clear()  # type: ignore[attr-defined]  # the library keeps them for reading
+                if line.get(key) is not None:
+                    path = PurePosixPath(line[key])
+                    data = read_bytes(stage / kind / path.name)
+                    own[key] = [tar.offset + tarfile.BLOCKSIZE, len(data)]  # behind the header
+                    add_member(tar, f"{path.stem}{ENDINGS[kind]}{path.suffix}", data)
 
 
-def _counts(lines: list[dict[str, Any]]) -> dict[str, Any]:
-    """Count what the statistics of the dataset need from the shard's metadata."""
+def add_member(tar: tarfile.TarFile, name: str, data: bytes) -> None:
+    """Write a file into a tar, without times and owners, so that the same files give the same bytes."""
+    member = tarfile.TarInfo(name)
+    member.size = len(data)
+    tar.addfile(member, io.BytesIO(data))
+    tar.members.clear()  # type: ignore[attr-defined]  # the library keeps them for reading
+
+
+def counts_of(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Count what the statistics of a dataset need from lines of metadata."""
     pupils = [line["labels"]["pupil"] for line in lines]
-    sizes = [pupil["amodal"]["semi_axes_px"][0] for pupil in pupils if pupil["amodal"]["semi_axes_px"] is not None]
+    sizes = [pupil["amodal"]["semi_axes_px"] for pupil in pupils]
     return {
         "pupils_visible": sum(pupil["visible"]["pixels"] > 0 for pupil in pupils),
         "glints_visible": sum(glint["visible"] for line in lines for glint in line["labels"]["glints"]),
-        "pupil_semi_axis_px": [float(f"{size:.6g}") for size in sizes],
+        "pupil_semi_axis_px": [axes[0] for axes in sizes if axes is not None],
     }

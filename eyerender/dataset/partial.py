@@ -17,7 +17,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -35,25 +35,14 @@ from ..base.storage.files import (
     write_json,
 )
 from ..folders.imagefile import Writer
-from ..folders.imagefolder import DONE, IMAGE_SCHEMA, LINES, SHARDS, STAGE, shard_name
-from .done import (
-    KINDS,
-    PACKED_SHARD_SCHEMA,
-    SHARD_SCHEMA,
-    cpu_family,
-    described,
-    picture_file,
-    read_done_file,
-    run_versions,
-    sum_of,
-)
+from ..folders.imagefolder import DONE, IMAGE_SCHEMA, KINDS, LINES, SHARDS, STAGE, shard_name
+from .done import FILES, PACKED, cpu_family, described, picture_file, read_done_file, run_versions, sum_of
 from .maker import MadeSample
-from .packing import pack, unpack
+from .packing import SHARD, pack, unpack
 from .plan import Plan
 
 CHECKPOINT_S = 10.0
 """Time between checkpoints: the most work lost when a worker is killed."""
-_SHARD = "shard"  # folder of the lines
 
 
 class PartialShard:
@@ -80,11 +69,11 @@ class PartialShard:
         self._hash = hashlib.sha256()
         self._size = 0
         self._writer = Writer()
-        self.stage = folder / f"{STAGE}{shard_name(shard)}-{uuid.uuid4().hex[:12]}"
+        self.stage = new_stage(folder, shard)
         found = _claimed(folder, shard, self.stage)
-        if found is not None and found["schema"] == PACKED_SHARD_SCHEMA:
+        if found is not None and found["schema"] == PACKED.shard:
             found = _unpacked(self.stage, found)
-        for kind in (*plan.spec.labels.pictures, _SHARD):
+        for kind in (*plan.spec.labels.pictures, SHARD):
             make_folder(self.stage / kind)
         self._lines = self._new_lines()
         if found is not None:
@@ -142,13 +131,13 @@ class PartialShard:
             kind, file = name.split("/")
             self._files[self._place(kind, file)] = sum_of(self.stage / name)
         self._new = []
-        for kind in (*self.plan.spec.labels.pictures, _SHARD, "."):
+        for kind in (*self.plan.spec.labels.pictures, SHARD, "."):
             sync_folder(self.stage / kind)
         sync_folder(self.folder)
         own = {"bytes": self._size, "sha256": self._hash.hexdigest()}
         samples, chosen = described(self.plan.spec.shard_samples(self.shard))
         done = {
-            "schema": SHARD_SCHEMA,
+            "schema": FILES.shard,
             "shard": self.shard,
             "samples": samples,
             **({} if chosen is None else {"chosen": chosen}),
@@ -192,20 +181,20 @@ class PartialShard:
 
     def _new_lines(self) -> BinaryIO:
         """Open a new metadata file, which replaces the old one at the next checkpoint."""
-        path = self.stage / _SHARD / f"{LINES}.new"
+        path = self.stage / SHARD / f"{LINES}.new"
         path.unlink(missing_ok=True)
         return open(path, "xb")
 
     def _publish_lines(self) -> None:
         self._lines.flush()
         os.fsync(self._lines.fileno())
-        os.replace(self.stage / _SHARD / f"{LINES}.new", self.stage / _SHARD / LINES)
+        os.replace(self.stage / SHARD / f"{LINES}.new", self.stage / SHARD / LINES)
 
     def _sort_lines(self) -> None:
         self._lines.close()
         places = sorted(self._places)
         self._places, self._hash, self._size, self.images = [], hashlib.sha256(), 0, 0
-        with open(self.stage / _SHARD / LINES, "rb") as file:
+        with open(self.stage / SHARD / LINES, "rb") as file:
             self._lines = self._new_lines()
             for sample, first, length in places:
                 file.seek(first)
@@ -249,7 +238,7 @@ class PartialShard:
             kind, _, file = name.split("/")
             if name != own and sum_of(inside(self.stage, f"{kind}/{file}")) != entry:
                 raise InputError(f"{name}: its checksum differs")
-        with opened(self.stage / _SHARD / LINES, follow=False) as file:
+        with opened(self.stage / SHARD / LINES, follow=False) as file:
             data = file.read(done["files"][own]["bytes"])
         if hashlib.sha256(data).hexdigest() != done["files"][own]["sha256"]:
             raise InputError("its lines differ")
@@ -277,7 +266,18 @@ def stages(folder: Path) -> Iterator[tuple[int, Path]]:
             yield int(number), stage
 
 
-def reopen(folder: Path, shard: int, kinds: Sequence[str]) -> None:
+def new_stage(folder: Path, shard: int) -> Path:
+    """Return a new name for the temporary folder of a shard."""
+    return folder / f"{STAGE}{shard_name(shard)}-{uuid.uuid4().hex[:12]}"
+
+
+def places(folder: Path, stage: Path, shard: int) -> list[tuple[Path, Path]]:
+    """Return the folders of a shard, each with its place in a temporary folder; that of the lines comes last."""
+    name = shard_name(shard)
+    return [*((folder / kind / name, stage / kind) for kind in KINDS), (folder / SHARDS / name, stage / SHARD)]
+
+
+def reopen(folder: Path, shard: int) -> None:
     """Turn a finished shard back into a partial one, which `PartialShard` can continue with more or fewer samples.
 
     If the process is killed between the moves, `take_back` completes them.
@@ -285,14 +285,13 @@ def reopen(folder: Path, shard: int, kinds: Sequence[str]) -> None:
     Raises:
         OSError: a file cannot be moved.
     """
-    name = shard_name(shard)
-    stage = folder / f"{STAGE}{name}-{uuid.uuid4().hex[:12]}"
+    stage = new_stage(folder, shard)
     stage.mkdir()
-    os.rename(folder / SHARDS / name / DONE, stage / DONE)
-    for place, own in ((SHARDS, _SHARD), *((kind, kind) for kind in kinds)):
-        if (folder / place / name).is_dir():  # packed shards have no folders of pictures
-            os.rename(folder / place / name, stage / own)
-            sync_folder(folder / place)
+    os.rename(folder / SHARDS / shard_name(shard) / DONE, stage / DONE)
+    for place, own in places(folder, stage, shard):
+        if place.is_dir():  # packed shards have no folders of pictures
+            os.rename(place, own)
+            sync_folder(place.parent)
     sync_folder(stage)
     sync_folder(folder)
 
@@ -306,10 +305,9 @@ def take_back(folder: Path, shards: Iterable[int]) -> None:
     wanted = set(shards)
     for shard, stage in stages(folder):
         if shard in wanted and (stage / DONE).is_file():
-            for place, own in ((SHARDS, _SHARD), *((kind, kind) for kind in KINDS)):
-                source = folder / place / shard_name(shard)
-                if source.is_dir() and not (stage / own).exists():
-                    os.rename(source, stage / own)
+            for place, own in places(folder, stage, shard):
+                if place.is_dir() and not own.exists():
+                    os.rename(place, own)
 
 
 def remove_stages(folder: Path, shards: Iterable[int], finished: set[int]) -> None:

@@ -103,8 +103,7 @@ class Plan:
     """A dataset spec with its eyes, and the checksums of all files that it names, including eye files.
 
     `files` maps names, relative to the folder `base`, to SHA-256. Workers of a run find the files there, wherever they
-    run. `aliases` are pairs of places of the spec's file in which one draw stands. `scenes` is what gives the scenes in
-    place of the spec, if anything does.
+    run. `scenes` is what gives the scenes in place of the spec, if anything does.
     """
 
     spec: DatasetSpec
@@ -112,7 +111,6 @@ class Plan:
     files: Mapping[str, str]
     base: Path
     source: str = ""
-    aliases: tuple[tuple[str, str], ...] = ()
     scenes: OwnScenes | None = None
 
     @classmethod
@@ -153,10 +151,7 @@ class Plan:
             return _of_function(spec, own, eye)
         if eye is not None:
             spec = spec.replaced("--eye", _with_eye(spec, eye))
-        if file is None:
-            return cls.of(spec)
-        aliases = tuple(aliased_draws(read_yaml(file)))
-        return replace(cls.of(spec, base=file.parent, source=str(file)), aliases=aliases)
+        return cls.of(spec) if file is None else cls.of(spec, base=file.parent, source=str(file))
 
     @classmethod
     def of(cls, spec: DatasetSpec, *, base: Path | None = None, source: str = "") -> Plan:
@@ -258,7 +253,8 @@ class Plan:
     def warnings(self) -> list[InputWarning]:
         """Return probable mistakes in the scenes of some samples, spread over the dataset; each is reported once."""
         found: dict[tuple[str, str], InputWarning] = {}
-        for first, again in self.aliases:
+        data = read_yaml(Path(self.source)) if os.path.isfile(self.source) else {}
+        for first, again in aliased_draws(data):
             reason = f"is an alias of {first}, but drawn on its own; use 'variables' for one value in both places"
             found["alias", again] = InputWarning(code="alias", reason=reason, source=self.source, path=again)
         count = min(self.spec.count, _LOOKED_AT)
@@ -505,12 +501,7 @@ def plan_digest(mapping: Mapping[str, Any]) -> str:
     spec["planned"] = spec.get("planned") or spec["count"]
     del spec["count"]
     spec.pop("choice", None)
-    return mapping_digest({**mapping, "spec": spec})
-
-
-def mapping_digest(mapping: Mapping[str, Any]) -> str:
-    """Compute the SHA-256 of a mapping's canonical JSON."""
-    text = json.dumps(mapping, sort_keys=True, separators=(",", ":"))
+    text = json.dumps({**mapping, "spec": spec}, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 

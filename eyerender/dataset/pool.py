@@ -52,6 +52,22 @@ class _Worker:
     is_ready: bool = False
 
 
+class Retries:
+    """Shards that wait to be made, how often each was tried, and the reasons why some were given up."""
+
+    def __init__(self, shards: Iterable[int]) -> None:
+        self.pending, self.tries, self.lost = deque(shards), Counter[int](), dict[int, str]()
+
+    def failed(self, shard: int, reason: str) -> int:
+        """Put a shard whose worker ended in front again, or give it up; return how often it was tried."""
+        self.tries[shard] += 1
+        if self.tries[shard] >= TRIES:
+            self.lost[shard] = reason
+        elif shard != NO_SHARD:
+            self.pending.appendleft(shard)
+        return self.tries[shard]
+
+
 class LocalPool:
     """Engine that makes shards with worker processes on this machine."""
 
@@ -74,35 +90,30 @@ class LocalPool:
             InputError: a file that the scenes name cannot be used, or has changed.
             EyerenderError: the disk is full or not writable.
         """
-        pending, tries, lost = deque(shards), Counter[int](), dict[int, str]()
+        left = Retries(shards)
         self._made = 0
         try:
-            while pending or self._busy():
-                self._hand_out(pending)
+            while left.pending or self._busy():
+                self._hand_out(left.pending)
                 wait([w.pipe for w in self._workers] + [w.process.sentinel for w in self._workers], timeout=1.0)
                 for worker in list(self._workers):
                     made = self._made
                     reason = self._listen(worker, events)
                     if self._made > made:
-                        del tries[NO_SHARD]  # workers do start, so only consecutive deaths end a run
+                        del left.tries[NO_SHARD]  # workers do start, so only consecutive deaths end a run
                     if reason is None:
                         if worker.shard is None and worker.images >= self.recycle_images:
                             self._end(worker)  # before memory leaks of its libraries add up
                         continue
                     self._end(worker)
                     shard = NO_SHARD if worker.shard is None else worker.shard
-                    tries[shard] += 1
-                    if tries[shard] < TRIES:
-                        if shard != NO_SHARD:
-                            pending.appendleft(shard)
-                    elif shard == NO_SHARD:
+                    tries = left.failed(shard, reason)
+                    if NO_SHARD in left.lost:
                         raise EyerenderError(f"workers cannot start: {reason}")
-                    else:
-                        lost[shard] = reason
-                        if len(lost) >= HOPELESS and not self._made:
-                            return lost
-                    events.retry(shard, reason, tries[shard])
-            return lost
+                    if len(left.lost) >= HOPELESS and not self._made:
+                        return left.lost
+                    events.retry(shard, reason, tries)
+            return left.lost
         finally:
             self.close()
 

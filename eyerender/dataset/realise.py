@@ -3,10 +3,13 @@
 Attempt a of sample i draws every random value of the sample again. Grids and sequences stay, because they are the
 design; a Sobol draw becomes a random one; the subject's identity stays. The first attempt that succeeds is the sample.
 After `attempts` failures, or at once if nothing random is left to draw, the sample is given up.
+
+`image_line` gives the metadata of one image of a sample.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +18,10 @@ from ..analytic.observer import trace
 from ..base.errors import EyerenderError, InputError, InputWarning
 from ..folders.outfolder import refuse_non_empty
 from ..imaging.capture import check_windows
+from ..population.table import default_table
 from ..rig.camera import Window, in_window
 from ..scene import Frames, Scene
-from ..scene.observation import Observations
+from ..scene.observation import EYES, Observations
 from .plan import Plan, Sample, is_function
 from .spec import DatasetSpec
 
@@ -215,3 +219,68 @@ def _require_pupils(scene: Scene, found: Observations) -> None:
             raise InputError(f"no apparent pupil: {found.pupil.reason[row]}")
         if not in_window(window, found.pupil.points_px[row]).all():
             raise InputError("the apparent pupil leaves the window")
+
+
+def image_name(sample: int, frame: int, frames: int, side: str) -> str:
+    """Return the name of an image without suffix; `frame` counts within the sample, which has `frames` frames."""
+    return f"{sample:08d}-{f'{frame:03d}-' if frames > 1 else ''}{side}"
+
+
+def image_line(
+    found: Realised, row: int, frames: int, window: Window, labels: dict[str, Any]
+) -> tuple[str, dict[str, Any]]:
+    """Return name and metadata, without the names of its files, of observation `row` of a sample.
+
+    `frames` is the number of frames per sample.
+    """
+    sample, scene, observations = found.sample, found.scene, found.observations
+    assert sample is not None
+    assert scene is not None
+    assert observations is not None
+    turn = sample.turn
+    (record,) = observations.take([row]).records()
+    frame = record["frame"]
+    side = EYES[int(observations.index.eye[row])]
+    eye = sample.eye or scene.eye_file(side).to_mapping()
+    line = {
+        "sample": turn.sample,
+        "subject": turn.subject,
+        "split": sample.split,
+        "sequence_index": turn.sequence,
+        "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
+        "bit_depth": scene.spec.sensor.bit_depth,
+        "gamma": scene.spec.sensor.gamma,
+        # Keys of version 4 that no scene fills yet: time within the sequence, movements, and what the eye wears.
+        **dict.fromkeys(("time_s", "event", "rig_pose")),
+        # A frame's number is unique in the whole dataset.
+        "records": [{**record, "frame": turn.sample * frames + frame}],
+        "labels": labels,
+        "parameters": {
+            "eye_model": scene.eye_name,
+            "pupil_diameter_mm": scene.stop_diameter_mm(side),
+            "wavelength_nm": scene.spec.wavelength_nm,
+            "spp": scene.spec.image.spp,
+            "seed": scene.spec.seed,
+            "camera": int(observations.index.camera[row]),
+            "attempt": turn.attempt,
+            "subject_attempt": turn.subject_attempt,
+            "draws": sample.draws,
+            "spectacles": None,
+            "contact_lens": None,
+            **_person(scene, side),
+            # Stored as text, because their nested keys may differ between samples, which table columns do not allow.
+            "scene_json": json.dumps(sample.scene, sort_keys=True),
+            "eye_json": json.dumps({k: v for k, v in eye.items() if k != "sources"}, sort_keys=True),
+        },
+    }
+    return image_name(turn.sample, frame, frames, side), line
+
+
+def _person(scene: Scene, side: str) -> dict[str, Any]:
+    """Return the metadata `person`; its entrance pupil is that at the table's luminance, not that of the image."""
+    found: dict[str, Any] = scene.person_numbers(side)
+    if "entrance_pupil_mm" not in found.get("person", {}):
+        return found
+    luminance = default_table().constant("luminance_cd_m2")
+    named = {"entrance_pupil_mm": f"entrance_pupil_at_{luminance:g}_cd_m2_mm"}
+    return {"person": {named.get(key, key): value for key, value in found["person"].items()}}

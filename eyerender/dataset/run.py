@@ -3,44 +3,41 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..base.errors import EyerenderError, InputError, Warn
-from ..base.processes import usable_cpus
 from ..base.progress import Progress, Say
 from ..base.storage.files import MAX_FILE_BYTES, make_folder, read_json, remove_file
 from ..base.storage.lock import LOCK, final_lock, run_lock
-from ..folders.imagefolder import DATASET, LOG, finished
+from ..folders.imagefolder import DATASET, finished
 from ..folders.outfolder import clear, refuse_non_empty
 from ..rig.plausibility import saturation_warnings
 from .assemble import assemble, damage
 from .done import cpu_family, described, read_done, samples_of
-from .environment import environment, flags
+from .environment import environment
+from .estimate import Speed, keep_rate
 from .options import RunOptions
 from .partial import checkpoints, reopen
 from .plan import Plan
 from .pool import NO_SHARD, LocalPool
-from .rates import Rate, keep_rate, now
 from .realise import frames_of
 from .runfile import begin, refuse_another_count, refuse_taken, settle, was_resized
 from .selection import in_spread_order
 from .shard import Staged, commit, is_finished, remove_leftovers, withdraw_damaged
 from .spec import DatasetSpec
+from .status import Log
 from .worker import Job
 
 if TYPE_CHECKING:
     from .cluster import RayEngine
 
 LOG_S = 60.0  # the log is written at least so often while samples are made
-MEMORY_A_WORKER = 1.0e9  # bytes, resident size after fourteen subjects, with head-room
 
 
 def generate(
@@ -137,7 +134,8 @@ def opened_run(
         with run_lock(folder, part, say):
             if options.overwrite and n == 1:
                 clear(folder)
-            run = Run(plan=plan, folder=folder, options=options, part=part, frames=frames, progress=progress, say=say)
+            told: dict[str, Any] = {"progress": progress, "say": say, "log": Log(folder, part)}
+            run = Run(plan=plan, folder=folder, options=options, part=part, frames=frames, **told)
             with final_lock(folder, say):
                 resumed = begin(folder, plan, run.repaired)
             try:
@@ -163,16 +161,36 @@ def opened_run(
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def worker_count(options: RunOptions, shards: int) -> tuple[int, int]:
-    """Return the number of workers and the threads of each; by default one worker per processor, as memory allows."""
-    cpus = options.threads or usable_cpus()
-    workers = options.workers
-    if workers is None:
-        memory = MEMORY_A_WORKER
-        with suppress(OSError, ValueError, AttributeError):
-            memory = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        workers = max(1, min(cpus, int(memory / MEMORY_A_WORKER), shards))
-    return workers, max(1, cpus // workers)
+@dataclass(slots=True)
+class Counts:
+    """Counts of a run, for its progress."""
+
+    total: int = 0  # samples of the shards to make
+    samples: int = 0  # of these, samples that are made, with those that earlier runs made
+    kept: int = 0  # samples that earlier runs made
+    images: int = 0
+    rejected: int = 0
+    given_up: int = 0
+    retries: int = 0
+    _by_shard: dict[int, int] = field(default_factory=dict)
+
+    def take(self, shard: int, samples: int, images: int | None = None) -> None:
+        """Take the number of samples of a shard that are made; `images` are those of the last sample, 0 for kept ones.
+
+        The first report of a shard tells which samples were kept.
+        """
+        if images is not None and shard not in self._by_shard:
+            self.kept += samples - 1 if images else samples
+        self.samples += samples - self._by_shard.get(shard, 0)
+        self._by_shard[shard] = samples
+        self.images += images or 0
+
+    def note(self, seconds: float) -> str:
+        """Describe the rate after so many seconds, and the time left."""
+        rate, new = self.images / seconds if seconds > 0 else 0.0, self.samples - self.kept
+        left = (self.total - self.samples) * seconds / new if new > 0 else 0.0
+        redrawn = f", {self.rejected} attempts redrawn, {self.given_up} samples given up" if self.rejected else ""
+        return f"samples, {rate:.2f} images/s, {_clock(left)} left{redrawn}"
 
 
 @dataclass(kw_only=True)
@@ -186,24 +204,10 @@ class Run:
     frames: int
     progress: Progress
     say: Say
-    start: float = field(default_factory=time.monotonic)
-    made: dict[int, int] = field(default_factory=dict)  # samples by shard, with those that were kept
-    kept: int = 0  # samples of `made` that earlier runs made
-    images: int = 0
-    rejected: int = 0
-    given_up: int = 0
-    retries: int = 0
-    total: int = 0
-    samples: int = 0  # sum of `made`
-    loading_s: float = 0.0  # until the first worker could render
-    first_shards: dict[str, tuple[int, float]] = field(default_factory=dict)  # per worker: samples, seconds
-    timed: int = 0  # samples of the other shards that this run has finished
-    worker_seconds: float = 0.0  # and the time that they took
-    staged_images: int = 0
-    bytes: int = 0
-    backends: set[str] = field(default_factory=set)
-    seen: set[str] = field(default_factory=set)
-    logged: float = 0.0  # when the log was last written
+    log: Log
+    counts: Counts = field(default_factory=Counts)
+    speed: Speed = field(default_factory=Speed)
+    makers: set[str] = field(default_factory=set)  # backends and processors that made shards
     verified: set[int] = field(default_factory=set)  # shards whose checksums this run has verified
     todo: list[int] = field(default_factory=list)  # the shards to make
     intact: bool = False  # whether the dataset is assembled already
@@ -228,18 +232,18 @@ class Run:
             if problem is not None and ((self.folder / DATASET).exists() or not self.todo):
                 self.repaired(f"the dataset is assembled again: {problem}")
         self.intact = not self.todo and problem is None and not self._verifies
-        self.total = sum(len(self.plan.spec.shard_samples(s)) for s in self.todo)
+        self.counts.total = sum(len(self.plan.spec.shard_samples(s)) for s in self.todo)
         if self.todo:
             remove_file(self.folder / DATASET)  # a folder that has one is complete
             for shard in sorted(done) if self._verifies else ():
                 with suppress(InputError):  # a damaged shard of another part
                     self._mixed(read_done(self.folder, shard), old=True)
-            self._log(
+            self.log.write(
                 "start",
                 shards=len(self.todo),
                 finished=len(done & mine),
                 engine=self.options.engine,
-                options=flags(self.options),
+                options={key: value for key, value in asdict(self.options).items() if value is not None},
                 source_sha256=environment()["source_sha256"],
                 cpu=cpu_family(),
             )
@@ -253,11 +257,11 @@ class Run:
             "complete": not missing,
             "shards_made": len(self.todo),
             "shards_missing": len(missing),
-            "images_made": self.images,
-            "seconds": round(time.monotonic() - self.start, 3),
-            "retries": self.retries,
+            "images_made": self.counts.images,
+            "seconds": round(self.log.seconds, 3),
+            "retries": self.counts.retries,
         }
-        self._log("end", **(statistics or {}))
+        self.log.write("end", **(statistics or {}))
         if statistics is not None:
             summary |= {"statistics": statistics}
         return summary
@@ -316,15 +320,16 @@ class Run:
         Raises:
             EyerenderError: some shards could not be made; the engines raise further errors.
         """
-        self.progress(0, self.total, "samples")
+        self.progress(0, self.counts.total, "samples")
         try:
             lost = self._engine(len(todo)).run(todo, self)
         except BaseException as error:
             with suppress(OSError):
-                self._log("stop", reason=type(error).__name__)
+                self.log.write("stop", reason=type(error).__name__)
             raise
         finally:
-            self._keep_rate()
+            if self.options.engine == "local" and (rate := self.speed.rate()) is not None:
+                keep_rate(self.plan, rate)  # for estimates of later runs
             remove_leftovers(self.folder, mine, finished(self.folder))
         if lost:
             shard, reason = next(iter(lost.items()))
@@ -336,7 +341,7 @@ class Run:
     def repaired(self, what: str) -> None:
         """Report that something damaged is made or written again."""
         self.say(f"repairing: {what}")
-        self._log("repair", what=what)
+        self.log.write("repair", what=what)
 
     def _missing(self) -> set[int]:
         return set(self.plan.spec.shards) - finished(self.folder)
@@ -359,14 +364,14 @@ class Run:
                 continue
             else:
                 reopened += 1
-            reopen(self.folder, shard, self.plan.spec.labels.pictures)
+            reopen(self.folder, shard)
         if reopened or aside:
             self.say(f"{reopened} finished shards get more or fewer samples; {aside} are set aside")
-            self._log("resize", reopened=reopened, aside=aside)
+            self.log.write("resize", reopened=reopened, aside=aside)
 
     def _engine(self, shards: int) -> LocalPool | RayEngine:
         options = self.options
-        workers, threads = worker_count(options, shards)
+        workers, threads = options.processes(shards)
         job = Job.of(self.plan, self.frames, self.folder, options.backend, threads)
         if options.engine == "ray":
             from .cluster import RayEngine
@@ -374,63 +379,32 @@ class Run:
             return RayEngine(job, options.workers, address=options.address, timeout_s=options.timeout_s)
         return LocalPool(job, min(workers, shards), timeout_s=options.timeout_s)
 
-    def _keep_rate(self) -> None:
-        """Store the speed of this machine, for estimates of later runs of this spec."""
-        if self.options.engine != "local" or not self.first_shards or len(self.backends) != 1:
-            return
-        begun, spent = (sum(column) for column in zip(*self.first_shards.values(), strict=True))
-        # The first shard of a worker includes its start; a short run has no others.
-        usual = self.worker_seconds / self.timed if self.timed else spent / begun
-        samples = self.timed + int(begun)
-        rate = Rate(
-            how="run",
-            time=now(),
-            backend=next(iter(self.backends)),
-            samples=samples,
-            start_seconds=self.loading_s + max(spent - begun * usual, 0.0) / len(self.first_shards),
-            seconds=usual,
-            subject_seconds=0.0,
-            images=self.staged_images / samples,
-            bytes=self.bytes / samples,
-        )
-        keep_rate(self.plan, rate)
-
     # Reports of the engine.
 
     def ready(self, backend: dict[str, Any], worker: str) -> None:
         """Record that a worker can render."""
-        self.loading_s = self.loading_s or time.monotonic() - self.start
-        self._log("worker", worker=worker, backend=backend)
-        self.backends.add(backend["name"])
+        self.speed.ready(backend["name"], self.log.seconds)
+        self.log.write("worker", worker=worker, backend=backend)
         self._mixed({"backend": backend, "cpu": cpu_family() if self.options.engine == "local" else None})
 
     def sample(self, shard: int, samples: int, images: int) -> None:
         """Record finished samples of a shard: one that was made, or `samples` taken over from an earlier worker."""
-        if shard not in self.made:
-            self.kept += samples - 1 if images else samples
-        self._count(shard, samples)
-        self.images += images
-        if time.monotonic() - self.logged > LOG_S:
-            self._log("progress", made=self.images)
+        self.counts.take(shard, samples, images)
+        if time.monotonic() - self.log.written > LOG_S:
+            self.log.write("progress", made=self.counts.images)
         self._show()
 
     def staged(self, staged: Staged, worker: str) -> None:
         """Record that a shard is written."""
+        samples = len(self.plan.spec.shard_samples(staged.shard))
         if not is_finished(self.folder, staged.shard):
             commit(self.folder, staged)
             self.verified.add(staged.shard)
-            samples = len(self.plan.spec.shard_samples(staged.shard))
-            if worker in self.first_shards:
-                self.timed += samples
-                self.worker_seconds += staged.seconds
-            else:
-                self.first_shards[worker] = samples, staged.seconds
-            self.staged_images += staged.images
-            self.bytes += staged.bytes
-        self._count(staged.shard, len(self.plan.spec.shard_samples(staged.shard)))
-        self.rejected += staged.rejected
-        self.given_up += staged.given_up
-        self._log(
+            self.speed.take(staged, samples, worker)
+        self.counts.take(staged.shard, samples)
+        self.counts.rejected += staged.rejected
+        self.counts.given_up += staged.given_up
+        self.log.write(
             "shard",
             shard=staged.shard,
             images=staged.images,
@@ -439,59 +413,31 @@ class Run:
             shard_seconds=round(staged.seconds, 3),
             worker=worker,
             bytes=staged.bytes,
-            made=self.images,
+            made=self.counts.images,
         )
         self._show()
 
     def retry(self, shard: int, reason: str, tries: int) -> None:
         """Record that a shard's worker ended."""
-        self.retries += 1
-        self._count(shard, 0)
+        self.counts.retries += 1
+        self.counts.take(shard, 0)
         what = "a worker" if shard == NO_SHARD else f"shard {shard}"
         self.say(f"{what}: {reason} (try {tries})")
-        self._log("retry", shard=shard, reason=reason, tries=tries)
-
-    def _count(self, shard: int, samples: int) -> None:
-        self.samples += samples - self.made.get(shard, 0)
-        self.made[shard] = samples
+        self.log.write("retry", shard=shard, reason=reason, tries=tries)
 
     def _show(self) -> None:
-        samples, seconds = self.samples, time.monotonic() - self.start
-        rate = self.images / seconds if seconds > 0 else 0.0
-        new = samples - self.kept
-        left = (self.total - samples) * seconds / new if new > 0 else 0.0
-        note = f"samples, {rate:.2f} images/s, {_clock(left)} left"
-        if self.rejected:
-            note += f", {self.rejected} attempts redrawn, {self.given_up} samples given up"
-        self.progress(samples, self.total, note)
+        self.progress(self.counts.samples, self.counts.total, self.counts.note(self.log.seconds))
 
     def _mixed(self, made_by: dict[str, Any], *, old: bool = False) -> None:
         """Warn if shards of different backends or processors are combined: their bytes may differ in rounding."""
         backend = made_by["backend"]
         key = json.dumps([backend["name"], backend.get("llvm"), backend.get("device"), made_by.get("cpu")])
-        if self.seen and key not in self.seen and not old:
+        if self.makers and key not in self.makers and not old:
             self.say(
                 "warning: different backends or processors make the shards of this dataset, so rounding may differ"
             )
-            self._log("warning", reason="mixed backends or processors", backend=backend)
-        self.seen.add(key)
-
-    def _log(self, event: str, **data: Any) -> None:
-        line = {
-            "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-            "host": socket.gethostname(),
-            "part": f"{self.part[0]}/{self.part[1]}",
-            "event": event,
-            "seconds": round(time.monotonic() - self.start, 3),
-            **data,
-        }
-        self.logged = time.monotonic()
-        with open(self.folder / LOG, "ab+") as file:
-            if file.tell():
-                file.seek(-1, os.SEEK_END)
-                if file.read(1) != b"\n":  # a power cut may have truncated the last line
-                    file.write(b"\n")
-            file.write(json.dumps(line).encode() + b"\n")
+            self.log.write("warning", reason="mixed backends or processors", backend=backend)
+        self.makers.add(key)
 
 
 def _clock(seconds: float) -> str:

@@ -13,12 +13,12 @@ from ..base.errors import InputError
 from ..base.progress import Say
 from ..base.storage.files import MAX_FILE_BYTES, PART, read_json, remove_file, remove_parts, write_json
 from ..base.storage.lock import LOCK
-from ..folders.imagefolder import DATASET, LOG, METADATA, PACKED_RUN_SCHEMA, RUN, RUN_SCHEMA, SHARDS, STAGE, finished
+from ..folders.imagefolder import DATASET, KINDS, LOG, METADATA, RUN, SHARDS, STAGE, finished
 from ..folders.outfolder import MARKER, clear
 from ..folders.packed import INDEX
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
-from .done import KINDS, read_done, run_versions
+from .done import FILES, PACKED, read_done, run_versions
 from .environment import environment
 from .plan import Plan
 
@@ -99,9 +99,9 @@ def refuse_another_count(folder: Path, plan: Plan) -> None:
 
 def _content(plan: Plan) -> dict[str, Any]:
     """Return the content of run.json."""
-    schema = PACKED_RUN_SCHEMA if plan.spec.is_packed else RUN_SCHEMA
     made_with = {"versions": run_versions(), "environment": environment()}
-    return {"schema": schema, "digest": plan.digest, **plan.to_mapping(), **made_with}
+    layout = PACKED if plan.spec.is_packed else FILES
+    return {"schema": layout.run, "digest": plan.digest, **plan.to_mapping(), **made_with}
 
 
 def settle(folder: Path, plan: Plan) -> None:
@@ -141,7 +141,7 @@ def _read(path: Path) -> tuple[dict[str, Any] | None, str]:
         found = read_json(path, limit=MAX_FILE_BYTES, follow=False)
     except InputError as error:
         return None, error.reason
-    if found.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
+    if found.get("schema") not in (FILES.run, PACKED.run):
         raise InputError("does not describe a run of this version", source=str(path))
     return found, ""
 

@@ -17,11 +17,10 @@ from pathlib import Path
 
 from ..base.errors import InputError
 from ..base.storage.files import make_folder, remove_file, sync_folder
-from ..folders.imagefolder import DONE, LINES, SHARDS, shard_name
-from ..folders.packed import LINES_GZ
-from .done import KINDS, PACKED_SHARD_SCHEMA, compare_sums, read_done
+from ..folders.imagefolder import DONE, KINDS, LINES, SHARDS, shard_name
+from .done import FILES, PACKED, compare_sums, read_done
 from .maker import Maker
-from .partial import PartialShard, remove_stages, take_back
+from .partial import PartialShard, places, remove_stages, take_back
 
 
 class Stopped(Exception):
@@ -105,17 +104,17 @@ def commit(folder: Path, staged: Staged) -> None:
     Raises:
         OSError: a file cannot be moved.
     """
-    stage, name = Path(staged.stage), shard_name(staged.shard)
-    moves = [(stage / kind, folder / kind / name) for kind in KINDS if (stage / kind).is_dir()]
-    moves.append((stage / "shard", folder / SHARDS / name))
-    for source, place in moves:
+    stage = Path(staged.stage)
+    moves = [(place, own) for place, own in places(folder, stage, staged.shard) if own.is_dir()]
+    for place, own in moves:
         shutil.rmtree(place, ignore_errors=True)  # remains of a run that ended between these renames
         make_folder(place.parent)
-        os.rename(source, place)
-    for _, place in moves:
+        os.rename(own, place)
+    for place, _ in moves:
         sync_folder(place.parent)
-    os.rename(stage / DONE, folder / SHARDS / name / DONE)
-    sync_folder(folder / SHARDS / name)
+    lines = moves[-1][0]
+    os.rename(stage / DONE, lines / DONE)
+    sync_folder(lines)
     stage.rmdir()
 
 
@@ -142,11 +141,9 @@ def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool =
     if done["shard"] != shard or digest not in (None, done["digest"]):
         yield f"{SHARDS}/{name}/{DONE}: is of another {'spec' if done['shard'] == shard else 'shard'}"
         return
-    packed = done["schema"] == PACKED_SHARD_SCHEMA
-    places = tuple(f"{kind}/{name}/" for kind in (*(() if packed else KINDS), SHARDS))
-    if f"{SHARDS}/{name}/{LINES_GZ if packed else LINES}" not in done["files"] or not all(
-        n.startswith(places) for n in done["files"]
-    ):
+    layout = PACKED if done["schema"] == PACKED.shard else FILES
+    own = tuple(f"{kind}/{name}/" for kind in (*layout.kinds, SHARDS))
+    if f"{SHARDS}/{name}/{layout.lines}" not in done["files"] or not all(n.startswith(own) for n in done["files"]):
         yield f"{SHARDS}/{name}/{DONE}: files: do not belong to this shard"
         return
     yield from compare_sums(folder, done["files"], quick=quick)

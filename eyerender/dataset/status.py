@@ -1,11 +1,14 @@
-"""Status of a run, from its log and the names of its shards: rates by host, time left, retries, disk.
+"""Log of a run, and its status from the log and the names of its shards: rates by host, time left, retries, disk.
 
 Only small files are read, so this is quick for large runs, and may be called while they are at work.
 """
 
 from __future__ import annotations
 
+import json
+import os
 import shutil
+import socket
 import time
 from calendar import timegm
 from collections.abc import Iterator
@@ -18,12 +21,47 @@ from ..base.errors import InputError
 from ..base.storage.files import MAX_FILE_BYTES, opened, parse_json, read_json
 from ..folders.imagefolder import DATASET, LOG, PACKED_RUN_SCHEMA, RUN, RUN_SCHEMA, finished
 from .partial import checkpoints
-from .selection import Selection
+from .spec import DatasetSpec
 
 SCHEMA = "eyerender/status/1"
 SILENT_S = 180.0
 """A part at work writes to the log once a minute; after this silence it counts as stalled or killed."""
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
+
+
+class Log:
+    """Writer of the log of one part of a run, from its start on.
+
+    Attributes:
+        written: when an event was last written.
+    """
+
+    def __init__(self, folder: Path, part: tuple[int, int]) -> None:
+        self._path, self._part, self._start = folder / LOG, part, time.monotonic()
+        self.written = 0.0
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the start."""
+        return time.monotonic() - self._start
+
+    def write(self, event: str, **data: Any) -> None:
+        """Append an event."""
+        line = {
+            "time": time.strftime(_TIME, time.gmtime()),
+            "host": socket.gethostname(),
+            "part": f"{self._part[0]}/{self._part[1]}",
+            "event": event,
+            "seconds": round(self.seconds, 3),
+            **data,
+        }
+        self.written = time.monotonic()
+        with open(self._path, "ab+") as file:
+            if file.tell():
+                file.seek(-1, os.SEEK_END)
+                if file.read(1) != b"\n":  # a power cut may have truncated the last line
+                    file.write(b"\n")
+            file.write(json.dumps(line).encode() + b"\n")
 
 
 @dataclass(slots=True, kw_only=True)
@@ -77,18 +115,17 @@ def status(path: str | Path) -> dict[str, Any]:
     run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
     if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
         raise InputError("does not describe a run of this version", source=str(folder / RUN))
-    selection = _selection(run, str(folder / RUN))
+    try:
+        selection = DatasetSpec.from_mapping(run["spec"]).selection
+    except (KeyError, InputError) as error:
+        raise InputError(f"has no spec that can be read ({error})", source=str(folder / RUN), path="spec") from None
     parts = _parts(folder)
     shards, there = selection.shards, finished(folder)
     done = sorted(there.intersection(shards))
     kept = checkpoints(folder)
     missing = frozenset(shards) - there
     at_work = sum(images for shard, images in kept.items() if shard in missing)
-    samples = (
-        sum(len(selection.shard_samples(shard)) for shard in done)
-        if selection.spread or (selection.interleave is not None and selection.count % selection.planned)
-        else _plain(selection, done)
-    )
+    samples = sum(map(selection.shard_count, done))
     is_finished = (folder / DATASET).is_file()
     left = 0 if is_finished else selection.count - samples - at_work
     rates = [part.rate for part in parts if part.rate is not None]
@@ -112,35 +149,6 @@ def status(path: str | Path) -> dict[str, Any]:
         "bytes_free": shutil.disk_usage(folder).free,
         "parts": [part.to_mapping() for part in parts],
     }
-
-
-def _selection(run: dict[str, Any], source: str) -> Selection:
-    spec = run.get("spec")
-    try:
-        assert isinstance(spec, dict)
-        count = int(spec["count"])
-        planned = int(spec.get("planned") or count)
-        return Selection(
-            count=count,
-            planned=planned,
-            subjects=int(spec.get("subjects") or planned),
-            shard_size=int(spec["shard_size"]),
-            spread=spec.get("choice") == "spread" and count % planned > 0,
-            interleave=int(spec["seed"]) if spec.get("layout") == "webdataset" else None,
-        )
-    except (AssertionError, KeyError, TypeError, ValueError, ZeroDivisionError):
-        raise InputError("has no count and shard_size", source=source, path="spec") from None
-
-
-def _plain(selection: Selection, shards: list[int]) -> int:
-    """Count the samples of some shards, each of which has all its samples."""
-    if selection.interleave is not None:
-        per_block = -(-selection.planned // selection.shard_size)
-        short = per_block * selection.shard_size - selection.planned
-        return len(shards) * selection.shard_size - short * sum((shard + 1) % per_block == 0 for shard in shards)
-    last = (selection.count - 1) // selection.shard_size
-    short = selection.shard_size * (last + 1) - selection.count if last in shards[-1:] else 0
-    return len(shards) * selection.shard_size - short
 
 
 def _parts(folder: Path) -> list[_Part]:

@@ -20,7 +20,7 @@ from scipy.io import loadmat
 from eyerender.apps.benchmark.folder import load_labelled
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.dataset.columns import type_first
+from eyerender.dataset.assemble import type_first
 from eyerender.dataset.export import FORMATS, export, parquet
 from eyerender.dataset.export.coco import run_lengths
 from eyerender.dataset.export.gaze import yaw_pitch_deg

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.dataset.interleaving import scrambled
-from eyerender.dataset.selection import Selection
+from eyerender.dataset.selection import Selection, scrambled
 
 
 @pytest.mark.parametrize(

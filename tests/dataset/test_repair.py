@@ -10,7 +10,7 @@ import pytest
 from eyerender.base.errors import InputError
 from eyerender.base.storage.files import write_json
 from eyerender.cli.main import run
-from eyerender.dataset.assemble import damage, verify_dataset
+from eyerender.dataset.assemble import verify_dataset
 from eyerender.dataset.runfile import begin, refuse_taken
 from eyerender.dataset.shard import verify
 from eyerender.folders.outfolder import MARKER
@@ -217,16 +217,6 @@ def test_nothing_damaged_is_exported(tiny, tmp_path, capsys, name):
     assert name in err
     assert "start generate again on the folder to repair it" in err
     assert not (tmp_path / "out").exists()
-
-
-def test_folders_of_older_versions_have_their_metadata_compared_with_the_shards(tiny, tmp_path):
-    folder = shutil.copytree(tiny, tmp_path / "copy")
-    dataset = json.loads((folder / "dataset.json").read_text())
-    del dataset["checksums"]
-    (folder / "dataset.json").write_text(json.dumps(dataset))
-    assert list(verify_dataset(folder)) == []
-    change_digit(folder / "metadata.jsonl")
-    assert list(damage(folder)) == ["metadata.jsonl: differs from the shards"]
 
 
 @pytest.mark.packaging

@@ -19,7 +19,6 @@ from eyerender.base.storage.lock import run_lock
 from eyerender.dataset.options import RunOptions
 from eyerender.dataset.pool import LocalPool
 from eyerender.dataset.realise import frames_of
-from eyerender.dataset.run import worker_count
 from eyerender.dataset.worker import Job
 from eyerender.folders.imagefolder import finished
 from tests.support import stages
@@ -248,9 +247,9 @@ def test_workers_are_recycled(tmp_path):
 
 
 def test_threads_are_divided():
-    assert worker_count(RunOptions(workers=2, threads=8), 100) == (2, 4)
-    assert worker_count(RunOptions(workers=3, threads=2), 100) == (3, 1)
-    assert worker_count(RunOptions(threads=2), 1) == (1, 2)
+    assert RunOptions(workers=2, threads=8).processes(100) == (2, 4)
+    assert RunOptions(workers=3, threads=2).processes(100) == (3, 1)
+    assert RunOptions(threads=2).processes(1) == (1, 2)
 
 
 def test_samples_given_up_are_recorded(tmp_path):

@@ -9,8 +9,8 @@ import pytest
 
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.dataset import rates
-from eyerender.dataset.rates import Rate, keep_rate, last_rate
+from eyerender.dataset import estimate as rates
+from eyerender.dataset.estimate import Rate, keep_rate, last_rate
 from eyerender.dataset.status import SILENT_S, status
 from tests.support.dataset_specs import plan
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import eyerender as er
-from eyerender.dataset.line import image_line
 from eyerender.dataset.plan import Plan
-from eyerender.dataset.realise import realise, windows_of
+from eyerender.dataset.realise import image_line, realise, windows_of
 from eyerender.eye.entrance import entrance_pupil_mm
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.eye.refraction import at_cornea_d

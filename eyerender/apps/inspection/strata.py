@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...base.arrays import Bools, Ints, Objects
-from ...dataset.interleaving import scrambled
+from ...dataset.selection import scrambled
 from .figures import DRAW
 from .reading import Contents, spread
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..reading import WEBDATASET, WHOLE
+from ..card import WEBDATASET, WHOLE
 from . import gaze
 from .encoding import LARGEST_GAIN, LEVEL, SAMPLED, SHARE, Encoding
 

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ...base.storage.files import write_bytes
-from ...folders.imagefolder import ARRAY_KEYS, METADATA
-from ..columns import type_first
-from ..done import KINDS, picture_file
+from ...folders.imagefolder import KINDS, METADATA
+from ..assemble import type_first
+from ..done import picture_file
 from .item import Item, Items
 
 
@@ -40,8 +40,7 @@ def _files(item: Item) -> tuple[str, dict[str, bytes]]:
     """Return the line of an image and its files by name."""
     line, files = item.exported_line(), {}
     for kind, key in KINDS.items():
-        is_kept = "mask" in key or key in ARRAY_KEYS
-        data = item.entry.data(key) if is_kept else item.encode(key)
+        data = item.encode(key)
         if data is not None:
             line[key] = f"{kind}/{picture_file(kind, item.name)}"
             files[line[key]] = data

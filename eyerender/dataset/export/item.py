@@ -20,12 +20,13 @@ from ...folders.imagefile import image_of, png_bytes
 from ...folders.imagefolder import METADATA, Entries, ImageEntry, ImageFolder, opened_entries
 from ...optics.ellipse import Ellipse, signed_distance
 from ...scene.parts import BACKGROUND, IRIS, PUPIL
-from ..interleaving import scrambled
+from ..selection import scrambled
 from ..validation.problems import WRONG
 from .encoding import RAW, Encoding
 
 Prepared = TypeVar("Prepared")
 LinePlace = tuple[Path, int]
+_COUNTS = ("file_name", "noiseless_file_name")  # pictures whose values are encoded
 _CHUNK = 16  # images that a process prepares at a time
 
 
@@ -80,7 +81,7 @@ class Item:
         return self.encoding.apply(self.image, self.bit_depth, self.entry.gamma)
 
     def encode(self, key: str = "file_name") -> bytes | None:
-        """Encode one of the sample's images as the PNG file of the export.
+        """Return one of the image's files as it stands in the export: counts are encoded, others are unchanged.
 
         Args:
             key: one of `FILE_KEYS`.
@@ -92,7 +93,8 @@ class Item:
             InputError: the file cannot be read.
         """
         data = self.entry.data(key)
-        if data is None or self.encoding.keeps(self.bit_depth, self.entry.gamma):
+        is_kept = key not in _COUNTS or self.encoding.keeps(self.bit_depth, self.entry.gamma)
+        if data is None or is_kept:
             return data
         source = self.entry.folder / self.line[key]
         counts = _integers(image_of(data, str(source))[0], source)

@@ -102,8 +102,7 @@ def _row(item: Item, lights: int) -> dict[str, Any]:
 
 
 def _picture(item: Item, name: str) -> dict[str, Any] | None:
-    key = _PICTURES[name]
-    data = item.entry.data(key) if "mask" in name else item.encode(key)
+    data = item.encode(_PICTURES[name])
     return None if data is None else {"bytes": data, "path": f"{item.name}.png"}
 
 

@@ -32,7 +32,7 @@ def write(items: Items, out: Path) -> None:
 
 def _files(item: Item, lights: int) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Return the files of an image by name, and its row."""
-    files = {"images": item.encode(), "masks": item.entry.data("mask_file_name")}
+    files = {"images": item.encode(), "masks": item.encode("mask_file_name")}
     named = {f"{kind}/{item.name}.png": data for kind, data in files.items() if data is not None}
     return named, row_of(item, lights)
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ...backends.choose import BackendChoice
 from ...base.progress import Progress
 from ...base.storage.files import shown
-from ...folders.imagefolder import ARRAY_KEYS, ImageEntry, ImageFolder
-from ..done import KINDS, cpu_family, read_done, run_versions
+from ...folders.imagefolder import ARRAY_KEYS, KINDS, ImageEntry, ImageFolder
+from ..done import cpu_family, read_done, run_versions
 from ..maker import Maker
 from .problems import Problems
 from .truth import DatasetTruth
@@ -82,7 +82,7 @@ def _differences(entry: ImageEntry, made: Mapping[str, NDArray[Any]]) -> Iterato
 
 def _pixels(entry: ImageEntry, key: str) -> NDArray[Any] | None:
     if key in ARRAY_KEYS:
-        return entry.array(key)
+        return entry.pixels(key)
     found = entry.picture(key)
     return None if found is None else found[0]
 

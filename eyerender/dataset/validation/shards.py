@@ -30,22 +30,16 @@ _EXACT_INTEGER = 2**53
 
 
 def check_run(images: ImageFolder, quick: bool, problems: Problems, step: Progress) -> None:
-    """Check the shards of a dataset, and metadata.jsonl against their lines if the run is finished."""
-    check_shards(images, quick, problems, step)
-    if not images.unfinished and images.dataset.get("schema") != PACKED_SCHEMA:
-        compare_lines(images.path, problems)
-
-
-def check_shards(images: ImageFolder, quick: bool, problems: Problems, step: Progress) -> None:
-    """Check every shard that dataset.json lists, and the files assembled from the shards.
+    """Check every shard that dataset.json lists, and the files assembled from the shards if the run is finished.
 
     A shard must exist, unless the run is unfinished, and belong to the plan. Its files must have the stated sizes and,
     unless `quick`, checksums.
     """
     folder, dataset = images.path, images.dataset
     if not images.unfinished:
-        # dataset.json of older versions has no checksums; `compare_lines` then checks metadata.jsonl.
-        problems.extend(damage(folder, quick=quick or dataset.get("checksums") is None))
+        problems.extend(damage(folder, quick=quick))
+        if dataset.get("schema") != PACKED_SCHEMA:
+            compare_lines(folder, problems)
     there = sorted(finished(folder))
     digest = dataset.get("digest")
     for k, shard in enumerate(there):

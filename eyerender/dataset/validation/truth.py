@@ -18,7 +18,7 @@ from ...analytic.observer import trace
 from ...base.arrays import Bools, Floats
 from ...base.errors import InputError
 from ...base.storage.files import parse_json, shown
-from ...folders.imagefolder import DATASET, RESULTS, ImageFolder, shard_name, versions
+from ...folders.imagefolder import DATASET, KINDS, RESULTS, ImageFolder, shard_name, versions
 from ...imaging.labels import EyeInWindow, known_labels, limbus_px
 from ...region.mesh import lid_margins
 from ...rendering.glints.tracing import GlintScene, glint_table
@@ -27,11 +27,10 @@ from ...rendering.scene.pixels import lid_margins_px
 from ...scene import Frames, Scene
 from ...scene.observation import EYES, Observations
 from ...scene.spec import SceneSpec
-from ..done import KINDS, picture_file
-from ..line import image_line, image_name
+from ..done import picture_file
 from ..ownscenes import GivenScene
-from ..plan import Plan, mapping_digest, plan_digest
-from ..realise import Realised, frames_of, realise
+from ..plan import Plan, plan_digest
+from ..realise import Realised, frames_of, image_line, image_name, realise
 from .problems import WRONG, Problems, differences
 
 # Rays are traced to 1e-9 mm, and mathematical functions of other machines change the last digits: 1e-8 px at the
@@ -97,9 +96,7 @@ class DatasetTruth:
         """Read the plan in dataset.json, whose first line is `first`; what is wrong is added to the problems."""
         try:
             plan = Plan.from_mapping(dataset, Path())
-            mapping = {k: dataset[k] for k in plan.to_mapping()}
-            # Earlier versions included the number of samples in the digest.
-            if dataset["digest"] not in (plan_digest(mapping), mapping_digest(mapping)):
+            if dataset["digest"] != plan_digest({k: dataset[k] for k in plan.to_mapping()}):
                 problems.add(f"{DATASET}: its digest does not match its spec, eyes and files")
             if plan.scenes is not None and first is not None:
                 return cls._of_stored(plan, dict(first), _other_results(dataset))
