@@ -42,7 +42,7 @@ from .base.processes import usable_cpus
 from .dataset.plan import Plan
 from .dataset.realise import frames_of
 from .dataset.spec import DatasetSpec, GeometryKind
-from .folders.imagefolder import ImageFolder
+from .folders.imagefolder import KINDS, ImageFolder
 from .region.mesh import LID_MARKS
 
 if TYPE_CHECKING:
@@ -157,19 +157,8 @@ class FolderDataset(Dataset[Any]):
 
     def _image(self, row: int) -> dict[str, Any]:
         entry = self.folder.entries[row]
-        pictures = {
-            "images": entry.image,
-            "noiseless": entry.noiseless,
-            "masks": entry.mask,
-            "amodal_masks": entry.amodal_mask,
-            "highlights": entry.highlight_mask,
-            "instances": entry.instance_mask,
-            "depth": entry.depth,
-            "normals": entry.normals,
-            "iris_coordinates": entry.iris_coordinates,
-        }
         where = f"{entry.source}: line {entry.number}"
-        item = _item(self.parts, entry.line, lambda kind: pictures[kind](), where)
+        item = _item(self.parts, entry.line, lambda kind: entry.pixels(KINDS[kind]), where)
         return item if self.size is None else _fitted(item, entry.window[2:], self.size)
 
 

@@ -9,6 +9,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import EyerenderError, InputError
+from ..base.progress import Progress, notify
 from ..base.storage.files import MAX_FILE_BYTES, read_json, remove_parts, write_json, write_text, written
 from ..folders.imagefolder import (
     CONVENTIONS,
@@ -23,6 +25,7 @@ from ..folders.imagefolder import (
     DONE,
     LINES,
     METADATA,
+    RUN,
     SHARDS,
     finished,
     packed_index,
@@ -38,6 +41,7 @@ from .shard import verify
 from .spec import DatasetSpec
 
 FAILURES, CARD = "failures.jsonl", "README.md"
+_SHOWN = 50  # missing shards that are named
 
 
 def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
@@ -167,30 +171,37 @@ def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> I
         yield from compare_sums(folder, sums, quick=quick)
 
 
-def verify_finished(folder: Path, digest: str | None) -> Iterator[str]:
-    """Describe each damaged file of the finished shards of an unfinished run."""
-    for shard in sorted(finished(folder)):
-        yield from verify(folder, shard, digest)
+def verify_dataset(folder: Path, *, quick: bool = False, progress: Progress | None = None) -> Iterator[str]:
+    """Describe each damaged file of a dataset: the results of `damage`, of `verify` for its shards, and missing shards.
 
-
-def verify_dataset(folder: Path, *, quick: bool = False) -> Iterator[str]:
-    """Describe each damaged file of a finished dataset: the results of `damage`, and of `verify` for its shards.
+    Of an unfinished run, only the finished shards are verified.
 
     Args:
         folder: the dataset.
         quick: compare sizes only.
+        progress: called with shards verified, shards in all and "shards".
     """
-    problems = list(damage(folder, quick=quick))
-    yield from problems
-    if any(problem.startswith(f"{DATASET}: ") for problem in problems):
+    is_whole, there = (folder / DATASET).is_file(), sorted(finished(folder))
+    if is_whole:
+        yield from damage(folder, quick=quick)
+    try:
+        dataset = read_json(folder / (DATASET if is_whole else RUN), limit=MAX_FILE_BYTES, follow=False)
+    except InputError:
         return
-    dataset = read_json(folder / DATASET, limit=MAX_FILE_BYTES, follow=False)
-    shards = shards_of(dataset)
-    if shards is None:
+    digest, asked = dataset.get("digest"), shards_of(dataset)
+    for k, shard in enumerate(there):
+        yield from verify(folder, shard, digest if isinstance(digest, str) else None, quick=quick)
+        notify(progress, k + 1, len(there), "shards")
+    if asked is None:
         yield f"{DATASET}: spec: has no count and shard_size"
         return
-    for shard in shards:
-        yield from verify(folder, shard, dataset.get("digest"), quick=quick)
+    known, wanted = frozenset(there), asked if isinstance(asked, range) else frozenset(asked)
+    if is_whole:
+        absent = (shard for shard in asked if shard not in known)
+        yield from (f"{SHARDS}/{shard_name(shard)}: missing" for shard in islice(absent, _SHOWN))
+        if (more := len(asked) - sum(shard in wanted for shard in there) - _SHOWN) > 0:
+            yield f"{SHARDS}: {more} more are missing"
+    yield from (f"{SHARDS}/{shard_name(s)}: dataset.json has no such shard" for s in there if s not in wanted)
 
 
 def shards_of(dataset: Mapping[str, Any]) -> Sequence[int] | None:

@@ -17,11 +17,12 @@ from ..backends.choose import BackendChoice
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..folders.imagefolder import FILE_KEYS, Entries, ImageEntry, ImageFolder
+from .assemble import verify_dataset
 from .validation.images import Tally, check_images
 from .validation.lines import Lines, check_records
 from .validation.problems import WRONG, Problems
 from .validation.rendering import render_again
-from .validation.shards import check_run
+from .validation.shards import compare_lines
 from .validation.truth import Again, DatasetTruth, NoTruth, SceneTruth, truth_of
 
 SAMPLE = 64
@@ -62,7 +63,8 @@ def validate(
     problems, tally, notes = Problems(), Tally(), [folder.unfinished] if folder.unfinished else []
     truth = _truth(folder, problems, notes)
     if folder.dataset.get("kind") == "dataset":
-        check_run(folder, quick, problems, step)
+        problems.extend(verify_dataset(path, quick=quick, progress=step))
+        compare_lines(folder, problems)
     total = len(folder.entries)
     rows = range(total) if deep else sampled(total, str(folder.dataset.get("digest")), SAMPLE)
     able = truth is not None and truth.stale is None

@@ -19,7 +19,7 @@ from ...base.storage.files import write_json, write_text
 from ...folders.exported import EXPORT
 from ...folders.imagefolder import DATASET, ImageFolder
 from ...folders.outfolder import staged
-from ..assemble import verify_dataset, verify_finished
+from ..assemble import verify_dataset
 from ..validation.problems import WRONG
 from . import coco, ellseg, imagefolder, labels, openeds, parquet, table, teyed, webdataset, yolo
 from .card import export_card
@@ -93,8 +93,7 @@ def export(
         raise InputError("is not a generated dataset (its kind is not 'dataset')", source=str(Path(path) / DATASET))
     if format == "labels":
         labels.check_packed(folder)
-    digest = folder.dataset.get("digest")
-    for problem in verify_finished(folder.path, digest) if folder.unfinished else verify_dataset(folder.path):
+    for problem in verify_dataset(folder.path):
         raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(path))
     total = len(folder.entries)
 

@@ -6,7 +6,6 @@ Only a few bytes are kept of each line.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,30 +34,6 @@ _ALWAYS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Shape:
-    """Keys of an object and, for nested objects and lists of objects, their shapes."""
-
-    keys: frozenset[str]
-    objects: tuple[tuple[str, _Shape], ...]
-    lists: tuple[tuple[str, _Shape], ...]
-
-    @classmethod
-    def of(cls, node: dict[str, Any]) -> _Shape:
-        objects = [(k, cls.of(v)) for k, v in node.items() if isinstance(v, dict)]
-        lists = [(k, cls.of(v[0])) for k, v in node.items() if isinstance(v, list) and v and isinstance(v[0], dict)]
-        return cls(frozenset(node), tuple(objects), tuple(lists))
-
-    def fits(self, node: Any) -> bool:
-        """Return whether a value is an object of this shape."""
-        return (
-            isinstance(node, dict)
-            and node.keys() == self.keys
-            and all(shape.fits(node[key]) for key, shape in self.objects)
-            and all(isinstance(node[key], list) and all(map(shape.fits, node[key])) for key, shape in self.lists)
-        )
-
-
 class Lines:
     """Checker of the metadata, line by line, and finally of properties that concern several lines."""
 
@@ -69,8 +44,7 @@ class Lines:
         self._names = np.zeros(count, dtype=np.uint64)
         self._subjects = np.full(count, -1, dtype=np.int64)
         self._splits = np.zeros(count, dtype=np.uint64)
-        self._first: dict[str, Any] = {}
-        self._shape: _Shape | None = None
+        self._first: tuple[set[str], set[str]] | None = None  # keys of the first line
 
     def take(self, number: int, entry: ImageEntry) -> Iterator[str]:
         """Describe what is wrong with line `number`, counted from 0.
@@ -86,10 +60,9 @@ class Lines:
         if "subject" not in line:
             return
         self._subjects[number], self._splits[number] = line["subject"], hashed(str(line["split"]).encode())
-        if self._shape is None:
-            self._first, self._shape = line, _Shape.of(line)
-        if not self._shape.fits(line):
-            yield from _other_keys(line, self._first)
+        keys = _keys(line)
+        self._first = self._first or keys
+        yield from _other_keys(keys, self._first)
         for path in _ALWAYS:
             node: Any = line
             for key in path.split("."):
@@ -171,27 +144,31 @@ def _agree(line: dict[str, Any]) -> Iterator[str]:
             yield f"the glint of light {glint['light']} of its labels differs from that of its record"
 
 
-def _other_keys(line: dict[str, Any], first: dict[str, Any]) -> Iterator[str]:
+def _other_keys(own: tuple[set[str], set[str]], first: tuple[set[str], set[str]]) -> Iterator[str]:
     """Return keys that only one of two lines has; below a null any keys are allowed."""
-    keys: set[str] = set()
-    known: set[str] = set()
-    nulls: set[str] = set()
-    _collect(line, "", keys, nulls)
-    _collect(first, "", known, nulls)
-    other = sorted(key for key in keys ^ known if not any(key.startswith(n) for n in nulls))
+    nulls = own[1] | first[1]
+    other = sorted(key for key in own[0] ^ first[0] if not any(key.startswith(null) for null in nulls))
     if other:
         yield f"has other keys than line 1 ({', '.join(key[1:] for key in other[:3])})"
 
 
-def _collect(node: Any, path: str, found: set[str], nulls: set[str]) -> None:
-    """Collect the key paths of a line; lists count as one entry; `nulls` gets the prefixes of paths below a null."""
-    found.add(path)
-    if isinstance(node, dict):
-        for key, value in node.items():
-            _collect(value, f"{path}.{key}", found, nulls)
-    elif isinstance(node, list):
-        if node and isinstance(node[0], dict):
-            for value in node:
-                _collect(value, f"{path}[]", found, nulls)
-    elif node is None:
-        nulls |= {f"{path}.", f"{path}["}
+def _keys(line: dict[str, Any]) -> tuple[set[str], set[str]]:
+    """Return the paths of the keys of a line, and the prefixes of paths below its nulls and empty lists."""
+    found, nulls = set[str](), set[str]()
+
+    def collect(node: Any, path: str) -> None:
+        found.add(path)
+        if isinstance(node, dict):
+            for key, value in node.items():
+                collect(value, f"{path}.{key}")
+        elif isinstance(node, list):
+            if node and isinstance(node[0], dict):
+                for value in node:
+                    collect(value, f"{path}[]")
+            elif not node:
+                nulls.add(f"{path}[")
+        elif node is None:
+            nulls.update((f"{path}.", f"{path}["))
+
+    collect(line, "")
+    return found, nulls

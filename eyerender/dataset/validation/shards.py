@@ -1,129 +1,78 @@
-"""Checks of the finished dataset against its shards.
-
-Files are compared with their checksums, and metadata.jsonl with the shards' lines.
-"""
+"""Comparison of metadata.jsonl with the lines of the shards."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from contextlib import suppress
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...base.arrays import Ints
 from ...base.errors import InputError
-from ...base.progress import Progress
 from ...base.storage.files import opened, parse_json, shown
 from ...base.storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
-from ...folders.imagefolder import LINES, METADATA, PACKED_SCHEMA, SHARDS, ImageFolder, finished, shard_name
-from ..assemble import damage, shards_of
-from ..shard import verify
+from ...folders.imagefolder import DATASET_SCHEMA, LINES, METADATA, SHARDS, ImageFolder, finished, shard_name
 from .problems import SHOWN, Problems, differences
 
 _EXACT_INTEGER = 2**53
 
 
-def check_run(images: ImageFolder, quick: bool, problems: Problems, step: Progress) -> None:
-    """Check every shard that dataset.json lists, and the files assembled from the shards if the run is finished.
-
-    A shard must exist, unless the run is unfinished, and belong to the plan. Its files must have the stated sizes and,
-    unless `quick`, checksums.
-    """
-    folder, dataset = images.path, images.dataset
-    if not images.unfinished:
-        problems.extend(damage(folder, quick=quick))
-        if dataset.get("schema") != PACKED_SCHEMA:
-            compare_lines(folder, problems)
-    there = sorted(finished(folder))
-    digest = dataset.get("digest")
-    for k, shard in enumerate(there):
-        problems.extend(verify(folder, shard, digest if isinstance(digest, str) else None, quick=quick))
-        step(k + 1, len(there), "shards")
-    asked = shards_of(dataset)
-    if asked is None:
-        return  # then the plan cannot be read either
-    known = frozenset(there)
-    asked_for = asked if isinstance(asked, range) else frozenset(asked)
-    if not images.unfinished:
-        missing = len(asked) - sum(shard in asked_for for shard in there)
-        absent = (s for s in asked if s not in known)
-        problems.extend(f"{SHARDS}/{shard_name(s)}: missing" for s in islice(absent, SHOWN))
-        problems.count += max(missing - SHOWN, 0)
-    problems.extend(f"{SHARDS}/{shard_name(s)}: dataset.json has no such shard" for s in there if s not in asked_for)
-
-
-def compare_lines(folder: Path, problems: Problems) -> None:
+def compare_lines(images: ImageFolder, problems: Problems) -> None:
     """Compare metadata.jsonl with the shards' lines as values; the order of lines and of keys does not matter.
 
+    A folder of packed shards, or of an unfinished run, has no metadata.jsonl.
+
     Lines whose text differs are parsed and compared by image name. Whole numbers are equal to their floating-point
-    form. This takes some ten bytes of memory per line.
+    form. This takes some ten bytes of memory per line, and some hundred for one whose text differs.
     """
+    folder = images.path
+    if images.unfinished or images.dataset["schema"] != DATASET_SCHEMA:
+        return
     mine = [folder / METADATA]
     theirs = [folder / SHARDS / shard_name(shard) / LINES for shard in sorted(finished(folder))]
-    hashes = [np.fromiter((hashed(raw) for _, raw in _lines(files)), dtype=np.uint64) for files in (mine, theirs)]
-    a = _values(mine, np.flatnonzero(~np.isin(hashes[0], hashes[1])))
-    b = _values(theirs, np.flatnonzero(~np.isin(hashes[1], hashes[0])))
-    _, at, to = np.intersect1d(a["name"], b["name"], return_indices=True)
-    changed = a["value"][at] != b["value"][to]
-    pairs = np.stack([a["number"][at[changed]], b["number"][to[changed]]], axis=1)
-    pairs = pairs[np.argsort(pairs[:, 0])]
-    first = [dict(_objects(files, np.sort(pairs[:SHOWN, k]))) for k, files in enumerate((mine, theirs))]
-    for number, other in pairs[:SHOWN].tolist():
-        line = first[0].get(number, {})
-        said = next(differences(first[1].get(other, {}), line, 0.0), "it has other keys")
-        problems.add(f"{METADATA} line {number + 1}: {line.get('file_name')} differs from its shard: {said}")
-    problems.count += max(len(pairs) - SHOWN, 0)
-    for files, found, others, words in ((mine, a, b, "this line is in no shard"), (theirs, b, a, f"not in {METADATA}")):
-        alone = np.sort(found["number"][~np.isin(found["name"], others["name"])])
-        where = METADATA if files is mine else f"{SHARDS}/*/{LINES}"
-        for number, line in _objects(files, alone[:SHOWN]):
-            problems.add(f"{where} line {number + 1}: {shown(line.get('file_name'))}: {words}")
-        problems.count += max(len(alone) - SHOWN, 0)
+    texts = (np.fromiter((hashed(raw) for raw in _lines(files)), dtype=np.uint64) for files in (mine, theirs))
+    same = frozenset(np.intersect1d(*texts).tolist())
+    found, expected = ({name: (at, value) for at, name, value, _ in _others(files, same)} for files in (mine, theirs))
+    changed = sorted(found[name] for name in found.keys() & expected.keys() if found[name][1] != expected[name][1])
+    numbers = {number for number, _ in changed[:SHOWN]}
+    wrong = {name: (number, line) for number, name, _, line in _others(mine, same) if number in numbers}
+    for _, name, _, line in _others(theirs, same):
+        if name in wrong:
+            number, own = wrong.pop(name)
+            said = next(differences(line, own, 0.0), "it has other keys")
+            problems.add(f"{METADATA} line {number + 1}: {name} differs from its shard: {said}")
+    problems.count += max(len(changed) - SHOWN, 0)
+    for own, other, where, words in (
+        (found, expected, METADATA, "this line is in no shard"),
+        (expected, found, f"{SHARDS}/*/{LINES}", f"not in {METADATA}"),
+    ):
+        alone = sorted((number, name) for name, (number, _) in own.items() if name not in other)
+        problems.extend(f"{where} line {number + 1}: {shown(name)}: {words}" for number, name in alone)
 
 
-def _values(files: Sequence[Path], numbers: Ints) -> NDArray[np.void]:
-    """Read lines with given numbers: their numbers, and hashes of their images' names and of their values."""
+def _others(files: Sequence[Path], same: Set[int]) -> Iterator[tuple[int, str, int, dict[str, Any]]]:
+    """Yield each object whose text is not among `same`: its number, its image's name, the hash of its values, itself.
 
-    def rows() -> Iterator[tuple[int, int, int]]:
-        for number, line in _objects(files, numbers):
-            with suppress(RecursionError):  # too deeply nested for metadata; another check reports it
-                values = json.dumps(_plain(line), sort_keys=True)
-                yield number, hashed(str(line.get("file_name")).encode()), hashed(values.encode())
-
-    return np.fromiter(rows(), dtype=[("number", np.int64), ("name", np.uint64), ("value", np.uint64)])
-
-
-def _objects(files: Sequence[Path], numbers: Ints) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Read the lines with given numbers, in order, that are objects; other checks report the rest."""
-    if not len(numbers):
-        return
-    wanted = iter(numbers.tolist())
-    next_ = next(wanted)
-    for number, raw in _lines(files):
-        if number == next_:
-            with suppress(InputError):
-                value = parse_json(raw)
-                if isinstance(value, dict):
-                    yield number, value
-            next_ = next(wanted, -1)
-            if next_ < 0:
-                return
+    Other checks report the lines that hold no object.
+    """
+    for number, raw in enumerate(_lines(files)):
+        if hashed(raw) not in same:
+            with suppress(InputError, RecursionError):  # too deeply nested for metadata
+                line = parse_json(raw)
+                if isinstance(line, dict):
+                    values = json.dumps(_plain(line), sort_keys=True)
+                    yield number, str(line.get("file_name")), hashed(values.encode()), line
 
 
-def _lines(files: Sequence[Path]) -> Iterator[tuple[int, bytes]]:
-    """Yield the lines of several files, numbered from 0; an unreadable file has none."""
-    number = 0
+def _lines(files: Sequence[Path]) -> Iterator[bytes]:
+    """Yield the lines of several files; an unreadable file has none."""
     for path in files:
         with suppress(InputError, OSError), opened(path, limit=MAX_BYTES, follow=False) as file:
             while raw := file.readline(MAX_LINE_BYTES):
-                yield number, raw.strip()
-                number += 1
+                yield raw.strip()
 
 
 def _plain(node: Any) -> Any:
