@@ -317,9 +317,8 @@ class StreamDataset(IterableDataset[Any]):
             InputError: the state belongs to another spec, batch size or number of lanes.
         """
         for name, own in (("digest", self.plan.digest), *((name, getattr(self, name)) for name in _STATE)):
-            known = state.get(name, 0) if name == "shuffle" else state[name]  # older states have none
-            if known != own:
-                raise InputError(f"is {known} in the state, but {own} here", path=name)
+            if state[name] != own:
+                raise InputError(f"is {state[name]} in the state, but {own} here", path=name)
         self._begin = state["next"] or 0
 
     def _items(self, index: int, workers: int) -> Iterator[Any]:

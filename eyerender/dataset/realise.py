@@ -38,13 +38,14 @@ class Rejection:
 
 @dataclass(frozen=True, kw_only=True)
 class Realised:
-    """A sample with its analytic observations; `sample` is None if it was given up."""
+    """A sample with its analytic observations; `sample` is None if it was given up, and `error` why."""
 
     index: int
     sample: Sample | None = None
     frames: Frames | None = None
     observations: Observations | None = None
     rejections: tuple[Rejection, ...]
+    error: InputError | None = None
     source: str = ""
 
     @property
@@ -138,16 +139,17 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
     try:
         reasons = plan.identity(subject)[1]
     except InputError as error:
-        return Realised(index=index, rejections=(Rejection(index, 0, str(error), "subject"),))
+        return Realised(index=index, rejections=(Rejection(index, 0, str(error), "subject"),), error=error)
     if sequence == 0:
         rejections += [Rejection(index, k, reason, "subject") for k, reason in enumerate(reasons)]
-    last = None
+    last, failed = None, None
     for attempt in range(spec.attempts):
         try:
             sample = plan.draw(index, attempt)
         except InputError as error:
             if plan.scenes is None:
                 raise
+            failed = error
             rejections.append(Rejection(index, attempt, str(error)))
             if not plan.scenes.takes_attempt:
                 break
@@ -158,11 +160,12 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
         try:
             posed, found = _observed(plan, sample, frames)
         except InputError as error:
+            failed = error
             reason = f"{error.path}: {error.reason}" if error.path else error.reason
             rejections.append(Rejection(index, attempt, reason))
             continue
         return Realised(index=index, sample=sample, frames=posed, observations=found, rejections=tuple(rejections))
-    return Realised(index=index, rejections=tuple(rejections))
+    return Realised(index=index, rejections=tuple(rejections), error=failed)
 
 
 def _observed(plan: Plan, sample: Sample, frames: int | None) -> tuple[Frames, Observations]:
@@ -196,13 +199,10 @@ def frames_of(plan: Plan) -> int:
     """
     first = realise(plan, 0)
     if first.observations is None:
-        last = first.rejections[-1] if first.rejections else Rejection(0, 0, "no reason known")
-        others: list[InputError] = []
-        try:
-            plan.draw(0, last.attempt).build()
-        except InputError as error:
-            others = [InputError(o.reason, source=plan.source, path=f"scene.{o.path}") for o in error.others]
-        reason = f"sample 0 cannot be made ({len(first.rejections)} attempts): {last.reason}"
+        last = first.rejections[-1].reason if first.rejections else "no reason known"
+        more = () if first.error is None else first.error.others
+        others = [InputError(other.reason, source=plan.source, path=f"scene.{other.path}") for other in more]
+        reason = f"sample 0 cannot be made ({len(first.rejections)} attempts): {last}"
         raise InputError(reason, source=plan.source, others=others)
     return int(first.observations.index.frame.max()) + 1
 

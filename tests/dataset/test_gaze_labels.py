@@ -9,7 +9,6 @@ import pytest
 
 import eyerender as er
 from eyerender.dataset.export import teyed
-from eyerender.dataset.export.gaze import gaze_of, pupil_of
 from eyerender.dataset.export.item import Item
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.folders.imagefolder import ImageEntry
@@ -86,14 +85,6 @@ def test_teyed_gaze_vector_is_the_optic_axis_of_drawn_people(people):
         scene = scene_of(population={"preset": "adults", "seed": 5, "subject": subject})
         for case in labels_of(scene, np.flatnonzero(scene.frames().index.fixation == subject % 9)):
             check_gaze(*case)
-
-
-def test_lines_of_version_3_are_exported_without_the_new_diameters():
-    ((_, _, labels),) = labels_of(scene_of(eye={"model": "E5"}), [0])
-    old = {**labels, "pupil": {"amodal": labels["pupil"]["amodal"]}}
-    assert pupil_of({"labels": old}) == {"pupil_entrance_diameter_mm": None, "pupil_stop_diameter_mm": None}
-    assert gaze_of({"labels": old}) == gaze_of({"labels": labels})
-    np.testing.assert_allclose(written_gaze({**old, "iris": labels["iris"]}), written_gaze(labels))
 
 
 @pytest.mark.parametrize("who", [{"eye": {"model": "E5"}}, {"population": {"preset": "adults", "subject": 3}}])

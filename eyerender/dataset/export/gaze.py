@@ -44,7 +44,7 @@ def gaze_of(line: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def pupil_of(line: dict[str, Any]) -> dict[str, float | None]:
-    """Return the pupil diameters by column name; None in datasets of versions before 4."""
+def pupil_of(line: dict[str, Any]) -> dict[str, float]:
+    """Return the pupil diameters by column name."""
     pupil = line["labels"]["pupil"]
-    return {f"pupil_{name}": pupil.get(name) for name in ("entrance_diameter_mm", "stop_diameter_mm")}
+    return {f"pupil_{name}": pupil[name] for name in ("entrance_diameter_mm", "stop_diameter_mm")}
