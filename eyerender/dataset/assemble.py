@@ -186,7 +186,9 @@ def verify_dataset(folder: Path, *, quick: bool = False, progress: Progress | No
         yield from damage(folder, quick=quick)
     try:
         dataset = read_json(folder / (DATASET if is_whole else RUN), limit=MAX_FILE_BYTES, follow=False)
-    except InputError:
+    except InputError as error:
+        if not is_whole:
+            yield f"{RUN}: {error.reason}"
         return
     digest, asked = dataset.get("digest"), shards_of(dataset)
     for k, shard in enumerate(there):
