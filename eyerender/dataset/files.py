@@ -11,7 +11,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import InputError
 from ..base.spec import file_digest
 from ..region.headspec import is_manifest, read_manifest
 from .template import possible
@@ -26,17 +25,6 @@ def sums_of_files(scene: Mapping[str, Any], base: Path) -> dict[str, str]:
         InputError: a file is missing or cannot be read.
     """
     return {name: sum_of_file(base / name) for name in sorted(set(_names(scene, base)))}
-
-
-def check_files(files: Mapping[str, str], base: Path) -> None:
-    """Check that files still have their checksums; fast if their times and sizes are unchanged.
-
-    Raises:
-        InputError: a file has changed.
-    """
-    for name, wanted in files.items():
-        if sum_of_file(base / name) != wanted:
-            raise InputError("has changed since the run began", source=str(base / name))
 
 
 def _names(scene: Mapping[str, Any], base: Path) -> Iterator[str]:

@@ -42,8 +42,8 @@ def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -
         raise InputError(error.reason, path=EXTENDS) from None
     below = read_yaml(file)
     known = data.get("format")
-    if known is not None and (found := below.get("format", known)) != known:
-        raise InputError(f"is {shown(found)}; this version reads format {known}", source=str(file), path="format")
+    if known is not None and (other := below.get("format", known)) != known:
+        raise InputError(f"is {shown(other)}; this version reads format {known}", source=str(file), path="format")
     below = extended(below, file_of, folder, depth + 1)
     own = {key: value for key, value in data.items() if key != EXTENDS}
     found: dict[str, Any] = _merged(below, own)

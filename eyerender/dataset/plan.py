@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from ..scene import Scene
 from ..scene.observation import EYES
 from ..scene.spec import SceneSpec
 from .draws import Unit, is_draw, unit_number
-from .files import check_files, sum_of_file, sums_of_files
+from .files import sum_of_file, sums_of_files
 from .gathering import aliased_draws
 from .options import PlanOptions
 from .ownscenes import OwnScenes
@@ -56,7 +57,6 @@ class Sample:
         split: name of its split.
         scene: plain mapping that `SceneSpec` validates.
         eye: mapping of its eye file; empty for a drawn person, whose eyes differ.
-        modified: whether the eye differs from the model's own.
         draws: value of every draw of the spec by its path, None if it was not used.
         base: folder to which the files of the scene are relative.
     """
@@ -65,7 +65,6 @@ class Sample:
     split: str
     scene: dict[str, Any]
     eye: dict[str, Any]
-    modified: bool
     draws: dict[str, Any]
     base: Path
 
@@ -277,34 +276,14 @@ class Plan:
         return [samples[k * len(samples) // count] for k in range(count)]
 
     def check_files(self) -> None:
-        """Check that the files that the spec names are unchanged since the plan was made.
+        """Check that the files that the spec names are unchanged since the plan was made; fast if their times are.
 
         Raises:
             InputError: a file has changed.
         """
-        check_files(self.files, self.base)
-
-    @cached_property
-    def _ranked(self) -> dict[int, NDArray[np.int32]]:
-        return {}
-
-    def _ranks(self, block: int) -> NDArray[np.int32]:
-        """Return the split index of each subject of a block, from the rank of its u; splits are sorted by name."""
-        if block not in self._ranked:
-            self._ranked[block] = self._rank(block)
-        return self._ranked[block]
-
-    def _rank(self, block: int) -> NDArray[np.int32]:
-        n = self.spec.subject_count
-        numbers = map(self._split_number, range(block * n, (block + 1) * n))
-        order = np.argsort(np.fromiter(numbers, float, n), kind="stable")
-        out = np.zeros(n, dtype=np.int32)
-        start = 0
-        for k, share in enumerate(self._shares):
-            end = n if k == len(self._shares) - 1 else round(n * share)
-            out[order[start:end]] = k
-            start = end
-        return out
+        for name, wanted in self.files.items():
+            if sum_of_file(self.base / name) != wanted:
+                raise InputError("has changed since the run began", source=str(self.base / name))
 
     @cached_property
     def _shares(self) -> tuple[float, ...]:
@@ -312,15 +291,8 @@ class Plan:
 
         Because of the sorting, the order of keys in a file has no effect.
         """
-        splits = self.spec.splits
-        total, share, out = sum(splits.values()), 0.0, []
-        for name in sorted(splits):
-            share += splits[name] / total
-            out.append(share)
-        return tuple(out)
-
-    def _split_number(self, subject: int) -> float:
-        return unit_number(self.spec.seed, "split", "subject", subject, 0)
+        total = sum(self.spec.splits.values())
+        return tuple(accumulate(self.spec.splits[name] / total for name in sorted(self.spec.splits)))
 
     def split_of(self, subject: int) -> str:
         """Return the split of a subject.
@@ -334,8 +306,8 @@ class Plan:
             return names[0]
         if self.spec.subject_count <= RANKED_SUBJECTS:
             block, k = divmod(subject, self.spec.subject_count)
-            return names[int(self._ranks(block)[k])]
-        u = self._split_number(subject)
+            return names[int(_split_ranks(self.spec.seed, self.spec.subject_count, block, self._shares)[k])]
+        u = _split_number(self.spec.seed, subject)
         return next((name for name, share in zip(names, self._shares, strict=True) if u < share), names[-1])
 
     def subject_of(self, sample: int) -> tuple[int, int]:
@@ -370,13 +342,12 @@ class Plan:
         tree.setdefault("name", f"{spec.name} {sample}")
         if "seed" not in tree:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
-        eye, eye_drawn, modified = self._eye_of(tree, turn) if own is None else (own.eye, {}, False)
+        eye, eye_drawn, _ = self._eye_of(tree, turn) if own is None else (own.eye, {}, False)
         return Sample(
             turn=turn,
             split=self.split_of(subject) if own is None or own.split is None else own.split,
             scene=tree,
             eye=eye,
-            modified=modified,
             draws={**drawn, **eye_drawn},
             base=self.base if own is None or own.base is None else own.base,
         )
@@ -449,6 +420,21 @@ class Plan:
         # The parameters of the other eyes were not used.
         asked = {k: v if k.startswith(f"eye_parameters.{model}.") else None for k, v in drawn.items()}
         return eye, asked, bool(mine)
+
+
+def _split_number(seed: int, subject: int) -> float:
+    return unit_number(seed, "split", "subject", subject, 0)
+
+
+@lru_cache(maxsize=16)
+def _split_ranks(seed: int, subjects: int, block: int, shares: tuple[float, ...]) -> NDArray[np.int32]:
+    """Return the split index of each subject of a block, from the rank of its u; splits are sorted by name."""
+    numbers = (_split_number(seed, subject) for subject in range(block * subjects, (block + 1) * subjects))
+    order = np.argsort(np.fromiter(numbers, float, subjects), kind="stable")
+    ends = [*(round(subjects * share) for share in shares[:-1]), subjects]
+    out = np.zeros(subjects, dtype=np.int32)
+    out[order] = np.searchsorted(ends, np.arange(subjects), side="right")
+    return out
 
 
 def is_function(given: object) -> bool:

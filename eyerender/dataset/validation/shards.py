@@ -33,23 +33,23 @@ def compare_lines(images: ImageFolder, problems: Problems) -> None:
         return
     mine = [folder / METADATA]
     theirs = [folder / SHARDS / shard_name(shard) / LINES for shard in sorted(finished(folder))]
-    texts = (np.fromiter((hashed(raw) for raw in _lines(files)), dtype=np.uint64) for files in (mine, theirs))
-    same = frozenset(np.intersect1d(*texts).tolist())
+    own, other = (np.fromiter(map(hashed, _lines(files)), dtype=np.uint64) for files in (mine, theirs))
+    same = frozenset(np.intersect1d(own, other).tolist())
     found, expected = ({name: (at, value) for at, name, value, _ in _others(files, same)} for files in (mine, theirs))
     changed = sorted(found[name] for name in found.keys() & expected.keys() if found[name][1] != expected[name][1])
     numbers = {number for number, _ in changed[:SHOWN]}
     wrong = {name: (number, line) for number, name, _, line in _others(mine, same) if number in numbers}
     for _, name, _, line in _others(theirs, same):
         if name in wrong:
-            number, own = wrong.pop(name)
-            said = next(differences(line, own, 0.0), "it has other keys")
+            number, changed_line = wrong.pop(name)
+            said = next(differences(line, changed_line, 0.0), "it has other keys")
             problems.add(f"{METADATA} line {number + 1}: {name} differs from its shard: {said}")
     problems.count += max(len(changed) - SHOWN, 0)
-    for own, other, where, words in (
+    for here, there, where, words in (
         (found, expected, METADATA, "this line is in no shard"),
         (expected, found, f"{SHARDS}/*/{LINES}", f"not in {METADATA}"),
     ):
-        alone = sorted((number, name) for name, (number, _) in own.items() if name not in other)
+        alone = sorted((number, name) for name, (number, _) in here.items() if name not in there)
         problems.extend(f"{where} line {number + 1}: {shown(name)}: {words}" for number, name in alone)
 
 
