@@ -14,7 +14,6 @@ import pytest
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset.export import export
-from eyerender.dataset.merge import merge
 from eyerender.dataset.status import status
 from eyerender.dataset.validate import validate
 from eyerender.eye.spec import EyeSpec
@@ -193,21 +192,6 @@ def test_a_damaged_index_is_refused(packed, tmp_path):
     (folder / "index.npy").write_bytes(b"\x93NUMPY")
     with pytest.raises(InputError, match="is not an index of images"):
         ImageFolder.load(folder)
-
-
-@pytest.mark.packaging
-def test_parts_of_machines_without_a_shared_disk_are_merged(packed, tmp_path):
-    for k in (1, 2):
-        make(tmp_path / f"part{k}", plan(**PACKED), part=(k, 2))
-    out = tmp_path / "out"
-    assert merge([tmp_path / "part1"], out)["shards_missing"] == 1
-    assert merge([tmp_path / "part1", tmp_path / "part2"], out)["complete"]
-    assert tree(out) == tree(packed)
-    assert validate(out)["ok"]
-    make(tmp_path / "other", plan(**PACKED, seed=6), part=(1, 3))
-    with pytest.raises(InputError, match="holds another run"):
-        merge([tmp_path / "part1", tmp_path / "other"], tmp_path / "mixed")
-    assert not (tmp_path / "mixed").exists()
 
 
 @pytest.mark.packaging

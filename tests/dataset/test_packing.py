@@ -108,6 +108,11 @@ def test_shards_are_packed_read_grown_and_merged(samples, tmp_path):
     assert merge([tmp_path / "part0"], tmp_path / "joined")["shards_missing"] == 1
     assert merge([tmp_path / "part0", tmp_path / "part1"], tmp_path / "joined")["complete"]
     assert tree(tmp_path / "joined") == before
+    (tmp_path / "other").mkdir()
+    begin(tmp_path / "other", plan(**PACKED, seed=6), print)
+    with pytest.raises(InputError, match="holds another run"):
+        merge([tmp_path / "part0", tmp_path / "other"], tmp_path / "mixed")
+    assert not (tmp_path / "mixed").exists()
 
 
 def test_a_place_in_a_tar_and_a_name_are_not_trusted(samples, tmp_path):
