@@ -135,7 +135,7 @@ def dataset_of(path, count, size):
     (record,) = trace(plan.draw(0).build(), boundary_points=6).records()
     sums = {"bytes": 1, "sha256": ""}
     done = {"schema": "eyerender/shard/1", "digest": plan.digest, "versions": {}, "cpu": "", "rejections": []}
-    done |= {"backend": {"name": "", "device": ""}, "given_up": []}
+    done |= {"backend": {"name": "", "device": ""}, "given_up": [], "images_saturated": 0}
     path.mkdir()
     with open(path / "metadata.jsonl", "w", encoding="utf-8") as metadata:
         for shard in range(count // size):
