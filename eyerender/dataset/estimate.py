@@ -65,7 +65,7 @@ def now() -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Speed:
     """Times of the workers of a run, from which the rate of its spec follows."""
 

@@ -134,8 +134,16 @@ def opened_run(
         with run_lock(folder, part, say):
             if options.overwrite and n == 1:
                 clear(folder)
-            told: dict[str, Any] = {"progress": progress, "say": say, "log": Log(folder, part)}
-            run = Run(plan=plan, folder=folder, options=options, part=part, frames=frames, **told)
+            run = Run(
+                plan=plan,
+                folder=folder,
+                options=options,
+                part=part,
+                frames=frames,
+                progress=progress,
+                say=say,
+                log=Log(folder, part),
+            )
             with final_lock(folder, say):
                 resumed = begin(folder, plan, run.repaired)
             try:
@@ -161,7 +169,7 @@ def opened_run(
             shutil.rmtree(folder, ignore_errors=True)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Counts:
     """Counts of a run, for its progress."""
 
@@ -232,7 +240,7 @@ class Run:
             if problem is not None and ((self.folder / DATASET).exists() or not self.todo):
                 self.repaired(f"the dataset is assembled again: {problem}")
         self.intact = not self.todo and problem is None and not self._verifies
-        self.counts.total = sum(len(self.plan.spec.shard_samples(s)) for s in self.todo)
+        self.counts.total = sum(map(self.plan.spec.selection.shard_count, self.todo))
         if self.todo:
             remove_file(self.folder / DATASET)  # a folder that has one is complete
             for shard in sorted(done) if self._verifies else ():
