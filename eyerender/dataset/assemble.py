@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -190,12 +189,14 @@ def verify_dataset(folder: Path, *, quick: bool = False, progress: Progress | No
         if not is_whole:
             yield f"{RUN}: {error.reason}"
         return
-    digest, asked = dataset.get("digest"), shards_of(dataset)
+    digest, spec = dataset.get("digest"), dataset.get("spec")
     for k, shard in enumerate(there):
         yield from verify(folder, shard, digest if isinstance(digest, str) else None, quick=quick)
         notify(progress, k + 1, len(there), "shards")
-    if asked is None:
-        yield f"{DATASET}: spec: has no count and shard_size"
+    try:
+        asked = DatasetSpec.from_mapping(spec if isinstance(spec, dict) else {}).shards
+    except InputError as error:
+        yield f"{DATASET if is_whole else RUN}: spec: {error}"
         return
     known, wanted = frozenset(there), asked if isinstance(asked, range) else frozenset(asked)
     if is_whole:
@@ -204,13 +205,6 @@ def verify_dataset(folder: Path, *, quick: bool = False, progress: Progress | No
         if (more := len(asked) - sum(shard in wanted for shard in there) - _SHOWN) > 0:
             yield f"{SHARDS}: {more} more are missing"
     yield from (f"{SHARDS}/{shard_name(s)}: dataset.json has no such shard" for s in there if s not in wanted)
-
-
-def shards_of(dataset: Mapping[str, Any]) -> Sequence[int] | None:
-    """Return the shard numbers of the spec in a dataset.json; None if it contains none."""
-    with suppress(InputError, KeyError):
-        return DatasetSpec.from_mapping(dataset["spec"]).shards
-    return None
 
 
 def type_first(lines: Callable[[], Iterable[str]], take: Callable[[dict[str, Any]], None]) -> Iterator[str]:
