@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from eyerender.base.errors import BackendError
-from tests.support.dataset_specs import make, plan
+from tests.support.dataset_specs import make_or_skip, plan
 
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
     """The folder of the tiny spec."""
-    folder = tmp_path_factory.mktemp("dataset") / "tiny"
-    try:
-        make(folder, plan())
-    except BackendError as error:
-        pytest.skip(f"nothing to render with: {error}")
-    return folder
+    return make_or_skip(tmp_path_factory.mktemp("dataset") / "tiny", plan())

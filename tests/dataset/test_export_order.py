@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import tarfile
 from itertools import pairwise
 
@@ -13,13 +12,9 @@ from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.dataset.export import FORMATS, export
 from eyerender.folders.imagefolder import ImageFolder
+from tests.support.dataset_specs import tree
 
 pytestmark = pytest.mark.render
-
-
-def bytes_of(folder):
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def order_of(folder):
@@ -40,7 +35,7 @@ def test_the_number_of_processes_changes_no_byte(tiny, tmp_path, format):
     shuffle = None if format == "teyed" else 3
     for workers in (1, 2):
         export(tiny, format, tmp_path / f"{workers}", workers=workers, shuffle=shuffle)
-    assert bytes_of(tmp_path / "1") == bytes_of(tmp_path / "2")
+    assert tree(tmp_path / "1") == tree(tmp_path / "2")
 
 
 def test_a_shuffled_export_has_the_same_images_in_another_order(tiny, tmp_path):
@@ -50,8 +45,8 @@ def test_a_shuffled_export_has_the_same_images_in_another_order(tiny, tmp_path):
     assert orders["sorted"] == sorted(orders["sorted"]) == sorted(orders["one"]) == list(range(24))
     assert orders["one"] == orders["again"]
     assert len({tuple(orders[name]) for name in ("sorted", "one", "two")}) == 3
-    pictures = {name: digest for name, digest in bytes_of(tmp_path / "one").items() if name.endswith(".png")}
-    assert pictures.items() <= bytes_of(tmp_path / "sorted").items()
+    pictures = {name: digest for name, digest in tree(tmp_path / "one").items() if name.endswith(".png")}
+    assert pictures.items() <= tree(tmp_path / "sorted").items()
 
 
 def test_a_shuffled_tar_mixes_subjects(tiny, tmp_path):

@@ -17,7 +17,6 @@ from hypothesis import given
 
 from eyerender.apps.inspection import inspect
 from eyerender.apps.quickstart import compare_folder
-from eyerender.base.errors import BackendError
 from eyerender.dataset.assemble import assemble
 from eyerender.dataset.done import sum_of
 from eyerender.dataset.export import FORMATS, export
@@ -28,7 +27,7 @@ from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageFolder, finished
 from eyerender.gaze.records import load_observations
 from eyerender.imaging.imageobserver import scene_of
-from tests.support.dataset_specs import make, plan
+from tests.support.dataset_specs import make_or_skip, plan
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
 SECRET = b"the secret of another folder"
@@ -52,11 +51,7 @@ HARMS = ("json", "json", "line", "line", "line", "bytes", "link", "link up", "pi
 def four(tmp_path_factory):
     """A dataset of four images in two shards."""
     folder = tmp_path_factory.mktemp("fuzzed") / "four"
-    try:
-        make(folder, small())
-    except BackendError as error:
-        pytest.skip(f"nothing to render with: {error}")
-    return folder
+    return make_or_skip(folder, small())
 
 
 def small() -> Any:

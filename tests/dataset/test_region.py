@@ -8,14 +8,13 @@ import shutil
 import numpy as np
 import pytest
 
-from eyerender.base.errors import BackendError
 from eyerender.dataset.export import export
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, find_dataset
 from eyerender.dataset.validate import validate
 from eyerender.folders.imagefile import read_image, write_png
 from eyerender.folders.imagefolder import ImageFolder
-from tests.support.dataset_specs import make
+from tests.support.dataset_specs import make_or_skip
 
 pytestmark = pytest.mark.render
 
@@ -27,12 +26,7 @@ def folder(tmp_path_factory):
     data |= {"count": 3, "subjects": 1, "splits": {"train": 1.0}}
     data["scene"]["image"]["spp"] = 1
     data["scene"]["region"]["blink"] = {"draw": "sequence", "values": [0.0, 0.45, 0.75]}
-    made = tmp_path_factory.mktemp("region") / "out"
-    try:
-        make(made, Plan.of(DatasetSpec.from_mapping(data)))
-    except BackendError as error:
-        pytest.skip(f"nothing to render with: {error}")
-    return made
+    return make_or_skip(tmp_path_factory.mktemp("region") / "out", Plan.of(DatasetSpec.from_mapping(data)))
 
 
 def test_it_is_a_sound_dataset(folder):

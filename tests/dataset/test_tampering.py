@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 
 import numpy as np
 import pytest
 
+from eyerender.dataset.done import sum_of
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.validate import SAMPLE, sampled, validate
 from eyerender.imaging.folder import render_folder
@@ -26,10 +26,6 @@ def lines_of(path):
 
 def write_lines(path, lines):
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-
-
-def sum_of(path):
-    return {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 def sign(folder):

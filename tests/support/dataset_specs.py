@@ -10,8 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
+from eyerender.base.errors import BackendError
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.run import generate
 from eyerender.dataset.spec import DatasetSpec
@@ -84,6 +86,15 @@ def make(folder: Path, made: Plan, **options: Any) -> dict[str, Any]:
     options.setdefault("threads", 1)
     done = generate(made, folder, **options, say=said.append)
     return {**done, "said": said}
+
+
+def make_or_skip(folder: Path, made: Plan) -> Path:
+    """Make a dataset; where there is no backend, the test is skipped."""
+    try:
+        make(folder, made)
+    except BackendError as error:
+        pytest.skip(f"nothing to render with: {error}")
+    return folder
 
 
 def tree(folder: Path) -> dict[str, str]:

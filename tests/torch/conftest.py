@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eyerender.base.errors import BackendError
-from tests.support.dataset_specs import make, plan
+from tests.support.dataset_specs import make_or_skip, plan
 
 CHANGES = {"count": 20, "subjects": 4, "labels": {"noiseless": True}}
 
@@ -13,12 +12,7 @@ CHANGES = {"count": 20, "subjects": 4, "labels": {"noiseless": True}}
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     """A folder that `generate` wrote."""
-    path = tmp_path_factory.mktemp("torch") / "made"
-    try:
-        make(path, plan(**CHANGES))
-    except BackendError as error:
-        pytest.skip(f"nothing to render with: {error}")
-    return path
+    return make_or_skip(tmp_path_factory.mktemp("torch") / "made", plan(**CHANGES))
 
 
 @pytest.fixture
