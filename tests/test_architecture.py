@@ -237,8 +237,8 @@ LARGE = {
 # first fields users give in order.
 POSITIONAL = {
     "Biconic", "Descent", "EyeImage", "EyePicture", "Finding", "GradientMedium", "GridSurface", "GuestrinEizenman",
-    "LabelledImage", "LashPlan", "Outcome", "Patch", "Pixels", "Place", "Quadric", "Regression", "Scene", "Score",
-    "Stop", "Sums", "Surface", "Visible", "ZernikeSurface", "_Table",
+    "LashPlan", "Outcome", "Patch", "Pixels", "Place", "Quadric", "Regression", "Scene", "Score",
+    "Stop", "Sums", "Surface", "Table", "Visible", "ZernikeSurface", "_Table",
 }  # fmt: skip
 
 

@@ -78,7 +78,7 @@ def test_wheel_holds_what_the_package_reads_and_nothing_of_the_checkout(site):
     scenes = {p.name for p in (ROOT / "scenes").glob("*.yaml")}
     assert {f"eyerender/data/scenes/{name}" for name in scenes} <= names
     assert "eyerender/py.typed" in names
-    assert "eyerender/report/templates/comparison.html.j2" in names
+    assert "eyerender/report/templates/page.html.j2" in names
     assert not [n for n in names if n.startswith(("tests/", "scripts/", "docs/"))]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
 from collections.abc import Iterator
@@ -25,7 +24,8 @@ from ..imaging.capture import make_renderer, render_windows
 from ..population.people import PopulationSpec
 from ..population.statistics import Moments, Refusals, Survey, pieces, refusals, survey
 from ..population.table import Source, Table, default_table
-from ..report.page import Card, Figure, Page, Section, write_page
+from ..report.overlay import picture
+from ..report.page import Card, Content, Figure, Page, Section, write_page
 from ..report.page import Table as PageTable
 from ..report.style import ANALYTIC, IMAGE, figure, svg
 from ..scene import Scene
@@ -241,14 +241,14 @@ def page_of(found: Result, sheet: Image.Image | None) -> Page:
         Card(f"{pairs:.1f} standard errors", f"largest deviation of {len(s.pairs)} correlations from the table"),
         Card(f"{r.people} of {r.n}", "people with an eye that physics refuses"),
     ]
-    sections = [Section("What was drawn", _lead(found), [Figure(_histograms(s), _HISTOGRAMS)], [_quantities(s, table)])]
+    sections = [Section("What was drawn", _lead(found), Figure(_histograms(s), _HISTOGRAMS), _quantities(s, table))]
     sections.append(
-        Section("Correlations", ["Within the right eyes; residuals have no refraction, age and sex in them."],
-                [Figure(_matrix(s), "Correlations of the right eyes as drawn.")], [_correlations(s)])
+        Section("Correlations", "Within the right eyes; residuals have no refraction, age and sex in them.",
+                 Figure(_matrix(s), "Correlations of the right eyes as drawn."), _correlations(s))
     )  # fmt: skip
     if sheet is not None:
-        sections.append(Section("Faces", [], [Figure(_picture(sheet), "Right and left eye of the first people.")]))
-    refused = [
+        sections.append(Section("Faces", Figure(_picture(sheet), "Right and left eye of the first people.")))
+    refused: list[Content] = [
         f"Both eyes of {r.n} people were built: surfaces must not cross, the stop must lie inside the chamber, and "
         "rays must reach the fovea."
     ]
@@ -258,9 +258,10 @@ def page_of(found: Result, sheet: Image.Image | None) -> Page:
             "deviations, and all others by less."
         )
     rows = [(reason, str(number)) for reason, number in sorted(r.reasons.items(), key=lambda item: -item[1])]
-    tables = [PageTable(header=("reason", "eyes"), rows=rows, wide=(0,))] if rows else []
-    sections.append(Section("What physics refuses", refused, [], tables))
-    sections.append(Section("Sources", [_MARKS], [], [_sources(table, found.population)]))
+    if rows:
+        refused.append(PageTable(("reason", "eyes"), rows, wide=(0,)))
+    sections.append(Section("What physics refuses", *refused))
+    sections.append(Section("Sources", _MARKS, _sources(table, found.population)))
     lead = table.presets[found.population.preset].description.capitalize() + "."
     return Page(f"People: {found.population.preset}", [lead], cards, sections)
 
@@ -275,12 +276,12 @@ _MARKS = (
 )
 
 
-def _lead(found: Result) -> list[str]:
+def _lead(found: Result) -> str | None:
     where = found.population.where
     if not where:
-        return []
+        return None
     told = ", ".join(f"{name} {value}" for name, value in where.items())
-    return [f"Only people with {told}; the table's values are of all people, so they are left out."]
+    return f"Only people with {told}; the table's values are of all people, so they are left out."
 
 
 def _histograms(s: Survey) -> str:
@@ -332,7 +333,7 @@ def _quantities(s: Survey, table: Table) -> PageTable:
     ]  # fmt: skip
     header = ("quantity", "mean, table", "mean, drawn", "SD, table", "SD, drawn", "off by (standard errors)", "marks")
     caption = "Means and standard deviations, with standard errors; of the eyes, the right ones."
-    return PageTable(header=header, rows=rows, caption=caption, wide=(6,))
+    return PageTable(header, rows, caption, wide=(6,))
 
 
 def _off(m: Moments) -> str:
@@ -347,7 +348,7 @@ def _correlations(s: Survey) -> PageTable:
     ]  # fmt: skip
     header = ("pair", "source", "joint distribution", "drawn", "off by (standard errors)", "where from")
     caption = "The source's value may be of residuals; all other values are of the quantities themselves."
-    return PageTable(header=header, rows=rows, caption=caption, wide=(5,))
+    return PageTable(header, rows, caption, wide=(5,))
 
 
 def _sources(table: Table, population: PopulationSpec) -> PageTable:
@@ -362,7 +363,7 @@ def _sources(table: Table, population: PopulationSpec) -> PageTable:
         rows += [(name, source.what, source.mark, source.text) for source in told]
     rows += [(name, "value", constant.mark, constant.text) for name, constant in table.constants.items()]
     header = ("quantity", "what", "mark", "source")
-    return PageTable(header=header, rows=rows, caption="Every number and its source", wide=(3,), folded=True)
+    return PageTable(header, rows, "Every number and its source", wide=(3,), folded=True)
 
 
 def _marks(table: Table, name: str) -> str:
@@ -374,8 +375,7 @@ def _marks(table: Table, name: str) -> str:
 def _picture(sheet: Image.Image) -> str:
     data = io.BytesIO()
     sheet.save(data, format="JPEG", quality=88)
-    text = base64.b64encode(data.getvalue()).decode()
-    return f'<img alt="faces" style="max-width: 100%" src="data:image/jpeg;base64,{text}">'
+    return picture(data.getvalue(), "jpeg", sheet.size, title="faces")
 
 
 def _number(value: float) -> str:

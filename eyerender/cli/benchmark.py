@@ -28,7 +28,8 @@ def bench_extractors(
 
     The output folder receives report.html, results.json, results.csv and times.json; only times.json differs between
     identical runs. Each extractor runs in its own process. If it crashes, hangs or returns invalid answers, only its
-    own result fails, with a reason. Answers are stored, so a second run only computes what is new.
+    own result fails, with a reason. An interrupted run leaves its answers in the output folder, and the same command
+    resumes from them.
 
     The exit code is 1 if an extractor gives no usable answer to any image. With --against or --require it is also 1 if
     an extractor fails on any image, if a required figure is not reached, or if significantly more images were lost than

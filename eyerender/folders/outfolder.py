@@ -115,7 +115,7 @@ def clear(folder: Path, *, known: bool = False) -> None:
     else:
         refuse_non_empty(folder, True)
     listed = _listed(folder) or set()
-    _mark(folder, listed)
+    mark(folder, listed)
     _empty(folder, listed)
     (folder / MARKER).unlink()
 
@@ -170,7 +170,7 @@ def _publish(stage: Path, final: Path) -> None:
     is_whole = any(True for _ in _made_here(final, old, strict=False))  # the old content, if there is any
     try:
         # From here on the folder is identifiable at every moment.
-        _mark(final, old | new)
+        mark(final, old | new)
         is_whole = False
         _empty(final, old, keep=stage.name)
         for entry in sorted(stage.iterdir(), key=lambda p: p.name == DATASET):
@@ -181,7 +181,7 @@ def _publish(stage: Path, final: Path) -> None:
         if not new.isdisjoint(_SIGNS):  # its own files identify it
             (final / MARKER).unlink()
         else:
-            _mark(final, new)
+            mark(final, new)
     except BaseException:
         if not is_whole:
             with suppress(OSError):
@@ -190,7 +190,8 @@ def _publish(stage: Path, final: Path) -> None:
         raise
 
 
-def _mark(folder: Path, names: Set[str]) -> None:
+def mark(folder: Path, names: Set[str]) -> None:
+    """Write the marker of a folder, which lists what this package makes there."""
     write_json(folder / MARKER, {"schema": FOLDER_SCHEMA, "files": sorted(names)})
 
 

@@ -14,8 +14,8 @@ from ..imaging.comparison import Comparison
 from ..scene import Scene
 from ..scene.observation import EYES
 from .overlay import eye_picture
-from .page import write_template
-from .style import ANALYTIC, IMAGE, TARGET, figure, svg
+from .page import Card, Content, Figure, Gallery, Key, Listing, Page, Section, Table, number, write_page
+from .style import ANALYTIC, ANALYTIC_ON_DARK, IMAGE, IMAGE_ON_DARK, TARGET, figure, svg
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,20 +33,87 @@ def write_report(
 
     >>> er.write_report("report.html", scene, er.apps.compare_folder("out")[0], [])  # doctest: +SKIP
     """
-    values = {
-        "scene": scene.spec,
-        "scene_yaml": scene.spec.to_yaml(),
-        "data": comparison.to_mapping(),
-        "rows": _rows(comparison),
-        "pictures": _pictures(scene, comparison, entries),
-        # A grid of targets is listed column by column; other lists are filled row by row.
-        "grid": scene.spec.targets.grid if scene.spec.targets and scene.spec.targets.grid else (3, None),
-        "feature_figure": feature_figure(comparison),
-        "gaze_figure": gaze_figure(scene, comparison),
-        "timings": timings,
-        "versions": versions(),
-    }
-    write_template(path, "comparison.html.j2", values)
+    title = f"{scene.name}: two observers compared"
+    sections = [
+        _images(scene, comparison, entries),
+        Section(
+            "Feature errors",
+            "The figure shows image-derived minus analytic features. The apparent pupil is not exactly an ellipse, "
+            "and the image has noise, so the centres of the two fits differ slightly.",
+            Figure(feature_figure(comparison), ""),
+        ),
+        Section("Gaze errors", *_gaze(scene, comparison)),
+        Section("Every image", Table(_HEADER, _rows(comparison))),
+        Section(
+            "How this was made",
+            ", ".join(f"{t.step} {t.seconds:.1f} s" for t in timings) + "." if timings else None,
+            ", ".join(f"{name} {version}" for name, version in versions().items()) + ".",
+            Listing("The scene, with every default filled in", scene.spec.to_yaml()),
+        ),
+    ]
+    lead = [
+        scene.spec.description,
+        "The analytic observer computes the apparent pupil and the glints by ray optics through the cornea of eye "
+        f"model {scene.spec.eye.model}. The image observer recovers them from the pixels of the rendered "
+        f"{scene.spec.wavelength_nm:g} nm images. The same gaze estimator uses both.",
+    ]
+    write_page(path, Page(title, lead, _cards(comparison, len(entries)), sections))
+
+
+def _cards(comparison: Comparison, images: int) -> list[Card]:
+    data = comparison.to_mapping()
+    features, gaze = data["features"], data["gaze"]
+    pupils, glints, centre, glint = (features[key] for key in ("pupils", "glints", "pupil_centre_px", "glint_px"))
+    cards = [
+        Card(f"{pupils['found']} of {pupils['expected']}", f"pupils found in {images} images"),
+        Card(_median(centre), f"pupil centre error, median{_most(centre)}"),
+        Card(_median(glint), f"glint error, median{_most(glint)}; {glints['found']} of {glints['expected']} found"),
+    ]
+    for key in ("analytic", "image") if gaze else ():
+        mean = (gaze[key] or {}).get("mean_deg")
+        cards.append(Card("-" if mean is None else f"{mean:.3f}°", f"gaze error from {key} features, mean"))
+    return cards
+
+
+def _median(errors: dict[str, Any]) -> str:
+    return f"{errors['median']:.3f} px" if errors["n"] else "-"
+
+
+def _most(errors: dict[str, Any]) -> str:
+    return f" (max {errors['max']:.3f})" if errors["n"] else ""
+
+
+def _images(scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry]) -> Section:
+    """Show the images of each eye; those of a grid of targets, which is listed by columns, are placed like it."""
+    grid = scene.spec.targets.grid if scene.spec.targets else None
+    text = (
+        "The pictures are enlarged around the eye. The numbers are measured in the "
+        f"{scene.spec.sensor.bit_depth}-bit images."
+    )
+    if grid:
+        text += " Each picture is placed like its target on the screen, as the subject sees it."
+    key = (
+        (ANALYTIC_ON_DARK, "analytic: pupil ellipse, its centre and the glints (upright crosses)"),
+        (IMAGE_ON_DARK, "recovered from the image (dashed, diagonal crosses; small and faint: a reflection that does "
+         "not belong to a light)"),
+    )  # fmt: skip
+    galleries = [
+        Gallery(pictures, f"{side} eye", 20.0, grid[1] if grid else None)
+        for side, pictures in _pictures(scene, comparison, entries).items()
+    ]
+    return Section("The images", text, Key(key, ("analytic", "found")), *galleries)
+
+
+def _gaze(scene: Scene, comparison: Comparison) -> list[Content]:
+    data, drawn = comparison.to_mapping(), gaze_figure(scene, comparison)
+    if drawn is None or not data["gaze"]:
+        return [f"None: {data['gaze_reason'] or 'the scene has no screen'}."]
+    return [
+        f"Estimator: {data['gaze']['estimator']}. Each target is estimated with a calibration on all other targets "
+        "(leave one target out). The estimate is the mean of both eyes, and the error is the angle at the mid-point of "
+        "the eyes.",
+        Figure(drawn, ""),
+    ]
 
 
 def feature_figure(comparison: Comparison) -> str:
@@ -101,8 +168,10 @@ def gaze_figure(scene: Scene, comparison: Comparison) -> str | None:
         return svg(fig)
 
 
-def _pictures(scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry]) -> dict[str, list[dict[str, Any]]]:
-    out: dict[str, list[dict[str, Any]]] = {}
+def _pictures(
+    scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry]
+) -> dict[str, list[tuple[str, list[str]]]]:
+    out: dict[str, list[tuple[str, list[str]]]] = {}
     # Matte parts are well below full scale, to leave headroom for glints. This level is white enough for viewing.
     full = 0.7 * scene.spec.sensor.full_scale_dn
     truth, found = comparison.truth, comparison.found
@@ -116,7 +185,7 @@ def _pictures(scene: Scene, comparison: Comparison, entries: Sequence[ImageEntry
         crop = (width, min(image.shape[0], width * 3 // 4))
         scale = max(1, round(400 / width))
         picture = eye_picture(image, entry.window[:2], full, truth, found, row, crop_px=crop, scale=scale, title=name)
-        out.setdefault(side, []).append({"svg": picture, "name": name, "error": _error(comparison, row)})
+        out.setdefault(side, []).append((picture, [name, _error(comparison, row)]))
     return out
 
 
@@ -131,7 +200,13 @@ def _error(comparison: Comparison, row: int) -> str:
     return f"pupil centre {centre:.3f} px{glint}"
 
 
-def _rows(comparison: Comparison) -> list[dict[str, Any]]:
+_HEADER = (
+    "frame", "eye", "target (mm)", "pupil centre (px)", "semi-axis (px)", "glint (px)", "gaze, analytic (deg)",
+    "gaze, image (deg)",
+)  # fmt: skip
+
+
+def _rows(comparison: Comparison) -> list[tuple[str, ...]]:
     errors, index = comparison.features, comparison.truth.index
     gaze = []
     for g in (comparison.gaze_truth, comparison.gaze_found):
@@ -140,23 +215,14 @@ def _rows(comparison: Comparison) -> list[dict[str, Any]]:
     for i in range(len(index)):
         frame = int(index.frame[i])
         glint = np.linalg.norm(errors.glint_px[i], axis=-1)
-        rows.append(
-            {
-                "frame": frame,
-                "eye": EYES[int(index.eye[i])],
-                "target": _triple(index.target_mm[i]),
-                "centre": _number(float(np.linalg.norm(errors.centre_px[i]))),
-                "axes": _number(float(np.abs(errors.semi_axes_px[i]).max())),
-                "glint": _number(float(glint[np.isfinite(glint)].max()) if np.isfinite(glint).any() else np.nan),
-                "gaze_analytic": _number(gaze[0].get(frame, np.nan)),
-                "gaze_image": _number(gaze[1].get(frame, np.nan)),
-            }
+        sizes = (
+            float(np.linalg.norm(errors.centre_px[i])),
+            float(np.abs(errors.semi_axes_px[i]).max()),
+            float(np.max(glint, initial=-np.inf, where=np.isfinite(glint))),
+            *(known.get(frame) for known in gaze),
         )
+        rows.append((str(frame), EYES[int(index.eye[i])], _triple(index.target_mm[i]), *map(number, sizes)))
     return rows
-
-
-def _number(value: float) -> str:
-    return f"{value:.4f}" if np.isfinite(value) else "-"
 
 
 def _triple(values: Any) -> str:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from ..base.arrays import Bytes, Floats
-from ..folders.imagefile import preview
+from ..base.arrays import Floats
+from ..folders.imagefile import png_bytes, preview
 from ..scene.observation import Observations
 from .style import ANALYTIC_ON_DARK, IMAGE_ON_DARK
 
@@ -51,16 +49,32 @@ def eye_picture(
     y0 = int(np.clip(round(centre[1] - origin_px[1] - (ch - 1) / 2), 0, h - ch))
     shown = preview(image[y0 : y0 + ch, x0 : x0 + cw], full_scale)
     shift = np.array([x0 + origin_px[0] - 0.5, y0 + origin_px[1] - 0.5])  # pixel i covers [i, i + 1) in the drawing
-    parts = [
-        f'<svg class="eye" viewBox="0 0 {cw} {ch}" width="{cw * scale}" height="{ch * scale}" role="img" '
-        f'xmlns="http://www.w3.org/2000/svg"><title>{title}</title>',
-        f'<image width="{cw}" height="{ch}" style="image-rendering:pixelated" '
-        f'href="data:image/png;base64,{_png(shown)}"/>',
-    ]
-    for name, seen in (("analytic", truth), ("found", found)):
-        parts.append(feature_marks(seen, row, shift, analytic=name == "analytic"))
-    parts.append("</svg>")
-    return "".join(parts)
+    marks = feature_marks(truth, row, shift, analytic=True) + feature_marks(found, row, shift, analytic=False)
+    return picture(png_bytes(shown), "png", (cw, ch), width=cw * scale, over=marks, title=title)
+
+
+def picture(
+    data: bytes, kind: str, size: tuple[int, int], *, width: int | None = None, over: str = "", title: str = ""
+) -> str:
+    """Embed a picture in an <svg>.
+
+    Args:
+        data: the content of its file.
+        kind: png or jpeg.
+        size: width and height of the drawing's coordinates, px of the picture.
+        width: width on the screen; None: as wide as its place.
+        over: markup to draw over it.
+        title: text alternative.
+    """
+    w, h = size
+    wide = "" if width is None else f' width="{width}"'
+    pixels = ' style="image-rendering:pixelated"' if kind == "png" else ""
+    return (
+        f'<svg viewBox="0 0 {w} {h}"{wide} role="img" xmlns="http://www.w3.org/2000/svg">'
+        f"<title>{html.escape(title)}</title>"
+        f'<image width="{w}" height="{h}" preserveAspectRatio="none"{pixels} '
+        f'href="data:image/{kind};base64,{base64.b64encode(data).decode()}"/>{over}</svg>'
+    )
 
 
 def feature_marks(seen: Observations, row: int, shift: Floats, *, analytic: bool, scale: float = 1.0) -> str:
@@ -113,9 +127,3 @@ def _cross(at: Floats, size: float, *, diagonal: bool, scale: float = 1.0) -> st
 
 def _thin(width: float) -> str:
     return f"{width:g}".removeprefix("0")
-
-
-def _png(image: Bytes) -> str:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG", optimize=True)
-    return base64.b64encode(buffer.getvalue()).decode()

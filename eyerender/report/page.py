@@ -1,17 +1,17 @@
-"""Self-contained HTML pages: cards, and sections with text, figures and tables.
+"""Self-contained HTML pages: cards, and sections of text, figures, tables and pictures.
 
-A page is a `Page`, or a separate template that extends `page.html.j2` and fills its blocks with the macros of
-`parts.html.j2`.
+A page is plain data; `page.html.j2` turns it into HTML. All text is escaped; figures and pictures hold markup of this
+package.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..base.storage.files import write_text
 
@@ -33,7 +33,7 @@ class Figure:
     small: bool = False
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Table:
     """Header, rows of text, a caption; `wide` columns (by index) hold sentences and may wrap."""
 
@@ -45,23 +45,57 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
-    """A heading and its content in this order: text, figures, tables."""
+class Gallery:
+    """Pictures in a grid, each as markup and lines of text, of which the first is its name.
 
-    heading: str
-    text: Sequence[str] = ()
-    figures: Sequence[Figure] = ()
-    tables: Sequence[Table] = ()
+    Attributes:
+        pictures: the pictures.
+        heading: a heading above them.
+        width_rem: smallest width of a picture.
+        rows: number of rows, filled column by column; None: as many columns as fit, filled row by row.
+    """
+
+    pictures: Sequence[tuple[str, Sequence[str]]]
+    heading: str = ""
+    width_rem: float = 13.5
+    rows: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """Colours of marks and their meanings; with `switches` (classes of the marks), each kind can be hidden."""
+
+    colours: Sequence[tuple[str, str]]
+    switches: Sequence[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """Preformatted text under its caption, folded."""
+
+    caption: str
+    text: str
+
+
+Content = str | Figure | Table | Gallery | Key | Listing | None
+"""Content of a section: a paragraph, one of the classes above, or None, which adds nothing."""
+
+
+class Section:
+    """A heading and its content."""
+
+    def __init__(self, heading: str, *content: Content) -> None:
+        self.heading, self.content = heading, content
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A report."""
+    """A report; sections that are None add nothing."""
 
     title: str
     lead: Sequence[str]
-    cards: Sequence[Card] = ()
-    sections: Sequence[Section] = field(default_factory=tuple)
+    cards: Sequence[Card]
+    sections: Sequence[Section | None]
 
 
 def degrees_text(value: float | None) -> str:
@@ -69,19 +103,19 @@ def degrees_text(value: float | None) -> str:
     return "not seen" if value is None else f"{value:.3g}°"
 
 
+def number(value: float | None, decimals: int = 4) -> str:
+    """Format a number of a table; a dash for None and for what is not finite."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
+
+
 def write_page(path: Path, page: Page) -> None:
     """Write one self-contained HTML file; on an error, nothing is left."""
-    write_template(path, "page.html.j2", {"page": page})
-
-
-def write_template(path: Path, template: str, values: Mapping[str, Any], package: str = "eyerender.report") -> None:
-    """Fill a template of a package and write it as a self-contained HTML file; on an error, nothing is left."""
     environment = Environment(
-        loader=ChoiceLoader([PackageLoader(package), PackageLoader("eyerender.report")]),
+        loader=PackageLoader("eyerender.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    # `contents` collects the headings while the sections are rendered; the page lists them at the top.
-    write_text(path, environment.get_template(template).render(contents=[], **values))
+    environment.filters["kind"] = lambda content: type(content).__name__
+    write_text(path, environment.get_template("page.html.j2").render(page=page))

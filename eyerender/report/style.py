@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..base.arrays import Floats
+
 ANALYTIC, IMAGE, TARGET = "#0072B2", "#D55E00", "#222222"
 # These are the same two hues, light enough for dark images.
 ANALYTIC_ON_DARK, IMAGE_ON_DARK = "#56B4E9", "#FF9F1C"
@@ -44,6 +46,23 @@ def legend_above(fig: Any, panel: Any, columns: int) -> None:
     """Put the legend of one panel above all panels, which share it."""
     handles, labels = panel.get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False)
+
+
+def heat_map(
+    values: Floats,
+    extent: tuple[float, float, float, float],
+    labels: tuple[str, str],
+    *,
+    ends: tuple[float | None, float | None] = (None, None),
+    bar: str = "",
+) -> str:
+    """Draw a small map of values (rows from the top, columns), with the labels of its axes and of its colour bar."""
+    with figure(3.3, 2.7) as (fig, ax):
+        image = ax.imshow(values, extent=extent, aspect="auto", vmin=ends[0], vmax=ends[1])
+        fig.colorbar(image, label=bar)
+        ax.grid(False)
+        ax.set(xlabel=labels[0], ylabel=labels[1])
+        return svg(fig)
 
 
 def svg(fig: Any) -> str:

@@ -110,7 +110,7 @@ def test_a_centre_within_five_pixels_is_right_and_nothing_else_is_known(tmp_path
     scores = [score(image, reply, 0.0, ("pupil",)) for reply in (answer(50, 26), answer(50, 26.1), answer(None, None))]
     assert [s.outcome for s in scores] == ["right", "wrong", "none"]
     assert scores[0].centre_px == pytest.approx(5.0)
-    summary = summarise(scores, [None] * 3, reports_glints=False)
+    summary = summarise(scores)
     assert summary["rates"]["right"] == pytest.approx(1 / 3)
     assert (summary["iou"]["median"], summary["semi_axes_bias_px"]) == (None, None)
     curves = curves_of(scores)

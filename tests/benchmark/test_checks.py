@@ -1,4 +1,4 @@
-"""Benches as regression tests: stored answers, identical reruns, required figures, losses, the assumed gamma."""
+"""Benches as regression tests: identical reruns, interrupted runs, required figures, losses, the assumed gamma."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import shutil
 import numpy as np
 import pytest
 
-from eyerender.apps.benchmark import answercache
+from eyerender.apps.benchmark.answers import ANSWERS
 from eyerender.apps.benchmark.checks import Requirement, compare_with, problems_of
-from eyerender.apps.benchmark.exact import mcnemar
 from eyerender.apps.benchmark.folder import load_labelled
+from eyerender.apps.benchmark.intervals import mcnemar
 from eyerender.apps.benchmark.run import bench_extractors
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
@@ -29,8 +29,6 @@ def find(image, request):
 @pytest.fixture
 def counting(tmp_path, monkeypatch):
     """A function that makes a module whose extractor writes down the images about which it is asked."""
-    (tmp_path / "cache").mkdir()
-    monkeypatch.setattr(answercache, "cache_folder", lambda: tmp_path / "cache")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
 
     def make(name, a=15.0):
@@ -42,54 +40,59 @@ def counting(tmp_path, monkeypatch):
     return make
 
 
-def test_identical_runs_are_byte_equal_and_ask_nothing_again(drawn, counting, tmp_path, monkeypatch):
-    first, asked = counting("first")
-    out = [tmp_path / f"out{k}" for k in range(3)]
-    bench_extractors(drawn, out[0], [first])
-    assert len(asked()) == 6 + 1  # the first image twice: the first call loads libraries
-    with monkeypatch.context() as patch:  # two reports tell whether they are equal
-        patch.setattr("eyerender.apps.benchmark.run.write_bench_report", lambda *_: None)
-        bench_extractors(drawn, out[1], [first])
-    assert len(asked()) == 7
-    bench_extractors(drawn, out[2], [first], fresh=True, jobs=2)
-    assert len(asked()) == 7 + 8
-    assert (out[0] / "report.html").read_bytes() == (out[2] / "report.html").read_bytes()
-    for name in ("results.json", "results.csv"):
-        assert len({(folder / name).read_bytes() for folder in out}) == 1, name
-    assert json.loads((out[2] / "times.json").read_text())["extractors"][0]["round_trip_ms"]["n"] == 6
+def interrupted(drawn, out, extractor, after, **options):
+    """A run that ends with a KeyboardInterrupt after some answers."""
+
+    def progress(done, _total, _what):
+        if done == after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        bench_extractors(drawn, out, [extractor], progress=progress, **options)
+
+
+def test_an_interrupted_run_resumes_to_equal_bytes(drawn, counting, tmp_path):
+    extractor, asked = counting("first")
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    bench_extractors(drawn, whole, [extractor], jobs=2)
+    assert len(asked()) == 6 + 2  # twice the first image of each process: the first call loads libraries
+    interrupted(drawn, out, extractor, 4)
+    assert len(asked()) == 8 + 5
+    with open(out / ANSWERS, "a") as file:
+        file.write('{"extractor": "first')  # as of a killed run
+    bench_extractors(drawn, out, [extractor])
+    assert len(asked()) == 13 + 3
+    assert sorted(p.name for p in out.iterdir()) == ["report.html", "results.csv", "results.json", "times.json"]
+    for name in ("report.html", "results.json", "results.csv"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    assert json.loads((out / "times.json").read_text())["extractors"][0]["round_trip_ms"]["n"] == 6
 
 
 @pytest.mark.packaging
 @pytest.mark.usefixtures("no_report")
-def test_only_what_is_new_is_asked(drawn, counting, tmp_path):
-    first, asked_first = counting("first")
-    bench_extractors(drawn, tmp_path / "a", [first])
-    second, asked_second = counting("second")
-    bench_extractors(drawn, tmp_path / "b", [first, second])
-    assert (len(asked_first()), len(asked_second())) == (7, 7)
-    # Another image, other code: what depends on them is asked again.
-    folder = shutil.copytree(drawn, tmp_path / "copy")
-    bench_extractors(folder, tmp_path / "c", [first])
-    assert len(asked_first()) == 7  # where the images are does not matter
-    shutil.copy(folder / "images/small-010000.png", folder / "images/small-010001.png")
+def test_answers_of_another_task_are_asked_again(drawn, counting, tmp_path):
+    extractor, asked = counting("first")
+    out, folder = tmp_path / "out", shutil.copytree(drawn, tmp_path / "copy")
+    bench_extractors(folder, out, [extractor])
+    interrupted(folder, out, extractor, 3)  # beside the results of an earlier run
+    assert len(asked()) == 7 + 4
     image = folder / "images/small-010002.png"
     image.write_bytes(image.read_bytes() + b" ")  # the same picture, but another file
-    bench_extractors(folder, tmp_path / "d", [first])
-    assert asked_first()[7:] == ["small-010002.png"] * 2
-    _, asked_first = counting("first", a=16.0)
-    bench_extractors(drawn, tmp_path / "e", [first])
-    assert len(asked_first()) == 7
+    interrupted(folder, out, extractor, 3)
+    assert len(asked()) == 11 + 4
+    interrupted(folder, out, extractor, 5, fresh=True)
+    assert len(asked()) == 15 + 6
+    _, asked = counting("first", a=16.0)  # other code
+    bench_extractors(folder, out, [extractor])
+    assert len(asked()) == 7
 
 
 @pytest.mark.usefixtures("no_report")
 def test_failures_are_not_stored(drawn, tmp_path, monkeypatch):
-    (tmp_path / "cache").mkdir()
-    monkeypatch.setattr(answercache, "cache_folder", lambda: tmp_path / "cache")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
     (tmp_path / "moody.py").write_text("def find(image, request):\n    raise RuntimeError('not today')\n")
-    data = bench_extractors(drawn, tmp_path / "a", ["moody:find"])
-    assert data["extractors"][0]["summary"]["error"] == 6
-    assert [p.read_text() for p in (tmp_path / "cache/answers").iterdir()] == []
+    interrupted(drawn, tmp_path / "out", "moody:find", 6)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,9 @@ from scipy.stats import norm
 
 import make_ideal_images as ideal
 from eyerender.apps.benchmark.bound import Edge, edge_of, is_bounded, measure_edge
-from eyerender.apps.benchmark.folder import LabelledImage, load_labelled
+from eyerender.apps.benchmark.folder import load_labelled
 from eyerender.apps.benchmark.glintlabels import GlintLook, TrueGlint
+from eyerender.apps.benchmark.labelled import BenchImage
 from eyerender.apps.benchmark.protocol import Reply
 from eyerender.apps.benchmark.score import GlintScore, Score, score, score_glints
 from eyerender.apps.benchmark.summary import bins, breakdown, efficiency, failures, summarise
@@ -24,9 +25,9 @@ from eyerender.folders.imagefile import read_image
 from eyerender.optics.ellipse import Ellipse, signed_distance
 
 PUPIL = Ellipse(np.array([50.0, 40.0]), np.array([20.0, 16.0]), 0.4)
-IMAGE = LabelledImage(
-    "a.png", Path("a.png"), 8, (100, 80), PUPIL, PUPIL.points(120), 1.0,
-    (TrueGlint(0, (45.0, 40.0)), TrueGlint(1, (55.0, 40.0)), TrueGlint(2, (50.0, 30.0))), {},
+IMAGE = BenchImage(
+    name="a.png", path=Path("a.png"), bit_depth=8, size=(100, 80), pupil=PUPIL, outline_px=PUPIL.points(120),
+    glints=(TrueGlint(0, (45.0, 40.0)), TrueGlint(1, (55.0, 40.0)), TrueGlint(2, (50.0, 30.0))),
 )  # fmt: skip
 
 
@@ -84,7 +85,7 @@ def test_false_and_unnamed_glints_are_counted():
     assert got.false_kinds == ("elsewhere", "repeated")
     assert [matched for matched, _ in got.matches] == [True, True, False]
     scores = [Score("right", offset_px=(0, 0), axes_px=(0, 0), iou=0.98, boundary_px=0.2, glints=got)]
-    recall = summarise(scores, [None], True)["glints"]["recall_by"]
+    recall = summarise(scores)["glints"]["recall_by"]
     assert recall["visible"] == {"whole": {"true": 3, "matched": 2, "recall": 2 / 3}}
 
 
@@ -104,28 +105,28 @@ def test_rates_are_over_the_images_that_show_a_pupil():
         Score("absent", with_pupil=False),
         Score("false", with_pupil=False),
     ]
-    got = summarise(scores, [None] * len(scores), False)
+    got = summarise(scores)
     assert got["rates"] == {"right": 0.5, "wrong": 1 / 6, "none": 1 / 6, "error": 1 / 6, "false": 0.5}
     assert (got["without_pupil"], got["false"]) == (2, 1)
     assert got["centre_px"] == {"n": 3, "median": 0.5, "p95": 0.5, "worst": 0.5}
     assert got["centre_px_of_all_found"]["worst"] == 15.0
     assert got["centre_bias_px"] == pytest.approx([0.3, 0.4])
     assert got["semi_axes_bias_px"] == pytest.approx([0.1, -0.2])
-    images = [replace(IMAGE, name=f"{k}.png") for k in range(len(scores))]
-    listed = {f["outcome"]: (f["count"], f["first"]) for f in failures(scores, images)}
+    named = [replace(s, image=f"{k}.png") for k, s in enumerate(scores)]
+    listed = {f["outcome"]: (f["count"], f["first"]) for f in failures(named)}
     assert listed == {"wrong": (1, "3.png"), "none": (1, "4.png"), "error": (1, "5.png"), "false": (1, "7.png")}
 
 
 def test_an_extractor_at_the_bound_has_efficiency_one():
     rng = np.random.default_rng(3)
     sigmas = rng.uniform(0.005, 0.05, 4000)
-    scores = [Score("right", offset_px=tuple(rng.normal(0.0, s, 2))) for s in sigmas]
-    value = efficiency(scores, sigmas.tolist())["value"]
+    scores = [Score("right", offset_px=tuple(rng.normal(0.0, s, 2)), sigma_px=s) for s in sigmas.tolist()]
+    value = efficiency(scores)["value"]
     # The median of 4000 Rayleigh draws scatters by 1 / (2 f sqrt(n)) = 1.3 %, f the density at it.
     assert value == pytest.approx(1.0, abs=0.05)
-    far = [Score("right", offset_px=(2 * s.offset_px[0], 2 * s.offset_px[1])) for s in scores]
-    assert efficiency(far, sigmas.tolist())["value"] == pytest.approx(0.5 * value)
-    assert efficiency([Score("none")], [0.01])["value"] is None
+    far = [replace(s, offset_px=(2 * s.offset_px[0], 2 * s.offset_px[1])) for s in scores]
+    assert efficiency(far)["value"] == pytest.approx(0.5 * value)
+    assert efficiency([Score("none", sigma_px=0.01)])["value"] is None
 
 
 def test_under_a_lid_the_edge_is_measured_where_it_is_visible():
@@ -245,8 +246,7 @@ def test_bins():
 def test_a_breakdown_holds_every_image_with_a_pupil_once():
     scores = [Score("right", offset_px=(0.1 * k, 0.0), axes_px=(0, 0), iou=1.0, boundary_px=0.0) for k in range(8)]
     scores += [Score("absent", with_pupil=False), Score("none", "dark")]
-    factors = [{"noise_dn": float(k % 2)} for k in range(9)] + [{}]
-    got = breakdown(scores, [None] * 10, factors, False)
+    got = breakdown([replace(s, factors={"noise_dn": float(k % 2)} if k < 9 else {}) for k, s in enumerate(scores)])
     assert list(got) == ["noise_dn"]
     assert [b["with_pupil"] for b in got["noise_dn"]] == [4, 4]
     assert [b["centre_px"]["median"] for b in got["noise_dn"]] == pytest.approx([0.3, 0.4])

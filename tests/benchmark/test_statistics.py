@@ -13,9 +13,9 @@ from eyerender.apps.benchmark.asking import Run
 from eyerender.apps.benchmark.conventions import Conventions
 from eyerender.apps.benchmark.curves import curves_of
 from eyerender.apps.benchmark.failurekinds import kind_of
-from eyerender.apps.benchmark.folder import LabelledImage
 from eyerender.apps.benchmark.glintlabels import TrueGlint
 from eyerender.apps.benchmark.intervals import subject_interval, wilson
+from eyerender.apps.benchmark.labelled import BenchImage
 from eyerender.apps.benchmark.paired import common_errors, pairs_of
 from eyerender.apps.benchmark.protocol import Greeting
 from eyerender.apps.benchmark.registry import ExtractorCommand
@@ -83,8 +83,8 @@ def test_an_interval_of_subjects_needs_two_and_is_never_empty():
 
 PUPIL = Ellipse(np.array([100.0, 80.0]), np.array([20.0, 18.0]), 0.3)
 IRIS = Ellipse(np.array([101.0, 80.0]), np.array([50.0, 48.0]), 0.0)
-IMAGE = LabelledImage(
-    "a.png", Path("a.png"), 8, (200, 160), PUPIL, PUPIL.points(120), 1.0, (TrueGlint(0, (110.0, 84.0)),), {},
+IMAGE = BenchImage(
+    name="a.png", path=Path("a.png"), bit_depth=8, size=(200, 160), pupil=PUPIL, glints=(TrueGlint(0, (110.0, 84.0)),),
     iris=IRIS, lids_px=(np.stack([np.arange(20.0, 180.0, 4.0), np.full(40, 30.0)], axis=-1),),
 )  # fmt: skip
 
@@ -131,7 +131,7 @@ def test_errors_are_compared_on_the_pupils_that_both_find():
     easy, hard = [0.10] * 5, [0.50] * 6
     first = run_of("first", [*map(answer, easy), *[answer(9, right=False)] * 6])
     second = run_of("second", [*[answer(0.08)] * 5, *map(answer, hard)])
-    own = [summarise(r.scores, [None] * 11, False)["centre_px"]["median"] for r in (first, second)]
+    own = [summarise(r.scores)["centre_px"]["median"] for r in (first, second)]
     assert own == [0.1, 0.5]
     (pair,) = pairs_of([first, second])
     assert (pair["common"], pair["centre_px"]) == (5, [0.1, 0.08])
@@ -170,7 +170,7 @@ def test_tiers_of_visibility():
 def test_a_summary_has_intervals_for_every_rate():
     scores = [answer(0.1, subject=str(k)) for k in range(8)]
     scores.append(Score("false", with_pupil=False, subject="9", kind="shadow"))
-    got = summarise(scores, [None] * 9, False)
+    got = summarise(scores)
     assert got["intervals"]["right"]["wilson"] == pytest.approx(wilson(8, 8))
     assert got["intervals"]["false"]["subjects"] is None
     assert set(got["intervals"]) == {"right", "wrong", "none", "error", "false"}

@@ -156,7 +156,7 @@ def test_the_page_shows_faults_and_outliers(found):
     text = page.read_text()
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*', text) == []
     (own,) = data["datasets"]
-    assert text.count('<figure class="tile">') > len(own["outliers"]) + 20
+    assert text.count('<div class="picture">') > len(own["outliers"]) + 20
     assert own["outliers"][0]["image"] in text
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import ttest_rel
 
 from eyerender.apps.study.budget import ALGORITHM, BOTH, EYE, IMAGE, NOISE, budgets
-from eyerender.apps.study.page_parts import budget_values
+from eyerender.apps.study.page_parts import budget_section
 from eyerender.apps.study.run import run_study
 
 
@@ -100,7 +100,7 @@ def test_what_was_not_observed_has_no_term():
     assert budgets(drawn(("image", "image-noiseless"))) == []
     (one,) = budgets(drawn(("analytic",), ("E1",)))
     assert [t.name for t in one.terms] == [ALGORITHM]
-    assert budget_values([one], ["a"]) is None  # a sum of one term says nothing
+    assert budget_section([one], ["a"], "it") is None  # a sum of one term says nothing
     (noisy,) = budgets(drawn(("analytic", "image"), ("E4",)))
     assert (noisy.reference, [t.name for t in noisy.terms]) == ("E4", [ALGORITHM, BOTH])
     other = drawn(("analytic",), ("E1", "E2"))

@@ -6,12 +6,12 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from ...base.errors import InputError
 from ...base.jit import ensure_compiled
-from .answercache import AnswerCache, StoredAnswer
-from .folder import LabelledImage
+from .answers import Answers
+from .labelled import BenchImage
 from .options import BenchOptions
 from .process import ExtractorProcess, Failed
 from .protocol import Greeting, Reply, Request
@@ -31,11 +31,6 @@ class Run:
     greeting: Greeting | None
     scores: tuple[Score, ...]
 
-    @property
-    def reports_glints(self) -> bool:
-        """Whether the extractor announced that it reports glints."""
-        return self.greeting is not None and "glints" in self.greeting.reports
-
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
@@ -48,11 +43,10 @@ class _Answer:
 
 def ask_extractors(
     extractors: Sequence[ExtractorCommand],
-    images: Sequence[LabelledImage],
+    images: Sequence[BenchImage],
     options: BenchOptions,
     *,
-    keys: Sequence[str] = (),
-    caches: Sequence[AnswerCache] = (),
+    answers: Answers | None = None,
     step: Callable[[str], None] = lambda _name: None,
 ) -> list[Run]:
     """Run every extractor on every image; the scores include every failure.
@@ -62,19 +56,14 @@ def ask_extractors(
     Args:
         extractors: the extractors.
         images: the images.
-        options: jobs, time limits, and whether to use stored answers.
-        keys: `image_key` of every image, if there are caches.
-        caches: stored answers of every extractor.
+        options: jobs and time limits.
+        answers: stored answers, which receive the new ones.
         step: called with an extractor's name after each of its answers.
     """
     if any(argument.startswith(_OWN) for extractor in extractors for argument in extractor.argv):
         ensure_compiled()  # once, before the clocks of several processes run
-    known = list(caches) or [AnswerCache(None) for _ in extractors]
-    names = list(keys) or [str(k) for k in range(len(images))]
-    askers = [
-        _Asker(extractor, images, options, cache, names, step)
-        for extractor, cache in zip(extractors, known, strict=True)
-    ]
+    known = Answers() if answers is None else answers
+    askers = [_Asker(extractor, images, options, known, step) for extractor in extractors]
     size = -(-len(images) // options.jobs) or 1
     parts = [range(start, min(start + size, len(images))) for start in range(0, len(images), size)]
     with ThreadPoolExecutor(options.jobs) as pool:
@@ -95,14 +84,13 @@ class _Asker:
     def __init__(
         self,
         extractor: ExtractorCommand,
-        images: Sequence[LabelledImage],
+        images: Sequence[BenchImage],
         options: BenchOptions,
-        cache: AnswerCache,
-        keys: Sequence[str],
+        stored: Answers,
         step: Callable[[str], None],
     ) -> None:
         self._extractor, self._images, self._options = extractor, images, options
-        self._cache, self._keys, self._step = cache, keys, step
+        self._stored, self._step = stored, step
         self._answers: list[_Answer | None] = [None] * len(images)
         self._greeting: Greeting | None = None
         self._processes: set[ExtractorProcess] = set()
@@ -154,24 +142,24 @@ class _Asker:
                 continue
             failures = 0
             scores.append(score(image, answer.reply, answer.trip_s, reports))
-        named = (replace(s, subject=i.subject or i.name) for s, i in zip(scores, self._images, strict=True))
-        return Run(self._extractor, greeting, tuple(named))
+        return Run(self._extractor, greeting, tuple(scores))
 
     def _answer(self, row: int, process: ExtractorProcess | None) -> tuple[_Answer, ExtractorProcess | None]:
         """Return the answer for one image, stored or new, and the process to use next."""
-        stored = None if self._options.fresh else self._cache.get(self._keys[row])
+        stored = self._stored.get(self._extractor.name, row)
         if stored is not None:
-            with suppress(InputError):  # another version may have stored it
-                greeting = Greeting.parse(stored.greeting)
-                reply = Reply.parse(stored.line, stored.request_id, greeting.conventions)
+            line, told, trip_s = stored
+            with suppress(InputError):  # the file may have been damaged
+                greeting = Greeting.parse(told)
+                reply = Reply.parse(line, row, greeting.conventions)
                 self._greeting = self._greeting or greeting
-                return _Answer(reply, stored.trip_s), process
+                return _Answer(reply, trip_s), process
         if process is None or not process.alive:
             process = self._open(process)
         image = self._images[row]
         reply, trip_s = process.ask(Request(row, str(image.path.resolve()), image.bit_depth, image.hints))
         if reply.error is None:
-            self._cache.put(self._keys[row], StoredAnswer(row, reply.line, process.greeting_line, trip_s))
+            self._stored.put(self._extractor.name, row, (reply.line, process.greeting_line, trip_s))
         return _Answer(reply, trip_s), process
 
     def _open(self, before: ExtractorProcess | None) -> ExtractorProcess:

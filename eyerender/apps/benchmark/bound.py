@@ -58,6 +58,16 @@ class Edge:
         radius = math.sqrt(float(pupil.semi_axes_px.prod()))
         return self.noise_dn / abs(self.step_dn) * math.sqrt(2.0 * self.sigma_px / (math.sqrt(math.pi) * radius))
 
+    def factors(self) -> dict[str, float]:
+        """Return what a measured edge tells about possible causes of an error, and how well it was measured."""
+        return {
+            "noise_dn": self.noise_dn,
+            "blur_px": math.sqrt(max(self.sigma_px**2 - 1.0 / 12.0, 0.0)),
+            "edge_arc_deg": self.arc_deg,
+            "edge_step_error": self.step_sd_dn / abs(self.step_dn),
+            "edge_width_error": self.sigma_sd_px / self.sigma_px,
+        }
+
 
 def is_bounded(visible: float | None, known: Mapping[str, float]) -> bool:
     """Return whether the bound applies to an image: the pupil is wholly visible and no lid may hide it."""

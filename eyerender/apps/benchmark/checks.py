@@ -11,7 +11,7 @@ from typing import Any
 
 from ...base.errors import InputError
 from ...base.storage.files import read_json, shown
-from .exact import mcnemar
+from .intervals import mcnemar
 
 RESULTS_SCHEMA = "eyerender/bench-extractors/3"
 # Version 2 has no conditions and fewer results for glints; what --against needs is the same.

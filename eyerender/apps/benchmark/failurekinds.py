@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...base.arrays import Bytes
 from ...optics.ellipse import Ellipse, iou, signed_distance
 from ...scene.parts import BACKGROUND, FRAME
-from .folder import LabelledImage
+from .labelled import BenchImage
 
 FailureKind = Literal["near miss", "glint", "iris", "lash or lid", "shadow", "elsewhere"]
 KINDS: dict[FailureKind, str] = {
@@ -29,7 +29,7 @@ _CROSSES = 0.05  # share of an ellipse on either side of the border between eye 
 _IRIS_RATIO = (1.4, 8.0)
 
 
-def kind_of(found: Ellipse, image: LabelledImage, grey: NDArray[Any], mask: Bytes | None) -> FailureKind:
+def kind_of(found: Ellipse, image: BenchImage, grey: NDArray[Any], mask: Bytes | None) -> FailureKind:
     """Return the kind of a wrong ellipse: the first of `KINDS` that applies.
 
     Args:
@@ -42,9 +42,10 @@ def kind_of(found: Ellipse, image: LabelledImage, grey: NDArray[Any], mask: Byte
     if true is not None and iou(found, true) >= _NEAR:
         return "near miss"
     small = _SMALL_PX if true is None else _SMALL * math.sqrt(float(true.semi_axes_px.prod()))
-    if _on_glint(found, image) and math.sqrt(float(found.semi_axes_px.prod())) <= small:
+    on_glint = bool(np.any(signed_distance(found, image.glints_px) < 1.0))
+    if on_glint and math.sqrt(float(found.semi_axes_px.prod())) <= small:
         return "glint"
-    if _is_iris(found, image):
+    if iou(found, image.iris) >= _IRIS if image.iris is not None else _is_like_iris(found, true):
         return "iris"
     inside = _inside(found, grey.shape)
     if _crosses_lid(found, image, inside, mask):
@@ -55,22 +56,16 @@ def kind_of(found: Ellipse, image: LabelledImage, grey: NDArray[Any], mask: Byte
     return "elsewhere"
 
 
-def _on_glint(found: Ellipse, image: LabelledImage) -> bool:
-    spots = np.array([g.xy_px for g in image.glints]).reshape(-1, 2)
-    return bool(np.any(signed_distance(found, spots) < 1.0)) if len(spots) else False
-
-
-def _is_iris(found: Ellipse, image: LabelledImage) -> bool:
-    if image.iris is not None:
-        return iou(found, image.iris) >= _IRIS
-    if image.pupil is None:
+def _is_like_iris(found: Ellipse, true: Ellipse | None) -> bool:
+    """Return whether an ellipse is as large as an iris about the pupil."""
+    if true is None:
         return False
-    ratio = math.sqrt(found.area_px2 / image.pupil.area_px2)
-    concentric = np.hypot(*(found.centre_px - image.pupil.centre_px)) < 0.5 * image.pupil.semi_axes_px[0]
+    ratio = math.sqrt(found.area_px2 / true.area_px2)
+    concentric = np.hypot(*(found.centre_px - true.centre_px)) < 0.5 * true.semi_axes_px[0]
     return bool(concentric) and _IRIS_RATIO[0] <= ratio <= _IRIS_RATIO[1]
 
 
-def _crosses_lid(found: Ellipse, image: LabelledImage, inside: NDArray[np.bool_], mask: Bytes | None) -> bool:
+def _crosses_lid(found: Ellipse, image: BenchImage, inside: NDArray[np.bool_], mask: Bytes | None) -> bool:
     if mask is not None and inside.any():
         skin = float(np.mean(np.isin(mask[inside], (BACKGROUND, FRAME))))
         return _CROSSES <= skin <= 1.0 - _CROSSES

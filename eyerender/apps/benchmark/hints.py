@@ -13,6 +13,8 @@ from ...base.storage.files import read_json, shown
 
 HINTS = "hints.json"
 HINTS_SCHEMA = "eyerender/hints/1"
+NO_HINTS: dict[str, Any] = {"polarity": "auto", "gamma": 1.0, "radius_px": None, "rig": None}
+"""Hints of a request about an image of which nothing is known."""
 
 
 class RigHints(Spec):

@@ -1,4 +1,4 @@
-"""95 % intervals of rates: Wilson's, and one for images that are correlated within subjects."""
+"""95 % intervals of rates (Wilson's, and one for images that are correlated within subjects), and the paired test."""
 
 from __future__ import annotations
 
@@ -74,3 +74,18 @@ def subject_interval(
         variance = float(np.var((weights @ part) / (weights @ whole))) * count / (count - 1)
         effective = min(total, share * (1.0 - share) / max(variance, 1e-12))
     return wilson(share * effective, effective, float(stdtrit(count - 1, 0.5 + 0.5 * LEVEL)))
+
+
+def mcnemar(only_first: int, only_second: int) -> float:
+    """Compute the two-sided p value of the exact McNemar test.
+
+    If both extractors are equally good, each image on which exactly one succeeds is the first's with probability 1/2.
+
+    Args:
+        only_first: number of images on which only the first succeeds.
+        only_second: number of images on which only the second succeeds.
+    """
+    from scipy.stats import binomtest
+
+    discordant = only_first + only_second
+    return float(binomtest(only_first, discordant).pvalue) if discordant else 1.0

@@ -1,20 +1,24 @@
-"""Read public layouts: OpenEDS (segmentation), COCO and TEyeD, written by other programs or `export-dataset`.
-
-LPW and ExCuSe, which label only centres, are in `centrelabels`.
+"""Read public layouts, written by other programs or `export-dataset`.
 
     SPLIT/images/NAME.png, SPLIT/labels/NAME.npy       OpenEDS 2019: 0 background, 1 sclera, 2 iris, 3 pupil
     annotations/*.json with images and annotations     COCO: the category `pupil`, an instance per image
     VIDEOS/NAME.mp4, ANNOTATIONS/NAME.mp4pupil_eli.txt TEyeD: FRAME;ANGLE;CENTER X;CENTER Y;WIDTH;HEIGHT;
+    SUBJECT/N.avi, SUBJECT/N.txt                       LPW: a line `x y` per frame, the pupil's centre
+    NAME.txt, NAME/IMAGE.png                           ExCuSe and ElSe: a heading, then `index image x y`, where `image`
+                                                       is the number in the file's name, and the centre is at twice the
+                                                       image's size and with y upward from its lower edge
 
 The ellipse of a COCO instance is its `ellipse` (centre x, y, semi-axes a, b, angle in rad) if it has one, as in exports
-of this package; otherwise it is fitted to the mask, as for OpenEDS. Frames of a video are unpacked into the cache.
+of this package; otherwise it is fitted to the mask, as for OpenEDS. Frames of a video are unpacked into the cache. A
+centre outside of the frame means that nobody labelled it, so it is left out.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,36 +31,31 @@ from ...base.storage.files import inside, read_json, read_text
 from ...folders.exported import EXPORT, exported_gamma
 from ...folders.video import unpacked
 from ...optics.ellipse import Ellipse
-from .centrelabels import is_excuse, is_lpw, read_excuse, read_lpw
 from .glintlabels import TrueGlint
-from .own import FEWEST_PIXELS, MAX_IMAGES, SUFFIXES, Labelled, ellipse_of_mask
+from .labelled import BenchImage
+from .own import FEWEST_PIXELS, MAX_IMAGES, SUFFIXES, ellipse_of_mask
 
 PUPIL = 3
 _ANNOTATIONS_BYTES = 2**30
 _MOST_PIXELS = 2**26
+_EXCUSE_SCALE = 2.0  # the labels were made on images of twice the size
+Reader = Callable[[Path], Iterator[BenchImage]]
 
 
-def layout_of(folder: Path) -> str | None:
-    """Name of the layout that a folder has: openeds, coco, teyed, lpw or excuse, None for any other."""
-    if (folder / "VIDEOS").is_dir() and (folder / "ANNOTATIONS").is_dir():
-        return "teyed"
-    if any((folder / "annotations").glob("*.json")):
-        return "coco"
-    if any(folder.glob("labels/*.npy")) or any(folder.glob("*/labels/*.npy")):
-        return "openeds"
-    if is_lpw(folder):
-        return "lpw"
-    return "excuse" if is_excuse(folder) else None
+def reader_of(folder: Path) -> Reader | None:
+    """Return the reader of the layout that a folder has; None for any other.
 
-
-def read_layout(folder: Path, layout: str) -> Iterator[Labelled]:
-    """Yield every labelled image of a folder.
-
-    Raises:
-        InputError: a label cannot be used, or names a missing image.
+    The reader yields every labelled image. It raises `InputError` if a label cannot be used, or names a missing image.
     """
-    readers = {"openeds": _openeds, "coco": _coco, "teyed": _teyed, "lpw": read_lpw, "excuse": read_excuse}
-    return readers[layout](folder)
+    if (folder / "VIDEOS").is_dir() and (folder / "ANNOTATIONS").is_dir():
+        return _teyed
+    if any((folder / "annotations").glob("*.json")):
+        return _coco
+    if _openeds_labels(folder):
+        return _openeds
+    if _lpw_videos(folder):
+        return _lpw
+    return _excuse if _excuse_tables(folder) else None
 
 
 def stated_gamma(folder: Path) -> float | None:
@@ -71,13 +70,13 @@ def stated_gamma(folder: Path) -> float | None:
     return gamma
 
 
-def _openeds(folder: Path) -> Iterator[Labelled]:
-    subjects = {}
-    if (folder / "files.csv").is_file():
-        rows = csv.DictReader(read_text(folder / "files.csv").splitlines())
-        subjects = {str(row.get("file")): str(row.get("subject") or "") for row in rows}
-    labels = sorted([*folder.glob("labels/*.npy"), *folder.glob("*/labels/*.npy")])
-    for label in labels[:MAX_IMAGES]:
+def _openeds_labels(folder: Path) -> list[Path]:
+    return sorted([*folder.glob("labels/*.npy"), *folder.glob("*/labels/*.npy")])
+
+
+def _openeds(folder: Path) -> Iterator[BenchImage]:
+    subjects = _subjects(folder / "files.csv", "file")
+    for label in _openeds_labels(folder)[:MAX_IMAGES]:
         home = label.parent.parent
         name = next((f"{label.stem}{s}" for s in SUFFIXES if (home / "images" / f"{label.stem}{s}").is_file()), None)
         if name is None:
@@ -93,10 +92,17 @@ def _openeds(folder: Path) -> Iterator[Labelled]:
         mask = np.asarray(classes) == PUPIL
         # Between closed lids, a few pixels of the pupil may be visible: too few for an outline, and to be found.
         pupil = ellipse_of_mask(mask, str(label)) if np.count_nonzero(mask) >= FEWEST_PIXELS else None
-        yield Labelled(name=relative, path=path, pupil=pupil, subject=subjects.get(relative, ""))
+        yield BenchImage.read(relative, path, pupil, subject=subjects.get(relative, ""))
 
 
-def _coco(folder: Path) -> Iterator[Labelled]:
+def _subjects(table: Path, key: str) -> dict[str, str]:
+    """Read the subject of every file from a table of an export; empty without the table."""
+    if not table.is_file():
+        return {}
+    return {str(row.get(key)): str(row.get("subject") or "") for row in csv.DictReader(read_text(table).splitlines())}
+
+
+def _coco(folder: Path) -> Iterator[BenchImage]:
     files = sorted((folder / "annotations").glob("*.json"))
     # Files of keypoints or captions stand beside those of instances, as in the public COCO data.
     for file in [file for file in files if file.name.startswith("instances")] or files:
@@ -121,7 +127,7 @@ def _coco(folder: Path) -> Iterator[Labelled]:
                 )
                 name = path.relative_to(folder).as_posix()
                 subject = str(image.get("subject", ""))
-                yield Labelled(name=name, path=path, pupil=pupil, glints=glints, subject=subject)
+                yield BenchImage.read(name, path, pupil, glints=glints, subject=subject)
         except InputError:
             raise
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
@@ -144,8 +150,8 @@ def _coco_pupil(marks: list[Mapping[str, Any]], shape: tuple[int, int], source: 
         raise InputError("has several pupils; the benchmark needs images of one eye", source=source)
     numbers, drawn = marks[0].get("ellipse"), marks[0]["segmentation"]
     if numbers is not None:
-        x, y, a, b, angle = (float(v) for v in _ellipse_numbers(numbers))
-        return _checked(x, y, a, b, angle, source)
+        x, y, a, b, angle = (float(v) for v in _listed(numbers))
+        return _ellipse(x, y, a, b, angle, source)
     if shape[0] * shape[1] > _MOST_PIXELS or min(shape) < 1:
         raise InputError("has an impossible size", source=source)
     if isinstance(drawn, dict):
@@ -156,7 +162,7 @@ def _coco_pupil(marks: list[Mapping[str, Any]], shape: tuple[int, int], source: 
     return ellipse_of_mask(np.array(picture, dtype=bool), source)
 
 
-def _ellipse_numbers(numbers: Any) -> list[float]:
+def _listed(numbers: Any) -> list[float]:
     if isinstance(numbers, Mapping):
         return [*numbers["centre_px"], *numbers["semi_axes_px"], numbers["angle_rad"]]
     return list(numbers)
@@ -172,31 +178,73 @@ def _decoded(counts: Any, shape: tuple[int, int], source: str) -> Bools:
     return np.asarray(np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(shape, order="F"))
 
 
-def _checked(x: float, y: float, a: float, b: float, angle: float, source: str) -> Ellipse:
+def _ellipse(x: float, y: float, a: float, b: float, angle: float, source: str) -> Ellipse:
     if not (math.isfinite(x + y + a + b + angle) and min(a, b) > 0.0 and max(abs(x), abs(y), a, b) < 1e5):
         raise InputError("has no ellipse", source=source)
     return Ellipse(np.array([x, y]), np.array([a, b]), angle)
 
 
-def _teyed(folder: Path) -> Iterator[Labelled]:
-    subjects = {}
-    if (folder / "splits.csv").is_file():
-        rows = csv.DictReader(read_text(folder / "splits.csv").splitlines())
-        subjects = {str(row.get("video")): str(row.get("subject") or "") for row in rows}
+def _teyed(folder: Path) -> Iterator[BenchImage]:
+    subjects = _subjects(folder / "splits.csv", "video")
     for video in sorted((folder / "VIDEOS").glob("*.mp4")):
-        source = folder / "ANNOTATIONS" / f"{video.name}pupil_eli.txt"
-        rows_of_file = read_text(source).splitlines()[1:]
+        table = folder / "ANNOTATIONS" / f"{video.name}pupil_eli.txt"
         frames = unpacked(inside(folder / "VIDEOS", video.name, source=str(folder)))
-        for number, row in enumerate(rows_of_file[:MAX_IMAGES], start=2):
-            try:
-                frame, degrees, x, y, width, height = (float(cell) for cell in row.split(";")[:6])
-            except ValueError:
-                raise InputError("needs six numbers", source=str(source), path=f"line {number}") from None
+        for where, (frame, degrees, x, y, width, height) in _rows(table, 6, heading=True):
             if not 1 <= frame <= len(frames):
-                raise InputError("names a frame that the video lacks", source=str(source), path=f"line {number}")
-            where = f"{source}: line {number}"
-            shows = width > 0.0 and height > 0.0
-            pupil = _checked(x, y, width / 2, height / 2, math.radians(degrees), where) if shows else None
-            path = frames[int(frame) - 1]
+                raise InputError("names a frame that the video lacks", source=str(table), path=where)
+            pupil = None
+            if width > 0.0 and height > 0.0:
+                pupil = _ellipse(x, y, width / 2, height / 2, math.radians(degrees), f"{table}: {where}")
             subject = subjects.get(video.name) or video.stem
-            yield Labelled(name=f"{video.name}/{int(frame):06d}", path=path, pupil=pupil, subject=subject)
+            yield BenchImage.read(f"{video.name}/{int(frame):06d}", frames[int(frame) - 1], pupil, subject=subject)
+
+
+def _lpw_videos(folder: Path) -> list[Path]:
+    videos = [*folder.glob("*.avi"), *folder.glob("*/*.avi")]
+    return sorted(v for v in videos if v.with_suffix(".txt").is_file())
+
+
+def _lpw(folder: Path) -> Iterator[BenchImage]:
+    for video in _lpw_videos(folder):
+        table = video.with_suffix(".txt")
+        frames = unpacked(inside(video.parent, video.name, source=str(folder)))
+        rows = list(_rows(table, 2))
+        if len(rows) > len(frames):
+            raise InputError(f"labels {len(rows)} frames; the video has {len(frames)}", source=str(table))
+        for k, (path, (_, (x, y))) in enumerate(zip(frames, rows, strict=False), start=1):
+            name = f"{video.relative_to(folder).as_posix()}/{k:06d}"
+            image = BenchImage.read(name, path, centre_px=(x, y), subject=video.parent.name)
+            if image.contains(x, y):
+                yield image
+
+
+def _excuse_tables(folder: Path) -> list[Path]:
+    return sorted(t for t in folder.glob("*.txt") if any(t.with_suffix("").glob("*.png")))
+
+
+def _excuse(folder: Path) -> Iterator[BenchImage]:
+    for table in _excuse_tables(folder):
+        home = table.with_suffix("")
+        images = {int(p.stem): p.name for p in sorted(home.glob("*.png")) if p.stem.isdecimal()}
+        for where, (_, number, x, y) in _rows(table, 4, heading=True):
+            if number not in images:
+                raise InputError(f"there is no image {number:g} in {home.name}", source=str(table), path=where)
+            path = inside(home, images[int(number)], source=str(table))
+            image = BenchImage.read(f"{home.name}/{path.name}", path, subject=home.name)
+            centre = x / _EXCUSE_SCALE, image.size[1] - y / _EXCUSE_SCALE
+            if image.contains(*centre):
+                yield replace(image, centre_px=centre)
+
+
+def _rows(table: Path, count: int, *, heading: bool = False) -> Iterator[tuple[str, list[float]]]:
+    """Yield the place (`line N`) and the first numbers of each line of a table, separated by spaces or semicolons."""
+    for k, line in enumerate(read_text(table).splitlines()[: MAX_IMAGES + heading], start=1):
+        if not line.strip() or (heading and k == 1):
+            continue
+        try:
+            values = [float(cell) for cell in line.replace(";", " ").split()[:count]]
+        except ValueError:
+            values = []
+        if len(values) < count or not all(map(math.isfinite, values)):
+            raise InputError(f"needs {count} numbers", source=str(table), path=f"line {k}")
+        yield f"line {k}", values

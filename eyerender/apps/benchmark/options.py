@@ -29,7 +29,7 @@ class BenchOptions:
         eye_error_mm: Standard deviation, per axis and in mm, of the error of the eye position given to extractors.
         pupil_class: Value of the pupil in masks of several classes.
         quick: Use a tenth of the images, with hard conditions in the same proportion.
-        fresh: Ignore stored answers and run on every image again.
+        fresh: Ignore the answers that an interrupted run left in the output folder.
         against: The results.json of an earlier benchmark to compare with.
         require: A result that must be reached, such as right>=.95 or own-fast:centre_px<.1. Repeat the option for
             several.

@@ -16,8 +16,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from ...folders.imagefolder import DATASET, RUN
 from ...folders.video import unpacked
 from ...optics.ellipse import Ellipse, fit_ellipse_direct, signed_distance
 from .glintlabels import TrueGlint
+from .labelled import BenchImage
 
 LABELS, MASKS, IMAGES = "labels.csv", "masks", "images"
 COLUMNS = ("centre_x_px", "centre_y_px", "semi_axis_a_px", "semi_axis_b_px", "angle_deg")
@@ -41,29 +42,6 @@ GLINTS = "glints.csv"
 _TRIALS, _NEAR_PX, _OUTSIDE_PX = 200, 0.7, 1.2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Labelled:
-    """Labels of an image.
-
-    Attributes:
-        name: name of the image.
-        path: file.
-        pupil: None where the image shows none, or only its centre is known.
-        centre_px: (x, y) of a pupil of which only the centre is known.
-        visible: visible share of the pupil, None where it is unknown.
-        glints: those that the image shows.
-        subject: whose eye it is, "" where that is unknown.
-    """
-
-    name: str
-    path: Path
-    pupil: Ellipse | None = None
-    centre_px: tuple[float, float] | None = None
-    visible: float | None = None
-    glints: tuple[TrueGlint, ...] = ()
-    subject: str = ""
-
-
 def is_own(folder: Path) -> bool:
     """Return whether a folder holds the user's own labelled images."""
     # A run that has not finished has run.json only.
@@ -71,8 +49,8 @@ def is_own(folder: Path) -> bool:
     return not ours and ((folder / LABELS).is_file() or (folder / MASKS).is_dir())
 
 
-def own_labels(folder: Path, pupil_class: int | None = None) -> Iterator[Labelled]:
-    """Yield the labels of every image.
+def own_images(folder: Path, pupil_class: int | None = None) -> Iterator[BenchImage]:
+    """Yield every image with its labels.
 
     Args:
         folder: the folder.
@@ -83,9 +61,9 @@ def own_labels(folder: Path, pupil_class: int | None = None) -> Iterator[Labelle
             `pupil_class` is not given.
     """
     glints = _glints(folder)
-    labels = _of_table(folder) if (folder / LABELS).is_file() else _of_masks(folder, pupil_class)
-    for label in labels:
-        yield replace(label, glints=tuple(glints.get(label.name, ())))
+    images = _of_table(folder) if (folder / LABELS).is_file() else _of_masks(folder, pupil_class)
+    for image in images:
+        yield replace(image, glints=tuple(glints.get(image.name, ())))
 
 
 def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
@@ -94,10 +72,7 @@ def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
     if not (folder / GLINTS).is_file():
         return out
     source = str(folder / GLINTS)
-    lines = csv.DictReader(io.StringIO(read_text(folder / GLINTS)))
-    missing = sorted({"image", "x_px", "y_px"} - set(lines.fieldnames or ()))
-    if missing:
-        raise InputError(f"has no column {missing[0]}", source=source)
+    lines = _lines(folder / GLINTS, ("image", "x_px", "y_px"))
     for k, line in enumerate(lines):
         try:
             x, y, light = float(line["x_px"]), float(line["y_px"]), int(line.get("light") or -1)
@@ -109,12 +84,9 @@ def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
     return out
 
 
-def _of_table(folder: Path) -> Iterator[Labelled]:
+def _of_table(folder: Path) -> Iterator[BenchImage]:
     source = str(folder / LABELS)
-    lines = csv.DictReader(io.StringIO(read_text(folder / LABELS)))
-    missing = sorted({"image", *COLUMNS} - set(lines.fieldnames or ()))
-    if missing:
-        raise InputError(f"has no column {missing[0]}", source=source)
+    lines = _lines(folder / LABELS, ("image", *COLUMNS))
     videos: dict[Path, list[Path]] = {}
     for k, line in enumerate(lines):
         where = f"line {k + 2}"
@@ -126,7 +98,16 @@ def _of_table(folder: Path) -> Iterator[Labelled]:
         cells = [line[column] for column in COLUMNS]
         pupil = _ellipse(cells, source, where) if any(cells) else None
         visible = _share(line.get("visible"), source, where)
-        yield Labelled(name=str(name), path=path, pupil=pupil, visible=visible, subject=str(line.get("subject") or ""))
+        yield BenchImage.read(str(name), path, pupil, visible=visible, subject=str(line.get("subject") or ""))
+
+
+def _lines(table: Path, columns: Sequence[str]) -> csv.DictReader[str]:
+    """Read a table that must have some columns."""
+    lines = csv.DictReader(io.StringIO(read_text(table)))
+    missing = sorted(set(columns) - set(lines.fieldnames or ()))
+    if missing:
+        raise InputError(f"has no column {missing[0]}", source=str(table))
+    return lines
 
 
 def _image_or_frame(home: Path, name: str, videos: dict[Path, list[Path]], at: tuple[str, str]) -> Path:
@@ -166,7 +147,7 @@ def _ellipse(cells: list[str | None], source: str, where: str) -> Ellipse:
     return Ellipse(np.array([x, y]), np.array([a, b]), math.radians(degrees))
 
 
-def _of_masks(folder: Path, pupil_class: int | None) -> Iterator[Labelled]:
+def _of_masks(folder: Path, pupil_class: int | None) -> Iterator[BenchImage]:
     home = folder / IMAGES if (folder / IMAGES).is_dir() else folder
     images = {p.stem: p for p in sorted(home.iterdir()) if p.suffix.lower() in SUFFIXES}
     masks = [p for p in sorted((folder / MASKS).iterdir()) if p.suffix.lower() in SUFFIXES]
@@ -182,7 +163,7 @@ def _of_masks(folder: Path, pupil_class: int | None) -> Iterator[Labelled]:
             values = ", ".join(str(v) for v in found[:6])
             raise InputError(f"has several classes ({values}); --pupil-class names the pupil's", source=str(mask))
         value = pupil_class if pupil_class is not None else (found[0] if len(found) else 1)
-        yield Labelled(name=path.name, path=path, pupil=ellipse_of_mask(level == value, str(mask)))
+        yield BenchImage.read(path.name, path, ellipse_of_mask(level == value, str(mask)))
 
 
 def ellipse_of_mask(mask: Bools, source: str = "") -> Ellipse | None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...optics.ellipse import Ellipse
-from ...report.page import Card, Figure, Page, Section, Table, write_page
+from ...report.page import Card, Figure, Page, Section, Table, number, write_page
 from ...report.style import TARGET, figure, legend_above, svg
 
 Row = dict[str, Any]
+Format = Callable[[Any], str]
+Columns = Sequence[tuple[str, str, Format]]
 
 # The colours are Okabe and Ito's; an extractor keeps its colour and marker in every figure.
 _LOOK = (
@@ -45,54 +47,38 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
     entries, cards = data["extractors"], _cards(data)
     varying = [name for name in data["factors"] if any(e["breakdown"].get(name) for e in entries)]
     sections = [
-        Section(
-            "Results",
-            tables=(_pupil_table(entries), _rate_table(entries), _glint_table(entries), _recall_table(entries)),
-        ),
+        Section("Results", *_summary_tables(entries), _recall_table(entries)),
         Section(
             "Compared in pairs",
-            [
-                "The same images, extractor against extractor. An image is a success if its pupil is right, or if none "
-                "is reported where none is. p is the exact McNemar test's, not corrected for the number of pairs. "
-                "Errors are compared on the pupils that both find right."
-            ],
-            tables=(_pair_table(data["pairs"]), _common_table(data["common"])),
+            "The same images, extractor against extractor. An image is a success if its pupil is right, or if none "
+            "is reported where none is. p is the exact McNemar test's, not corrected for the number of pairs. "
+            "Errors are compared on the pupils that both find right.",
+            _pair_table(data["pairs"]),
+            _common_table(data["common"]),
         ),
-        Section("Errors", figures=_error_figures(data, rows)),
+        Section("Errors", *_error_figures(data, rows)),
         Section(
             "Other thresholds",
-            ["Share of the images with a pupil that are right, if another overlap or another error is allowed."],
-            [Figure(curve_figure(entries), "Overlap, centre error in radii of the pupil, and confidence.")],
+            "Share of the images with a pupil that are right, if another overlap or another error is allowed.",
+            Figure(curve_figure(entries), "Overlap, centre error in radii of the pupil, and confidence."),
         ),
         Section(
             "Breakdown",
-            [
-                "The figures show the median centre error of the right pupils, and the share of right pupils, against "
-                "every quantity that varies in this folder. Noise, blur and contrast are the folder's own figures if "
-                "it states them; otherwise they are measured along the true outline."
-            ],
-            [Figure(factor_figure(data, name), f"By {data['factors'][name]['what']}.") for name in varying],
-            [_factor_table(data, name) for name in varying],
+            "The figures show the median centre error of the right pupils, and the share of right pupils, against "
+            "every quantity that varies in this folder. Noise, blur and contrast are the folder's own figures if "
+            "it states them; otherwise they are measured along the true outline.",
+            *(Figure(factor_figure(data, name), f"By {data['factors'][name]['what']}.") for name in varying),
+            *(_factor_table(data, name) for name in varying),
         ),
         Section(
             "Hard conditions",
-            [
-                "Share of right answers on the images of each condition; an image may be of several. Where no pupil is "
-                "seen, the answer that there is none is right."
-            ],
-            tables=(_condition_table(data),),
+            "Share of right answers on the images of each condition; an image may be of several. Where no pupil is "
+            "seen, the answer that there is none is right.",
+            _condition_table(data),
         ),
-        Section("Failures", figures=_thumbnail_figures(thumbnails), tables=(_failure_table(entries),)),
-        Section("How this was made", _how(data), tables=(_convention_table(entries),)),
+        Section("Failures", *_thumbnail_figures(thumbnails), _failure_table(entries), _not_run_table(data)),
+        Section("How this was made", *_how(data), _convention_table(entries)),
     ]
-    if data["not_run"]:
-        table = Table(
-            header=("extractor", "why"),
-            rows=[(e["name"], e["reason"]) for e in data["not_run"]],
-            caption="Not run",
-            wide=(1,),
-        )
-        sections[6] = replace(sections[6], tables=(_failure_table(entries), table))
     write_page(path, Page(f"{data['folder']}: extractors compared", _lead(data), cards, sections))
 
 
@@ -266,9 +252,13 @@ def factor_figure(data: Row, name: str) -> str:
         axes[0].set(ylabel="median centre error (px)")
         axes[1].set(ylabel="share of pupils right", ylim=(-0.03, 1.05))
         for ax in axes:
-            ax.set(xlabel=f"{what['what']} ({what['unit']})" if what["unit"] != "1" else what["what"])
+            ax.set(xlabel=_with_unit(what))
         legend_above(fig, axes[0], 5)
         return svg(fig)
+
+
+def _with_unit(what: Row) -> str:
+    return str(what["what"]) if what["unit"] == "1" else f"{what['what']} ({what['unit']})"
 
 
 def _bounds(entries: Sequence[Row], name: str) -> list[float | None]:
@@ -297,28 +287,94 @@ def _error_figures(data: Row, rows: Sequence[Row]) -> list[Figure]:
     return out
 
 
-def _pupil_table(entries: Sequence[Row]) -> Table:
-    header = (
-        "extractor", "right", "centre error: median", "95 %", "bias x", "bias y", "efficiency", "bias a", "bias b",
-        "boundary", "IoU",
-    )  # fmt: skip
-    rows = []
-    for e in entries:
-        s = e["summary"]
-        bias, axes = s["centre_bias_px"] or (None, None), s["semi_axes_bias_px"] or (None, None)
-        rows.append(
-            (
-                e["name"], f"{s['right']} of {s['with_pupil']}", _px(s["centre_px"]["median"]),
-                _px(s["centre_px"]["p95"]), *map(_signed, bias), _number(s["efficiency"]["value"], 2),
-                *map(_signed, axes), _px(s["boundary_px"]["median"]), _number(s["iou"]["median"], 4),
-            )
-        )  # fmt: skip
-    caption = (
-        "Errors of the right pupils, in px. Efficiency: Cramér-Rao bound divided by the error, median of the ratio; "
-        "1 reaches the bound. Boundary: mean distance of the true outline, median over the images. Times are in "
-        "times.json."
-    )
-    return Table(header=header, rows=rows, caption=caption)
+def _of(part: str, whole: str) -> Format:
+    """Format two counts of a summary, such as 3 of 4."""
+    return lambda s: f"{s[part]} of {s[whole]}" if s and s[whole] else "-"
+
+
+def _span(ends: Sequence[float] | None) -> str:
+    return "-" if ends is None else f"{100 * ends[0]:.1f} to {100 * ends[1]:.1f} %"
+
+
+def _signed(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.4f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.0f} %" if value in (0.0, 1.0) else f"{100 * value:.1f} %"
+
+
+def _two_digits(value: float | None) -> str:
+    return number(value, 2)
+
+
+# Columns of the tables: heading, place in a summary, and format.
+_FOUND: Columns = [("right", "", _of("right", "with_pupil"))]
+_RATES: Columns = [(outcome, f"rates.{outcome}", _percent) for outcome, _ in _OUTCOMES]
+_SPANS: Columns = [("95 %", "intervals.right.wilson", _span), ("95 %, subjects", "intervals.right.subjects", _span)]
+_ABSENT: Columns = [("pupil where none is", "", _of("false", "without_pupil"))]
+_CENTRE: Columns = [("centre error: median", "centre_px.median", number), ("95 %", "centre_px.p95", number)]
+_BIAS: Columns = [("bias x", "centre_bias_px.0", _signed), ("bias y", "centre_bias_px.1", _signed)]
+_EFFICIENCY: Columns = [("efficiency", "efficiency.value", _two_digits)]
+_AXES: Columns = [("bias a", "semi_axes_bias_px.0", _signed), ("bias b", "semi_axes_bias_px.1", _signed)]
+_BOUNDARY: Columns = [("boundary", "boundary_px.median", number)]
+_ALL_FOUND: Columns = [
+    ("all found: 95 %", "centre_px_of_all_found.p95", number), ("worst", "centre_px_of_all_found.worst", number)
+]  # fmt: skip
+_GLINTS: Columns = [
+    ("found", "glints", lambda g: f"{g['matched']} of {g['true']}" if g else "-"),
+    ("recall", "glints.recall", _percent),
+    ("precision", "glints.precision", _percent),
+    ("identity swaps", "glints", _of("swapped", "named")),
+    ("unnamed", "glints.unnamed", lambda n: "-" if n is None else str(n)),
+    ("error: median", "glints.error_px.median", number),
+    ("95 %", "glints.error_px.p95", number),
+    ("false", "glints.false_kinds", lambda kinds: ", ".join(f"{n} {kind}" for kind, n in (kinds or {}).items()) or "-"),
+]
+
+
+def _cells(summary: Row, columns: Columns) -> list[str]:
+    """Format the figures of a summary; places are keys or indices with dots between them."""
+    out = []
+    for _, place, form in columns:
+        value: Any = summary
+        for key in filter(None, place.split(".")):
+            value = None if value is None else value[int(key) if key.isdecimal() else key]
+        out.append(form(value))
+    return out
+
+
+def _summary_table(entries: Sequence[Row], columns: Columns, caption: str, wide: Sequence[int] = ()) -> Table:
+    rows = [(e["name"], *_cells(e["summary"], columns)) for e in entries]
+    return Table(("extractor", *(heading for heading, *_ in columns)), rows, caption, wide)
+
+
+def _summary_tables(entries: Sequence[Row]) -> list[Table]:
+    """Return the tables of pupils, rates and glints."""
+    return [
+        _summary_table(
+            entries,
+            [*_FOUND, *_CENTRE, *_BIAS, *_EFFICIENCY, *_AXES, *_BOUNDARY, ("IoU", "iou.median", number)],
+            "Errors of the right pupils, in px. Efficiency: Cramér-Rao bound divided by the error, median of the "
+            "ratio; 1 reaches the bound. Boundary: mean distance of the true outline, median over the images. Times "
+            "are in times.json.",
+        ),
+        _summary_table(
+            entries,
+            [*_RATES[:1], *_SPANS, *_RATES[1:], *_ABSENT, *_ALL_FOUND],
+            "Rates, and the centre errors (px) including wrong pupils. The first interval is Wilson's for independent "
+            "images; the second resamples subjects. results.json has both for every rate.",
+        ),
+        _summary_table(
+            entries,
+            _GLINTS,
+            "Glints: a reported glint matches a true one within 2 px, or within its radius and 1 px if that is more. "
+            "Errors are in px. Swaps: matches with the wrong light, of the matches with a light. Unnamed: matches "
+            "without a light, although the lights are known. A dash means that the extractor does not search for "
+            "glints.",
+            wide=(8,),
+        ),
+    ]
 
 
 def _condition_table(data: Row) -> Table:
@@ -333,28 +389,7 @@ def _condition_table(data: Row) -> Table:
                 shares.append(_percent((s["right"] + absent) / s["images"]))
             rows.append((name, condition["what"], str(len(condition["images"])), *shares))
     header = ("condition", "what", "images", *(e["name"] for e in data["extractors"]))
-    return Table(header=header, rows=rows, caption="Right answers by condition", wide=(1,))
-
-
-def _rate_table(entries: Sequence[Row]) -> Table:
-    rows = []
-    for e in entries:
-        s = e["summary"]
-        spans = s["intervals"]
-        rates = [_percent(s["rates"][o]) for o, _ in _OUTCOMES]
-        rates[:1] = [rates[0], _span(spans["right"]["wilson"]), _span(spans["right"]["subjects"])]
-        absent = f"{s['false']} of {s['without_pupil']}" if s["without_pupil"] else "-"
-        worst = s["centre_px_of_all_found"]
-        rows.append((e["name"], *rates, absent, _px(worst["p95"]), _px(worst["worst"])))
-    header = (
-        "extractor", "right", "95 %", "95 %, subjects", "wrong", "none", "error", "pupil where none is",
-        "all found: 95 %", "worst",
-    )  # fmt: skip
-    caption = (
-        "Rates, and the centre errors (px) including wrong pupils. The first interval is Wilson's for independent "
-        "images; the second resamples subjects. results.json has both for every rate."
-    )
-    return Table(header=header, rows=rows, caption=caption)
+    return Table(header, rows, "Right answers by condition", wide=(1,))
 
 
 def _pair_table(pairs: Sequence[Row]) -> Table:
@@ -362,54 +397,16 @@ def _pair_table(pairs: Sequence[Row]) -> Table:
     for pair in pairs:
         medians = pair["centre_px"] or (None, None)
         counts = (str(pair["only_first"]), str(pair["only_second"]), f"{pair['p']:.2g}", str(pair["common"]))
-        rows.append((pair["first"], pair["second"], *counts, *map(_px, medians)))
+        rows.append((pair["first"], pair["second"], *counts, *map(number, medians)))
     header = ("first", "second", "only first", "only second", "p", "both right", "first: median error", "second")
-    return Table(header=header, rows=rows, caption="Successes of only one of two extractors.", folded=len(rows) > 20)
+    return Table(header, rows, "Successes of only one of two extractors.", folded=len(rows) > 20)
 
 
 def _common_table(common: Row) -> Table:
-    rows = [
-        (name, _px(e["centre_px"]["median"]), _px(e["centre_px"]["p95"]), _px(e["boundary_px"]["median"]))
-        for name, e in common["extractors"].items()
-    ]
+    columns = [*_CENTRE, *_BOUNDARY]
+    rows = [(name, *_cells(e, columns)) for name, e in common["extractors"].items()]
     caption = f"Errors (px) on the {common['n']} pupils that all of these find right."
-    return Table(header=("extractor", "centre error: median", "95 %", "boundary"), rows=rows, caption=caption)
-
-
-def _glint_table(entries: Sequence[Row]) -> Table:
-    rows = []
-    for e in entries:
-        g = e["summary"]["glints"]
-        if g is None:
-            rows.append((e["name"], *["-"] * 8))
-            continue
-        swaps = f"{g['swapped']} of {g['named']}" if g["named"] else "-"
-        rows.append(
-            (
-                e["name"], f"{g['matched']} of {g['true']}", _percent(g["recall"]), _percent(g["precision"]), swaps,
-                str(g["unnamed"]), _px(g["error_px"]["median"]), _px(g["error_px"]["p95"]),
-                ", ".join(f"{n} {kind}" for kind, n in g["false_kinds"].items()) or "-",
-            )
-        )  # fmt: skip
-    header = (
-        "extractor",
-        "found",
-        "recall",
-        "precision",
-        "identity swaps",
-        "unnamed",
-        "error: median",
-        "95 %",
-        "false",
-    )
-    return Table(
-        header=header,
-        rows=rows,
-        caption="Glints: a reported glint matches a true one within 2 px, or within its radius and 1 px if that is "
-        "more. Errors are in px. Swaps: matches with the wrong light, of the matches with a light. Unnamed: matches "
-        "without a light, although the lights are known. A dash means that the extractor does not search for glints.",
-        wide=(8,),
-    )
+    return Table(("extractor", *(heading for heading, *_ in columns)), rows, caption)
 
 
 def _recall_table(entries: Sequence[Row]) -> Table:
@@ -421,31 +418,19 @@ def _recall_table(entries: Sequence[Row]) -> Table:
             for name, g in members.items():
                 rows.append((e["name"], group, name, f"{g['matched']} of {g['true']}", _percent(g["recall"])))
     header = ("extractor", "by", "glints", "found", "recall")
-    return Table(header=header, rows=rows, caption="Recall of glints by their look and place.")
+    return Table(header, rows, "Recall of glints by their look and place.")
 
 
 def _factor_table(data: Row, name: str) -> Table:
     what = data["factors"][name]
+    columns = [*_RATES, *_CENTRE, *_BIAS, *_EFFICIENCY, *_BOUNDARY, ("glint recall", "glints.recall", _percent)]
     rows = []
     for e in data["extractors"]:
         for b in e["breakdown"].get(name, []):
             span = f"{b['low']:.4g}" if b["low"] == b["high"] else f"{b['low']:.4g} to {b['high']:.4g}"
-            bias = b["centre_bias_px"] or (None, None)
-            g = b["glints"]
-            rows.append(
-                (
-                    e["name"], span, str(b["with_pupil"]), *(_percent(b["rates"][o]) for o, _ in _OUTCOMES),
-                    _px(b["centre_px"]["median"]), _px(b["centre_px"]["p95"]), _signed(bias[0]), _signed(bias[1]),
-                    _number(b["efficiency"]["value"], 2), _px(b["boundary_px"]["median"]),
-                    _percent(g["recall"]) if g else "-",
-                )
-            )  # fmt: skip
-    header = (
-        "extractor", what["what"] if what["unit"] == "1" else f"{what['what']} ({what['unit']})", "images", "right",
-        "wrong", "none", "error", "centre: median", "95 %", "bias x", "bias y", "efficiency", "boundary",
-        "glint recall",
-    )  # fmt: skip
-    return Table(header=header, rows=rows, caption=f"By {what['what']}", folded=True)
+            rows.append((e["name"], span, str(b["with_pupil"]), *_cells(b, columns)))
+    header = ("extractor", _with_unit(what), "images", *(heading for heading, *_ in columns))
+    return Table(header, rows, f"By {what['what']}", folded=True)
 
 
 def _failure_table(entries: Sequence[Row]) -> Table:
@@ -455,9 +440,12 @@ def _failure_table(entries: Sequence[Row]) -> Table:
         for f in e["failures"]
     ]  # fmt: skip
     caption = "Every reason why an image has no right pupil." if rows else "Every extractor found every pupil right."
-    return Table(
-        header=("extractor", "outcome", "images", "reason", "first image"), rows=rows, caption=caption, wide=(3,)
-    )
+    return Table(("extractor", "outcome", "images", "reason", "first image"), rows, caption=caption, wide=(3,))
+
+
+def _not_run_table(data: Row) -> Table | None:
+    rows = [(e["name"], e["reason"]) for e in data["not_run"]]
+    return Table(("extractor", "why"), rows, caption="Not run", wide=(1,)) if rows else None
 
 
 def _convention_table(entries: Sequence[Row]) -> Table:
@@ -470,8 +458,8 @@ def _convention_table(entries: Sequence[Row]) -> Table:
         )  # fmt: skip
         rows.append((e["name"], e["given"], e["says"] or "-", words))
     return Table(
-        header=("extractor", "given as", "calls itself", "declares"),
-        rows=rows,
+        ("extractor", "given as", "calls itself", "declares"),
+        rows,
         caption="Declared conventions; answers are converted before they are compared.",
         wide=(3,),
     )
@@ -507,23 +495,3 @@ def _lead(data: Row) -> list[str]:
             "centre is within 5 px, and overlap, axes and boundary are unknown."
         )
     return lead
-
-
-def _px(value: float | None) -> str:
-    return _number(value, 4)
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _span(ends: Sequence[float] | None) -> str:
-    return "-" if ends is None else f"{100 * ends[0]:.1f} to {100 * ends[1]:.1f} %"
-
-
-def _signed(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.4f}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.0f} %" if value in (0.0, 1.0) else f"{100 * value:.1f} %"

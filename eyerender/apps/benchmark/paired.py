@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .asking import Run
-from .exact import mcnemar
+from .intervals import mcnemar
 from .score import Score
 from .summary import sizes
 

@@ -5,22 +5,20 @@ results.json and results.csv are identical for identical runs; times.json holds 
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import os
 import platform
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...base.errors import EyerenderError
+from ...backends.probe import cpu_name
 from .asking import Run
 from .curves import curves_of
-from .folder import LabelledImage
+from .labelled import BenchImage
 from .score import Score
 from .summary import FACTORS, breakdown, by_condition, failures, sizes, summarise
 
@@ -34,9 +32,7 @@ _LEAST_FOR_ORIGIN = 8
 _EDGE_COLUMNS = ("edge_arc_deg", "edge_step_error", "edge_width_error")
 
 
-def entry_of(
-    run: Run, images: Sequence[LabelledImage], sigmas: Sequence[float | None], factors: Sequence[dict[str, float]]
-) -> dict[str, Any]:
+def entry_of(run: Run) -> dict[str, Any]:
     """Return the results of one extractor."""
     greeting = run.greeting
     return {
@@ -45,15 +41,14 @@ def entry_of(
         "says": greeting.name if greeting else None,
         "conventions": greeting.conventions.to_mapping() if greeting else None,
         "reports": list(greeting.reports) if greeting else None,
-        "summary": summarise(run.scores, sigmas, run.reports_glints),
+        "summary": summarise(run.scores),
         "suggested_origin": suggested_origin(run),
-        "breakdown": breakdown(run.scores, sigmas, factors, run.reports_glints),
-        "conditions": by_condition(run.scores, sigmas, [image.conditions for image in images], run.reports_glints),
+        "breakdown": breakdown(run.scores),
+        "conditions": by_condition(run.scores),
         "curves": curves_of(run.scores),
-        "failures": failures(run.scores, images),
+        "failures": failures(run.scores),
         "answers": [
-            {"image": i.name, "outcome": s.outcome, "iou": s.iou, "centre_px": s.centre_px, "confidence": s.confidence}
-            for i, s in zip(images, run.scores, strict=True)
+            {key: getattr(s, key) for key in ("image", "outcome", "iou", "centre_px", "confidence")} for s in run.scores
         ],
     }
 
@@ -77,21 +72,20 @@ def suggested_origin(run: Run) -> dict[str, str] | None:
     return {"declared": declared, "suggested": other, "text": _ORIGIN.format(other, declared)}
 
 
-def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors: dict[str, float]) -> dict[str, Any]:
+def row_of(run: Run, s: Score) -> dict[str, Any]:
     """Return one line of results.csv: the answer of an extractor for an image."""
-    s = run.scores[k]
     dx, dy = s.offset_px or (None, None)
     da, db = s.axes_px or (None, None)
     g = s.glints
     return {
         "extractor": run.extractor.name,
-        "image": image.name,
+        "image": s.image,
         "outcome": s.outcome,
         "reason": s.reason,
         "centre_x_px": dx,
         "centre_y_px": dy,
         "centre_px": s.centre_px,
-        "bound_sigma_px": sigma,
+        "bound_sigma_px": s.sigma_px,
         "semi_axis_a_px": da,
         "semi_axis_b_px": db,
         "angle_deg": s.angle_deg,
@@ -105,23 +99,23 @@ def row_of(run: Run, k: int, image: LabelledImage, sigma: float | None, factors:
         "glints_named": g.named if g else None,
         "glints_swapped": g.swapped if g else None,
         "glint_px": float(np.mean([np.hypot(*e) for e in g.errors_px])) if g and g.errors_px else None,
-        "conditions": "; ".join(image.conditions),
-        **{name: factors.get(name) for name in (*FACTORS, *_EDGE_COLUMNS)},
+        "conditions": "; ".join(s.conditions),
+        **{name: s.factors.get(name) for name in (*FACTORS, *_EDGE_COLUMNS)},
     }
 
 
-def times_of(runs: Sequence[Run], images: Sequence[LabelledImage]) -> dict[str, Any]:
+def times_of(runs: Sequence[Run]) -> dict[str, Any]:
     """Return the content of times.json: the machine, and each extractor's times in total and per image, in ms."""
     return {
         "schema": TIMES_SCHEMA,
-        "machine": {"system": platform.platform(), "processor": _processor(), "threads": 1},
+        "machine": {"system": platform.platform(), "processor": f"{cpu_name()}, {os.cpu_count()} cores", "threads": 1},
         "extractors": [
             {
                 "name": run.extractor.name,
                 **{kind: sizes(_times(run.scores, kind)) for kind in _TIMES},
                 "answers": [
-                    {"image": i.name, **{kind: _ms(getattr(s, field)) for kind, field in _TIMES.items()}}
-                    for i, s in zip(images, run.scores, strict=True)
+                    {"image": s.image, **{kind: _ms(getattr(s, field)) for kind, field in _TIMES.items()}}
+                    for s in run.scores
                 ],
             }
             for run in runs
@@ -129,7 +123,7 @@ def times_of(runs: Sequence[Run], images: Sequence[LabelledImage]) -> dict[str, 
     }
 
 
-def digest_of(image: LabelledImage, key: str) -> str:
+def digest_of(image: BenchImage, key: str) -> str:
     """Compute the digest of an image, its hints and its truth, by which benchmarks recognise the same task."""
     pupil = None if image.pupil is None else image.pupil.numbers()
     truth: list[Any] = [key, pupil, image.visible, [[g.light, *g.xy_px] for g in image.glints]]
@@ -138,25 +132,10 @@ def digest_of(image: LabelledImage, key: str) -> str:
     return hashlib.sha256(json.dumps(truth).encode()).hexdigest()[:16]
 
 
-def gammas_of(images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
+def gammas_of(images: Sequence[BenchImage]) -> list[dict[str, Any]]:
     """Return the encoding gammas given to the extractors, their sources, and the number of images of each."""
     counts = Counter((float(image.hints["gamma"]), image.gamma_from) for image in images)
     return [{"gamma": gamma, "from": source, "images": n} for (gamma, source), n in sorted(counts.items())]
-
-
-def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write rows as a CSV file.
-
-    Raises:
-        EyerenderError: the file cannot be written.
-    """
-    try:
-        with open(path, "w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-    except OSError as error:
-        raise EyerenderError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
 _TIMES = {"cpu_ms": "cpu_s", "wall_ms": "wall_s", "round_trip_ms": "trip_s"}
@@ -168,12 +147,3 @@ def _times(scores: Sequence[Score], kind: str) -> Any:
 
 def _ms(seconds: float | None) -> float | None:
     return None if seconds is None else 1e3 * seconds
-
-
-def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
-    except OSError:
-        names = []
-    return f"{names[0] if names else platform.processor() or platform.machine()}, {os.cpu_count()} cores"

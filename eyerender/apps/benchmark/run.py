@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,27 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from ...base.arrays import Floats
 from ...base.errors import InputError
 from ...base.progress import Progress, notify
-from ...base.storage.files import write_json
-from ...folders.imagefile import read_any_image
-from ...folders.imagefolder import versions
-from ...folders.outfolder import refuse_non_empty, staged
-from ...scene.parts import IRIS, PUPIL
-from .answercache import AnswerCache, check_reference, image_key
+from ...base.storage.files import csv_text, write_json, write_text
+from ...base.storage.lock import LOCK
+from ...folders.imagefolder import STAGE, versions
+from ...folders.outfolder import MARKER, refuse_non_empty, staged
+from .answers import ANSWERS, Answers, code_digest, image_key, task_of
 from .asking import Run, ask_extractors
-from .bound import Edge, edge_of, is_bounded
 from .checks import RESULTS_SCHEMA, Requirement, compare_with, problems_of, read_results
 from .conditions import CONDITIONS, balanced
 from .failurekinds import KINDS, kind_of
-from .folder import LabelledImage, load_labelled
+from .folder import load_labelled, with_edge
+from .labelled import BenchImage
 from .options import BenchOptions
 from .page import Thumbnail, write_bench_report
 from .paired import common_errors, pairs_of
 from .registry import ExtractorCommand, defaults, resolve
-from .results import digest_of, entry_of, gammas_of, row_of, times_of, write_csv
-from .summary import FACTORS, failure_kind
+from .results import digest_of, entry_of, gammas_of, row_of, times_of
+from .summary import FACTORS, failures_by_kind
 
 REPORT, RESULTS, TABLE, TIMES = "report.html", "results.json", "results.csv", "times.json"
 THUMBNAILS = 4  # pictures of each kind of failure of an extractor
@@ -46,6 +43,8 @@ def bench_extractors(
     **changes: Any,
 ) -> dict[str, Any]:
     """Run extractors on a labelled folder; write report.html, results.json, results.csv and times.json.
+
+    Until these are written, the output folder holds the answers so far, from which the same call resumes.
 
     >>> er.apps.bench_extractors("out", "bench", ["own-fast"])  # doctest: +SKIP
 
@@ -75,7 +74,8 @@ def bench_extractors(
     if options.quick:
         chosen_rows = balanced([i.conditions for i in images], [i.subject or i.name for i in images])
         images = [images[k] for k in chosen_rows]
-    sources = [check_reference(extractor, options.start_timeout_s) for extractor in chosen]
+    code = [code_digest(extractor, options.start_timeout_s) for extractor in chosen]
+    images = [with_edge(image) for image in images]
     keys = [image_key(image) for image in images]
     done, total = 0, len(chosen) * len(images)
 
@@ -85,20 +85,20 @@ def bench_extractors(
         notify(progress, done, total, name)
 
     notify(progress, 0, total, "")
-    caches = [AnswerCache.of(extractor, files) for extractor, files in zip(chosen, sources, strict=True)]
-    asked = ask_extractors(chosen, images, options, keys=keys, caches=caches, step=step)
-    runs = [_classified(run, images) for run in asked]
-    data, rows = _results(Path(folder), runs, images, keys)
-    data["not_run"] = [{"name": name, "reason": reason} for name, reason in sorted(absent.items())]
-    data["required"] = [
-        bar.check(entry) for bar in required for entry in data["extractors"] if bar.name in ("", entry["name"])
-    ]
-    data["against"] = [] if old is None else compare_with(old, data, str(options.against))
-    data["problems"] = problems_of(data, gated=bool(required or old))
     with staged(output, overwrite=is_bench) as place:
-        write_csv(place / TABLE, rows)
+        answers = Answers(Path(output) / ANSWERS, task_of(chosen, code, keys), fresh=options.fresh)
+        runs = [_classified(run, images) for run in ask_extractors(chosen, images, options, answers=answers, step=step)]
+        data = _results(Path(folder), runs, images, keys)
+        data["not_run"] = [{"name": name, "reason": reason} for name, reason in sorted(absent.items())]
+        data["required"] = [
+            bar.check(entry) for bar in required for entry in data["extractors"] if bar.name in ("", entry["name"])
+        ]
+        data["against"] = [] if old is None else compare_with(old, data, str(options.against))
+        data["problems"] = problems_of(data, gated=bool(required or old))
+        rows = [row_of(run, score) for run in runs for score in run.scores]
+        write_text(place / TABLE, csv_text(list(rows[0]), [list(row.values()) for row in rows]))
         write_bench_report(place / REPORT, data, rows, [one for run in runs for one in _thumbnails(run, images)])
-        write_json(place / TIMES, times_of(runs, images))
+        write_json(place / TIMES, times_of(runs))
         write_json(place / RESULTS, data)
     return data
 
@@ -119,17 +119,9 @@ def _chosen(extractors: Sequence[str | ExtractorCommand] | None) -> tuple[list[E
     return chosen, absent
 
 
-def _results(
-    folder: Path, runs: Sequence[Run], images: Sequence[LabelledImage], keys: Sequence[str]
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the content of results.json without its checks, and the rows of results.csv."""
-    edges = [_edge(image) for image in images]
-    sigmas = [
-        e.centre_sigma_px(i.pupil) if e and i.pupil and is_bounded(i.visible, i.known) else None
-        for e, i in zip(edges, images, strict=True)
-    ]
-    factors = [_factors(image, edge) for image, edge in zip(images, edges, strict=True)]
-    data = {
+def _results(folder: Path, runs: Sequence[Run], images: Sequence[BenchImage], keys: Sequence[str]) -> dict[str, Any]:
+    """Return the content of results.json without its checks."""
+    return {
         "schema": RESULTS_SCHEMA,
         "folder": folder.absolute().name or str(folder),
         "images": len(images),
@@ -138,94 +130,57 @@ def _results(
         "gamma": gammas_of(images),
         "image_digests": {image.name: digest_of(image, key) for image, key in zip(images, keys, strict=True)},
         "versions": versions(),
-        "edge": _edge_summary(edges, images),
+        "edge": _edge_summary(images),
         "factors": {name: {"what": what, "unit": unit} for name, (what, unit) in FACTORS.items()},
         "failure_kinds": dict(KINDS),
         "conditions": {
             name: {"what": what, "images": [i.name for i in images if name in i.conditions]}
             for name, what in CONDITIONS.items()
         },
-        "extractors": [entry_of(run, images, sigmas, factors) for run in runs],
+        "extractors": [entry_of(run) for run in runs],
         "common": common_errors(runs),
         "pairs": pairs_of(runs),
     }
-    rows = [row_of(run, k, images[k], sigmas[k], factors[k]) for run in runs for k in range(len(images))]
-    return data, rows
 
 
-def _edge(image: LabelledImage) -> Edge | None:
-    glints: Floats = np.array([g.xy_px for g in image.glints]).reshape(-1, 2)
-    grey = read_any_image(image.path)[0] if not image.known else np.zeros((0, 0))
-    classes = None if image.known else image.classes()
-    shows = None if classes is None else np.isin(classes, (PUPIL, IRIS))
-    if shows is None and not image.known and image.visible is not None and image.visible < 1.0:
-        return None  # the occluder of the outline is unknown
-    return edge_of(grey, image.bit_depth, image.pupil, glints, image.known, shows)
-
-
-def _classified(run: Run, images: Sequence[LabelledImage]) -> Run:
+def _classified(run: Run, images: Sequence[BenchImage]) -> Run:
     """Add to every wrong ellipse the kind of object that it shows."""
     scores = []
     for s, image in zip(run.scores, images, strict=True):
         if s.outcome in ("wrong", "false") and s.ellipse is not None and not s.by_centre:
-            s = replace(s, kind=kind_of(s.ellipse, image, read_any_image(image.path)[0], image.classes()))
+            s = replace(s, kind=kind_of(s.ellipse, image, image.grey(), image.classes()))
         scores.append(s)
     return replace(run, scores=tuple(scores))
 
 
-def _thumbnails(run: Run, images: Sequence[LabelledImage]) -> list[Thumbnail]:
+def _thumbnails(run: Run, images: Sequence[BenchImage]) -> list[Thumbnail]:
     """Return crops of the first images of every kind of failure, the most frequent kinds first."""
-    kinds: dict[tuple[str, str], list[int]] = {}
-    for k, s in enumerate(run.scores):
-        if s.outcome not in ("right", "absent"):
-            kinds.setdefault((s.outcome, failure_kind(s)), []).append(k)
-    out = []
-    for (outcome, reason), which in sorted(kinds.items(), key=lambda item: -len(item[1])):
-        for k in which[:THUMBNAILS]:
-            image, _, _ = read_any_image(images[k].path)
-            text = f"{outcome}: {reason}; {images[k].name}"
-            out.append(
-                Thumbnail(
-                    extractor=run.extractor.name,
-                    text=text,
-                    image=image,
-                    truth=images[k].pupil,
-                    found=run.scores[k].ellipse,
-                )
-            )
+    named, out = {image.name: image for image in images}, []
+    for (outcome, reason), scores in sorted(failures_by_kind(run.scores).items(), key=lambda item: -len(item[1])):
+        for s in scores[:THUMBNAILS]:
+            image = named[s.image]
+            text = f"{outcome}: {reason}; {image.name}"
+            name = run.extractor.name
+            out.append(Thumbnail(extractor=name, text=text, image=image.grey(), truth=image.pupil, found=s.ellipse))
     return out
 
 
-def _factors(image: LabelledImage, edge: Edge | None) -> dict[str, float]:
-    """Return possible causes of an error; noise and blur are those that the folder states, else measured."""
-    out = dict(image.factors)
-    if image.known:
-        out |= {"noise_dn": image.known["noise_dn"], "blur_px": image.known["blur_px"]}
-    elif edge is not None:
-        out |= {"noise_dn": edge.noise_dn, "blur_px": math.sqrt(max(edge.sigma_px**2 - 1.0 / 12.0, 0.0))}
-    if edge is not None:
-        out["contrast_to_noise"] = abs(edge.step_dn) / edge.noise_dn
-    if edge is not None and not image.known:
-        out |= {"edge_arc_deg": edge.arc_deg, "edge_step_error": edge.step_sd_dn / abs(edge.step_dn)}
-        out["edge_width_error"] = edge.sigma_sd_px / edge.sigma_px
-    return out
-
-
-def _edge_summary(edges: Sequence[Edge | None], images: Sequence[LabelledImage]) -> dict[str, Any]:
-    good = [e for e in edges if e is not None]
+def _edge_summary(images: Sequence[BenchImage]) -> dict[str, Any]:
+    good = [image.edge for image in images if image.edge is not None]
     return {
         "source": "the folder's parameters" if any(i.known for i in images) else "measured along the true outline",
         "n": len(good),
-        "noise_dn": float(np.median([e.noise_dn for e in good])) if good else None,
-        "step_dn": float(np.median([e.step_dn for e in good])) if good else None,
-        "sigma_px": float(np.median([e.sigma_px for e in good])) if good else None,
+        **{
+            name: float(np.median([getattr(edge, name) for edge in good])) if good else None
+            for name in ("noise_dn", "step_dn", "sigma_px")
+        },
     }
 
 
 def _is_bench(output: Path) -> bool:
-    """Return whether a folder holds a benchmark's files and nothing else."""
+    """Return whether a folder holds files of a benchmark, finished or interrupted, and nothing else."""
     try:
-        found = {p.name for p in output.iterdir()}
+        found = {p.name for p in output.iterdir() if not p.name.startswith((STAGE, LOCK))}
     except OSError:
         return False
-    return {REPORT, RESULTS, TABLE} <= found <= {REPORT, RESULTS, TABLE, TIMES}
+    return bool(found & {RESULTS, ANSWERS}) and found <= {REPORT, RESULTS, TABLE, TIMES, ANSWERS, MARKER}

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ...optics.ellipse import Ellipse, iou, signed_distance
-from .folder import LabelledImage
 from .glintlabels import TrueGlint, false_kind
+from .labelled import BenchImage
 from .protocol import Reply
 
 # right: IoU > 0.9, or a centre within 5 px where only that is known. wrong: another ellipse. none: no pupil reported.
@@ -71,6 +72,10 @@ class Score:
         kind: what a wrong ellipse shows instead of the pupil (`failurekinds`).
         radius_px: sqrt(a b) of the true pupil.
         by_centre: whether only the centre of the true pupil is known.
+        image: name of the image.
+        sigma_px: bound of the centre's standard deviation per axis; None where it does not apply.
+        factors: possible causes of an error, by name.
+        conditions: hard conditions of the image.
     """
 
     outcome: Outcome
@@ -91,6 +96,10 @@ class Score:
     kind: str | None = None
     radius_px: float | None = None
     by_centre: bool = False
+    image: str = ""
+    sigma_px: float | None = None
+    factors: Mapping[str, float] = field(default_factory=dict)
+    conditions: tuple[str, ...] = ()
 
     @property
     def centre_px(self) -> float | None:
@@ -98,16 +107,16 @@ class Score:
         return None if self.offset_px is None else math.hypot(*self.offset_px)
 
 
-def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str, ...]) -> Score:
+def score(image: BenchImage, reply: Reply, trip_s: float, reports: tuple[str, ...]) -> Score:
     """Score one answer."""
     glints = score_glints(image, reply) if "glints" in reports else None
     if reply.error is not None:
         return failed(image, reply.error, "glints" in reports)
     found, true = reply.ellipse, image.pupil
-    known: dict[str, Any] = {"confidence": reply.confidence, "glints": glints, "ellipse": found}
-    known |= {"cpu_s": reply.cpu_s, "wall_s": reply.wall_s, "trip_s": trip_s, "by_centre": image.centre_px is not None}
+    known = _of_image(image) | {"confidence": reply.confidence, "glints": glints, "ellipse": found}
+    known |= {"cpu_s": reply.cpu_s, "wall_s": reply.wall_s, "trip_s": trip_s}
     if image.centre_px is None and true is None:
-        return Score("absent" if found is None else "false", reply.reason, with_pupil=False, **known)
+        return Score("absent" if found is None else "false", reply.reason, **known)
     if found is None:
         return Score("none", reply.reason or "gave no reason", **known)
     if image.centre_px is not None:
@@ -135,18 +144,30 @@ def score(image: LabelledImage, reply: Reply, trip_s: float, reports: tuple[str,
     )
 
 
-def failed(image: LabelledImage, reason: str, reports_glints: bool) -> Score:
+def failed(image: BenchImage, reason: str, reports_glints: bool) -> Score:
     """Return the score of an image without a usable answer."""
     missed = tuple((False, glint) for glint in image.glints)
     glints = GlintScore(true=len(missed), matches=missed) if reports_glints else None
-    centre = image.centre_px is not None
-    return Score("error", reason, glints=glints, with_pupil=image.shows_pupil, by_centre=centre)
+    return Score("error", reason, glints=glints, **_of_image(image))
 
 
-def score_glints(image: LabelledImage, reply: Reply) -> GlintScore:
+def _of_image(image: BenchImage) -> dict[str, Any]:
+    """Return what the score takes over from its image."""
+    return {
+        "with_pupil": image.shows_pupil,
+        "by_centre": image.centre_px is not None,
+        "subject": image.subject or image.name,
+        "image": image.name,
+        "sigma_px": image.sigma_px,
+        "factors": image.factors,
+        "conditions": image.conditions,
+    }
+
+
+def score_glints(image: BenchImage, reply: Reply) -> GlintScore:
     """Match reported to true glints one to one within a glint's radius: first as many as possible, then the nearest."""
     true, reported = image.glints, reply.glints
-    places = np.array([g.xy_px for g in true]).reshape(-1, 2)
+    places = image.glints_px
     spots = np.array([xy for xy, _ in reported]).reshape(-1, 2)
     offset = spots[None] - places[:, None]
     apart = np.hypot(offset[..., 0], offset[..., 1])

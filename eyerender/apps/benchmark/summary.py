@@ -13,10 +13,9 @@ import numpy as np
 from ...base.arrays import Floats
 from .bound import MEDIAN_OF_RADIAL
 from .conditions import CONDITIONS
-from .folder import LabelledImage
 from .glintlabels import TrueGlint
 from .intervals import subject_interval, wilson
-from .score import Outcome, Score
+from .score import GlintScore, Outcome, Score
 
 # name -> (meaning, unit)
 FACTORS = {
@@ -40,8 +39,8 @@ _VISIBLE_TIERS = ((0.99, "whole"), (0.5, "0.5 and more"), (0.0, "less than 0.5")
 _VARIES = {"noise_dn": 0.25, "blur_px": 0.25, "contrast_to_noise": 0.25, "pupil_px": 0.1, "aspect": 0.05}
 
 
-def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], reports_glints: bool) -> dict[str, Any]:
-    """Summarise some images; `sigmas_px` holds the bound's sigma_c of each, None where it does not apply.
+def summarise(scores: Sequence[Score]) -> dict[str, Any]:
+    """Summarise some images.
 
     Errors are those of correctly found pupils (IoU > 0.9); `centre_px_of_all_found` includes wrong ones.
     """
@@ -60,7 +59,7 @@ def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], report
         **outcomes,
         "errors": counts["error"],
         "rates": {**{o: _ratio(n, shown) for o, n in outcomes.items()}, "false": _ratio(counts["false"], without)},
-        "intervals": _intervals(scores, reports_glints),
+        "intervals": _intervals(scores),
         "failure_kinds": dict(sorted(Counter(s.kind for s in scores if s.kind is not None).items())),
         "without_pupil": without,
         "false": counts["false"],
@@ -72,21 +71,21 @@ def summarise(scores: Sequence[Score], sigmas_px: Sequence[float | None], report
         "semi_axes_px": sizes(np.abs(axes).max(axis=1) if len(axes) else np.zeros(0)),
         "iou": sizes(np.array([s.iou for s in right if s.iou is not None]), low=True),
         "boundary_px": sizes(np.array([s.boundary_px for s in right if s.boundary_px is not None])),
-        "efficiency": efficiency(scores, sigmas_px),
-        "glints": _glints(scores) if reports_glints else None,
+        "efficiency": efficiency(scores),
+        "glints": _glints([s.glints for s in scores if s.glints is not None]),
     }
 
 
-def _intervals(scores: Sequence[Score], reports_glints: bool) -> dict[str, Any]:
+def _intervals(scores: Sequence[Score]) -> dict[str, Any]:
     """Compute 95 % intervals of every rate: `wilson` for independent trials, `subjects` for correlated images."""
     shown = [s for s in scores if s.with_pupil]
     trials: dict[str, tuple[Sequence[float], Sequence[float], list[Score]]] = {}
     trials |= {o: ([s.outcome == o for s in shown], [1] * len(shown), shown) for o in _OUTCOMES}
     without = [s for s in scores if not s.with_pupil]
     trials["false"] = ([s.outcome == "false" for s in without], [1] * len(without), without)
-    if reports_glints:
-        seen = [s for s in scores if s.glints is not None]
-        glints = [s.glints for s in seen if s.glints is not None]
+    seen = [s for s in scores if s.glints is not None]
+    glints = [s.glints for s in seen if s.glints is not None]
+    if glints:
         matched = [len(g.errors_px) for g in glints]
         trials["glint_recall"] = (matched, [g.true for g in glints], seen)
         trials["glint_precision"] = (matched, [g.reported for g in glints], seen)
@@ -100,12 +99,12 @@ def _intervals(scores: Sequence[Score], reports_glints: bool) -> dict[str, Any]:
     }
 
 
-def efficiency(scores: Sequence[Score], sigmas_px: Sequence[float | None]) -> dict[str, Any]:
+def efficiency(scores: Sequence[Score]) -> dict[str, Any]:
     """Compute 1 / median of (centre error / 1.177 sigma_c) over right pupils; 1 reaches the Cramer-Rao bound."""
     pairs = [
-        (c, MEDIAN_OF_RADIAL * sigma)
-        for s, sigma in zip(scores, sigmas_px, strict=True)
-        if s.outcome == "right" and sigma is not None and (c := s.centre_px) is not None
+        (s.centre_px, MEDIAN_OF_RADIAL * s.sigma_px)
+        for s in scores
+        if s.outcome == "right" and s.sigma_px is not None and s.centre_px is not None
     ]
     if not pairs:
         return {"n": 0, "value": None, "bound_median_px": None}
@@ -118,20 +117,25 @@ def efficiency(scores: Sequence[Score], sigmas_px: Sequence[float | None]) -> di
     }
 
 
-def failures(scores: Sequence[Score], images: Sequence[LabelledImage]) -> list[dict[str, Any]]:
+def failures(scores: Sequence[Score]) -> list[dict[str, Any]]:
     """Return every reason for a wrong, missing or unusable answer, with its count and first image."""
-    members: dict[tuple[Outcome, str], list[tuple[Score, str]]] = {}
-    for s, image in zip(scores, images, strict=True):
-        if s.outcome not in ("right", "absent"):
-            members.setdefault((s.outcome, failure_kind(s)), []).append((s, image.name))
     found = []
-    for (outcome, kind), those in members.items():
-        reason = kind if outcome == "wrong" else _joined([s.reason or kind for s, _ in those])
-        found.append({"outcome": outcome, "reason": reason, "count": len(those), "first": those[0][1]})
+    for (outcome, kind), those in failures_by_kind(scores).items():
+        reason = kind if outcome == "wrong" else _joined([s.reason or kind for s in those])
+        found.append({"outcome": outcome, "reason": reason, "count": len(those), "first": those[0].image})
     return sorted(found, key=lambda e: (-e["count"], e["outcome"], e["reason"]))
 
 
-def failure_kind(score: Score) -> str:
+def failures_by_kind(scores: Sequence[Score]) -> dict[tuple[Outcome, str], list[Score]]:
+    """Group failures by outcome and reason, in the order of their first images."""
+    members: dict[tuple[Outcome, str], list[Score]] = {}
+    for s in scores:
+        if s.outcome not in ("right", "absent"):
+            members.setdefault((s.outcome, _failure_kind(s)), []).append(s)
+    return members
+
+
+def _failure_kind(score: Score) -> str:
     """Return the reason of a failure for counting, without numbers, which differ from image to image."""
     if score.outcome == "wrong":
         return score.kind or "another ellipse than the pupil's"
@@ -182,44 +186,30 @@ def bins(values: Sequence[float | None], name: str) -> list[tuple[float, float, 
     return out
 
 
-def breakdown(
-    scores: Sequence[Score],
-    sigmas_px: Sequence[float | None],
-    factors: Sequence[dict[str, float]],
-    reports_glints: bool,
-) -> dict[str, list[dict[str, Any]]]:
+def breakdown(scores: Sequence[Score]) -> dict[str, list[dict[str, Any]]]:
     """Summarise every bin of every factor that varies, over the images that show a pupil."""
-    shown = [i for i, s in enumerate(scores) if s.with_pupil]
+    shown = [s for s in scores if s.with_pupil]
     out: dict[str, list[dict[str, Any]]] = {}
     for name in FACTORS:
         rows = []
-        for low, high, members in bins([factors[i].get(name) for i in shown], name):
-            at = [shown[m] for m in members]
-            figures = summarise([scores[i] for i in at], [sigmas_px[i] for i in at], reports_glints)
-            middle = float(np.median([factors[i][name] for i in at]))
-            rows.append({"low": low, "high": high, "median": middle, **figures})
+        for low, high, members in bins([s.factors.get(name) for s in shown], name):
+            some = [shown[m] for m in members]
+            middle = float(np.median([s.factors[name] for s in some]))
+            rows.append({"low": low, "high": high, "median": middle, **summarise(some)})
         if rows:
             out[name] = rows
     return out
 
 
-def by_condition(
-    scores: Sequence[Score],
-    sigmas_px: Sequence[float | None],
-    conditions: Sequence[Sequence[str]],
-    reports_glints: bool,
-) -> dict[str, dict[str, Any]]:
+def by_condition(scores: Sequence[Score]) -> dict[str, dict[str, Any]]:
     """Summarise the images of every condition that occurs."""
-    out = {}
-    for name in CONDITIONS:
-        at = [k for k, found in enumerate(conditions) if name in found]
-        if at:
-            out[name] = summarise([scores[k] for k in at], [sigmas_px[k] for k in at], reports_glints)
-    return out
+    groups = {name: [s for s in scores if name in s.conditions] for name in CONDITIONS}
+    return {name: summarise(some) for name, some in groups.items() if some}
 
 
-def _glints(scores: Sequence[Score]) -> dict[str, Any]:
-    parts = [s.glints for s in scores if s.glints is not None]
+def _glints(parts: Sequence[GlintScore]) -> dict[str, Any] | None:
+    if not parts:
+        return None
     true, reported = sum(g.true for g in parts), sum(g.reported for g in parts)
     errors = np.array([e for g in parts for e in g.errors_px]).reshape(-1, 2)
     named, swapped = sum(g.named for g in parts), sum(g.swapped for g in parts)

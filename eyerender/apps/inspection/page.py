@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import base64
+import html
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +16,8 @@ from ...base.errors import InputError
 from ...dataset.export.encoding import Encoding, measured_gain
 from ...dataset.validation.problems import WRONG
 from ...folders.imagefolder import ImageEntry
-from ...report.page import write_template
+from ...report.overlay import picture
+from ...report.page import Card, Content, Figure, Gallery, Key, Page, Section, Table, write_page
 from ...report.style import ANALYTIC, IMAGE, figure, svg
 from .comparing import Shift, only_in, shares
 from .faults import KINDS
@@ -28,22 +29,50 @@ from .strata import strata
 
 _WIDTH = 260  # of pictures on the page, px
 _SAMPLED = 64  # pictures from which the gain is measured
-_FAULTS, _PAIRS, _SHIFTS, _CORRELATED = 24, 8, 16, 36
+_FAULTS, _PAIRS, _SHIFTS, _CORRELATED, _NAMED = 24, 8, 16, 36, 40
+_SMALL_REM, _HISTOGRAM_REM = 5.9, 9.4
 _WHERE = {LABEL: "Labels", PICTURE: "Pictures", DRAW: "Draws", PERSON: "People"}
-PageValues = dict[str, Any]
+_MARKS = {"pupil": "#ff9f1c", "iris": "#56b4e9", "glints": "#7fdd4c"}
+Picture = tuple[str, Sequence[str]]
 
 
 def write(path: Path, found: Sequence[Inspection], moved: Sequence[Shift]) -> None:
     """Write the page of one dataset, or of two and their difference."""
-    first, *others = found
-    values = {
-        "title": f"Dataset {first.contents.folder.path.resolve().name}"
-        + "".join(f" and {o.contents.folder.path.resolve().name}" for o in others),
-        "datasets": [_dataset(one, several=bool(others)) for one in found],
-        "difference": _difference(first, others[0], moved) if others else None,
-        "colours": (IMAGE, ANALYTIC),
-    }
-    write_template(path, "inspection.html.j2", values, package="eyerender.apps.inspection")
+    names = [one.contents.folder.path.resolve().name for one in found]
+    several = len(found) > 1
+    lead = [*map(_about, found), "Pictures are shown with one gain for the whole dataset and a gamma of 2.2."]
+    cards: list[Card] = []
+    sections = [_difference(found[0], found[1], moved)] if several else []
+    for name, one in zip(names, found, strict=True):
+        before = f"{name}: " if several else ""
+        cards += _cards(one, before)
+        sections += _dataset(one, before)
+    write_page(path, Page(f"Dataset {' and '.join(names)}", lead, cards, sections))
+
+
+def _about(found: Inspection) -> str:
+    folder, read = found.contents.folder, len(found.contents)
+    images = len(folder.entries)
+    text = f"all of its {images} images were read"
+    if read < images:
+        text = f"{read} of its {images} images were read, spread evenly over it"
+    return f"{folder.path}: {text}{f'; {folder.unfinished}' if folder.unfinished else ''}."
+
+
+def _cards(found: Inspection, before: str) -> list[Card]:
+    subjects = set().union(*(own for _, own in found.splits.values()))
+    shared = f"subjects, {len(found.shared) or 'none'} of them in two splits"
+    numbers = (
+        (sum(map(len, found.faults().values())), "faults"),
+        (len(found.outliers), "outliers shown"),
+        (f"{_equal(found)} + {len(found.near)}", "equal pictures + near-duplicates"),
+        (len(subjects), shared),
+    )
+    return [Card(str(value), f"{before}{text}") for value, text in numbers]
+
+
+def _equal(found: Inspection) -> int:
+    return sum(len(group) - 1 for group in found.equal)
 
 
 class _Pictures:
@@ -72,95 +101,100 @@ class _Pictures:
         assert found is not None
         return entry, found[0], int(entry.line.get("bit_depth") or found[1])
 
-    def tile(self, at: int, text: Iterable[str], *, marked: bool = False) -> PageValues:
-        """PageValues of a picture on the page: its data, size, caption, and the labels to draw on it."""
-        tile: PageValues = {"text": list(text), "data": None, "marks": [], "size": (4, 3)}
+    def drawn(self, at: int, *, marked: bool = False) -> str:
+        """Draw a picture, with its labels on it if they are asked for."""
         found = self._read(at)
         if found is None:
-            return tile
+            return "no picture"
         entry, image, depth = found
         if image.dtype.kind == "u":
             codes = self._encoding.apply(image, depth, entry.gamma)
         else:
             codes = np.asarray(255 * image / max(float(image.max()), 1e-30), dtype=np.uint8)
-        tile["size"] = codes.shape[::-1]
-        tile["data"] = _jpeg(codes)
-        tile["marks"] = _marks(entry) if marked else []
-        return tile
+        height, width = codes.shape
+        over = _marks(entry, width / 60) if marked else ""
+        return picture(_jpeg(codes), "jpeg", (width, height), over=over, title=entry.name)
+
+    def tile(self, at: int, text: Iterable[str], *, marked: bool = False) -> Picture:
+        """Draw a picture with its caption."""
+        return self.drawn(at, marked=marked), list(text)
 
 
-def _jpeg(codes: Bytes) -> str:
-    picture = Image.fromarray(codes)
-    if picture.width > _WIDTH:
-        height = max(1, round(picture.height * _WIDTH / picture.width))
-        picture = picture.resize((_WIDTH, height), Image.Resampling.BOX)
+def _jpeg(codes: Bytes) -> bytes:
+    small = Image.fromarray(codes)
+    if small.width > _WIDTH:
+        small = small.resize((_WIDTH, max(1, round(small.height * _WIDTH / small.width))), Image.Resampling.BOX)
     file = io.BytesIO()
-    picture.save(file, "JPEG", quality=80)
-    return base64.b64encode(file.getvalue()).decode()
+    small.save(file, "JPEG", quality=80)
+    return file.getvalue()
 
 
-def _marks(entry: ImageEntry) -> list[PageValues]:
-    """Outlines of pupil and iris and the visible glints, in pixels of the picture; pixel i covers [i, i + 1)."""
+def _marks(entry: ImageEntry, radius: float) -> str:
+    """Draw outlines of pupil and iris and the visible glints, in pixels of the picture; pixel i covers [i, i + 1)."""
     x0, y0 = entry.window[:2]
-    found: list[PageValues] = []
+    found = []
     try:
         for part in ("iris", "pupil"):
             outline = entry.labels[part]["amodal"]
             (x, y), (a, b) = outline["centre_px"], outline["semi_axes_px"]
-            turn = float(np.degrees(outline["angle_rad"]))
-            found.append({"kind": part, "x": x - x0 + 0.5, "y": y - y0 + 0.5, "a": a, "b": b, "turn": turn})
+            x, y, turn = x - x0 + 0.5, y - y0 + 0.5, float(np.degrees(outline["angle_rad"]))
+            found.append(
+                f'<ellipse stroke="{_MARKS[part]}" cx="{x:.1f}" cy="{y:.1f}" rx="{a:.1f}" ry="{b:.1f}" '
+                f'transform="rotate({turn:.1f} {x:.1f} {y:.1f})" {_LINE}/>'
+            )
         for glint in entry.labels["glints"]:
             if glint["visible"]:
                 x, y = glint["xy_px"]
-                found.append({"kind": "glint", "x": x - x0 + 0.5, "y": y - y0 + 0.5})
+                x, y = x - x0 + 0.5, y - y0 + 0.5
+                found.append(
+                    f'<circle stroke="{_MARKS["glints"]}" cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" {_LINE}/>'
+                )
     except (*WRONG, InputError):
         pass  # what there is of the labels is drawn
-    return found
+    return "".join(found)
 
 
-def _dataset(found: Inspection, *, several: bool) -> PageValues:
+_LINE = 'fill="none" vector-effect="non-scaling-stroke" stroke-width="1.3px"'
+
+
+def _dataset(found: Inspection, before: str) -> list[Section]:
+    """Return the sections of one dataset."""
     contents, pictures = found.contents, _Pictures(found.contents)
-    faults = found.faults()
-    return {
-        "before": f"{contents.folder.path.resolve().name}: " if several else "",
-        "path": str(contents.folder.path),
-        "unfinished": contents.folder.unfinished,
-        "read": len(contents),
-        "images": len(contents.folder.entries),
-        "subjects": len(set().union(*(own for _, own in found.splits.values()))) if found.splits else 0,
-        "fault_count": sum(map(len, faults.values())),
-        "fault_rows": [[kind, str(len(own)), KINDS[kind]] for kind, own in faults.items()],
-        "fault_tiles": _fault_tiles(found, faults, pictures),
-        "fault_lines": [[kind, found.name(at), detail] for kind, own in faults.items() for at, detail in own[:100]],
-        "outliers": [
-            pictures.tile(
-                o.at, [found.name(o.at), *(f"{r.column}: {r.value:.4g}; {r.usual}" for r in o.reasons)], marked=True
+    sections: dict[str, Sequence[Content]] = {
+        "Faults": _faults(found, pictures),
+        "Outliers": _outliers(found, pictures),
+        "Near-duplicates": _duplicates(found, pictures),
+        "Splits": _splits(found),
+        "Contact sheet": [
+            Gallery(
+                [pictures.tile(at, [_short(contents, at)]) for at in part.shown],
+                f"{name}: {part.name} ({part.images} images)" if len(parts) > 1 else name,
+                _SMALL_REM,
             )
-            for o in found.outliers
-        ],
-        "equal": [_pair(found, pictures, group[0], group[1], f"{len(group)} equal") for group in found.equal[:_PAIRS]],
-        "equal_count": sum(len(group) - 1 for group in found.equal),
-        "near": [
-            _pair(found, pictures, p.first, p.second, f"correlation {p.correlation:.5f}") for p in found.near[:_PAIRS]
-        ],
-        "near_count": len(found.near),
-        "split_rows": _split_rows(found),
-        "shared": [[str(subject), ", ".join(names)] for subject, names in list(found.shared.items())[:50]],
-        "shared_count": len(found.shared),
-        "strata": [
-            (name, [(part, [pictures.tile(at, [_short(contents, at)]) for at in part.shown]) for part in parts])
             for name, parts in strata(contents)
+            for part in parts
         ],
-        "histograms": _histograms(found.distributions),
-        "constant": [[d.column, f"{d.quantiles[0]:.6g}"] for d in found.distributions.values() if not len(d.counts)],
-        "correlation_figure": _correlation_figure(found),
-        "correlation_rows": [[a, b, f"{rho:+.2f}"] for a, b, rho in found.strongest],
+        "Distributions": _distributions(found.distributions),
+        "Correlations": _correlations(found),
     }
+    return [Section(before + heading, *content) for heading, content in sections.items()]
 
 
-def _fault_tiles(
-    found: Inspection, faults: Mapping[str, list[tuple[int, str]]], pictures: _Pictures
-) -> list[PageValues]:
+def _faults(found: Inspection, pictures: _Pictures) -> list[Content]:
+    faults = found.faults()
+    if not faults:
+        return ["None was found."]
+    listed = [(kind, found.name(at), detail) for kind, own in faults.items() for at, detail in own[:100]]
+    return [
+        Table(("fault", "images", "meaning"), [(k, str(len(own)), KINDS[k]) for k, own in faults.items()], wide=(2,)),
+        "Labels on the pictures:",
+        Key([(colour, part) for part, colour in _MARKS.items()]),
+        Gallery(_fault_tiles(found, faults, pictures)),
+        Table(("fault", "image", "what was found"), listed, "List of faults, up to 100 of each kind", (1, 2), True),
+    ]
+
+
+def _fault_tiles(found: Inspection, faults: Mapping[str, list[tuple[int, str]]], pictures: _Pictures) -> list[Picture]:
     """Pictures with faults: one of each kind, then a second one, and so on; each image once."""
     shown: dict[int, list[str]] = {}
     for turn in range(max(map(len, faults.values()), default=0)):
@@ -174,48 +208,103 @@ def _fault_tiles(
     return [pictures.tile(at, [found.name(at), *texts], marked=True) for at, texts in shown.items()]
 
 
-def _pair(found: Inspection, pictures: _Pictures, first: int, second: int, text: str) -> PageValues:
+def _outliers(found: Inspection, pictures: _Pictures) -> list[Content]:
+    if not found.outliers:
+        return ["No image is unusual."]
+    tiles = []
+    for o in found.outliers:
+        lines = [found.name(o.at), *(f"{r.column}: {r.value:.4g}; {r.usual}" for r in o.reasons)]
+        tiles.append(pictures.tile(o.at, lines, marked=True))
+    return [
+        "The images with the most unusual numbers. A number is unusual alone if it is far from the middle 98 % of its "
+        "column, or together with the other numbers of its image if these suggest another value. Outliers of a sound "
+        "dataset are rare, not wrong.",
+        Gallery(tiles),
+    ]
+
+
+def _duplicates(found: Inspection, pictures: _Pictures) -> list[Content]:
     splits = found.contents.groups.get("split")
-    names = [found.name(at) + ("" if splits is None else f" ({splits[at]})") for at in (first, second)]
-    return {"text": text, "tiles": [pictures.tile(at, [n]) for at, n in zip((first, second), names, strict=True)]}
+    listed = [(group[0], group[1], f"{len(group)} equal") for group in found.equal[:_PAIRS]]
+    listed += [(p.first, p.second, f"correlation {p.correlation:.5f}") for p in found.near[:_PAIRS]]
+    pairs = []
+    for first, second, text in listed:
+        names = [found.name(at) + ("" if splits is None else f" ({splits[at]})") for at in (first, second)]
+        pairs.append((pictures.drawn(first) + pictures.drawn(second), [text, *names]))
+    return [
+        f"{_equal(found)} pictures have the same pixels as an earlier one, and {len(found.near)} pairs differ by "
+        "little more than noise or brightness.",
+        Gallery(pairs, width_rem=22.0),
+    ]
 
 
 def _short(contents: Contents, at: int) -> str:
     return f"subject {contents.subjects[at]}" if contents.subjects[at] >= 0 else contents.names[at]
 
 
-def _split_rows(found: Inspection) -> list[list[str]]:
+def _splits(found: Inspection) -> list[Content]:
     total = sum(n for n, _ in found.splits.values())
     rows = []
     for name, (images, subjects) in found.splits.items():
         per = f"{images / len(subjects):.1f}" if subjects else "-"
-        rows.append([name or "-", str(images), f"{images / total:.1%}", str(len(subjects)), per])
-    return rows
+        rows.append((name or "-", str(images), f"{images / total:.1%}", str(len(subjects)), per))
+    shared = [(str(subject), ", ".join(names)) for subject, names in list(found.shared.items())[:50]]
+    count = f"{len(found.shared)} subjects are" if shared else "No subject is"
+    return [
+        Table(("split", "images", "share", "subjects", "images per subject"), rows),
+        f"{count} in more than one split.",
+        Table(("subject", "splits"), shared) if shared else None,
+    ]
 
 
-def _histograms(distributions: Mapping[str, Distribution]) -> list[tuple[str, list[PageValues]]]:
-    """Histograms by where their numbers are from."""
-    found = []
+def _distributions(distributions: Mapping[str, Distribution]) -> list[Content]:
+    """Show histograms by where their numbers are from."""
+    out: list[Content] = [
+        "Under each histogram: the 1 % quantile, the median and the 99 % quantile. The first and the last bar hold all "
+        "beyond."
+    ]
     for start, heading in _WHERE.items():
         own = [d for name, d in distributions.items() if name.startswith(start) and len(d.counts)]
         if own:
-            found.append((heading, [_histogram(d, d.column.removeprefix(start)) for d in own]))
-    return found
+            drawn = [_histogram(d, d.column.removeprefix(start)) for d in own]
+            out.append(Gallery(drawn, heading, _HISTOGRAM_REM))
+    constant = [(d.column, f"{d.quantiles[0]:.6g}") for d in distributions.values() if not len(d.counts)]
+    if constant:
+        out.append(Table(("number", "value"), constant, "Numbers that are the same in all images", folded=True))
+    return out
 
 
-def _histogram(d: Distribution, name: str) -> PageValues:
+def _histogram(d: Distribution, name: str) -> Picture:
     q = d.quantiles
-    text = f"{q[1]:.4g} … {q[3]:.4g} … {q[5]:.4g}"
-    more = [f"{word} {value:.4g}" for word, value in (("min", q[0]), ("max", q[6]))]
-    return {"name": name, "bars": [_bars(d.counts)], "text": text, "more": ", ".join(more)}
+    lines = [name, f"{q[1]:.4g} … {q[3]:.4g} … {q[5]:.4g}", f"min {q[0]:.4g}, max {q[6]:.4g}"]
+    return _bars(name, [d.counts], [ANALYTIC]), lines
 
 
-def _bars(counts: Ints) -> str:
-    """Path of the bars of a histogram in a box of 100 x 40."""
-    heights = 39 * counts / max(int(counts.max(initial=0)), 1)
-    step = 100 / len(counts)
-    points = (f"L{k * step:.2f} {40 - h:.2f}L{(k + 1) * step:.2f} {40 - h:.2f}" for k, h in enumerate(heights))
-    return f"M0 40{''.join(points)}L100 40Z"
+def _bars(name: str, parts: Sequence[Ints], colours: Sequence[str]) -> str:
+    """Draw histograms of the same bins over each other; the highest bar of all has full height."""
+    top = max(max(int(counts.max(initial=0)) for counts in parts), 1)
+    paths = []
+    for counts, colour in zip(parts, colours, strict=True):
+        step = 100 / len(counts)
+        points = (
+            f"L{k * step:.2f} {40 - h:.2f}L{(k + 1) * step:.2f} {40 - h:.2f}" for k, h in enumerate(39 * counts / top)
+        )
+        paths.append(f'<path fill="{colour}" fill-opacity=".65" d="M0 40{"".join(points)}L100 40Z"/>')
+    return (
+        '<svg viewBox="0 0 100 40" preserveAspectRatio="none" role="img" xmlns="http://www.w3.org/2000/svg">'
+        f"<title>histogram of {html.escape(name)}</title>{''.join(paths)}</svg>"
+    )
+
+
+def _correlations(found: Inspection) -> list[Content]:
+    drawn = _correlation_figure(found)
+    if drawn is None:
+        return ["Fewer than two numbers vary."]
+    rows = [(a, b, f"{rho:+.2f}") for a, b, rho in found.strongest]
+    return [
+        Figure(drawn, "Spearman's rank correlations of the numbers that depend most on others."),
+        Table(("number", "number", "correlation"), rows, "The strongest correlations", wide=(0, 1), folded=True),
+    ]
 
 
 def _correlation_figure(found: Inspection) -> str | None:
@@ -236,49 +325,58 @@ def _correlation_figure(found: Inspection) -> str | None:
         return svg(fig)
 
 
-def _difference(first: Inspection, second: Inspection, moved: Sequence[Shift]) -> PageValues:
-    """PageValues of the section on two datasets."""
+def _difference(first: Inspection, second: Inspection, moved: Sequence[Shift]) -> Section:
+    """Compare two datasets."""
     a, b = first.contents, second.contents
     beyond = [shift for shift in moved if shift.distance > shift.chance]
     rows = [
-        [
-            s.column,
-            f"{s.distance:.3f}",
-            f"{s.chance:.3f}",
-            *(f"{m:.4g}" for m in s.medians),
+        (
+            s.column, f"{s.distance:.3f}", f"{s.chance:.3f}", *(f"{m:.4g}" for m in s.medians),
             "{} and {}".format(*s.counts),
-        ]
+        )
         for s in moved
-    ]
+    ]  # fmt: skip
     groups = [
-        [name, f"{distance:.3f}", value, f"{one:.1%}", f"{other:.1%}"]
+        (name, f"{distance:.3f}", value, f"{one:.1%}", f"{other:.1%}")
         for name, distance, parts in shares(a, b)
         for value, one, other in parts
     ]
-    return {
-        "names": [str(a.folder.path), str(b.folder.path)],
-        "compared": len(moved),
-        "beyond": len(beyond),
-        "rows": rows,
-        "groups": groups[:100],
-        "histograms": [_both(first, second, shift) for shift in beyond[:_SHIFTS]],
-        "only": [(only_in(a, b), str(a.folder.path)), (only_in(b, a), str(b.folder.path))],
-    }
+    header = ("number", "distance", "by chance", "median, first", "median, second", "counted")
+    content: list[Content] = [
+        f"{len(beyond)} of {len(moved)} numbers differ by more than chance. The distance of Kolmogorov and Smirnov is "
+        "the largest difference of the two cumulative distributions, from 0 to 1. Two samples of one distribution "
+        'exceed the distance "by chance" in one case of twenty. Numbers that are the same in all images of a subject '
+        "count once per subject.",
+    ]
+    if beyond:
+        content += [
+            Key([(IMAGE, str(a.folder.path)), (ANALYTIC, str(b.folder.path))]),
+            "The first and the last bar hold all beyond.",
+            Gallery([_both(first, second, shift) for shift in beyond[:_SHIFTS]], width_rem=_HISTOGRAM_REM),
+        ]
+    content += [
+        Table(header, rows, "All numbers that both have", wide=(0,), folded=len(rows) > 20),
+        Table(
+            ("group", "distance", "value", "first", "second"),
+            groups[:100],
+            "Shares of groups; the distance is half the sum of the differences",
+        ),
+    ]
+    for own, other in ((a, b), (b, a)):
+        names = only_in(own, other)
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        if names:
+            content.append(f"Only in {own.folder.path}: {', '.join(names[:_NAMED])}{more}.")
+    return Section("Difference of the two", *content)
 
 
-def _both(first: Inspection, second: Inspection, shift: Shift) -> PageValues:
-    """Histograms of a column in both datasets, with the bins of both."""
+def _both(first: Inspection, second: Inspection, shift: Shift) -> Picture:
+    """Draw histograms of a column in both datasets, with the bins of both."""
     values = [one.contents.columns[shift.column].astype(float) for one in (first, second)]
     values = [v[np.isfinite(v)] for v in values]
     low, high = np.quantile(np.concatenate([np.quantile(v, (0.002, 0.998)) for v in values]), (0, 1))
     edges = np.linspace(low, high if high > low else low + 1, 31)
     # Shares, so that the areas of two datasets of different sizes are equal.
-    bars = [binned(v, edges) / len(v) for v in values]
-    top = max(float(part.max()) for part in bars)
-    paths = [_bars(np.round(1e6 * part / top).astype(np.int64)) if top else "" for part in bars]
-    return {
-        "name": shift.column,
-        "bars": paths,
-        "text": f"{edges[0]:.4g} … {edges[-1]:.4g}",
-        "more": f"distance {shift.distance:.3f}",
-    }
+    bars = [np.round(1e6 * binned(v, edges) / len(v)).astype(np.int64) for v in values]
+    lines = [shift.column, f"{edges[0]:.4g} … {edges[-1]:.4g}", f"distance {shift.distance:.3f}"]
+    return _bars(shift.column, bars, [IMAGE, ANALYTIC]), lines

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from ...base.arrays import Bytes
 from ...folders.imagefile import png_bytes
+from ...report.overlay import picture
 from ...report.page import Card, Figure, Page, Section, Table, write_page
 from ...report.style import ANALYTIC, IMAGE, figure, svg
 from .figures import FIGURES
@@ -27,10 +27,10 @@ def write(
 ) -> None:
     """Write the page of one or two folders."""
     title = "How real the pictures look" if len(found) == 1 else "Two folders of pictures compared"
-    sections = [Section("Figures", figures=_spread(found) if len(found) == 2 else (), tables=[_table(found, ratios)])]
+    sections = [Section("Figures", _spread(found) if len(found) == 2 else None, _table(found, ratios))]
     if test is not None:
         sections.append(_separability(found, test))
-    sections += [Section(f"Pictures of {f.path}", text=[_about(f)], figures=_montage(f)) for f in found]
+    sections += [Section(f"Pictures of {f.path}", _about(f), _montage(f)) for f in found]
     skipped = [[f.path, s.name, s.reason] for f in found for s in f.skipped[:50]]
     if skipped:
         table = Table(
@@ -40,7 +40,7 @@ def write(
             wide=(2,),
             folded=True,
         )
-        sections.append(Section("Not measured", tables=[table]))
+        sections.append(Section("Not measured", table))
     cards = [Card(f"{len(f.rows)} of {f.images}", f"images of {f.path} measured") for f in found]
     lead = [
         "All figures but noise and clipped pixels are measured in pictures resized so that the iris' radius R is 50 "
@@ -78,7 +78,7 @@ def _table(found: Sequence[FolderFigures], ratios: Mapping[str, float | None] | 
         if ratios is not None:
             row.append(text(ratios[name]))
         rows.append([*row, meaning])
-    return Table(header=header, rows=rows, wide=(len(header) - 1,))
+    return Table(header, rows, wide=(len(header) - 1,))
 
 
 def _cell(f: FolderFigures, name: str) -> str:
@@ -100,20 +100,20 @@ def _separability(found: Sequence[FolderFigures], test: Mapping[str, Separabilit
         rows.append([kind, f"{result.auc:.2f}", f"{low:.2f} to {high:.2f}", "{} and {}".format(*result.images)])
         for f, shown in zip(found, result.revealing, strict=True):
             figures.append(_enlarged(montage(shown, len(shown)), f"{kind}: most typical of {f.path}"))
-    table = Table(header=("patch", "area under the ROC curve", "90 % interval", "images"), rows=rows)
-    text = [
+    table = Table(("patch", "area under the ROC curve", "90 % interval", "images"), rows)
+    text = (
         "A classifier was trained on patches of some images and asked to which folder those of other images belong; .5 "
         "is chance, 1 is certainty. All patches have equal scale, blur, compression and noise. Read it beside the "
         "same test of two folders of real frames of different cameras. The patches shown reveal their folder most."
-    ]
-    return Section("Can they be told apart?", text=text, tables=[table], figures=figures)
+    )
+    return Section("Can they be told apart?", text, *figures, table)
 
 
-def _spread(found: Sequence[FolderFigures]) -> list[Figure]:
+def _spread(found: Sequence[FolderFigures]) -> Figure | None:
     """Plot the middle half of the images of both folders, relative to the median of the second."""
     names = [n for n in FIGURES if all(f.values(n) for f in found) and (found[1].median(n) or 0) > 0]
     if not names:
-        return []
+        return None
     with figure(8.4, 0.34 * len(names) + 1.2) as (fig, ax):
         for k, (f, colour) in enumerate(zip(found, (IMAGE, ANALYTIC), strict=True)):
             for row, name in enumerate(names):
@@ -127,26 +127,20 @@ def _spread(found: Sequence[FolderFigures]) -> list[Figure]:
         ax.set(xscale="log", ylim=(len(names) - 0.5, -0.5), xlabel=f"value over the median of {found[1].path}")
         ax.set_yticks(range(len(names)), names)
         fig.legend(loc="outside upper center", ncols=2, frameon=False)
-        return [Figure(svg(fig), "Medians (dots) and the middle half of the images (bars).")]
+        return Figure(svg(fig), "Medians (dots) and the middle half of the images (bars).")
 
 
-def _montage(f: FolderFigures) -> list[Figure]:
+def _montage(f: FolderFigures) -> Figure | None:
     if not f.tiles:
-        return []
+        return None
     count = min(len(f.tiles), _TILES)
     sheet = montage([f.tiles[k * len(f.tiles) // count] for k in range(count)])
-    return [_enlarged(sheet, f.path, 1)]
+    return _enlarged(sheet, f.path, 1)
 
 
 def _enlarged(sheet: Bytes, caption: str, times: int = 3) -> Figure:
     height, width = sheet.shape
-    data = base64.b64encode(png_bytes(sheet)).decode()
-    size = f'width="{width}" height="{height}"'
-    picture = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{times * width}">'
-        f'<image href="data:image/png;base64,{data}" {size}/></svg>'
-    )
-    return Figure(picture, caption)
+    return Figure(picture(png_bytes(sheet), "png", (width, height), width=times * width, title=caption), caption)
 
 
 def montage(tiles: Sequence[Bytes], columns: int = _COLUMNS) -> Bytes:

@@ -32,7 +32,7 @@ from ...imaging.imageobserver import ImageObserver
 from ...optics.transforms import direction_of
 from ...population.people import Person
 from ...report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
-from ...report.style import figure, svg
+from ...report.style import heat_map
 from ...scene import Scene
 from ...scene.people import Population
 from ...scene.spec import SceneSpec, Targets
@@ -323,18 +323,13 @@ def _gaze_section(survey: Survey, found: Figures) -> Section:
     )  # fmt: skip
     a, e = survey.azimuth_deg, survey.elevation_deg
     drawn = []
-    for title, values, (low, high) in maps:
-        with figure(3.3, 2.7) as (fig, ax):
-            grid = np.where(np.isfinite(values), values, np.nan).reshape(GRID, GRID)
-            image = ax.imshow(grid, extent=(-a, a, -e, e), aspect="auto", vmin=low, vmax=high)
-            fig.colorbar(image)
-            ax.grid(False)
-            ax.set_xlabel("azimuth to the left (deg)")
-            ax.set_ylabel("elevation (deg)")
-            drawn.append(
-                Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over azimuth and elevation of the optic axis.", True)
-            )
-    return Section("Where does the rig see well?", [], drawn)
+    for title, values, ends in maps:
+        grid = np.where(np.isfinite(values), values, np.nan).reshape(GRID, GRID)
+        drawing = heat_map(grid, (-a, a, -e, e), ("azimuth to the left (deg)", "elevation (deg)"), ends=ends)
+        drawn.append(
+            Figure(drawing, f"{title[0].upper()}{title[1:]}, over azimuth and elevation of the optic axis.", True)
+        )
+    return Section("Where does the rig see well?", *drawn)
 
 
 def _who_section(survey: Survey, found: Figures, data: dict[str, Any]) -> Section:
@@ -356,12 +351,12 @@ def _who_section(survey: Survey, found: Figures, data: dict[str, Any]) -> Sectio
     why = {"ray": "no ray: the mirror point is off the cornea", "sensor": "off the sensor", "lid": "behind a lid"}
     missing = [[why[name], f"{100 * share:.1f} %"] for name, share in data["glints_missing"].items()]
     tables = [
-        Table(header=["visible", "people x directions"], rows=coverage, caption="Coverage."),
-        Table(header=["reason", "glints"], rows=missing, caption="Why glints are missing. Lashes are not considered."),
-        Table(header=["person", "covered", "glints", "outline", "noise, 95th percentile", *TRAITS], rows=rows,
+        Table(["visible", "people x directions"], coverage, caption="Coverage."),
+        Table(["reason", "glints"], missing, caption="Why glints are missing. Lashes are not considered."),
+        Table(["person", "covered", "glints", "outline", "noise, 95th percentile", *TRAITS], rows,
               caption="The ten people for whom the rig covers least; those with the same coverage by their noise."),
     ]  # fmt: skip
-    return Section("For whom does it fail?", [], [], tables)
+    return Section("For whom does it fail?", *tables)
 
 
 def _traits_of(person: Person) -> list[str]:
@@ -375,25 +370,20 @@ def _slippage_section(data: dict[str, Any]) -> Section:
     rows = data["slippage"]
     plane, away = rows[: len(SHIFTS_MM) ** 2], rows[len(SHIFTS_MM) ** 2 :]
     drawn = []
-    for key, title, (low, high) in (
+    for key, title, ends in (
         ("noise_deg", "noise of gaze (median, deg)", (None, None)),
         ("covered_2_glints", "share of directions with two glints and 60 % of the outline", (0, 1)),
     ):
         values = np.array([np.nan if row[key] is None else row[key] for row in plane]).reshape(2 * (len(SHIFTS_MM),))
-        with figure(3.3, 2.7) as (fig, ax):
-            image = ax.imshow(values, extent=(-3.75, 3.75, -3.75, 3.75), aspect="auto", vmin=low, vmax=high)
-            fig.colorbar(image)
-            ax.grid(False)
-            ax.set_xlabel("eye to the left (mm)")
-            ax.set_ylabel("eye up (mm)")
-            drawn.append(Figure(svg(fig), f"{title[0].upper()}{title[1:]}, over the place of the eye.", True))
+        drawing = heat_map(values, (-3.75, 3.75, -3.75, 3.75), ("eye to the left (mm)", "eye up (mm)"), ends=ends)
+        drawn.append(Figure(drawing, f"{title[0].upper()}{title[1:]}, over the place of the eye.", True))
     table = [
         [f"{row['shift_mm'][0]:+.1f} mm", degrees_text(row["noise_deg"]), f"{100 * row['covered_2_glints']:.1f} %"]
         for row in away
     ]
     text = f"The first {_SLIPPING} people in all directions, with the eye shifted against the rig."
     head = ["nearer by", "noise", "covered"]
-    return Section("What does slippage do?", [text], drawn, [Table(header=head, rows=table)])
+    return Section("What does slippage do?", text, *drawn, Table(head, table))
 
 
 def _bias_section(data: dict[str, Any]) -> Section:
@@ -409,19 +399,19 @@ def _bias_section(data: dict[str, Any]) -> Section:
             columns = 4 if any(row[3] for row in rows) else 3
             caption = f"Errors on {what}, {count} {'person' if count == 1 else 'people'}."
             head = ["estimator", "U50E95", "U95E95", "note"][:columns]
-            tables.append(Table(header=head, rows=[row[:columns] for row in rows], caption=caption, wide=(3,)))
+            tables.append(Table(head, [row[:columns] for row in rows], caption=caption, wide=(3,)))
     text = (
         "Estimators that need no screen, each calibrated on nine targets. Errors on exact features have no noise: this "
         "is what each estimator assumes wrongly about the eye. Errors on rendered images add noise, lids, lashes and "
         "the extractor. With few people, U50E95 and U95E95 are almost the same."
     )
-    return Section("What do estimators add?", [text], [], tables)
+    return Section("What do estimators add?", text, *tables)
 
 
 def _safety_section(data: dict[str, Any]) -> Section:
     safety = data["safety"]
     if "lights" not in safety:
-        return Section("Eye safety", [f"{safety['reason']}. This is {NOTE}."])
+        return Section("Eye safety", f"{safety['reason']}. This is {NOTE}.")
     rows = []
     for light in safety["lights"]:
         retina = light["retina"]
@@ -433,4 +423,4 @@ def _safety_section(data: dict[str, Any]) -> Section:
         f"place of an eye box of 3 mm about the eye. This is {NOTE}."
     )
     head = ["LED", "distance (mm)", "cornea (W/m²)", "retina"]
-    return Section("Eye safety", [text], [], [Table(header=head, rows=rows, wide=(3,))])
+    return Section("Eye safety", text, Table(head, rows, wide=(3,)))

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Floats
+from ...report.page import Card, Content, Figure, Page, Section, Table, number
 from . import conditions as c
 from .conditions import ConditionsPart, PeoplePart
 from .figures import lines_figure, map_figure, sensitivity_figure
-from .page_parts import Report, Values, number
 from .results import Finding
 
 _WHO = {
@@ -83,47 +83,114 @@ def more(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> 
     }
 
 
-def page(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found: Sequence[Finding]) -> Report:
+def page(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found: Sequence[Finding]) -> Page:
     """Compose the report."""
-    head = np.array(c.HEAD_MM)
-    moved = ("to the subject's left (mm)", "towards the screen (mm)", "mean error (deg)", [(0.0, 0.0)])
-    across = ("to the subject's right (mm)", "up (mm)", "error (deg)")
-    values: Values = {
-        "trackers": {t: _WHO[t] for t in c.TRACKERS},
-        "models": [p.eye_model for p in parts],
-        "largest": [
-            (" ".join(f"{p.eye_model}\u00a0{np.nanmax(p.head_maps[t]):.2f}" for p in parts), t) for t in c.TRACKERS
-        ],
-        "screen_maps": {
-            t: map_figure(
-                {p.eye_model: p.screen_maps[t] for p in parts}, *_screen_axes(t, parts[0].screen_maps[t]), *across
-            )
-            for t in c.TRACKERS
-        },
-        "head_maps": {
-            t: map_figure({p.eye_model: p.head_maps[t] for p in parts}, head, head, *moved) for t in c.TRACKERS
-        },
-        "diameters": {t: _over_diameters(t, {p.eye_model: p.diameters for p in parts}) for t in c.TRACKERS},
-        "people": {
-            t: _over_diameters(t, {f"person {k}": found for p in people for k, found in p.diameters.items()})
-            for t in c.TRACKERS
-            if people
-        },
-        "sensitivity": _sensitivity_figure(parts),
-        "failed": [text for p in parts if (text := _failed(p))],
-        "noise_px": f"{c.NOISE_PX:g}",
-        "samples": c.SAMPLES,
-        "seed": c.SEED,
-        "precision": [
-            (t, p.eye_model, *(f"{p.precision[t][k]:.4f}" for k in c.QUALITY)) for t in c.TRACKERS for p in parts
-        ],
-        "values": [(f.id, f.rule, f"{f.value:.4f}", f.detail) for f in found],
-        "rows": [
-            (r.eye_model, r.variant or "", number(r.mean_deg), number(r.sd_deg), str(r.n), str(r.missing))
-            for r in [*(r for p in parts for r in p.rows), *(r for p in people for r in p.rows)]
-        ],
-    }
-    return Report("conditions.html.j2", values)
+    who = "; ".join(f"{t}: {_WHO[t]}" for t in c.TRACKERS)
+    lead = [
+        "This study shows how the errors of two trackers depend on the target, the head, the pupil and the eye. All "
+        f"features are analytic. {who}. Eye models: {', '.join(p.eye_model for p in parts)}."
+    ]
+    cards = [
+        Card(
+            " ".join(f"{p.eye_model}\u00a0{np.nanmax(p.head_maps[t]):.2f}" for p in parts),
+            f"largest mean error (deg) over heads within 40 mm, {t}",
+        )
+        for t in c.TRACKERS
+    ]
+    sections = [
+        Section(
+            "Over the screen",
+            "The maps show the error at each target for the central head position and a 4 mm pupil.",
+            *(_screen_map(t, parts) for t in c.TRACKERS),
+        ),
+        Section(
+            "Over head positions",
+            "The maps show the mean error over 3 x 3 targets after the head has moved from the calibration "
+            "position (0, 0).",
+            *(_head_map(t, parts) for t in c.TRACKERS),
+        ),
+        Section("Over the pupil diameter", *_diameters(parts, people)),
+        _sensitivity(parts),
+        _precision(parts),
+        _values(parts, people, found),
+    ]
+    return Page("Beyond the paper: conditions", lead, cards, sections)
+
+
+def _screen_map(tracker: str, parts: Sequence[ConditionsPart]) -> Figure:
+    maps = {p.eye_model: p.screen_maps[tracker] for p in parts}
+    x, y = _screen_axes(tracker, parts[0].screen_maps[tracker])
+    return Figure(
+        map_figure(maps, x, y, "to the subject's right (mm)", "up (mm)", "error (deg)"),
+        f"{tracker}: {_WHO[tracker]}. Screen coordinates are measured from the centre of the screen.",
+    )
+
+
+def _head_map(tracker: str, parts: Sequence[ConditionsPart]) -> Figure:
+    maps, head = {p.eye_model: p.head_maps[tracker] for p in parts}, np.array(c.HEAD_MM)
+    labels = ("to the subject's left (mm)", "towards the screen (mm)", "mean error (deg)")
+    return Figure(
+        map_figure(maps, head, head, *labels, [(0.0, 0.0)]),
+        f"{tracker}: {_WHO[tracker]}. The cross marks the calibration position.",
+    )
+
+
+def _diameters(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart]) -> list[Content]:
+    models = {p.eye_model: p.diameters for p in parts}
+    out: list[Content] = [
+        "The trackers are calibrated with a 4 mm pupil and tested with other diameters. The pupils widen about a fixed "
+        "centre, or about one that shifts with the diameter, by .06 mm per mm towards the nose as the pupil narrows "
+        "(the default of eye.margin). The eyes of a model are mirror images of each other, so horizontal errors cancel "
+        "in the mean of both; the error of one eye stands beside it.",
+        *(Figure(_over_diameters(t, models), f"{t}: mean error by pupil diameter and eye model.") for t in c.TRACKERS),
+    ]
+    if people:
+        drawn = {f"person {k}": found for p in people for k, found in p.diameters.items()}
+        out.append("The eyes of a drawn person differ, and so do the shifts of their pupils.")
+        for t in c.TRACKERS:
+            out.append(Figure(_over_diameters(t, drawn), f"{t}: mean error of drawn people by pupil diameter."))
+    return out
+
+
+def _sensitivity(parts: Sequence[ConditionsPart]) -> Section:
+    failed = "; ".join(text for p in parts if (text := _failed(p)))
+    return Section(
+        "Sensitivity to the eye parameters",
+        "One parameter of the eye grows by one step, and the tracker is calibrated on the changed eye. The figure "
+        "shows the change of the mean error, as half the difference between plus and minus one step.",
+        Figure(
+            _sensitivity_figure(parts),
+            "Each row is a parameter, with its step in brackets. A parameter that a model does not have (asphericity "
+            f"of a sphere, a posterior cornea) has no marker. {failed}",
+        ),
+    )
+
+
+def _precision(parts: Sequence[ConditionsPart]) -> Section:
+    rows = [(t, p.eye_model, *(number(p.precision[t][k]) for k in c.QUALITY)) for t in c.TRACKERS for p in parts]
+    return Section(
+        "Accuracy and precision",
+        f"Pupil centres and glints have Gaussian noise of {c.NOISE_PX:g} px in x and y, with {c.SAMPLES} samples per "
+        f"fixation and seed {c.SEED}. Accuracy is the angle from the target to the mean estimate. RMS-S2S is the root "
+        "mean square angle between successive samples. SD is the standard deviation about the mean. The table gives "
+        "means over all fixations, in degrees.",
+        Table(("tracker", "eye model", "accuracy", "RMS-S2S", "SD"), rows),
+    )
+
+
+def _values(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found: Sequence[Finding]) -> Section:
+    values = [(f.id, f.rule, number(f.value), f.detail) for f in found]
+    rows = [
+        (r.eye_model, r.variant or "", number(r.mean_deg), number(r.sd_deg), str(r.n), str(r.missing))
+        for part in (*parts, *people)
+        for r in part.rows
+    ]
+    header = ("eye model", "condition", "mean (deg)", "SD (deg)", "n", "missing")
+    return Section(
+        "Values",
+        Table(("id", "statement", "value", "detail"), values, wide=(1,)),
+        Table(header, rows, "Every condition", folded=True),
+    )
 
 
 def _over_diameters(tracker: str, who: dict[str, dict[str, list[float]]]) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from ...base.arrays import Floats
 from ...report.style import figure, legend_above, svg
 from .figures import STYLES
 
@@ -22,41 +24,42 @@ _ADDS = {term: term if term == "algorithm" else f"+ {term}" for term in _TERMS}
 
 def distances_figure(panels: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
     """Draw median distances (px) by eye model: feature -> series -> eye model -> px."""
-    models = list(dict.fromkeys(m for by in panels.values() for values in by.values() for m in values))
-    with figure(_width(panels), 3.9, len(panels)) as (fig, axes):
-        for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
-            for i, (label, values) in enumerate(by.items()):
-                marker, colour = STYLES[i % len(STYLES)]
-                at = [j for j, m in enumerate(models) if m in values]
-                x = np.array(at) + _shift(i, len(by))
-                ax.scatter(x, [values[models[j]] for j in at], s=38, marker=marker, color=colour, label=label)
-            ax.set_xticks(range(len(models)), models)
-            ax.set_xlim(-0.5, len(models) - 0.5)
-            ax.set_ylim(0, 1.12 * max((v for values in by.values() for v in values.values()), default=1.0))
-            ax.grid(axis="x", visible=False)
-            ax.set(title=name, ylabel="median distance (px)" if k == 0 else "", xlabel="eye model")
-        legend_above(fig, np.atleast_1d(axes)[0], 4 if len(panels) > 2 else 2)
-        return svg(fig)
+
+    def draw(ax: Any, x: Floats, values: Sequence[float], marker: str, colour: str, label: str) -> None:
+        ax.scatter(x, values, s=38, marker=marker, color=colour, label=label)
+        ax.set_ylim(0, max(ax.get_ylim()[1], 1.12 * max(values, default=1.0)))
+
+    return _by_model(panels, draw, "median distance (px)")
 
 
 def differences_figure(panels: Mapping[str, Mapping[str, Mapping[str, tuple[float, float, float]]]]) -> str:
     """Draw paired differences (deg) with their interval: estimator -> series -> eye model -> (mean, low, high)."""
+
+    def draw(ax: Any, x: Floats, values: Sequence[Any], marker: str, colour: str, label: str) -> None:
+        mean, low, high = np.array(values).reshape(-1, 3).T
+        ax.axhline(0, color="#444444", lw=0.8)
+        ax.errorbar(
+            x, mean, yerr=[mean - low, high - mean], fmt=marker, ms=6, color=colour, elinewidth=1.3, capsize=2.5,
+            label=label,
+        )  # fmt: skip
+
+    return _by_model(panels, draw, "difference of the gaze error (deg)")
+
+
+def _by_model(panels: Mapping[str, Mapping[str, Mapping[str, Any]]], draw: Callable[..., None], ylabel: str) -> str:
+    """Draw a panel per key and a series per protocol and observer, over the eye models."""
     models = list(dict.fromkeys(m for by in panels.values() for values in by.values() for m in values))
-    with figure(_width(panels), 3.9, len(panels)) as (fig, axes):
+    with figure(max(5.4, min(4.4 * len(panels), 13.0)), 3.9, len(panels)) as (fig, axes):
         for k, (ax, (name, by)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
-            ax.axhline(0, color="#444444", lw=0.8)
             for i, (label, values) in enumerate(by.items()):
                 marker, colour = STYLES[i % len(STYLES)]
                 at = [j for j, m in enumerate(models) if m in values]
-                mean, low, high = np.array([values[models[j]] for j in at]).reshape(-1, 3).T
-                ax.errorbar(
-                    np.array(at) + _shift(i, len(by)), mean, yerr=[mean - low, high - mean], fmt=marker, ms=6,
-                    color=colour, elinewidth=1.3, capsize=2.5, label=label,
-                )  # fmt: skip
+                x = np.array(at) + (i - (len(by) - 1) / 2) * min(0.16, 0.7 / len(by))
+                draw(ax, x, [values[models[j]] for j in at], marker, colour, label)
             ax.set_xticks(range(len(models)), models)
             ax.set_xlim(-0.5, len(models) - 0.5)
             ax.grid(axis="x", visible=False)
-            ax.set(title=name, ylabel="difference of the gaze error (deg)" if k == 0 else "", xlabel="eye model")
+            ax.set(title=name, ylabel=ylabel if k == 0 else "", xlabel="eye model")
         legend_above(fig, np.atleast_1d(axes)[0], 4 if len(panels) > 2 else 2)
         return svg(fig)
 
@@ -97,13 +100,3 @@ def budget_figure(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float, f
         order = [t for t in (*_ADDS.values(), "sum") if t in handles]
         fig.legend([handles[t] for t in order], order, loc="outside upper center", ncols=len(order), frameon=False)
         return svg(fig)
-
-
-def _width(panels: Mapping[str, object]) -> float:
-    """Return the width of a figure, inches."""
-    return max(5.4, min(4.4 * len(panels), 13.0))
-
-
-def _shift(i: int, n: int) -> float:
-    """Compute the offset of the i-th of n series from a tick."""
-    return (i - (n - 1) / 2) * min(0.16, 0.7 / n)

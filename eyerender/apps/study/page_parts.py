@@ -1,15 +1,11 @@
-"""Sections shared by several studies' reports, in `templates/sections.html.j2`."""
+"""Sections shared by several studies' reports."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import numpy as np
-
-from ...report.page import write_template
+from ...report.page import Card, Figure, Section, Table, number
 from .budget import ALGORITHM, BOTH, EYE, IMAGE, NOISE, Budget, Term
 from .figures import waterfall_figure
 from .observer_figures import budget_figure, differences_figure, distances_figure
@@ -17,39 +13,47 @@ from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
 from .results import Departure, Erratum, Finding, WaterfallStep
 
 Apart = tuple[Sequence[FeatureDifference], Sequence[GazeDifference]]
-Values = dict[str, Any]
-"""Values of a template: text, numbers as text, rows of a table, <svg> elements."""
 T = TypeVar("T")
 _Key = tuple[str, str, str, str]  # panel, protocol, observer, eye model
 _Panels = dict[str, dict[str, dict[str, T]]]
 
+ABOUT_OBSERVERS = (
+    "'Analytic' features come from ray optics. 'Image' features come from rendered images with sensor noise, and "
+    "'image-noiseless' features from renderings of the same seed without noise."
+)
+ABOUT_READINGS = (
+    "'Published' does what the authors' software did, with all its departures from the text of the paper. 'Corrected' "
+    f"does what the text and the cited algorithm say. {ABOUT_OBSERVERS}"
+)
+_NETS = (
+    "From left to right, the terms add up to the sum. They are net effects: a cause that moves gaze across the "
+    "existing error has nearly none. The rms angle between the paired estimates, in parentheses in the table, shows "
+    "how far it moves gaze."
+)
 
-@dataclass(frozen=True, slots=True)
-class Report:
-    """Template of a study's report and its values."""
 
-    template: str
-    values: Values
-
-    def write(self, path: Path) -> None:
-        """Write one self-contained HTML file; on an error, nothing is left."""
-        write_template(path, self.template, self.values, package="eyerender.apps.study")
-
-
-def overview(cells: Mapping[tuple[str, str], Mapping[str, str]]) -> Values:
+def overview(cells: Mapping[tuple[str, str], Mapping[str, str]], what: str) -> tuple[list[Card], Table | None]:
     """Return a page's first values, by (protocol, observer) and eye model: cards, or a table for more than four."""
     models = list(dict.fromkeys(m for by_model in cells.values() for m in by_model))
     if len(cells) <= 4:
         cards = [
-            (" ".join(f"{m}\u00a0{v}" for m, v in by_model.items()), ", ".join(key)) for key, by_model in cells.items()
+            Card(" ".join(f"{m}\u00a0{v}" for m, v in by_model.items()), f"{what}, {', '.join(key)}")
+            for key, by_model in cells.items()
         ]
-        return {"cards": cards, "models": models, "rows": []}
+        return cards, None
     rows = [(*key, *(by_model.get(m, "-") for m in models)) for key, by_model in cells.items()]
-    return {"cards": [], "models": models, "rows": rows}
+    caption = f"{what[0].upper()}{what[1:]}"
+    return [], Table(("protocol", "observer", *models), rows, caption=caption)
 
 
-def budget_values(made_of: Sequence[Budget], shown: Sequence[str]) -> Values | None:
-    """Return the values of the error budget's section; `shown` names the estimators drawn. None for a single term."""
+def budget_section(made_of: Sequence[Budget], shown: Sequence[str], who: str) -> Section | None:
+    """Say what the gaze error is made of; None for a single term.
+
+    Args:
+        made_of: the error budgets.
+        shown: the estimators drawn.
+        who: the algorithm in words.
+    """
     if not any(len(b.terms) > 1 for b in made_of):
         return None
     protocols = list(dict.fromkeys(b.protocol for b in made_of))
@@ -61,21 +65,41 @@ def budget_values(made_of: Sequence[Budget], shown: Sequence[str]) -> Values | N
         for name in shown
         if any(b.estimator == name for b in drawn)
     }
-    return {
-        "reference": made_of[0].reference,
-        "terms": terms,
-        "estimators": [_in_words(name, [b for b in drawn if b.estimator == name], terms) for name in panels],
-        "figure": budget_figure(panels),
-        "reading": f" ({protocol} reading)" if protocol in ("corrected", "published") else "",
-        "rows": [
-            (
-                b.protocol, b.estimator, b.eye_model, str(b.n), *(_told(b.term(term)) for term in terms),
-                number(b.total_deg),
-            )
-            for b in made_of
-            if b.estimator in shown
-        ],
-    }  # fmt: skip
+    reference = made_of[0].reference
+    said = {
+        ALGORITHM: f"'algorithm' is the error of {who} on exact features of {reference}, the simplest eye of this run",
+        EYE: f"'eye model' is what exact features of the model add to that of {reference}",
+        IMAGE: "'image' is what rendering an image and extracting its features adds",
+        NOISE: "'noise' is what the sensor noise adds",
+        BOTH: "'image and noise' is what noisy images add to exact features",
+    }
+    reading = f" ({protocol} reading)" if protocol in ("corrected", "published") else ""
+    rows = [
+        (
+            b.protocol, b.estimator, b.eye_model, str(b.n), *(_told(b.term(term)) for term in terms),
+            number(b.total_deg),
+        )
+        for b in made_of
+        if b.estimator in shown
+    ]  # fmt: skip
+    table = Table(
+        ("protocol", "estimator", "eye model", "n", *(f"{term} (deg)" for term in terms), "sum (deg)"),
+        rows,
+        caption="Every term ± half its 95 % interval; in parentheses the rms angle between the paired estimates, and "
+        "of several exposures its shift and scatter",
+        folded=len(rows) > 6,
+    )
+    caption = (
+        f"The gaze error of each eye model and what it is made of{reading}. Whiskers: 95 % interval of the mean paired "
+        "difference over the frames."
+    )
+    return Section(
+        "What the gaze error is made of",
+        f"The error has these terms: {'; '.join(said[term] for term in terms)}. {_NETS}",
+        *(_in_words(name, [b for b in drawn if b.estimator == name], terms) for name in panels),
+        Figure(budget_figure(panels), caption),
+        table,
+    )
 
 
 def _bar(term: Term) -> tuple[str, float, float, float]:
@@ -95,7 +119,7 @@ def _told(term: Term | None) -> str:
     return f"{term.deg:+.4f} ± {(term.high_deg - term.low_deg) / 2:.4f}{rms}"
 
 
-def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> Values:
+def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> str:
     """Summarise one estimator: its own error, and the ranges of the terms over the eye models."""
     ranges = []
     for term in terms[1:]:
@@ -103,12 +127,14 @@ def _in_words(name: str, made_of: Sequence[Budget], terms: Sequence[str]) -> Val
         if values:
             low, high = f"{min(values):+.3f}", f"{max(values):+.3f}"
             ranges.append(f"{term} {low}" if low == high else f"{term} {low} to {high}")
-    own = next(b.terms[0].deg for b in made_of)
-    return {"name": name, "own_deg": f"{own:.3f}", "ranges": ranges}
+    return (
+        f"{name}: the error of the algorithm itself is {made_of[0].terms[0].deg:.3f} deg. Over the eye models, the "
+        f"terms are {', '.join(ranges)} deg."
+    )
 
 
-def observers_values(apart: Apart, shown: Sequence[str] = ()) -> Values | None:
-    """Return the values of the observers' section; None for a single observer. `shown` names the estimators drawn."""
+def observers_section(apart: Apart, shown: Sequence[str] = ()) -> Section | None:
+    """Compare the observers; None for a single one. `shown` names the estimators drawn."""
     features, gaze = apart
     if not features:
         return None
@@ -126,12 +152,44 @@ def observers_values(apart: Apart, shown: Sequence[str] = ()) -> Values | None:
         (g.estimator, g.protocol, g.observer, g.eye_model): (g.difference_deg, g.low_deg, g.high_deg) for g in gaze
     }
     estimators = [name for name in shown if any(g.estimator == name for g in gaze)]
-    return {
-        "distances": distances_figure(_panels(drawn, series, distances)),
-        "differences": differences_figure(_panels(estimators, series, differences)) if estimators else None,
-        "features": [_feature_row(f) for f in features],
-        "gaze": [_gaze_row(g) for g in gaze],
-    }
+    effect = None
+    if estimators:
+        effect = Figure(
+            differences_figure(_panels(estimators, series, differences)),
+            "The effect on the gaze error: mean of the paired differences, image minus analytic, with its 95 % "
+            "confidence interval. Above zero, images increase the error.",
+        )
+    feature_table = Table(
+        (
+            "protocol", "observer", "eye model", "feature", "n", "missing", "bias x (px)", "bias y (px)", "SD x (px)",
+            "SD y (px)", "median distance (px)", "bias at the eye (µm)", "SD at the eye (µm)",
+        ),
+        [_feature_row(f) for f in features],
+        caption="Features: bias and spread, in px and at the eye",
+        folded=len(features) > 30,
+    )  # fmt: skip
+    gaze_table = Table(
+        (
+            "protocol", "observer", "eye model", "estimator", "n", "analytic (deg)", "image (deg)", "difference (deg)",
+            "95 % interval",
+        ),
+        [_gaze_row(g) for g in gaze],
+        caption="Gaze errors: paired differences, image minus analytic",
+        folded=len(gaze) > 20,
+    )  # fmt: skip
+    return Section(
+        "The observers compared",
+        "The tables give image-derived minus analytic features of the same frames, and the resulting gaze errors. "
+        "Lengths at the eye are pixels times distance over focal length.",
+        Figure(
+            distances_figure(_panels(drawn, series, distances)),
+            "Median distance of image-derived from analytic features, by eye model. (Semi-axes: length of the "
+            "vector of both differences.)",
+        ),
+        effect,
+        feature_table,
+        gaze_table,
+    )
 
 
 def _panels(names: Sequence[str], series: Sequence[tuple[str, str]], values: Mapping[_Key, T]) -> _Panels[T]:
@@ -164,12 +222,12 @@ def _gaze_row(g: GazeDifference) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _micrometres(value: float | None) -> str:
-    return "-" if value is None else f"{1000 * value:.1f}"
+def _micrometres(mm: float | None) -> str:
+    return number(None if mm is None else 1000 * mm, 1)
 
 
-def findings_values(found: Sequence[Finding]) -> Values:
-    """Return every finding with its details, and one row per statement with a column per observer."""
+def findings_section(found: Sequence[Finding]) -> Section:
+    """List every finding; one row per statement and a column per observer, where several tested it."""
     told = {True: "true", False: "false", None: ""}
     rows = [
         (
@@ -178,23 +236,36 @@ def findings_values(found: Sequence[Finding]) -> Values:
         )
         for f in found
     ]  # fmt: skip
+    header = (
+        "id", "verdict", "statement: value", "value", "threshold", "protocol", "observer", "detail",
+        "the paper's sentence",
+    )  # fmt: skip
     keys = list(dict.fromkeys((f.protocol, f.observer) for f in found))
+    text = "Each statement is tested on the data of this run. Its value is shown beside its threshold."
+    if len(keys) < 3:
+        return Section("Findings", text, Table(header, rows, wide=(2, 5, 7, 8)))
     by = {(f.id, f.rule, f.threshold, f.protocol, f.observer): f for f in found}
     sentences = {(f.id, f.rule, f.threshold): f.sentence for f in found}
     by_statement = []
-    for statement in dict.fromkeys((f.id, f.rule, f.threshold) for f in found):
+    for statement, sentence in sentences.items():
         cells = []
         for key in keys:
             f = by.get((*statement, *key))
             cells.append("" if f is None or f.value is None else f"{told[f.verdict]} {f.value:.3g}".strip())
-        by_statement.append((*statement, *cells, sentences[statement]))
-    return {"rows": rows, "readings": [", ".join(key) for key in keys], "by_statement": by_statement}
+        by_statement.append((*statement, *cells, sentence))
+    statements = Table(
+        ("id", "statement: value", "threshold", *map(", ".join, keys), "the paper's sentence"),
+        by_statement,
+        wide=(1, 3 + len(keys)),
+    )
+    details = Table(header, rows, "Every finding with its details", wide=(2, 5, 7, 8), folded=True)
+    return Section("Findings", text, statements, details)
 
 
-def waterfall_values(
+def waterfall_section(
     steps: Sequence[WaterfallStep], departures: Sequence[Departure], measures: Sequence[str]
-) -> Values | None:
-    """Return the steps from published to corrected; None if only one protocol was run."""
+) -> Section | None:
+    """Show the steps from published to corrected; None if only one protocol was run."""
     if not steps:
         return None
     models = list(dict.fromkeys(s.eye_model for s in steps))
@@ -210,23 +281,37 @@ def waterfall_values(
         return number(step.errors[measure]) + alone
 
     panels = {m: {e: [by[e, n].errors[m] for n in names] for e in shown} for m in measures}
-    return {
-        "figure": waterfall_figure(labels, panels),
-        "columns": [f"{e} {m}" for e in models for m in measures],
-        "rows": [
-            (label, *(cell(e, n, m) for e in models for m in measures)) for label, n in zip(labels, names, strict=True)
-        ],
-    }
+    table = Table(
+        ("corrected so far", *(f"{e} {m}" for e in models for m in measures)),
+        [(label, *(cell(e, n, m) for e in models for m in measures)) for label, n in zip(labels, names, strict=True)],
+        caption="Mean error (deg) after each correction; in brackets with that correction alone and all other "
+        "departures kept.",
+        folded=True,
+    )
+    return Section(
+        "From published to corrected",
+        "Departures of the authors' software are corrected one after the other, from top to bottom.",
+        Figure(waterfall_figure(labels, panels), "Mean error after each correction, by eye model."),
+        table,
+    )
 
 
-def errata_values(departures: Sequence[Departure], faults: Sequence[Erratum]) -> Values:
-    """Return the departures of the software, and the misprints of the paper."""
-    return {
-        "departures": [(d.title, d.paper, d.software, d.corrected) for d in departures],
-        "misprints": [(e.where, e.printed, e.used, e.effect) for e in faults],
-    }
-
-
-def number(value: float | None, decimals: int = 4) -> str:
-    """Format a number of a table; a dash for None."""
-    return "-" if value is None or not np.isfinite(value) else f"{value:.{decimals}f}"
+def errata_section(departures: Sequence[Departure], faults: Sequence[Erratum]) -> Section:
+    """List the departures of the software, and the misprints of the paper."""
+    wide = (0, 1, 2, 3)
+    return Section(
+        "Errata",
+        "This section lists where the authors' software departs from the paper, and the misprints of the paper.",
+        Table(
+            ("departure", "the paper", "the authors' software", "corrected"),
+            [(d.title, d.paper, d.software, d.corrected) for d in departures],
+            caption="Departures of the software",
+            wide=wide,
+        ),
+        Table(
+            ("where", "printed", "used", "effect"),
+            [(e.where, e.printed, e.used, e.effect) for e in faults],
+            caption="Misprints",
+            wide=wide,
+        ),
+    )

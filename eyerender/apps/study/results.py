@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Floats
-from ...base.storage.files import write_json, write_text
+from ...base.storage.files import csv_text, write_json, write_text
 from ...folders.imagefolder import versions
 from ...rig.rig import RigGeometry
 from ...scene.observation import Observations
@@ -169,12 +167,3 @@ def table(kind: type, items: Sequence[Any]) -> str:
     """Format dataclasses as CSV; empty cells for None."""
     names = [f.name for f in fields(kind)]
     return csv_text(names, ([getattr(item, name) for name in names] for item in items))
-
-
-def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Format rows as CSV; empty cells for None."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return text.getvalue()

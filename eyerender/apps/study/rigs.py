@@ -17,7 +17,7 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats, finite_or_none
 from ...base.progress import Progress
-from ...base.storage.files import write_json, write_text
+from ...base.storage.files import csv_text, write_json, write_text
 from ...design.choice import SiteInformation, choose_lights, noise_of_some
 from ...design.crowd import OUTLINE, coverage_of, figures_of_people, users_of
 from ...design.noise import sensor_noise
@@ -30,7 +30,6 @@ from ...scene.people import Population
 from ...scene.spec import SceneSpec
 from .layouts import KnownLayout, known_layouts
 from .options import StudyOptions
-from .results import csv_text
 from .rigs_page import write_rigs_page
 
 SCHEMA = "eyerender/study/1"

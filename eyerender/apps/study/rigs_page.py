@@ -11,7 +11,7 @@ import numpy as np
 from ...base.arrays import Floats
 from ...design.people import GRID, LOST
 from ...report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
-from ...report.style import figure, svg
+from ...report.style import figure, heat_map, svg
 
 
 def write_rigs_page(path: Path, data: Mapping[str, Any], maps: Mapping[str, Floats]) -> None:
@@ -32,12 +32,12 @@ def write_rigs_page(path: Path, data: Mapping[str, Any], maps: Mapping[str, Floa
         "Lashes and frames are not considered.",
     ]
     sections = (
-        Section("Which layout loses whom?", [], [], [_overview(rows), _regions(rows), _why(rows)]),
-        Section("Where?", [], [Figure(_map(maps[row["layout"]]), f"{row['layout']}: share of people who are lost, over "
+        Section("Which layout loses whom?", _overview(rows), _regions(rows), _why(rows)),
+        Section("Where?", *[Figure(_map(maps[row["layout"]]), f"{row['layout']}: share of people who are lost, over "
                 "azimuth (to the left) and elevation of the optic axis.", True) for row in rows]),
-        Section("Who?", [_WHO], [], [_who(rows)]),
-        Section("What does each LED buy?", [_LEDS], [Figure(_buys(rows), "Noise of the optic axis (median) with the "
-                "best LEDs of each number.")], [_led_table(rows)]),
+        Section("Who?", _WHO, _who(rows)),
+        Section("What does each LED buy?", _LEDS, Figure(_buys(rows), "Noise of the optic axis (median) with the "
+                "best LEDs of each number."), _led_table(rows)),
     )  # fmt: skip
     write_page(path, Page("Six rigs and a population", lead, cards, sections))
 
@@ -66,13 +66,13 @@ def _overview(rows: Any) -> Table:
     ]  # fmt: skip
     head = ["layout", "what", "lost", "outline", "and 1 glint", "2", "3", "U50E95", "U95E95", "cornea limit"]
     caption = "Shares of people x directions; noise of gaze with a known person; share of the corneal limit."
-    return Table(header=head, rows=body, caption=caption, wide=(1,))
+    return Table(head, body, caption, wide=(1,))
 
 
 def _regions(rows: Any) -> Table:
     names = list(rows[0]["lost_by_region"])
     body = [[row["layout"], *(_percent(row["lost_by_region"][name]) for name in names)] for row in rows]
-    return Table(header=["looking", *names], rows=body, caption="Lost, by where people look.")
+    return Table(["looking", *names], body, caption="Lost, by where people look.")
 
 
 def _why(rows: Any) -> Table:
@@ -80,7 +80,7 @@ def _why(rows: Any) -> Table:
         [row["layout"], str(len(row["leds"])), *(f"{row['glints_missing'][name]:.2f}" for name in LOST)] for row in rows
     ]
     head = ["layout", "LEDs", "off the cornea", "off the sensor", "behind a lid"]
-    return Table(header=head, rows=body, caption="Mean number of glints that are missing, by reason.")
+    return Table(head, body, "Mean number of glints that are missing, by reason.")
 
 
 def _who(rows: Any) -> Table:
@@ -89,7 +89,7 @@ def _who(rows: Any) -> Table:
         [row["layout"], *(f"{100 * low:.0f} / {100 * high:.0f} %" for low, _, high in row["lost_by_third"].values())]
         for row in rows
     ]
-    return Table(header=["layout", *names], rows=body, caption="Lost directions: lowest third / highest third.")
+    return Table(["layout", *names], body, caption="Lost directions: lowest third / highest third.")
 
 
 def _led_table(rows: Any) -> Table:
@@ -100,17 +100,13 @@ def _led_table(rows: Any) -> Table:
         for one in row["leds"]
     ]  # fmt: skip
     head = ["layout", "LEDs", "noise, median", "95th percentile", "1 glint", "2 glints", "which"]
-    return Table(header=head, rows=body, caption="Shares of people x nine directions.", folded=True)
+    return Table(head, body, "Shares of people x nine directions.", folded=True)
 
 
 def _map(values: Floats) -> str:
-    with figure(3.3, 2.7) as (fig, ax):
-        image = ax.imshow(100 * values.reshape(GRID, GRID), extent=(-20, 20, -15, 15), aspect="auto", vmin=0, vmax=100)
-        fig.colorbar(image, label="lost (%)")
-        ax.grid(False)
-        ax.set_xlabel("azimuth to the left (deg)")
-        ax.set_ylabel("elevation (deg)")
-        return svg(fig)
+    grid = 100 * values.reshape(GRID, GRID)
+    labels = ("azimuth to the left (deg)", "elevation (deg)")
+    return heat_map(grid, (-20, 20, -15, 15), labels, ends=(0, 100), bar="lost (%)")
 
 
 def _buys(rows: Any) -> str:

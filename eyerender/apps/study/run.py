@@ -13,10 +13,11 @@ from typing import Any
 from ...base.errors import EyerenderError, InputError
 from ...base.processes import mapper, usable_cpus
 from ...base.progress import Progress, Say, notify
-from ...base.storage.files import read_json, write_json, write_text
+from ...base.storage.files import csv_text, read_json, write_json, write_text
 from ...base.storage.lock import writer_lock
 from ...eye.catalogue import load_eye
 from ...folders.outfolder import clear, refuse_non_empty
+from ...report.page import write_page
 from ...scene import Scene
 from . import blignaut, guestrin, head_mounted, summarise
 from .conditions import DRAWN_PEOPLE, conditions_part, people_part
@@ -26,7 +27,7 @@ from .literature import MODELS, VARIANTS
 from .observing import ObserverKind, Observing
 from .options import StudyOptions
 from .replicate import blignaut_part, facing, guestrin_part, scenes_of
-from .results import csv_text, write_results
+from .results import write_results
 
 STUDIES = ("guestrin2006", "blignaut2014", "observers", "conditions")
 RUN_SCHEMA = "eyerender/study/1"
@@ -114,7 +115,7 @@ def run_study(
         summary = write_results(folder, name, rows, found, more)
         if "waterfall" in more:
             write_text(folder / "waterfall.csv", _waterfall_csv(more["waterfall"]))
-        page.write(folder / REPORT)
+        write_page(folder / REPORT, page)
         return summary
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
+from ...report.page import Page
 from . import (
     blignaut,
     blignaut_page,
@@ -22,11 +23,11 @@ from . import (
 from .budget import Budget, budgets
 from .conditions import ConditionsPart, PeoplePart
 from .literature import VARIANTS
-from .page_parts import Apart, Report
+from .page_parts import Apart
 from .replicate import BlignautPart, GuestrinPart
 from .results import Finding, ModelResults, Row
 
-Results = tuple[list[Row], list[Finding], dict[str, Any], Report]
+Results = tuple[list[Row], list[Finding], dict[str, Any], Page]
 
 
 def guestrin_results(parts: Sequence[GuestrinPart], protocols: Sequence[str]) -> Results:

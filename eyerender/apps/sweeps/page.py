@@ -37,15 +37,15 @@ def write_report(path: Path, data: Mapping[str, Any]) -> None:
         "light on the cornea, and better in one of them. The noise counts the sensor alone. What an estimator assumes "
         "wrongly about the eye comes on top.",
     ]
-    plots = [
+    plots = (
         Figure(_plot(rows, "dropout", "dropout (%)", 100.0), "Noise of gaze against dropout: the share of people and "
                "directions without two glints and 60 % of the outline. Orange: the Pareto front.", True),
         Figure(_plot(rows, "cornea_w_m2", "light on the cornea (W/m²)", 1.0),
                "Noise of gaze against light on the cornea.", True),
-    ]  # fmt: skip
+    )  # fmt: skip
     sections = (
-        Section("Which layouts are worth a look?", [], plots, [_table(front)]),
-        Section("How were LEDs chosen?", [_CHOICE], [], [_places(front)]),
+        Section("Which layouts are worth a look?", *plots, _table(front)),
+        Section("How were LEDs chosen?", _CHOICE, _places(front)),
     )
     write_page(path, Page(f"Sweep of rigs: {data['scene']}", lead, cards, sections))
 
@@ -76,7 +76,7 @@ def _places(front: Sequence[Mapping[str, Any]]) -> Table:
     """Return the table of the places of LEDs that layouts on the front use."""
     places = {k: mm for row in front for k, mm in zip(row["chosen"], row["lights_mm"], strict=True)}
     rows = [[str(k), ", ".join(f"{v:.4g}" for v in places[k])] for k in sorted(places)]
-    return Table(header=["place", "position (mm)"], rows=rows, caption="Places of LEDs on the Pareto front.")
+    return Table(["place", "position (mm)"], rows, caption="Places of LEDs on the Pareto front.")
 
 
 _CHOICE = (
@@ -116,7 +116,7 @@ def _table(front: Sequence[Mapping[str, Any]]) -> Table:
     head = ["layout", "what varies", "noise", "U95E95", "dropout", "LEDs", "cornea", "places of LEDs"]
     more = f" The first {_MOST_ROWS} of {len(front)}; layouts.csv has all." if len(front) > _MOST_ROWS else ""
     caption = f"The Pareto front; noise is the median, the cornea's share is of the limit.{more}"
-    return Table(header=head, rows=rows, caption=caption, wide=(1, 7))
+    return Table(head, rows, caption, wide=(1, 7))
 
 
 def _values(values: Mapping[str, Any]) -> str:

@@ -7,14 +7,16 @@ come from other people, so only regular files within a size limit are read.
 
 from __future__ import annotations
 
+import csv
 import errno
 import glob
+import io
 import json
 import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from io import BufferedReader
@@ -118,6 +120,15 @@ def write_bytes(path: str | Path, data: bytes, *, sync: bool = True) -> None:
 def write_text(path: str | Path, text: str, *, sync: bool = True) -> None:
     """Write UTF-8 text atomically; raises like `written`."""
     write_bytes(path, text.encode(), sync=sync)
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Format rows as CSV; empty cells for None."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def write_json(path: str | Path, data: Any, *, sync: bool = True) -> None:

@@ -1,0 +1,128 @@
+"""An image of one eye with its labels, as every reader of a folder gives it to the benchmark."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...base.arrays import Bytes, Floats
+from ...folders.imagefile import read_any_image, read_image
+from ...optics.ellipse import Ellipse
+from .bound import Edge
+from .glintlabels import TrueGlint
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BenchImage:
+    """One image of one eye; positions are relative to the image, with pixel centres at integers.
+
+    Attributes:
+        name: name of the image.
+        path: file.
+        bit_depth: bits of the file.
+        size: (width, height).
+        pupil: None where the image shows none, or only its centre is known.
+        outline_px: (n, 2) outline of the pupil.
+        visible: visible share of the pupil; None if unknown.
+        glints: glints that the image shows.
+        hints: information given to extractors.
+        known: noise (DN), blur (px) and step (DN), if the folder states them.
+        factors: possible causes of an error, by name.
+        subject: the person; if "" (unknown), each image counts as a separate subject.
+        iris: outline of the iris; None if unknown.
+        lids_px: (n, 2) margins of the lids, as far as they are known.
+        mask_path: file of the classes of the pixels; None if unknown.
+        hidden_glints_px: positions of glints that are hidden in the image.
+        conditions: hard conditions (`conditions.CONDITIONS`).
+        centre_px: (x, y) of a pupil of which only the centre is known.
+        gamma_from: where the gamma of the hints comes from: the folder, an option (`given`), or nowhere (`assumed`).
+        edge: the pupil's edge (`bound`); None if it is unknown.
+        sigma_px: bound of the centre's standard deviation per axis; None where it does not apply.
+    """
+
+    name: str
+    path: Path
+    bit_depth: int
+    size: tuple[int, int]
+    pupil: Ellipse | None = None
+    outline_px: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    visible: float | None = None
+    glints: tuple[TrueGlint, ...] = ()
+    hints: Mapping[str, Any] = field(default_factory=dict)
+    known: Mapping[str, float] = field(default_factory=dict)
+    factors: Mapping[str, float] = field(default_factory=dict)
+    gamma_from: str = "folder"
+    subject: str = ""
+    iris: Ellipse | None = None
+    lids_px: tuple[Floats, ...] = ()
+    mask_path: Path | None = None
+    conditions: tuple[str, ...] = ()
+    hidden_glints_px: tuple[tuple[float, float], ...] = ()
+    centre_px: tuple[float, float] | None = None
+    edge: Edge | None = None
+    sigma_px: float | None = None
+
+    @classmethod
+    def read(
+        cls, name: str, path: Path, pupil: Ellipse | None = None, *, visible: float | None = None, **labels: Any
+    ) -> BenchImage:
+        """Read size and bit depth of an image of which the labels alone are known, no camera and no lights.
+
+        Args:
+            name: name of the image.
+            path: file.
+            pupil: its outline; a pupil of which nothing is visible is not shown.
+            visible: visible share of the pupil.
+            labels: further attributes.
+        """
+        image, depth, _ = read_any_image(path)
+        height, width = image.shape
+        pupil = None if visible == 0.0 else pupil
+        return cls(
+            name=name,
+            path=path,
+            size=(width, height),
+            pupil=pupil,
+            outline_px=np.zeros((0, 2)) if pupil is None else pupil.points(120),
+            visible=visible,
+            factors=factors_of(pupil, visible),
+            **{"bit_depth": depth, **labels},
+        )
+
+    @property
+    def shows_pupil(self) -> bool:
+        """Whether the image shows a pupil, of which the ellipse or only the centre is known."""
+        return self.pupil is not None or self.centre_px is not None
+
+    @property
+    def glints_px(self) -> Floats:
+        """Positions (n, 2) of the glints that the image shows."""
+        return np.array([g.xy_px for g in self.glints], dtype=np.float64).reshape(-1, 2)
+
+    def contains(self, x: float, y: float) -> bool:
+        """Return whether a position lies on the image."""
+        width, height = self.size
+        return -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
+
+    def grey(self) -> Any:
+        """Read the pixels (h, w) as stored."""
+        return read_any_image(self.path)[0]
+
+    def classes(self) -> Bytes | None:
+        """Read the class of each pixel (0 skin, 1 sclera, 2 iris, 3 pupil, 4 a frame); None if unknown."""
+        return None if self.mask_path is None else np.asarray(read_image(self.mask_path)[0], dtype=np.uint8)
+
+
+def factors_of(pupil: Ellipse | None, visible: float | None) -> dict[str, float]:
+    """Return possible causes of an error that follow from a pupil's outline and its visible share."""
+    if pupil is None:
+        return {}
+    a, b = pupil.semi_axes_px
+    x, y = pupil.centre_px % 1.0
+    out = {"pupil_px": math.sqrt(a * b), "aspect": b / a, "phase_x": float(x), "phase_y": float(y)}
+    return out if visible is None else out | {"occlusion": 1.0 - visible}
