@@ -59,7 +59,7 @@ def test_an_interrupted_run_resumes_to_equal_bytes(drawn, counting, tmp_path):
     interrupted(drawn, out, extractor, 4)
     assert len(asked()) == 8 + 5
     with open(out / ANSWERS, "a") as file:
-        file.write('{"extractor": "first')  # as of a killed run
+        file.write('["first:find", 5, "')  # as of a killed run
     bench_extractors(drawn, out, [extractor])
     assert len(asked()) == 13 + 3
     assert sorted(p.name for p in out.iterdir()) == ["report.html", "results.csv", "results.json", "times.json"]

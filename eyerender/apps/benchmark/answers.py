@@ -32,7 +32,7 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 class Answers:
     """Stored answers of one task, (line, greeting, round-trip time) by extractor and row of the image.
 
-    Without a file they are only kept in memory.
+    Without a file nothing is stored.
     """
 
     def __init__(self, path: Path | None = None, task: str = "", *, fresh: bool = False) -> None:
@@ -43,9 +43,9 @@ class Answers:
         with suppress(OSError, UnicodeDecodeError):
             lines = [] if path is None or fresh else path.read_text(encoding="utf-8").splitlines()
         for line in lines[1:] if lines[:1] == [self._first] else ():
-            with suppress(ValueError, KeyError, TypeError):  # the last line of a killed run may be truncated
-                data = json.loads(line)
-                self._known[data["extractor"], data["row"]] = data["line"], data["greeting"], data["trip_s"]
+            with suppress(ValueError, TypeError):  # the last line of a killed run may be truncated
+                extractor, row, text, greeting, trip_s = json.loads(line)
+                self._known[extractor, row] = text, greeting, trip_s
 
     def get(self, extractor: str, row: int) -> tuple[str, str, float] | None:
         """Return the stored answer of an extractor about an image."""
@@ -57,19 +57,17 @@ class Answers:
         Raises:
             OSError: the file cannot be written.
         """
+        if self._path is None:
+            return
         with self._lock:
             new = {(extractor, row): answer}
             self._known |= new
-            if self._path is None:
-                return
             if not self._begun:
                 mark(self._path.parent, {self._path.name})
                 self._path.write_text(self._first + "\n", encoding="utf-8")
                 self._begun, new = True, self._known
             with open(self._path, "a", encoding="utf-8") as file:
-                for (name, at), (line, greeting, trip_s) in new.items():
-                    data = {"extractor": name, "row": at, "line": line, "greeting": greeting, "trip_s": trip_s}
-                    file.write(json.dumps(data) + "\n")
+                file.writelines(json.dumps([*key, *value]) + "\n" for key, value in new.items())
 
 
 def image_key(image: BenchImage) -> str:
