@@ -182,8 +182,7 @@ def _values(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found
     values = [(f.id, f.rule, number(f.value), f.detail) for f in found]
     rows = [
         (r.eye_model, r.variant or "", number(r.mean_deg), number(r.sd_deg), str(r.n), str(r.missing))
-        for part in (*parts, *people)
-        for r in part.rows
+        for r in [*(r for p in parts for r in p.rows), *(r for p in people for r in p.rows)]
     ]
     header = ("eye model", "condition", "mean (deg)", "SD (deg)", "n", "missing")
     return Section(
