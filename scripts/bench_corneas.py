@@ -27,10 +27,11 @@ import numpy as np  # noqa: E402
 from eyerender.analytic.features import features  # noqa: E402
 from eyerender.backends.choose import choose_backend  # noqa: E402
 from eyerender.eye.catalogue import load_eye  # noqa: E402
-from eyerender.eye.corneas import grid_surface, zernike_surface  # noqa: E402
 from eyerender.eye.model import EyeModel  # noqa: E402
+from eyerender.eye.parts import PlacedSpec  # noqa: E402
 from eyerender.eye.pose import Poses  # noqa: E402
 from eyerender.eye.spec import EyeSpec  # noqa: E402
+from eyerender.eye.surfaces import surface_of  # noqa: E402
 from eyerender.optics.surfaces_measured import GridSurface, ZernikeSurface  # noqa: E402
 from tests.support.corneas import conic_depth, eye_with, grid_of, keratoconus, zernike_of  # noqa: E402
 
@@ -82,10 +83,10 @@ def exactness() -> Iterator[Row]:
     y, z = r * np.cos(angle), r * np.sin(angle)
     for radius in (6.5, 7.8):
         depth = partial(conic_depth, radius_mm=radius, conic_constant=0.0)
-        surface = zernike_surface(zernike_of(depth, 3.25, 14))
+        surface = surface_of(PlacedSpec(shape=zernike_of(depth, 3.25, 14)))
         away = np.abs(surface.local_sag(y, z) + conic_depth(y, z, radius, 0.0)).max()
         yield row(f"sphere of {radius:g} mm, order 14 on 3.25 mm", away, "mm", 1e-9)
-    grid = grid_surface(grid_of(keratoconus))
+    grid = surface_of(PlacedSpec(shape=grid_of(keratoconus)))
     near = r < 3.2
     truth = -keratoconus(y, z) + keratoconus(0.0, 0.0)
     yield row("cone on a grid of 0.25 mm", np.abs(grid.local_sag(y, z) - truth)[near].max(), "mm", 1e-6)

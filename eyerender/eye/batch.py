@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Indices
-from ..optics.transforms import read_only, stacked
+from ..base.arrays import Indices, frozen
+from ..optics.transforms import stacked
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
 
 Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str]
@@ -54,14 +54,14 @@ def _stacked(values: tuple[Any, ...]) -> Any:
     """Stack one part of n eyes: arrays or numbers, tuples, records of arrays, surfaces or media."""
     first = values[0]
     if isinstance(first, np.ndarray):
-        return read_only(stacked(values))
+        return frozen(stacked(values))
     if isinstance(first, tuple):
         return tuple(_stacked(parts) for parts in zip(*values, strict=True))
     if isinstance(first, _RECORDS):
         return type(first)(*(_stacked(tuple(getattr(v, f.name) for v in values)) for f in fields(first)))
     if hasattr(first, "stack"):
         return type(first).stack(values)
-    return None if first is None else read_only(list(map(float, values)))
+    return None if first is None else frozen(list(map(float, values)))
 
 
 def _taken(value: Any, index: Indices) -> Any:

@@ -1,27 +1,25 @@
-"""Build the model from an eye file, in four steps: surfaces, landmarks, stop, and the chief ray.
+"""Build the model from an eye file: surfaces and fovea, then the stop, then the chief ray through it.
 
-Surfaces and their landmarks are computed once for all pupil sizes of an eye.
+Surfaces and fovea are computed once for all pupil sizes of an eye.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
 
-from ..base.arrays import FloatLike
+from ..base.arrays import FloatLike, frozen
 from ..base.errors import InputError
 from ..optics.gradient import GradientMedium
+from ..optics.shells import passing_shells
 from ..optics.surfaces import Surface
-from ..optics.transforms import read_only
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
 from .model import EyeModel, LineOfSight, RotationCentres, Stop
 from .parts import EyeParts, GradientLensSpec, Side, SurfaceLensSpec
-from .shells import passing_shells
-from .stop import stop_of, stop_reach_mm
-from .surfaces import gradient_lens, index_at, sclera_of, surface_of
+from .surfaces import gradient_lens, index_at, sclera_of, stop_of, surface_of
 
 
 def build_eye(spec: EyeParts, side: Side, wavelength_nm: float, pupil_diameter_mm: float | None) -> EyeModel:
@@ -39,8 +37,9 @@ def build_eye(spec: EyeParts, side: Side, wavelength_nm: float, pupil_diameter_m
     if not (np.isfinite(wavelength_nm) and wavelength_nm > 0.0):
         raise InputError("must be a positive number", path="wavelength_nm")
     stop = fitting_stop(spec, pupil_diameter_mm)
-    x, y, z = (float(v) for v in stop.centre_mm)
-    eye = replace(_with_landmarks(_Key(spec), float(wavelength_nm), (x, y, z)), stop=stop)
+    text = json.dumps(spec.model_dump(mode="json", exclude={"name", "stop"}), sort_keys=True)
+    eye = replace(_without_pupil(_Optics(text, spec), float(wavelength_nm)), name=spec.name, stop=stop)
+    eye = replace(eye, chief_ray=chief_ray_in_air(eye, eye.fovea_mm))
     return eye if side == "right" else eye.mirrored()
 
 
@@ -56,7 +55,7 @@ def fitting_stop(spec: EyeParts, pupil_diameter_mm: float | None) -> Stop:
     if not (np.isfinite(diameter) and diameter > 0.0):
         raise InputError("must be > 0", path=path)
     stop = stop_of(spec, diameter)
-    if 2.0 * stop_reach_mm(stop) >= widest:
+    if 2.0 * stop.reach_mm >= widest:
         raise InputError(f"the pupil is wider than the iris or the cornea ({widest:g} mm)", path=path)
     # The implicit function is negative behind a surface.
     if not (surface_of(spec.cornea[-1]).implicit(stop.boundary(32)) < 0.0).all():
@@ -82,7 +81,7 @@ def bare_eye(spec: EyeParts, wavelength_nm: float, stop: Stop) -> EyeModel:
     elif isinstance(spec.lens, GradientLensSpec):
         back, back_indices, rims, gradient = gradient_lens(spec.lens, wavelength_nm)
         passing = passing_shells(len(back))
-    zero = read_only(np.zeros(3))
+    zero = frozen(np.zeros(3))
     return EyeModel(
         name=spec.name,
         side="right",
@@ -99,9 +98,9 @@ def bare_eye(spec: EyeParts, wavelength_nm: float, stop: Stop) -> EyeModel:
         iris_root_radius_mm=spec.iris.root_radius_mm,
         sclera=sclera_of(spec, front[0]),
         rotation=RotationCentres(
-            read_only(spec.rotation.azimuth_centre_mm),
-            read_only(spec.rotation.elevation_centre_mm),
-            read_only(spec.rotation.torsion_centre_mm),
+            frozen(spec.rotation.azimuth_centre_mm),
+            frozen(spec.rotation.elevation_centre_mm),
+            frozen(spec.rotation.torsion_centre_mm),
         ),
         fovea_mm=zero,
         chief_ray=LineOfSight(zero, zero),
@@ -109,38 +108,22 @@ def bare_eye(spec: EyeParts, wavelength_nm: float, stop: Stop) -> EyeModel:
     )
 
 
-class _Key:
-    """Cache key: a spec that equals every other spec with the same surfaces and fovea."""
+@dataclass(frozen=True, slots=True)
+class _Optics:
+    """Key of the cache: eye files are equal if all but name and stop is equal (`text`, as JSON)."""
 
-    __slots__ = ("spec", "text")
-
-    def __init__(self, spec: EyeParts) -> None:
-        self.spec = spec
-        self.text = json.dumps(spec.model_dump(mode="json", exclude={"name", "stop"}), sort_keys=True)
-
-    def __hash__(self) -> int:
-        return hash(self.text)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and other.text == self.text
+    text: str
+    spec: EyeParts = field(compare=False)
 
 
 @lru_cache(maxsize=64)
-def _with_surfaces(spec: _Key, wavelength_nm: float) -> EyeModel:
+def _without_pupil(optics: _Optics, wavelength_nm: float) -> EyeModel:
     """Build the right eye with its fovea, which does not depend on the stop; its stop is that of the file."""
-    parts = spec.spec
-    bare = bare_eye(parts, wavelength_nm, stop_of(parts, parts.stop.diameter_mm))
-    if parts.fovea.position_mm is not None:
-        fovea = np.array(parts.fovea.position_mm)
-    else:
-        field = np.radians(parts.fovea.field_deg)
-        fovea = fovea_by_nodal_ray(bare, incident_node(bare), field, parts.fovea.distance_mm)
-    return replace(bare, fovea_mm=read_only(fovea))
-
-
-@lru_cache(maxsize=256)
-def _with_landmarks(spec: _Key, wavelength_nm: float, stop_centre_mm: tuple[float, float, float]) -> EyeModel:
-    """Build the right eye with all landmarks; only the chief ray depends on the stop's centre."""
-    eye = replace(_with_surfaces(spec, wavelength_nm), name=spec.spec.name)
-    eye = replace(eye, stop=replace(eye.stop, centre_mm=np.array(stop_centre_mm)))
-    return replace(eye, chief_ray=chief_ray_in_air(eye, eye.fovea_mm))
+    spec = optics.spec
+    bare = bare_eye(spec, wavelength_nm, stop_of(spec, spec.stop.diameter_mm))
+    if spec.fovea.position_mm is not None:
+        return replace(bare, fovea_mm=frozen(spec.fovea.position_mm))
+    field_rad = np.radians(spec.fovea.field_deg)
+    return replace(
+        bare, fovea_mm=frozen(fovea_by_nodal_ray(bare, incident_node(bare), field_rad, spec.fovea.distance_mm))
+    )

@@ -9,10 +9,10 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats
 from ..base.errors import InputError, Refuse
+from ..optics.corneas import WINDOW, misfit_mm
 from ..optics.graphs import graphs_of
 from ..optics.surfaces import Surface, components
 from ..optics.surfaces_measured import Measured
-from .corneas import WINDOW, grid_surface, misfit_mm, zernike_surface
 from .model import Stop
 from .parts import (
     BiconicSpec,
@@ -27,8 +27,7 @@ from .parts import (
     SurfaceLensSpec,
     ZernikeSpec,
 )
-from .stop import stop_of, stop_reach_mm
-from .surfaces import gradient_geometry, surface_of
+from .surfaces import gradient_geometry, stop_of, surface_of
 
 _TOUCH_MM = 1e-6
 _BULGE_MM = 0.5
@@ -58,7 +57,7 @@ def check_eye(spec: EyeParts, *, source: str = "") -> None:
     stop = stop_of(spec, spec.stop.diameter_mm)
     if not (stop.relative_radius(np.linspace(0.0, 2.0 * np.pi, 720)) > 0.0).all():
         refuse("stop.contour", "the margin's radius must be > 0 all around")
-    radius = stop_reach_mm(stop)
+    radius = stop.reach_mm
     _check_widths(spec, refuse, radius)
     if any(abs(angle) >= 60.0 for angle in spec.fovea.field_deg):
         refuse("fovea.field_deg", "must be within 60 degrees of the optic axis")
@@ -180,17 +179,18 @@ def _shape_problem(placed: PlacedSpec) -> tuple[str, str] | None:
     if isinstance(shape, ZernikeSpec):
         if shape.base_radius_mm is not None and abs(shape.base_radius_mm) < _SMALLEST_RADIUS_MM:
             return "shape.base_radius_mm", f"must not lie within {_SMALLEST_RADIUS_MM:g} of 0"
-        return _continued(zernike_surface(shape))
+        return _continued(placed)
     if isinstance(shape, GridSpec):
-        return _grid_problem(shape) or _continued(grid_surface(shape))
+        return _grid_problem(shape) or _continued(placed)
     if isinstance(shape, QuadricSpec) and not any(shape.coefficients[:9]):
         return "shape.coefficients", "must not all be 0"
     return None
 
 
-def _continued(surface: Measured) -> tuple[str, str] | None:
+def _continued(placed: PlacedSpec) -> tuple[str, str] | None:
     """Describe the problem of a measured surface that its outer biconic fails to continue; None if there is none."""
-    away = misfit_mm(surface)
+    surface = surface_of(placed)
+    away = misfit_mm(surface) if isinstance(surface, Measured) else 0.0
     if away < _MISFIT_MM:
         return None
     return "shape", f"is no surface of an eye: at the end of its zone it is {away:.3g} mm from any biconic"

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
 
-from ..base.arrays import Floats, remembered, sealed
+from ..base.arrays import Floats, frozen, remembered
 from ..base.errors import InputError
 from ..base.status import Status
 from ..optics.gradient import GradientMedium
+from ..optics.nodal import crossed, parallel_rays
 from ..optics.shooting import connect
 from ..optics.surfaces import components, join
-from ..optics.trace import Crossing, Traced, outward_path, trace
-from ..optics.transforms import flip_y, normalize, read_only
+from ..optics.trace import Crossing, outward_path, trace
+from ..optics.transforms import flip_y, normalize
 from .model import EyeModel, LineOfSight
 
 NODE_RING_DEG = 14.3
@@ -56,44 +54,10 @@ def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Flo
     Raises:
         InputError: an object has no such ray.
     """
-    path = path_to_retina(eye)
-    direction, error, retina = _parallel_rays(path, objects_mm, normalize(guess_mm - objects_mm))
-    for k in np.flatnonzero(~(error < _PARALLEL)):
-        row = slice(k, k + 1)
-        # The ray meets the edge of a shell, where the index jumps. Solve it with the shells that it meets next to the
-        # edge.
-        met = crossed(path, trace(path, 1.0, objects_mm[row], direction[row]))
-        direction[row], error[row], retina[row] = _parallel_rays(met, objects_mm[row], direction[row])
-    if not (error < _PARALLEL).all():
+    found = parallel_rays(path_to_retina(eye), objects_mm, guess_mm)
+    if found is None:
         raise InputError("no nodal ray meets the retina", path="fovea")
-    return direction, retina
-
-
-def _parallel_rays(path: Sequence[Crossing], objects_mm: Floats, direction: Floats) -> tuple[Floats, Floats, Floats]:
-    """Solve for nodal rays by Newton's method: directions, |change of direction|, and retina points."""
-    for _ in range(30):
-        first, second = _tangents(direction)
-        bundle = np.stack([direction, direction + _STEP * first, direction + _STEP * second])
-        traced = trace(path, 1.0, np.broadcast_to(objects_mm, bundle.shape), normalize(bundle))
-        turn = traced.directions[-1] - traced.directions[0]
-        error = np.stack([np.sum(turn * first, -1), np.sum(turn * second, -1)], axis=-1)
-        ok = (traced.status == Status.OK).all(axis=0)
-        size = np.where(ok, np.linalg.norm(error[0], axis=-1), np.inf)
-        retina = traced.points_mm[-1, 0]
-        slope = np.stack([(error[1] - error[0]) / _STEP, (error[2] - error[0]) / _STEP], axis=-1)
-        singular = ~ok | ~(np.abs(np.linalg.det(slope)) > 1e-12)
-        slope = np.where(singular[:, None, None], np.eye(2), slope)
-        step = np.linalg.solve(slope, np.where(singular[:, None], 0.0, error[0])[..., None])[..., 0]
-        if np.max(np.abs(step)) < 1e-16:
-            break
-        direction = normalize(direction - step[..., :1] * first - step[..., 1:] * second)
-    return direction, size, retina
-
-
-def crossed(path: Sequence[Crossing], traced: Traced) -> tuple[Crossing, ...]:
-    """Return the surfaces that one traced ray (leading shape (1,)) met, without their rims."""
-    moved = np.linalg.norm(np.diff(traced.points_mm[:, 0], axis=0), axis=-1) > 0.0
-    return tuple(replace(c, rim_mm=np.inf, beyond_rim=Status.MISSED) for c, met in zip(path, moved, strict=True) if met)
+    return found
 
 
 @remembered
@@ -108,12 +72,11 @@ def incident_node(eye: EyeModel) -> Floats:
 
     That of a left eye is the mirror image of the right eye's.
     """
-    if eye.side == "left":
-        return sealed(flip_y(incident_node(eye.mirrored())))
+    right = eye if eye.side == "right" else eye.mirrored()
     angle = 2.0 * np.pi * np.arange(NODE_RAYS) / NODE_RAYS
     ring = np.radians(NODE_RING_DEG) * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
     objects = NODE_DISTANCE_MM * field_direction(ring)
-    directions, _ = nodal_rays(eye, objects, np.array([-7.0, 0.0, 0.0]))
+    directions, _ = nodal_rays(right, objects, np.array([-7.0, 0.0, 0.0]))
     i, j = np.triu_indices(NODE_RAYS, 1)
     gap = objects[i] - objects[j]
     cosine = np.sum(directions[i] * directions[j], -1)
@@ -121,7 +84,8 @@ def incident_node(eye: EyeModel) -> Floats:
     square = 1.0 - cosine**2
     s, t = (cosine * along_j - along_i) / square, (along_j - cosine * along_i) / square
     middle = 0.5 * (objects[i] + s[:, None] * directions[i] + objects[j] + t[:, None] * directions[j])
-    return sealed(np.mean(middle, axis=0))
+    node = np.mean(middle, axis=0)
+    return frozen(node if right is eye else flip_y(node))
 
 
 def fovea_by_nodal_ray(eye: EyeModel, node_mm: Floats, field_rad: Floats, distance_mm: float) -> Floats:
@@ -177,19 +141,10 @@ def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
     traced = trace(outward_path(eye.front, eye.front_indices), eye.front_indices[-1], centre, direction)
     if traced.status != Status.OK:
         raise InputError("the chief ray does not leave the eye", path="fovea")
-    return LineOfSight(read_only(traced.points_mm[-1]), read_only(traced.directions[-1]))
+    return LineOfSight(frozen(traced.points_mm[-1]), frozen(traced.directions[-1]))
 
 
 def field_direction(field_rad: Floats) -> Floats:
     """Compute unit vectors (..., 3) along (1, tan h, tan v) from field angles (h, v) (..., 2) in radians."""
     field = np.asarray(field_rad, dtype=np.float64)
     return normalize(np.stack([np.ones(field.shape[:-1]), np.tan(field[..., 0]), np.tan(field[..., 1])], axis=-1))
-
-
-def _tangents(direction: Floats) -> tuple[Floats, Floats]:
-    first = normalize(np.cross(direction, np.array([0.0, 0.0, 1.0])))
-    return first, np.cross(direction, first)
-
-
-_STEP = 1e-5
-_PARALLEL = 1e-13

@@ -26,7 +26,6 @@ import numpy as np
 from ..base.arrays import Floats, Ints
 from ..optics.surfaces import Surface
 from .model import EyeModel
-from .shells import shelled
 
 _LENS_RADIUS_MM = 4.5
 _WALL_MM = 1.0
@@ -68,7 +67,7 @@ class EyeMeshes:
 
 def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
     """Compute all meshes of an eye, in the eye frame (mm); a gradient lens is approximated by shells."""
-    eye = shelled(eye)
+    eye = eye.shelled()
     angle = 2 * np.pi * np.arange(sectors) / sectors
     cornea = cornea_patches(eye, rings, sectors)
     front = cornea[0]

@@ -8,10 +8,11 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from ..base.arrays import ArrayValue, Bools, FloatLike, Floats
+from ..base.arrays import ArrayValue, Bools, FloatLike, Floats, frozen
 from ..optics.gradient import GradientMedium
+from ..optics.shells import SHELLS, even_layers, lens_shells, passing_shells
 from ..optics.surfaces import Surface, Xyz, components, fit, shift, turn_back
-from ..optics.transforms import flip_y, mirror_rotation, read_only
+from ..optics.transforms import flip_y, mirror_rotation
 from .parts import Side
 
 __all__ = ["EyeModel", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
@@ -40,12 +41,17 @@ class Stop(ArrayValue):
 
     def __post_init__(self) -> None:
         for name in ("centre_mm", "rotation", "semi_axes_mm", "handed", "contour"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
+            object.__setattr__(self, name, frozen(getattr(self, name)))
 
     @property
     def normal(self) -> Floats:
         """Unit normal of the plane, towards the cornea, (..., 3)."""
         return np.asarray(self.rotation[..., :, 0])
+
+    @property
+    def reach_mm(self) -> float:
+        """Largest distance of the margin from the centre, within 0.1 %; of a single stop."""
+        return float(np.max(np.linalg.norm(self.boundary(360) - self.centre_mm, axis=-1)))
 
     def relative_radius(self, angle_rad: npt.ArrayLike) -> Floats:
         """Compute the relative radius r at the parameter f of the ellipse.
@@ -204,7 +210,7 @@ class EyeModel(ArrayValue):
         stop, centres, ray = self.stop, self.rotation, self.chief_ray
 
         def flipped(points: Floats) -> Floats:
-            return read_only(flip_y(points))
+            return frozen(flip_y(points))
 
         return replace(
             self,
@@ -224,4 +230,27 @@ class EyeModel(ArrayValue):
             fovea_mm=flipped(self.fovea_mm),
             chief_ray=LineOfSight(flipped(ray.point_mm), flipped(ray.direction)),
             lens_gradient=None if self.lens_gradient is None else self.lens_gradient.mirrored(),
+        )
+
+    def shelled(self, count: int = SHELLS) -> EyeModel:
+        """Replace the gradient lens of a single eye by shells; return any other eye unchanged."""
+        gradient = self.lens_gradient
+        if gradient is None:
+            return self
+        edge, core = float(gradient.core - gradient.fall), float(gradient.core)
+        shells = lens_shells(
+            self.back[0],
+            self.back[1],
+            gradient.centre_mm,
+            (edge, core, float(self.back_indices[-1])),
+            float(self.back_rims_mm[0]),
+            even_layers(count),
+        )
+        return replace(
+            self,
+            back=shells.surfaces,
+            back_indices=shells.indices,
+            back_rims_mm=shells.rims_mm,
+            back_passing=passing_shells(len(shells.surfaces)),
+            lens_gradient=None,
         )

@@ -17,9 +17,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..base.arrays import ArrayValue, Floats
+from ..base.arrays import ArrayValue, Floats, frozen
 from ..optics.surfaces import Xyz
-from ..optics.transforms import read_only
 from .model import EyeModel
 from .pose_kernels import move_all
 
@@ -34,7 +33,7 @@ class Poses(ArrayValue):
 
     def __post_init__(self) -> None:
         for name in ("azimuth_rad", "elevation_rad", "torsion_rad"):
-            object.__setattr__(self, name, read_only(np.atleast_1d(getattr(self, name))))
+            object.__setattr__(self, name, frozen(np.atleast_1d(getattr(self, name))))
 
     @classmethod
     def listing(cls, azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Poses:

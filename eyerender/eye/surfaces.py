@@ -1,4 +1,4 @@
-"""Build the surfaces and media of an eye file."""
+"""Build the surfaces, media and stop of an eye file."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import brentq
 
-from ..base.arrays import FloatLike, Floats
+from ..base.arrays import FloatLike, Floats, frozen
 from ..base.errors import InputError
+from ..optics.corneas import grid_surface, zernike_surface
 from ..optics.gradient import GradientMedium
 from ..optics.media import CauchyMedium, ConstantMedium, Medium
+from ..optics.shells import SHELLS, Layers, equator_radius_mm, even_layers, lens_shells
 from ..optics.surfaces import Surface
 from ..optics.surfaces_biconic import Biconic
 from ..optics.surfaces_quadric import Quadric
-from ..optics.transforms import read_only, tilt_rotation
-from .corneas import grid_surface, zernike_surface
-from .model import Sphere
+from ..optics.transforms import rotation_x, tilt_rotation
+from .model import Sphere, Stop
 from .parts import (
     LARGEST_INDEX,
     BiconicSpec,
@@ -29,11 +29,9 @@ from .parts import (
     MediumSpec,
     PlacedSpec,
     PlaneSpec,
-    QuadricSpec,
     SphereSpec,
     ZernikeSpec,
 )
-from .shells import SHELLS, Layers, even_layers, lens_shells
 
 
 @lru_cache(maxsize=64)
@@ -55,25 +53,24 @@ def surface_of(placed: PlacedSpec) -> Surface:
             conic_constants=np.array(shape.conic_constants),
         )
     if isinstance(shape, ZernikeSpec):
-        return zernike_surface(shape).placed(position, rotation)
+        zernike = zernike_surface(
+            shape.coefficients_mm,
+            shape.radius_mm,
+            base_radius_mm=shape.base_radius_mm,
+            base_conic_constant=shape.base_conic_constant,
+            zone_radius_mm=shape.zone_radius_mm,
+        )
+        return zernike.placed(position, rotation)
     if isinstance(shape, GridSpec):
-        return grid_surface(shape).placed(position, rotation)
+        assert shape.heights_mm is not None
+        assert shape.spacing_mm is not None
+        grid = grid_surface(shape.heights_mm, shape.spacing_mm, zone_radius_mm=shape.zone_radius_mm)
+        return grid.placed(position, rotation)
+    front = shape.side == "front"
     if isinstance(shape, EllipsoidSpec):
-        front = shape.side == "front"
         lead = shape.semi_axes_mm[0] * (-1.0 if front else 1.0)
         return Quadric.ellipsoid(shape.semi_axes_mm, position + rotation[:, 0] * lead, rotation, front)
-    return _general_quadric(shape, position, rotation)
-
-
-def _general_quadric(shape: QuadricSpec, position: Floats, rotation: Floats) -> Quadric:
-    a, b, c, d, e, f, g, h, i, k = shape.coefficients
-    # The scale ties the size of rounding errors to distances, not to the unit of the coefficients.
-    scale = max(abs(v) for v in (a, b, c, d, e, f)) or max(abs(v) for v in (g, h, i))
-    if b == c and d == e == f == 0.0 and b != 0.0:
-        scale = abs(b)
-    matrix = np.array([[a, d, e], [d, b, f], [e, f, c]]) / scale
-    sign = 1.0 if shape.side == "front" else -1.0
-    return Quadric.oriented(matrix, np.array([g, h, i]) / scale, np.array(k / scale), sign, position, rotation)
+    return Quadric.general(shape.coefficients, front, position, rotation)
 
 
 def medium_of(spec: MediumSpec) -> Medium:
@@ -101,12 +98,12 @@ def sclera_of(spec: EyeParts, cornea: Surface) -> Sphere:
     """Build the sclera: the sphere through the limbus circle, centred on the cornea's axis unless given otherwise."""
     radius = spec.sclera.radius_mm
     if spec.sclera.centre_mm is not None:
-        return Sphere(read_only(spec.sclera.centre_mm), radius)
+        return Sphere(frozen(spec.sclera.centre_mm), radius)
     angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     rim = spec.limbus_radius_mm
     depth = float(np.mean(cornea.sag(rim * np.cos(angle), rim * np.sin(angle))))
     local = np.array([depth - np.sqrt(max(radius**2 - rim**2, 0.0)), 0.0, 0.0])
-    return Sphere(read_only(cornea.to_eye(local)), radius)
+    return Sphere(frozen(cornea.to_eye(local)), radius)
 
 
 def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]:
@@ -144,7 +141,7 @@ def gradient_lens(
         index_at(medium, wavelength_nm, f"lens.{name}")
         for name, medium in (("edge", lens.edge), ("core", lens.core), ("vitreous", lens.vitreous))
     )
-    rim = _equator_radius(front, back)
+    rim = equator_radius_mm(front, back)
     if isinstance(front, Quadric) and isinstance(back, Quadric) and lens.shells is None and lens.layers is None:
         medium = GradientMedium.between(front, back, centre, edge, core)
         return (front, back), (edge, vitreous), (rim, rim), medium
@@ -155,15 +152,21 @@ def gradient_lens(
     return *lens_shells(front, back, centre, (edge, core, vitreous), rim, layers), None
 
 
-def _equator_radius(front: Surface, back: Surface) -> float:
-    """Compute the distance from the axis (mm) where the outer front and back surfaces meet; infinite if they do not."""
-    thickness = float(np.linalg.norm(front.origin_mm - back.origin_mm))
-
-    def gap(r: float) -> float:
-        height, zero = np.array(r), np.array(0.0)
-        return float(thickness + front.sag(height, zero) - back.sag(height, zero))
-
-    reach = 0.1
-    while reach < 20.0 and gap(reach) > 0.0:
-        reach += 0.1
-    return float(brentq(gap, reach - 0.1, reach)) if gap(reach) <= 0.0 else np.inf
+def stop_of(spec: EyeParts, diameter_mm: float) -> Stop:
+    """Build the stop of the right eye at a diameter (mm)."""
+    stop = spec.stop
+    change = diameter_mm - stop.diameter_mm
+    rotation = tilt_rotation(np.radians(stop.tilt_deg)) @ rotation_x(np.radians(stop.axis_deg))
+    # The pupil moves within the plane of the iris, which is fixed. Otherwise it would sink into a lens that is tilted
+    # with it.
+    depth = -float(rotation[1:, 0] @ stop.shift_mm_per_mm) / float(rotation[0, 0])
+    centre = np.array(stop.position_mm) + np.array([depth, *stop.shift_mm_per_mm]) * change
+    ratio = np.sqrt(1.0 - stop.ellipticity)
+    semi_axes = 0.5 * diameter_mm * np.array([1.0 / ratio, ratio])
+    if stop.contour is None:
+        return Stop(centre, rotation, semi_axes, np.array(1.0))
+    rows = (stop.contour.cosines, stop.contour.sines)
+    contour = np.zeros((2, max(map(len, rows))))
+    for row, values in zip(contour, rows, strict=True):
+        row[: len(values)] = values
+    return Stop(centre, rotation, semi_axes, np.array(1.0), contour)

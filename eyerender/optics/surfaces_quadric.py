@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -113,6 +114,27 @@ class Quadric(Surface):
             np.broadcast_to(factor[..., None] * np.asarray(vector), (*shape, 3)),
             np.broadcast_to(factor * np.asarray(constant), shape),
         )
+
+    @classmethod
+    def general(
+        cls, coefficients: Sequence[float], front: bool, origin_mm: npt.ArrayLike, rotation: npt.ArrayLike
+    ) -> Quadric:
+        """Create A x^2 + B y^2 + C z^2 + 2 D xy + 2 E xz + 2 F yz + 2 G x + 2 H y + 2 I z + K = 0, one of its sheets.
+
+        Args:
+            coefficients: A, B, C, D, E, F, G, H, I and K.
+            front: whether it is the sheet where dF/dx > 0 with these coefficients, instead of < 0.
+            origin_mm: place of the frame's origin.
+            rotation: rotation of the frame.
+        """
+        a, b, c, d, e, f, g, h, i, k = coefficients
+        # The scale ties the size of rounding errors to distances, not to the unit of the coefficients.
+        scale = max(abs(v) for v in (a, b, c, d, e, f)) or max(abs(v) for v in (g, h, i))
+        if b == c and d == e == f == 0.0 and b != 0.0:
+            scale = abs(b)
+        matrix = np.array([[a, d, e], [d, b, f], [e, f, c]]) / scale
+        sign = 1.0 if front else -1.0
+        return cls.oriented(matrix, np.array([g, h, i]) / scale, np.array(k / scale), sign, origin_mm, rotation)
 
     @property
     def coefficients(self) -> tuple[Floats | float, ...]:

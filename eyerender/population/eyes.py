@@ -18,8 +18,7 @@ from ..eye.kappa import fovea_of_kappa
 from ..eye.margin import drawn_contour
 from ..eye.parts import EyeParts
 from ..eye.spec import EyeSpec
-from ..eye.stop import stop_of
-from ..eye.surfaces import index_at, surface_of
+from ..eye.surfaces import index_at, stop_of, surface_of
 from ..optics.surfaces import Surface
 from .pupil import ellipticity
 from .refraction import AQUEOUS, CORNEA, LENS, VITREOUS

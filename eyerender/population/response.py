@@ -16,8 +16,7 @@ from ..base.errors import InputError
 from ..eye.entrance import entrance_pupil_mm, stop_for_entrance
 from ..eye.parts import EyeParts
 from ..eye.spec import EyeSpec
-from ..eye.stop import stop_of
-from ..eye.surfaces import index_at, surface_of
+from ..eye.surfaces import index_at, stop_of, surface_of
 from ..optics.surfaces import Surface
 from .eyes import BACK_PER_D, FORWARD, FRONT_PER_D, FRONT_Q_PER_D, amplitude_d, thickening_mm
 from .pupil import watson_yellott_mm

@@ -8,7 +8,6 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..eye.model import EyeModel
-from ..eye.shells import shelled
 from ..optics.surfaces import Surface
 from .style import ANALYTIC, IMAGE, TARGET, figure
 
@@ -44,7 +43,7 @@ def _draw(ax: Any, eye: EyeModel, across: int) -> None:
             normal, centre = eye.stop.normal, eye.stop.centre_mm
             rim &= x >= centre[0] - (s - centre[across]) * normal[across] / normal[0]
         _curve(ax, surface, x, s, across, rim, _CORNEA, 1.8, "cornea" if k == 0 else None)
-    shells = shelled(eye)
+    shells = eye.shelled()
     # A gradient lens has dozens of shells, so they get a grid that is no larger than they are.
     back = float(eye.stop.centre_mm[0]) - 6.0
     lx, ls = np.meshgrid(np.linspace(back, back + 7.0, _LENS_GRID), np.linspace(-6.5, 6.5, _LENS_GRID))

@@ -13,7 +13,6 @@ from eyerender.base.errors import InputError
 from eyerender.base.status import Status
 from eyerender.eye.catalogue import FOLDER, catalogue_files, catalogue_names, load_eye
 from eyerender.eye.parts import GradientLensSpec
-from eyerender.eye.shells import shelled
 from eyerender.eye.spec import EyeSpec
 from eyerender.optics.surfaces_biconic import Biconic
 from eyerender.optics.surfaces_quadric import Quadric
@@ -92,7 +91,7 @@ def test_the_shells_of_a_gradient_lens_follow_its_law():
     assert isinstance(spec.lens, GradientLensSpec)
     built = spec.model_copy(update={"lens": spec.lens.model_copy(update={"shells": 21})}).build()
     core, edge = (np.polyval(m.cauchy[::-1], 850.0**-2.0) for m in (spec.lens.core, spec.lens.edge))
-    for eye in (built, shelled(spec.build())):
+    for eye in (built, spec.build().shelled()):
         assert len(eye.back) == 42
         centre = np.array([-3.6 - 0.4 * 3.5, -0.371 + 0.4 * 0.101, 0.04 + 0.4 * 0.05])
         front, back = eye.back[:21], eye.back[21:][::-1]
@@ -120,7 +119,7 @@ def test_the_shells_of_a_gradient_lens_follow_its_law():
     assert len(eye.back) == 2
     assert eye.back_indices == pytest.approx((edge, built.back_indices[-1]), abs=1e-14)
     assert float(eye.lens_gradient.core) == pytest.approx(core, abs=1e-14)
-    assert shelled(load_eye("E4").build()) == load_eye("E4").build()
+    assert load_eye("E4").build().shelled() == load_eye("E4").build()
 
 
 def test_corneas_and_stops_stand_where_the_table_says():

@@ -12,7 +12,6 @@ from scipy.optimize import brentq
 from eyerender.base.status import Status
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.landmarks import path_to_retina
-from eyerender.eye.shells import shelled
 from eyerender.optics import gradient
 from eyerender.optics.gradient import GradientMedium
 from eyerender.optics.surfaces import components, join
@@ -176,7 +175,7 @@ def test_shells_converge_to_the_gradient():
     goal = trace(path_to_retina(eye), 1.0, starts, ways)
     assert (goal.status == Status.OK).all()
     numbers = np.array([21, 84, 168, 336, 672, 1344])
-    ends = [trace(path_to_retina(shelled(eye, int(n))), 1.0, starts, ways).points_mm[-1] for n in numbers]
+    ends = [trace(path_to_retina(eye.shelled(int(n))), 1.0, starts, ways).points_mm[-1] for n in numbers]
     error = np.linalg.norm(np.array(ends) - goal.points_mm[-1], axis=-1).mean(axis=1)
     assert error[0] == pytest.approx(8.5e-3, rel=0.05)  # mm on the retina, .03 deg
     assert np.abs(error * numbers / 0.18 - 1.0).max() < 0.1

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
-from eyerender.eye.corneas import WINDOW, grid_surface, zernike_surface
 from eyerender.eye.parts import PlacedSpec
 from eyerender.eye.surfaces import surface_of
+from eyerender.optics.corneas import WINDOW
 from eyerender.optics.surfaces import components
 from eyerender.optics.topography import smooth_heights, spline_coefficients
 from eyerender.optics.zernike import mirrored, orders, zernike
@@ -62,7 +62,7 @@ def test_mirrored_coefficients_are_those_of_the_mirrored_sum():
 def test_an_expansion_of_a_sphere_is_the_sphere(radius_mm):
     """Order 14 on the 6.5 mm that topographers report."""
     shape = zernike_of(partial(conic_depth, radius_mm=radius_mm, conic_constant=0.0), 3.25, 14)
-    surface = zernike_surface(shape)
+    surface = surface_of(PlacedSpec(shape=shape))
     y, z = disc(3.25)
     assert np.abs(surface.local_sag(y, z) + conic_depth(y, z, radius_mm, 0.0)).max() < 1e-9
     y, z = disc(5.8)
@@ -72,13 +72,13 @@ def test_an_expansion_of_a_sphere_is_the_sphere(radius_mm):
 def test_an_expansion_on_its_conic_alone_is_the_conic():
     shape = zernike_of(lambda y, z: 0.0 * y, 4.0, 2, base_radius_mm=7.8, base_conic_constant=-0.25)
     y, z = disc(5.8)
-    assert np.abs(zernike_surface(shape).local_sag(y, z) + conic_depth(y, z)).max() < 1e-9
+    assert np.abs(surface_of(PlacedSpec(shape=shape)).local_sag(y, z) + conic_depth(y, z)).max() < 1e-9
 
 
 def test_a_grid_passes_through_its_heights_and_is_a_bicubic_between_them():
     """scipy's own bicubic through the same heights differs only by the biconic that carries the spline."""
     shape = grid_of(keratoconus)
-    surface, heights = grid_surface(shape), np.array(shape.heights_mm)
+    surface, heights = surface_of(PlacedSpec(shape=shape)), np.array(shape.heights_mm)
     place = shape.spacing_mm * (np.arange(len(heights)) - len(heights) // 2)
     y, z = np.meshgrid(place, place)
     near = np.hypot(y, z) <= 0.75 * place[-1] / WINDOW[1]
@@ -134,14 +134,15 @@ def test_the_transition_bends_no_more_than_the_cornea(name):
 
 
 def test_a_batch_of_different_sizes_is_its_members():
-    small, large = grid_surface(grid_of(keratoconus, 4.5, 0.5)), grid_surface(grid_of(conic_depth, 5.5, 0.25))
+    grids = grid_of(keratoconus, 4.5, 0.5), grid_of(conic_depth, 5.5, 0.25)
+    small, large = (surface_of(PlacedSpec(shape=grid)) for grid in grids)
     batch = type(small).stack((small, large))
     y, z = disc(4.0, 60)
     for k, single in enumerate((small, large)):
         both = batch.local_sag(np.stack([y, y]), np.stack([z, z]))[k]
         assert np.allclose(both, single.local_sag(y, z), atol=1e-13)
-    short = zernike_surface(zernike_of(conic_depth, 3.25, 6))
-    long = zernike_surface(zernike_of(conic_depth, 3.25, 10))
+    short = surface_of(PlacedSpec(shape=zernike_of(conic_depth, 3.25, 6)))
+    long = surface_of(PlacedSpec(shape=zernike_of(conic_depth, 3.25, 10)))
     with pytest.raises(ValueError, match="shape"):
         np.stack([short.coefficients_mm, long.coefficients_mm])
     both = type(short).stack((short, long)).local_sag(np.stack([y, y]), np.stack([z, z]))

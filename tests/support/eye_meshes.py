@@ -6,12 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from eyerender.eye.shells import shelled
-
 
 def crossing(eye, meshes, tolerance_mm=1e-6):
     """Names of refracting patches that intersect the next surface outside them; empty for a valid eye."""
-    eye = shelled(eye)
+    eye = eye.shelled()
     order = [("cornea_front", eye.front[0])]
     if len(eye.front) > 1:
         order.append(("cornea_back", eye.front[-1]))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from ..base.arrays import FloatLike, Floats
-from ..optics.surfaces import Surface
-from .model import EyeModel
+from .surfaces import Surface
 
 SHELLS = 21
 """Shells per half where a lens has to be made of bodies: in meshes and drawings."""
@@ -64,30 +63,20 @@ def even_layers(count: int) -> Layers:
     return Layers(np.sqrt(1.0 - steps / count), (steps + 0.5) / count)
 
 
-def shelled(eye: EyeModel, count: int = SHELLS) -> EyeModel:
-    """Replace the gradient lens of a single eye by shells; any other eye is returned unchanged."""
-    gradient = eye.lens_gradient
-    if gradient is None:
-        return eye
-    edge, core = float(gradient.core - gradient.fall), float(gradient.core)
-    shells = lens_shells(
-        eye.back[0],
-        eye.back[1],
-        gradient.centre_mm,
-        (edge, core, float(eye.back_indices[-1])),
-        float(eye.back_rims_mm[0]),
-        even_layers(count),
-    )
-    return replace(
-        eye,
-        back=shells.surfaces,
-        back_indices=shells.indices,
-        back_rims_mm=shells.rims_mm,
-        back_passing=passing_shells(len(shells.surfaces)),
-        lens_gradient=None,
-    )
-
-
 def passing_shells(count: int) -> tuple[bool, ...]:
     """Return whether a ray may miss each surface of a lens of shells: true for all but the outermost."""
     return tuple(k not in (0, count - 1) for k in range(count))
+
+
+def equator_radius_mm(front: Surface, back: Surface) -> float:
+    """Compute the distance from the axis (mm) where the outer front and back surfaces meet; infinite if they do not."""
+    thickness = float(np.linalg.norm(front.origin_mm - back.origin_mm))
+
+    def gap(r: float) -> float:
+        height, zero = np.array(r), np.array(0.0)
+        return float(thickness + front.sag(height, zero) - back.sag(height, zero))
+
+    reach = 0.1
+    while reach < 20.0 and gap(reach) > 0.0:
+        reach += 0.1
+    return float(brentq(gap, reach - 0.1, reach)) if gap(reach) <= 0.0 else np.inf

@@ -1,4 +1,4 @@
-"""Build surfaces from the measured shapes of an eye file; the outer biconic is fitted once per shape."""
+"""Surfaces of measured corneas (Zernike terms, grids of heights), continued by the biconic that fits them best."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from functools import lru_cache
 import numpy as np
 
 from ..base.arrays import Floats
-from ..optics.surfaces_measured import GridSurface, Measured, ZernikeSurface
-from ..optics.topography import outer_biconic, spline_coefficients
-from ..optics.zernike import order_of, terms
-from .parts import GridSpec, ZernikeSpec
+from .surfaces_measured import GridSurface, Measured, ZernikeSurface
+from .topography import outer_biconic, spline_coefficients
+from .zernike import order_of, terms
 
 WINDOW = (0.75, 1.15)
 """Shares of the zone's radius between which the biconic takes over.
@@ -24,24 +23,47 @@ _ANY = np.array([8.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 @lru_cache(maxsize=4096)
-def zernike_surface(shape: ZernikeSpec) -> ZernikeSurface:
-    """Build the surface of Zernike terms, with its apex at the eye's origin."""
-    coefficients = np.zeros(terms(max(order_of(len(shape.coefficients_mm)), 1)))
-    coefficients[: len(shape.coefficients_mm)] = shape.coefficients_mm
-    base = np.array([0.0 if shape.base_radius_mm is None else 1.0 / shape.base_radius_mm, shape.base_conic_constant])
-    radius = np.array(shape.radius_mm)
-    zone = shape.radius_mm if shape.zone_radius_mm is None else shape.zone_radius_mm
+def zernike_surface(
+    coefficients_mm: tuple[float, ...],
+    radius_mm: float,
+    *,
+    base_radius_mm: float | None = None,
+    base_conic_constant: float = 0.0,
+    zone_radius_mm: float | None = None,
+) -> ZernikeSurface:
+    """Build the surface of Zernike terms with its apex at the origin; the biconic is fitted once per shape.
+
+    Args:
+        coefficients_mm: c_0, c_1, ... in the order of OSA/ANSI, depths.
+        radius_mm: radius of the disc on which the terms are orthonormal.
+        base_radius_mm: radius of curvature of the conic below the terms; None: a plane.
+        base_conic_constant: Q of that conic.
+        zone_radius_mm: radius of the measured zone; None: that of the disc.
+    """
+    coefficients = np.zeros(terms(max(order_of(len(coefficients_mm)), 1)))
+    coefficients[: len(coefficients_mm)] = coefficients_mm
+    base = np.array([0.0 if base_radius_mm is None else 1.0 / base_radius_mm, base_conic_constant])
+    radius = np.array(radius_mm)
+    zone = radius_mm if zone_radius_mm is None else zone_radius_mm
     alone = ZernikeSurface(np.zeros(3), np.eye(3), base, radius, coefficients, _ANY, _FAR)
     outer = outer_biconic(lambda y, z: alone.measured(y, z, False)[0], _ring(zone))
     return ZernikeSurface(np.zeros(3), np.eye(3), base, radius, coefficients, outer, _window(zone))
 
 
 @lru_cache(maxsize=256)
-def grid_surface(shape: GridSpec) -> GridSurface:
-    """Build the bicubic surface of a grid of heights, with its apex at the eye's origin."""
-    heights, spacing = np.array(shape.heights_mm).T, np.array(shape.spacing_mm)
+def grid_surface(
+    heights_mm: tuple[tuple[float, ...], ...], spacing_mm: float, *, zone_radius_mm: float | None = None
+) -> GridSurface:
+    """Build the bicubic surface of a grid of heights with its apex at the origin; it is fitted once per shape.
+
+    Args:
+        heights_mm: depths, row by row from low z to high z.
+        spacing_mm: spacing of the grid.
+        zone_radius_mm: radius of the measured zone; None: so that the transition ends at the rim of the grid.
+    """
+    heights, spacing = np.array(heights_mm).T, np.array(spacing_mm)
     half = 0.5 * (len(heights) - 1) * float(spacing)
-    zone = half / WINDOW[1] if shape.zone_radius_mm is None else shape.zone_radius_mm
+    zone = half / WINDOW[1] if zone_radius_mm is None else zone_radius_mm
     origin, middle = np.zeros(3), np.zeros(2)
 
     def on_biconic(outer: Floats, rest: Floats) -> GridSurface:
