@@ -5,23 +5,74 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats
+from ..base.arrays import Bools, Floats, Indices
 from ..base.errors import InputError
 from ..base.status import Status
+from ..eye.model import EyeModel
 from ..eye.pose import Poses
 from ..optics.ellipse import fit_ellipse_direct
-from ..rig.rig import RigLike
-from ..scene import Frames, Scene, as_frames
-from ..scene.observation import EYES, GlintFeatures, Observations, PupilFeatures
+from ..rig.rig import RigGeometry, RigLike
+from ..scene.observation import EYES, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
 from .features import Features, features
 
 ARC_POINTS = 6
 ARC_GAP_DEG = 120.0
 """Requirements for an ellipse of a partial pupil: number of visible points, and longest hidden stretch (degrees)."""
+
+
+class TraceableScene(Protocol):
+    """What ray optics needs of a scene: its numeric rig and eyes."""
+
+    @property
+    def rig(self) -> RigGeometry:
+        """The numeric rig."""
+        ...
+
+    @property
+    def eye_name(self) -> str:
+        """Name of the eye file, for messages."""
+        ...
+
+    def eyes_of(self, index: Index) -> tuple[list[EyeModel], Indices]:
+        """Build the numeric eyes of an index, and return which of them each row uses."""
+        ...
+
+
+@runtime_checkable
+class Traceable(Protocol):
+    """What ray optics needs of `Frames`: which eye is seen by which camera, and its pose."""
+
+    @property
+    def scene(self) -> TraceableScene:
+        """The scene with the rig and the eyes."""
+        ...
+
+    @property
+    def index(self) -> Index:
+        """Eye, camera and place of each row."""
+        ...
+
+    @property
+    def pose(self) -> PoseTruth:
+        """Pose of the eye of each row."""
+        ...
+
+    def seen_by(self, rig: RigLike | None) -> Self:
+        """Observe the same eyes with another rig."""
+        ...
+
+
+@runtime_checkable
+class FrameSource(Protocol):
+    """A scene, which poses its eyes in all of its frames."""
+
+    def frames(self) -> Traceable:
+        """Compute the pose of every (frame, eye)."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +88,12 @@ class AnalyticObserver:
 
     boundary_points: int = 30
 
-    def observe(self, frames: Frames, rig: RigLike | None = None) -> Observations:
+    def observe(self, frames: Traceable, rig: RigLike | None = None) -> Observations:
         """Observe every (frame, eye); `rig` replaces that of the frames."""
         return self.observe_in_detail(frames, rig)[0]
 
     def observe_in_detail(
-        self, frames: Frames, rig: RigLike | None = None, *, purkinje: Sequence[int] = (1,)
+        self, frames: Traceable, rig: RigLike | None = None, *, purkinje: Sequence[int] = (1,)
     ) -> tuple[Observations, Features]:
         """Observe with residuals, the pupil's deviation from an ellipse, and Purkinje images.
 
@@ -81,7 +132,7 @@ class AnalyticObserver:
         return observed, seen
 
 
-def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points: int = 30) -> Observations:
+def trace(frames: Traceable | FrameSource, rig: RigLike | None = None, *, boundary_points: int = 30) -> Observations:
     """Compute the apparent pupils and glints of frames, or of all frames of a scene, by ray optics.
 
     >>> er.trace(er.load_scene("headset")).pupil.centre_px.round(1)[0].tolist()
@@ -94,9 +145,12 @@ def trace(frames: Frames | Scene, rig: RigLike | None = None, *, boundary_points
 
     Raises:
         InputError: no pose of an eye fixates a target of the scene; the message names it and the reason.
+        TypeError: the argument is neither.
     """
-    frames = as_frames(frames)
-    return AnalyticObserver(boundary_points).observe(frames, rig)
+    posed = frames.frames() if isinstance(frames, FrameSource) else frames
+    if not isinstance(posed, Traceable):
+        raise TypeError(f"give frames or a scene, not {type(frames).__name__}")
+    return AnalyticObserver(boundary_points).observe(posed, rig)
 
 
 def purkinje_records(observed: Observations, seen: Features, orders: Sequence[int]) -> list[dict[str, Any]]:

@@ -7,8 +7,8 @@ from .anatomy import Skin as Skin
 from .anatomy import TearFilm as TearFilm
 from .headspec import Head as Head
 from .headspec import HeadParts as HeadParts
-from .iris import IrisPattern as IrisPattern
 from .look import Fundus as Fundus
+from .look import IrisPattern as IrisPattern
 from .look import Scattering as Scattering
 from .mesh import LidMargins as LidMargins
 from .mesh import RegionMesh as RegionMesh

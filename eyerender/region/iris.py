@@ -11,42 +11,22 @@ eye colour. Albedo varies little; the map is darker where light is trapped (cryp
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy import ndimage
 
 from ..base.arrays import Ints, Singles
 from ..base.spec import Spec
 from . import noise_kernels as kernels
 from .contour import step
+from .look import IrisPattern
 from .noise import band_noise, nearest_two
 
 RADIAL, ANGULAR = 256, 1024
 WIDTH_MM, MARGIN_MM = 3.8, 2.0  # width and margin radius of the iris that strengths and means refer to
 _SOFT = (1.5, 1.5)  # standard deviation of the smoothing of heights, rows and columns
-_Strength = Annotated[float, Field(ge=0, le=1.5)]
-
-
-class IrisPattern(Spec):
-    """Appearance of the front of the iris; strengths that are not given follow from `look.iris_seed`."""
-
-    crypts: _Strength | None = Field(default=None, description="depth and number of the crypts")
-    furrows: _Strength | None = Field(default=None, description="depth of the contraction furrows")
-    collarette: _Strength | None = Field(
-        default=None, description="height of the collarette and of the step at it, depth of the small gaps along it"
-    )
-    fibres: _Strength | None = Field(default=None, description="height and contrast of the radial fibres")
-    relief: Annotated[float, Field(ge=0, le=2)] = Field(
-        default=1.0, description="scale of all heights but that of the convexity; 0 is flat"
-    )
-    convexity_mm: Annotated[float, Field(ge=0, le=0.5)] = Field(
-        default=0.15,
-        description="how far the middle of the iris, pushed by the lens, stands before the plane of margin and root "
-        "(chosen; tomography shows 0 to 0.3 mm)",
-    )
 
 
 class DrawnPattern(Spec):

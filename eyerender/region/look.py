@@ -15,12 +15,30 @@ from typing import Annotated, Self
 from pydantic import Field, field_validator, model_validator
 
 from ..base.spec import KeyProblem, NonNegative, Spec
-from .iris import IrisPattern
 
 Albedo = Annotated[float, Field(ge=0, le=0.95)]
 Contrast = Annotated[float, Field(ge=0, le=1.5)]
 LIMBAL_RING = (0.62, 0.95)
 """Share of the way from pupil to root over which a limbal ring darkens."""
+
+
+class IrisPattern(Spec):
+    """Appearance of the front of the iris; strengths that are not given follow from `look.iris_seed`."""
+
+    crypts: Contrast | None = Field(default=None, description="depth and number of the crypts")
+    furrows: Contrast | None = Field(default=None, description="depth of the contraction furrows")
+    collarette: Contrast | None = Field(
+        default=None, description="height of the collarette and of the step at it, depth of the small gaps along it"
+    )
+    fibres: Contrast | None = Field(default=None, description="height and contrast of the radial fibres")
+    relief: Annotated[float, Field(ge=0, le=2)] = Field(
+        default=1.0, description="scale of all heights but that of the convexity; 0 is flat"
+    )
+    convexity_mm: Annotated[float, Field(ge=0, le=0.5)] = Field(
+        default=0.15,
+        description="how far the middle of the iris, pushed by the lens, stands before the plane of margin and root "
+        "(chosen; tomography shows 0 to 0.3 mm)",
+    )
 
 
 class Fundus(Spec):

@@ -141,8 +141,8 @@ def test_a_batch_of_different_sizes_is_its_members():
     for k, single in enumerate((small, large)):
         both = batch.local_sag(np.stack([y, y]), np.stack([z, z]))[k]
         assert np.allclose(both, single.local_sag(y, z), atol=1e-13)
-    short = surface_of(PlacedSpec(shape=zernike_of(conic_depth, 3.25, 6)))
-    long = surface_of(PlacedSpec(shape=zernike_of(conic_depth, 3.25, 10)))
+    short: Any = surface_of(PlacedSpec(shape=zernike_of(conic_depth, 3.25, 6)))
+    long: Any = surface_of(PlacedSpec(shape=zernike_of(conic_depth, 3.25, 10)))
     with pytest.raises(ValueError, match="shape"):
         np.stack([short.coefficients_mm, long.coefficients_mm])
     both = type(short).stack((short, long)).local_sag(np.stack([y, y]), np.stack([z, z]))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from eyerender.base.errors import InputError
-from eyerender.region.iris import ANGULAR, MARGIN_MM, RADIAL, WIDTH_MM, DrawnPattern, IrisPattern, iris_maps
-from eyerender.region.look import Look
+from eyerender.region.iris import ANGULAR, MARGIN_MM, RADIAL, WIDTH_MM, DrawnPattern, iris_maps
+from eyerender.region.look import IrisPattern, Look
 from eyerender.region.texture import sclera_texture, skin_texture
 
 OPEN = IrisPattern(crypts=1.2, fibres=0.9)

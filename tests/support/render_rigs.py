@@ -12,8 +12,7 @@ import numpy as np
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeModel
 from eyerender.eye.pose import Poses, rigid_motion
-from eyerender.region.iris import IrisPattern
-from eyerender.region.look import Fundus, Look
+from eyerender.region.look import Fundus, IrisPattern, Look
 from eyerender.rig.camera import Camera, PinholeCamera
 from eyerender.rig.light import Lamp, Led, LedRing
 from eyerender.rig.sensor import Sensor

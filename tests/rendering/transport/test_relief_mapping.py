@@ -13,7 +13,8 @@ from scipy import ndimage
 from eyerender.base.arrays import Floats, frozen
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeModel
-from eyerender.region.iris import ANGULAR, RADIAL, WIDTH_MM, DrawnPattern, IrisPattern, iris_maps
+from eyerender.region.iris import ANGULAR, RADIAL, WIDTH_MM, DrawnPattern, iris_maps
+from eyerender.region.look import IrisPattern
 from eyerender.rig.camera import Camera
 from eyerender.rig.light import Lamp
 from tests.support.render_oracles import cos4
