@@ -3,8 +3,8 @@ A run on several machines
 =========================
 
 Every sample is a function of the spec and its number, so machines need not exchange anything. Each makes a part of the
-shards in the same folder, and the last one assembles the dataset. On a cluster, ``scripts/slurm_generate.sh`` starts
-``eyerender generate SPEC DIR --shard K/N`` in each task of an array job.
+shards in the same folder, and the last one assembles the dataset. On a cluster, ``scripts/tools/slurm_generate.sh``
+starts ``eyerender generate SPEC DIR --shard K/N`` in each task of an array job.
 """
 
 import hashlib

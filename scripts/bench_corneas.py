@@ -22,18 +22,18 @@ from _bench import Report, Row, options_of, row, single_threaded
 single_threaded()
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from eyerender.analytic.features import features  # noqa: E402
-from eyerender.backends.choose import choose_backend  # noqa: E402
-from eyerender.eye.catalogue import load_eye  # noqa: E402
-from eyerender.eye.model import EyeModel  # noqa: E402
-from eyerender.eye.parts import PlacedSpec  # noqa: E402
-from eyerender.eye.pose import Poses  # noqa: E402
-from eyerender.eye.spec import EyeSpec  # noqa: E402
-from eyerender.eye.surfaces import surface_of  # noqa: E402
-from eyerender.optics.surfaces_measured import GridSurface, ZernikeSurface  # noqa: E402
-from tests.support.corneas import conic_depth, eye_with, grid_of, keratoconus, zernike_of  # noqa: E402
+from eyerender.analytic.features import features
+from eyerender.backends.choose import choose_backend
+from eyerender.eye.catalogue import load_eye
+from eyerender.eye.model import EyeModel
+from eyerender.eye.parts import PlacedSpec
+from eyerender.eye.pose import Poses
+from eyerender.eye.spec import EyeSpec
+from eyerender.eye.surfaces import surface_of
+from eyerender.optics.surfaces_measured import GridSurface, ZernikeSurface
+from tests.support.corneas import conic_depth, eye_with, grid_of, keratoconus, zernike_of
 
 COUNT = 1000
 KINDS = ("conic", "zernike", "grid")

@@ -23,11 +23,11 @@ from _bench import Report, options_of, row, single_threaded
 
 single_threaded()
 
-import eyerender as er  # noqa: E402
-from eyerender.gaze.estimate import RayEstimator, angular_error_deg  # noqa: E402
-from eyerender.gaze.store import choose_estimator  # noqa: E402
-from eyerender.population.people import Person  # noqa: E402
-from eyerender.scene.observation import Observations, concatenate  # noqa: E402
+import eyerender as er
+from eyerender.gaze.estimate import RayEstimator, angular_error_deg
+from eyerender.gaze.store import choose_estimator
+from eyerender.population.people import Person
+from eyerender.scene.observation import Observations, concatenate
 
 ESTIMATORS = ("maximum-likelihood", "hennessey", "guestrin-eizenman", "direction-regression", "regression")
 SEED, SLIPPAGE_MM = 21, 1.5

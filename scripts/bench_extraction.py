@@ -21,11 +21,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import Pool
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+sys.path.append(str(Path(__file__).resolve().parent / "tools"))
 import bench_rendered_rows
 import make_ideal_images as ideal
 from _bench import Report, options_of, row

@@ -37,21 +37,21 @@ from _people import recipe
 
 single_threaded()
 
-import numpy as np  # noqa: E402
-import yaml  # noqa: E402
+import numpy as np
+import yaml
 
-from eyerender.dataset import shard  # noqa: E402
-from eyerender.dataset.done import sum_of  # noqa: E402
-from eyerender.dataset.estimate import estimate  # noqa: E402
-from eyerender.dataset.maker import Maker  # noqa: E402
-from eyerender.dataset.plan import Plan  # noqa: E402
-from eyerender.dataset.pool import LocalPool  # noqa: E402
-from eyerender.dataset.realise import frames_of  # noqa: E402
-from eyerender.dataset.run import generate  # noqa: E402
-from eyerender.dataset.shard import Staged, commit, write_shard  # noqa: E402
-from eyerender.dataset.spec import DatasetSpec, GeometryKind, find_dataset  # noqa: E402
-from eyerender.dataset.worker import Job  # noqa: E402
-from eyerender.folders.imagefile import write_picture  # noqa: E402
+from eyerender.dataset import shard
+from eyerender.dataset.done import sum_of
+from eyerender.dataset.estimate import estimate
+from eyerender.dataset.maker import Maker
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.pool import LocalPool
+from eyerender.dataset.realise import frames_of
+from eyerender.dataset.run import generate
+from eyerender.dataset.shard import Staged, commit, write_shard
+from eyerender.dataset.spec import DatasetSpec, GeometryKind, find_dataset
+from eyerender.dataset.worker import Job
+from eyerender.folders.imagefile import write_picture
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "scripts" / "recipes"

@@ -22,6 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+sys.path.append(str(Path(__file__).resolve().parent / "tools"))
 import hard_eyes
 from _bench import Report, Row, options_of, row
 from extraction_tally import near

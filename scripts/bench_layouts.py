@@ -21,13 +21,13 @@ from _bench import Report, options_of, row, single_threaded
 
 single_threaded()
 
-from scipy.stats import spearmanr  # noqa: E402
+from scipy.stats import spearmanr
 
-import eyerender as er  # noqa: E402
-from eyerender.gaze.estimate import ray_errors_deg  # noqa: E402
-from eyerender.imaging.capture import EyeImage, render_windows  # noqa: E402
-from eyerender.rig.exposure import recorded  # noqa: E402
-from eyerender.scene.observation import Observations, concatenate  # noqa: E402
+import eyerender as er
+from eyerender.gaze.estimate import ray_errors_deg
+from eyerender.imaging.capture import EyeImage, render_windows
+from eyerender.rig.exposure import recorded
+from eyerender.scene.observation import Observations, concatenate
 
 LAYOUTS, REPEATS, SEED = 42, 24, 7
 FEW = (0, 2, 5, 7, 10)  # places of --quick

@@ -32,9 +32,9 @@ single_threaded()
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from eyerender.backends.choose import choose_backend  # noqa: E402
+from eyerender.backends.choose import choose_backend
 
 MODELS = ("E1", "E2", "E3", "E4", "E5")
 

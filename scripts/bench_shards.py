@@ -22,17 +22,17 @@ from _bench import Report, options_of, row, single_threaded
 
 single_threaded()
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from eyerender.dataset.assemble import assemble  # noqa: E402
-from eyerender.dataset.done import cpu_family, described, run_versions  # noqa: E402
-from eyerender.dataset.plan import Plan  # noqa: E402
-from eyerender.dataset.run import generate  # noqa: E402
-from eyerender.dataset.runfile import begin  # noqa: E402
-from eyerender.dataset.spec import DatasetSpec, find_dataset  # noqa: E402
-from eyerender.dataset.status import status  # noqa: E402
-from eyerender.folders.imagefolder import ImageFolder  # noqa: E402
-from eyerender.folders.packed import LINES_GZ, MEMBERS, TAR, pack_lines  # noqa: E402
+from eyerender.dataset.assemble import assemble
+from eyerender.dataset.done import cpu_family, described, run_versions
+from eyerender.dataset.plan import Plan
+from eyerender.dataset.run import generate
+from eyerender.dataset.runfile import begin
+from eyerender.dataset.spec import DatasetSpec, find_dataset
+from eyerender.dataset.status import status
+from eyerender.folders.imagefolder import ImageFolder
+from eyerender.folders.packed import LINES_GZ, MEMBERS, TAR, pack_lines
 
 IMAGES = 250
 LINED = 100  # shards that have lines, which are those of the first

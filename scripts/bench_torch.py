@@ -23,10 +23,10 @@ from _bench import Report, Row, options_of, row, single_threaded
 
 single_threaded()
 
-from bench_generate import Clock, plan  # noqa: E402
-from eyerender.dataset.pool import LocalPool  # noqa: E402
-from eyerender.dataset.realise import frames_of  # noqa: E402
-from eyerender.dataset.worker import Job  # noqa: E402
+from bench_generate import Clock, plan
+from eyerender.dataset.pool import LocalPool
+from eyerender.dataset.realise import frames_of
+from eyerender.dataset.worker import Job
 
 WORKERS, BATCH, SHARD, MIXED = 2, 8, 48, 4
 

@@ -26,7 +26,7 @@ MODULES = {
 }
 # Holds shared libraries and no module; backends/libraries.py loads them.
 LIBRARIES = {"karellen_llvm_core"}
-# Runs in an environment of its own, as an extractor to compare with; see scripts/setup_pupil_detectors.sh.
+# Runs in an environment of its own, as an extractor to compare with; see scripts/tools/setup_pupil_detectors.sh.
 ELSEWHERE = {"pupil_detectors"}
 
 

@@ -31,7 +31,6 @@ def test_short(): pass
 @pytest.mark.parametrize("k", range(3))
 def test_long_together(k): burn(0.09)
 def test_with_costly_fixture(costly): pass
-def test_between(): burn(0.15)
 @pytest.mark.fast
 def test_marked(): burn(0.25)
 """
@@ -42,7 +41,7 @@ from tests.support.quick import Quick, Recorder, listed
 LIST = Path("list.txt")
 
 def pytest_configure(config):
-    config.pluginmanager.register(Recorder(LIST, enter_s=0.2, leave_s=0.1))
+    config.pluginmanager.register(Recorder(LIST, quick_s=0.2))
 
 def pytest_collection_modifyitems(items):
     is_quick = Quick(listed(LIST))
@@ -68,20 +67,10 @@ def test_measured_tests_and_those_with_long_fixtures_are_left_out(tmp_path):
     (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = fast\n")
     (tmp_path / "conftest.py").write_text(CONFTEST)
     (tmp_path / "test_some.py").write_text(TESTS)
-    everything = {
-        "test_long",
-        "test_short",
-        "test_long_together",
-        "test_with_costly_fixture",
-        "test_between",
-        "test_marked",
-    }
-    assert quick_by(tmp_path) == everything
-    assert quick_by(tmp_path) == {"test_short", "test_between", "test_marked"}
-    # What is listed stays so until it is clearly quick.
-    (tmp_path / "list.txt").write_text("test_some.py::test_between\ntest_some.py::test_short\ntest_some.py::gone\n")
-    assert quick_by(tmp_path) == everything - {"test_between", "test_short"}
-    names = ["costly", "test_between", "test_long", "test_long_together", "test_marked"]
+    long = {"test_long", "test_long_together", "test_with_costly_fixture"}
+    assert quick_by(tmp_path) == {"test_short", "test_marked", *long}
+    assert quick_by(tmp_path) == {"test_short", "test_marked"}
+    names = ["costly", "test_long", "test_long_together", "test_marked"]
     assert listed(tmp_path / "list.txt") == [f"test_some.py::{name}" for name in names]
 
 

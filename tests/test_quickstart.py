@@ -133,7 +133,7 @@ def test_report_is_self_contained_and_shows_every_image(folder):
 
 @pytest.mark.packaging
 def test_python_twin_prints_the_same_numbers(folder, tmp_path):
-    script = ROOT / "scripts" / "quickstart.py"
+    script = ROOT / "scripts" / "tools" / "quickstart.py"
     if not script.is_file():
         pytest.skip("no checkout")
     source = script.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The tables of the validation page, from the files that `scripts/measure_validation.py` writes to `docs/data`."""
+"""Tables of the validation page, from the files that `scripts/tools/measure_validation.py` writes to `docs/data`."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from eyerender.cli.main import run
 from eyerender.extraction.baseline import contour_pupil
 from eyerender.folders.imagefile import read_image, write_png
 from eyerender.optics.ellipse import Ellipse, iou, signed_distance
-from tests.support.paths import ROOT, SCRIPTS
+from tests.support.paths import ROOT, TOOLS
 
 
 def test_the_shipped_extractors_are_installed():
@@ -48,7 +48,7 @@ def test_without_its_environment_pupil_detectors_is_named_but_not_run(monkeypatc
     monkeypatch.setenv(PUPIL_LABS_PYTHON, "/nonexistent/python")
     ready, absent = defaults()
     assert "pupil-detectors" not in [e.name for e in ready]
-    assert absent["pupil-detectors"].startswith("not set up; scripts/setup_pupil_detectors.sh")
+    assert absent["pupil-detectors"].startswith("not set up; scripts/tools/setup_pupil_detectors.sh")
     with pytest.raises(InputError, match="--extractor pupil-detectors: not set up"):
         resolve("pupil-detectors")
 
@@ -173,7 +173,7 @@ def test_deep_images_are_scaled_to_eight_bits(tmp_path):
     assert eight_bits(str(tmp_path / "a.png"), 12).flags.writeable
 
 
-@pytest.mark.skipif(pupil_labs_python() is None, reason="scripts/setup_pupil_detectors.sh has not been run")
+@pytest.mark.skipif(pupil_labs_python() is None, reason="scripts/tools/setup_pupil_detectors.sh has not been run")
 def test_pupil_detectors_in_its_own_environment(drawn, tmp_path):
     target = tmp_path / "results.json"
     argv = ["bench-extractors", str(drawn), "-o", str(tmp_path / "out"), "--extractor", "pupil-detectors"]
@@ -195,7 +195,7 @@ def test_cheshm_s_answers_are_rotated_rectangles_or_missing():
     assert cheshm_pupil(None)["reason"] == "no pupil detected"
 
 
-@pytest.mark.skipif(cheshm_python() is None, reason="scripts/setup_cheshm.sh has not been run")
+@pytest.mark.skipif(cheshm_python() is None, reason="scripts/tools/setup_cheshm.sh has not been run")
 @pytest.mark.parametrize("name", ["pure", "else_", "excuse", "swirski"])
 def test_cheshm_s_detectors_in_their_own_environment(drawn, tmp_path, name):
     data = bench_extractors(drawn, tmp_path / "out", [f"eyerender.apps.benchmark.shipped:{name}"])
@@ -224,7 +224,7 @@ def test_simple_detectors_find_drawn_pupils(drawn, monkeypatch, name):
 
 @pytest.mark.parametrize("script", ["setup_pupil_detectors.sh", "setup_cheshm.sh"])
 def test_the_set_up_script_refuses_what_it_does_not_know(tmp_path, script):
-    script = SCRIPTS / script
+    script = TOOLS / script
     env = {"PATH": os.environ["PATH"], "XDG_CACHE_HOME": str(tmp_path)}
     wrong = subprocess.run([script, "--farce"], env=env, capture_output=True, text=True)
     assert (wrong.returncode, wrong.stdout) == (2, "")

@@ -7,9 +7,9 @@ import subprocess
 
 import pytest
 
-from tests.support.paths import SCRIPTS
+from tests.support.paths import TOOLS
 
-SCRIPT = SCRIPTS / "slurm_generate.sh"
+SCRIPT = TOOLS / "slurm_generate.sh"
 
 pytestmark = pytest.mark.skipif(not SCRIPT.is_file(), reason="not a checkout")
 

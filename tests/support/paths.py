@@ -8,6 +8,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "scripts"
+TOOLS = SCRIPTS / "tools"
 DATA = ROOT / "tests" / "data"
 
 

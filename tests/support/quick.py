@@ -1,7 +1,7 @@
 """Which tests are quick: those for `./scripts/test --fast`.
 
-The file tests/data/not_quick.txt lists the tests and fixtures that are not. Every full run of `./scripts/test` measures
-them all and writes it, so that it keeps up with the tests; commit its changes. A test that it does not name is quick.
+The file tests/data/not_quick.txt lists the tests and fixtures that are not. `./scripts/test --record` measures
+them all and writes it. A test that it does not name is quick.
 The mark `fast` puts a test among the quick ones however long it takes. Times are processor seconds, with those of child
 processes, so that they come out alike on a busy machine.
 """
@@ -18,8 +18,7 @@ from typing import Any
 import pytest
 
 PLACE = Path(__file__).resolve().parents[1] / "data" / "not_quick.txt"
-ENTER_S, LEAVE_S = 0.5, 0.25
-"""A test enters the list with more than the first, and leaves it with less than the second."""
+QUICK_S = 0.5  # what takes longer is not quick
 
 
 def processor_s() -> float:
@@ -35,8 +34,8 @@ def name_of(item: pytest.Item) -> str:
 class Recorder:
     """A plugin that measures tests and fixtures, and writes the list when all have run."""
 
-    def __init__(self, place: Path = PLACE, enter_s: float = ENTER_S, leave_s: float = LEAVE_S) -> None:
-        self.place, self.enter_s, self.leave_s = place, enter_s, leave_s
+    def __init__(self, place: Path = PLACE, quick_s: float = QUICK_S) -> None:
+        self.place, self.quick_s = place, quick_s
         self.seconds: dict[str, float] = defaultdict(float)
 
     @pytest.hookimpl(wrapper=True)
@@ -63,8 +62,7 @@ class Recorder:
         if output is not None:
             output["seconds"] = dict(self.seconds)
         elif exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
-            before = set(listed(self.place))
-            names = [name for name, s in self.seconds.items() if s > (self.leave_s if name in before else self.enter_s)]
+            names = [name for name, seconds in self.seconds.items() if seconds > self.quick_s]
             self.place.write_text("".join(f"{name}\n" for name in sorted(names)), encoding="utf-8")
 
     @contextmanager

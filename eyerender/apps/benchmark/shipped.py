@@ -55,13 +55,13 @@ opencv_contour.reports = ("pupil",)  # type: ignore[attr-defined]
 def pupil_labs_python() -> Path | None:
     """Return the interpreter of the environment with `pupil-detectors`; None if there is none.
 
-    EYERENDER_PUPIL_DETECTORS names it; by default it is where scripts/setup_pupil_detectors.sh puts it.
+    EYERENDER_PUPIL_DETECTORS names it; by default it is where scripts/tools/setup_pupil_detectors.sh puts it.
     """
     return _interpreter(PUPIL_LABS_PYTHON, PUPIL_LABS)
 
 
 def cheshm_python() -> Path | None:
-    """Return the interpreter with `cheshm`: EYERENDER_CHESHM, else that of scripts/setup_cheshm.sh."""
+    """Return the interpreter with `cheshm`: EYERENDER_CHESHM, else that of scripts/tools/setup_cheshm.sh."""
     return _interpreter(CHESHM_PYTHON, "cheshm")
 
 

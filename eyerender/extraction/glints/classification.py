@@ -3,7 +3,7 @@
 A spot's features (its surroundings, distance from the pupil, shape and height) give a first logit of the probability
 that it is a glint of the cornea. The others are then compared with the brightest likely one: reflections of one rig's
 lamps are about equally high and wide, and those in the tear menisci are smaller. The weights of both steps are maximum
-a-posteriori estimates (logistic regression) from development images; `scripts/fit_glints.py` fits them.
+a-posteriori estimates (logistic regression) from development images; `scripts/tools/fit_glints.py` fits them.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ The covariance is multiplied by the exponential of a function of the same form, 
 centres of right ellipses, with equal weight on every kind of image. Texture, reflections and lids displace the boundary
 over longer stretches than the scatter of its points shows.
 
-`scripts/fit_confidence.py` fits the weights, which are in `weights.json`.
+`scripts/tools/fit_confidence.py` fits the weights, which are in `weights.json`.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from eyerender.imaging.capture import render_job, render_windows
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.labels import labels_of
-from tests.support.paths import SCRIPTS
+from tests.support.paths import TOOLS
 from tests.support.render_rigs import depths_mm
 
 pytestmark = pytest.mark.render
@@ -293,7 +293,7 @@ def test_the_own_region_as_a_head_hides_what_it_hides(renderer, tmp_path):
     import subprocess
     import sys
 
-    script = SCRIPTS / "describe_head.py"
+    script = TOOLS / "describe_head.py"
     subprocess.run([sys.executable, str(script), "--example", str(tmp_path)], check=True, capture_output=True)
     matte, dry = {"look": {"scattering": "off"}}, {"tears": {"height_mm": 0.0}}  # heads are matte
     # The menisci of a head are opaque, those of a region are not.
