@@ -237,7 +237,7 @@ LARGE = {
 # first fields users give in order.
 POSITIONAL = {
     "Biconic", "Descent", "EyeImage", "EyePicture", "Finding", "GradientMedium", "GridSurface", "GuestrinEizenman",
-    "LashPlan", "Outcome", "Patch", "Pixels", "Place", "Quadric", "Regression", "Scene", "Score",
+    "LashPlan", "Outcome", "Patch", "Pixels", "Quadric", "Regression", "Scene", "Score",
     "Stop", "Sums", "Surface", "Table", "Visible", "ZernikeSurface", "_Table",
 }  # fmt: skip
 

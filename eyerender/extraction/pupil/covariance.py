@@ -14,7 +14,17 @@ import numpy as np
 from ...base.arrays import Bools, Floats, Indices
 from ...base.jit import compiled
 from ...optics.ellipse import Ellipse
-from .places import BLOCK, COS_T, COS_U, NX, NY, SECTORS, SIN_T, SIN_U, Place, places, sector_at
+from .places import (
+    BLOCK,
+    PLACES,
+    SECTORS,
+    distance_slopes,
+    distance_slopes_at,
+    find_places,
+    middles,
+    place_in,
+    sector_at,
+)
 
 SHAPE = 5  # number of parameters
 GROUPS = SECTORS // 3  # each is longer than the noise's correlation
@@ -32,11 +42,9 @@ ROUGHER = 3.0
 ELONGATION = 0.07
 
 
-def distance_slopes(ellipse: Ellipse, place: Place) -> Floats:
-    """Compute derivatives (5, n) of the signed distance by cx, cy and the shape matrix (aa, bb, ab), ellipse's axes."""
-    cos, sin = math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)
-    nx, ny, c, s = place.nx, place.ny, place.cos_t, place.sin_t
-    return np.array([ny * sin - nx * cos, -nx * sin - ny * cos, -nx * c, -ny * s, -nx * s - ny * c])
+def outline_slopes(ellipse: Ellipse, count: int = SECTORS) -> Floats:
+    """Compute the `distance_slopes` (5, count) in the middle of each of `count` sectors."""
+    return np.array(distance_slopes(middles(ellipse, count), math.cos(ellipse.angle_rad), math.sin(ellipse.angle_rad)))
 
 
 def sector_excess(plain: Floats, inverse: Floats, sums: Floats) -> float:
@@ -77,18 +85,17 @@ def _edge_sums(ellipse: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats
     """Compute the sums of `EdgeSums` for an ellipse (cx, cy, a, b, angle) and points (x, y)."""
     cos, sin = math.cos(ellipse[4]), math.sin(ellipse[4])
     matrix, scores, slopes = np.zeros((SHAPE, SHAPE)), np.zeros((SHAPE, GROUPS)), np.zeros((SHAPE, GROUPS))
-    number, row, place = np.zeros(GROUPS, dtype=np.int64), np.empty(SHAPE), np.empty(8 * BLOCK)
+    number, row, block = np.zeros(GROUPS, dtype=np.int64), np.empty(SHAPE), np.empty(PLACES)
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
-        places(ellipse, x, y, start, count, place)
+        find_places(ellipse, x, y, start, count, block)
         for i in range(count):
-            c, s, nx, ny = place[COS_T + i], place[SIN_T + i], place[NX + i], place[NY + i]
-            row[0], row[1] = ny * sin - nx * cos, -nx * sin - ny * cos  # as in `distance_slopes`
-            row[2], row[3], row[4] = -nx * c, -ny * s, -nx * s - ny * c
-            k = sector_at(place[COS_U + i], place[SIN_U + i]) * GROUPS // SECTORS
+            place = place_in(block, i)
+            row[0], row[1], row[2], row[3], row[4] = distance_slopes_at(place, cos, sin)
+            k = sector_at(place.cos_u, place.sin_u) * GROUPS // SECTORS
             number[k] += 1
             for j in range(SHAPE):
-                scores[j, k] += row[j] * place[i]
+                scores[j, k] += row[j] * place.distance
                 slopes[j, k] += row[j]
                 for m in range(SHAPE):
                     matrix[j, m] += row[j] * row[m]
@@ -119,7 +126,7 @@ def hidden_part(ellipse: Ellipse, seen: Bools, residual_px: float) -> Floats:
         seen: (SECTORS,) which sectors are visible.
         residual_px: root mean square distance of the edge points in them.
     """
-    slopes = distance_slopes(ellipse, Place.middles(ellipse))
+    slopes = outline_slopes(ellipse)
     visible = slopes * seen
     matrix = visible @ slopes.T
     ridge = 1e-9 * np.trace(matrix) * np.eye(SHAPE)
@@ -182,7 +189,7 @@ def boundary_deviation(ellipse: Ellipse, covariance: Floats) -> float:
 
 def _along_outline(ellipse: Ellipse, covariance: Floats) -> float:
     """Compute the rms of the boundary's standard deviation, given the covariance (5, 5) of centre and shape matrix."""
-    slopes = distance_slopes(ellipse, Place.middles(ellipse, 32))
+    slopes = outline_slopes(ellipse, 32)
     return math.sqrt(max(float(np.sum(slopes * (covariance @ slopes))) / slopes.shape[1], 0.0))
 
 

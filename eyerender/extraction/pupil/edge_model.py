@@ -20,20 +20,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Indices
 from ...base.jit import compiled, inlined
 from ...optics.ellipse import Ellipse
-from .places import BLOCK, COS_U, CURVATURE, SIN_U, places, sector_at
-
-# Columns of a block of profiles, all by the distance d: the edge E (first), its derivatives by the distance, sigma and
-# the kurtosis, the blurred ramp max(d, 0), and its derivatives by the distance and sigma.
-BY_DISTANCE, BY_SIGMA, BY_KURTOSIS, RAMP, RAMP_BY_DISTANCE, RAMP_BY_SIGMA = (k * BLOCK for k in range(1, 7))
-
-# Columns of a block of local levels; the inner level comes first.
-STEP, WITHIN, BEND = (k * BLOCK for k in range(1, 4))
+from .places import BLOCK, PLACES, find_places, place_in, sector_at
 
 # Phi and phi at z = -LAST to LAST in steps of 1 / FINE; a Taylor series of fourth order leads to 1e-11 between them.
 FINE, LAST = 32, 8
@@ -104,71 +98,129 @@ class EdgeModel:
 _EXACT = np.zeros(0)
 
 
-@inlined
-def profiles(place: Floats, count: int, sigma: float, kurtosis: float, out: Floats) -> None:
-    """Write the blurred step and ramp across the boundary at `count` positions, as columns of out (7 BLOCK,).
+class Profile(NamedTuple):
+    """The blurred step and ramp across the boundary at one point.
 
-    E goes from 0 inside to 1 outside. The derivative of -(z^3 - 3 z) phi is He_4 phi.
-
-    Args:
-        place: (8 BLOCK,) of `places`.
-        count: number of points.
-        sigma: standard deviation of the blur, px.
-        kurtosis: excess kurtosis of the blur.
-        out: (7 BLOCK,) edge, its derivatives, ramp and its derivatives.
+    Attributes:
+        edge: E, from 0 inside to 1 outside.
+        by_distance: its derivative by the distance.
+        by_sigma: its derivative by the standard deviation of the blur.
+        by_kurtosis: its derivative by the kurtosis of the blur.
+        ramp: R, the blurred max(d, 0).
+        ramp_by_distance: its derivative by the distance.
+        ramp_by_sigma: its derivative by the standard deviation of the blur.
     """
-    for i in range(count):
-        z, half = min(max(place[i] / sigma, -float(LAST)), float(LAST)), 0.5 * place[CURVATURE + i]
-        at = int(z * FINE + (LAST * FINE + 0.5))
-        near = at * (1.0 / FINE) - LAST
-        d, n2, bell, z2 = z - near, near * near, _BELL[at], z * z
-        second, third, fourth = 0.5 * (n2 - 1.0), near * (3.0 - n2) / 6.0, (n2 * (n2 - 6.0) + 3.0) / 24.0
-        density = bell * (1.0 + d * (-near + d * (second + d * (third + d * fourth))))
-        series = 1.0 + d * (-0.5 * near + d * (second / 3.0 + d * (0.25 * third + d * 0.2 * fourth)))
-        step, tails = _PHI[at] + bell * d * series, z * (3.0 - z2) * density / 24.0
-        bend = density * (1.0 + (kurtosis / 24.0) * (z2 * (z2 - 6.0) + 3.0))
-        out[i] = step + half * sigma * density + kurtosis * tails
-        out[BY_DISTANCE + i] = bend / sigma - half * z * density
-        out[BY_SIGMA + i] = half * (1.0 + z2) * density - z * bend / sigma
-        out[BY_KURTOSIS + i], out[RAMP + i] = tails, place[i] * step + sigma * density
-        out[RAMP_BY_DISTANCE + i], out[RAMP_BY_SIGMA + i] = step, density
+
+    edge: float
+    by_distance: float
+    by_sigma: float
+    by_kurtosis: float
+    ramp: float
+    ramp_by_distance: float
+    ramp_by_sigma: float
+
+
+PROFILES = 7 * BLOCK  # numbers in a block of profiles
 
 
 @inlined
-def turn_harmonics(place: Floats, count: int, basis: Floats) -> None:
+def profile_in(block: Floats, i: int) -> Profile:
+    """Read profile i of a block (PROFILES,)."""
+    return Profile(
+        block[i], block[BLOCK + i], block[2 * BLOCK + i], block[3 * BLOCK + i],
+        block[4 * BLOCK + i], block[5 * BLOCK + i], block[6 * BLOCK + i],
+    )  # fmt: skip
+
+
+@inlined
+def put_profile(block: Floats, i: int, profile: Profile) -> None:
+    """Write profile i of a block (PROFILES,)."""
+    block[i], block[BLOCK + i], block[2 * BLOCK + i], block[3 * BLOCK + i] = profile[:4]
+    block[4 * BLOCK + i], block[5 * BLOCK + i], block[6 * BLOCK + i] = profile[4:]
+
+
+@inlined
+def profile_at(distance: float, curvature: float, sigma: float, kurtosis: float) -> Profile:
+    """Compute the profile at a distance from the boundary. The derivative of -(z^3 - 3 z) phi is He_4 phi."""
+    z, half = min(max(distance / sigma, -float(LAST)), float(LAST)), 0.5 * curvature
+    at = int(z * FINE + (LAST * FINE + 0.5))
+    near = at * (1.0 / FINE) - LAST
+    d, n2, bell, z2 = z - near, near * near, _BELL[at], z * z
+    second, third, fourth = 0.5 * (n2 - 1.0), near * (3.0 - n2) / 6.0, (n2 * (n2 - 6.0) + 3.0) / 24.0
+    density = bell * (1.0 + d * (-near + d * (second + d * (third + d * fourth))))
+    series = 1.0 + d * (-0.5 * near + d * (second / 3.0 + d * (0.25 * third + d * 0.2 * fourth)))
+    step, tails = _PHI[at] + bell * d * series, z * (3.0 - z2) * density / 24.0
+    bend = density * (1.0 + (kurtosis / 24.0) * (z2 * (z2 - 6.0) + 3.0))
+    return Profile(
+        edge=step + half * sigma * density + kurtosis * tails,
+        by_distance=bend / sigma - half * z * density,
+        by_sigma=half * (1.0 + z2) * density - z * bend / sigma,
+        by_kurtosis=tails,
+        ramp=distance * step + sigma * density,
+        ramp_by_distance=step,
+        ramp_by_sigma=density,
+    )
+
+
+class Levels(NamedTuple):
+    """Terms of the model's level at one point: inner + step E + within d + bend R.
+
+    `within` is the slope inside, `bend` the change of the slope across the boundary.
+    """
+
+    inner: float
+    step: float
+    within: float
+    bend: float
+
+
+LEVELS = 4 * BLOCK  # numbers in a block of levels
+
+
+@inlined
+def levels_in(block: Floats, i: int) -> Levels:
+    """Read levels i of a block (LEVELS,)."""
+    return Levels(block[i], block[BLOCK + i], block[2 * BLOCK + i], block[3 * BLOCK + i])
+
+
+@inlined
+def put_levels(block: Floats, i: int, levels: Levels) -> None:
+    """Write levels i of a block (LEVELS,)."""
+    block[i], block[BLOCK + i], block[2 * BLOCK + i], block[3 * BLOCK + i] = levels
+
+
+@inlined
+def turn_harmonics(places: Floats, count: int, basis: Floats) -> None:
     """Advance the harmonics (cos k u, then sin k u) in basis (2 BLOCK,) to the next order."""
     for i in range(count):
-        c, s, cu, su = basis[i], basis[BLOCK + i], place[COS_U + i], place[SIN_U + i]
-        basis[i], basis[BLOCK + i] = c * cu - s * su, s * cu + c * su
+        place, c, s = place_in(places, i), basis[i], basis[BLOCK + i]
+        basis[i], basis[BLOCK + i] = c * place.cos_u - s * place.sin_u, s * place.cos_u + c * place.sin_u
 
 
 @inlined
-def local_levels(place: Floats, count: int, numbers: Floats, basis: Floats, out: Floats) -> None:
-    """Write the terms of the model's level at `count` positions, as columns of out (4 BLOCK,).
-
-    The level is inner + step E + within d + bend R, where within is the slope inside and bend the change of the slope
-    across the boundary.
+def local_levels(places: Floats, count: int, numbers: Floats, basis: Floats, out: Floats) -> None:
+    """Write the levels at `count` places.
 
     Args:
-        place: (8 BLOCK,) of `places`.
+        places: (PLACES,) the places.
         count: number of points.
         numbers: (p,) the model (see `EdgeModel.numbers`).
         basis: (2 BLOCK,) scratch memory.
-        out: (4 BLOCK,) the result.
+        out: (LEVELS,) the result.
     """
     outer, plane = numbers[11:], 1.0 / math.sqrt(numbers[2] * numbers[3])
     for i in range(count):
-        lean = numbers[9] * place[COS_U + i] + numbers[10] * place[SIN_U + i]
-        out[i], out[STEP + i] = numbers[6] + lean, outer[0] - numbers[6] - lean
-        out[WITHIN + i], out[BEND + i] = lean * plane, numbers[7] - lean * plane
+        place = place_in(places, i)
+        lean = numbers[9] * place.cos_u + numbers[10] * place.sin_u
+        step, within = outer[0] - numbers[6] - lean, lean * plane
+        put_levels(out, i, Levels(numbers[6] + lean, step, within, numbers[7] - within))
         basis[i], basis[BLOCK + i] = 1.0, 0.0
     for j in range(1, outer.size, 2):
-        turn_harmonics(place, count, basis)
+        turn_harmonics(places, count, basis)
+        sloping = plane if j == 1 else 0.0
         for i in range(count):
-            part = outer[j] * basis[i] + outer[j + 1] * basis[BLOCK + i]
-            out[STEP + i] += part
-            if j == 1:
-                out[BEND + i] += part * plane
+            at, part = levels_in(out, i), outer[j] * basis[i] + outer[j + 1] * basis[BLOCK + i]
+            put_levels(out, i, Levels(at.inner, at.step + part, at.within, at.bend + part * sloping))
 
 
 @compiled("f8[::1], f8[::1], f8[::1]")
@@ -176,21 +228,20 @@ def boundary_terms(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floa
     """Compute what the level at pixels (n,) depends on, except the displacement of the boundary.
 
     Returns:
-        Sectors (n,); distance, curvature, cos u, sin u and the four `local_levels` as rows (8, n).
+        Sectors (n,); distance, curvature, cos u, sin u and the four `Levels` as rows (8, n).
     """
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
     bins, out = np.empty(x.size, dtype=np.int64), np.empty((8, x.size))
-    place, basis, local = np.empty(8 * BLOCK), np.empty(2 * BLOCK), np.empty(4 * BLOCK)
+    places, basis, levels = np.empty(PLACES), np.empty(2 * BLOCK), np.empty(LEVELS)
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
-        places(ellipse, x, y, start, count, place)
-        local_levels(place, count, numbers, basis, local)
+        find_places(ellipse, x, y, start, count, places)
+        local_levels(places, count, numbers, basis, levels)
         for i in range(count):
-            bins[start + i] = sector_at(place[COS_U + i], place[SIN_U + i])
-            out[0, start + i], out[1, start + i] = place[i], place[CURVATURE + i]
-            out[2, start + i], out[3, start + i] = place[COS_U + i], place[SIN_U + i]
-            for k in range(4):
-                out[4 + k, start + i] = local[k * BLOCK + i]
+            place, k = place_in(places, i), start + i
+            bins[k] = sector_at(place.cos_u, place.sin_u)
+            out[0, k], out[1, k], out[2, k], out[3, k] = place.distance, place.curvature, place.cos_u, place.sin_u
+            out[4, k], out[5, k], out[6, k], out[7, k] = levels_in(levels, i)
     return bins, out
 
 
@@ -200,18 +251,12 @@ def levels_and_slopes(terms: Floats, displaced: Floats, numbers: Floats) -> tupl
 
     The boundary at each pixel is `displaced` (n,) px into the ellipse.
     """
-    n = displaced.size
-    level, slope, place, edge = np.empty(n), np.empty(n), np.empty(8 * BLOCK), np.empty(7 * BLOCK)
-    for start in range(0, n, BLOCK):
-        count = min(BLOCK, n - start)
-        for i in range(count):
-            place[i], place[CURVATURE + i] = terms[0, start + i] + displaced[start + i], terms[1, start + i]
-        profiles(place, count, numbers[5], numbers[8], edge)
-        for i in range(count):
-            k = start + i
-            inner, step, within, bend = terms[4, k], terms[5, k], terms[6, k], terms[7, k]
-            level[k] = inner + step * edge[i] + within * place[i] + bend * edge[RAMP + i]
-            slope[k] = step * edge[BY_DISTANCE + i] + within + bend * edge[RAMP_BY_DISTANCE + i]
+    level, slope = np.empty(displaced.size), np.empty(displaced.size)
+    for k in range(displaced.size):
+        distance, at = terms[0, k] + displaced[k], Levels(terms[4, k], terms[5, k], terms[6, k], terms[7, k])
+        profile = profile_at(distance, terms[1, k], numbers[5], numbers[8])
+        level[k] = at.inner + at.step * profile.edge + at.within * distance + at.bend * profile.ramp
+        slope[k] = at.step * profile.by_distance + at.within + at.bend * profile.ramp_by_distance
     return level, slope
 
 
@@ -219,7 +264,8 @@ def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
     """Compute levels (n,) of the model with these parameters; `displaced` is empty for an exact ellipse."""
     terms, between = boundary_terms(x, y, numbers)[1], np.zeros(x.size)
     if displaced.size:
-        at = (np.arctan2(terms[3], terms[2]) / (2.0 * np.pi) + 0.5) * displaced.size - 0.5
+        _, _, cos_u, sin_u, *_ = terms
+        at = (np.arctan2(sin_u, cos_u) / (2.0 * np.pi) + 0.5) * displaced.size - 0.5
         low = np.floor(at).astype(np.intp)
         first, second = displaced[low % displaced.size], displaced[(low + 1) % displaced.size]
         between = first + (at - low) * (second - first)

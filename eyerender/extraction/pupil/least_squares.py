@@ -17,21 +17,17 @@ from ...base.jit import compiled, inlined, summing
 from ..products import add_products, largest_size, solve
 from .covariance import SHAPE
 from .edge_model import (
-    BEND,
-    BY_DISTANCE,
-    BY_KURTOSIS,
-    BY_SIGMA,
-    RAMP,
-    RAMP_BY_DISTANCE,
-    RAMP_BY_SIGMA,
-    STEP,
-    WITHIN,
+    LEVELS,
+    PROFILES,
     EdgeModel,
+    levels_in,
     local_levels,
-    profiles,
+    profile_at,
+    profile_in,
+    put_profile,
     turn_harmonics,
 )
-from .places import BLOCK, COS_T, COS_U, NX, NY, SIN_T, SIN_U, places
+from .places import BLOCK, PLACES, distance_slopes_at, find_places, place_in
 
 # Parameters without the harmonics: shape, sigma, inner level, slope, kurtosis, lean (two), mean outer level.
 FIXED = SHAPE + 7
@@ -140,44 +136,45 @@ class Sums:
 
 @inlined
 def _rows(
-    place: Floats, edge: Floats, level: Floats, start: int, count: int, numbers: Floats, out: tuple[Floats, ...]
+    places: Floats, profiles: Floats, level: Floats, start: int, count: int, numbers: Floats, out: tuple[Floats, ...]
 ) -> None:  # fmt: skip
     """Write a block's derivatives of the level by the parameters, residuals, and derivatives by the distance.
 
     Args:
-        place: (8 BLOCK,) of `places`.
-        edge: (7 BLOCK,) of `profiles`.
+        places: (PLACES,) the places.
+        profiles: (PROFILES,) the profiles there.
         level: (n,) levels of all pixels.
         start: first pixel of the block.
         count: number of pixels in it.
         numbers: (p,) the model (see `EdgeModel.numbers`).
         out: receives the derivatives (p BLOCK,), parameter after parameter in the order of `numbers`, the residuals
-            (BLOCK,) and the derivatives by the distance (BLOCK,). It ends with scratch memory (2 and 4 BLOCK,).
+            (BLOCK,) and the derivatives by the distance (BLOCK,). It ends with scratch memory (2 BLOCK, and LEVELS).
     """
-    rows, residual, steep, basis, local = out
+    rows, residual, steep, basis, levels = out
     cos, sin, plane = math.cos(numbers[4]), math.sin(numbers[4]), 1.0 / math.sqrt(numbers[2] * numbers[3])
-    local_levels(place, count, numbers, basis, local)
+    local_levels(places, count, numbers, basis, levels)
     for i in range(count):
-        inner, step, within, bend = local[i], local[STEP + i], local[WITHIN + i], local[BEND + i]
-        steep[i] = step * edge[BY_DISTANCE + i] + within + bend * edge[RAMP_BY_DISTANCE + i]
-        residual[i] = level[start + i] - (inner + step * edge[i] + within * place[i] + bend * edge[RAMP + i])
-        rows[5 * BLOCK + i] = step * edge[BY_SIGMA + i] + bend * edge[RAMP_BY_SIGMA + i]
-        rows[6 * BLOCK + i], rows[7 * BLOCK + i] = 1.0 - edge[i], edge[RAMP + i]
-        rows[8 * BLOCK + i] = step * edge[BY_KURTOSIS + i]
-        sloping = 1.0 - edge[i] + (place[i] - edge[RAMP + i]) * plane
-        rows[9 * BLOCK + i], rows[10 * BLOCK + i] = sloping * place[COS_U + i], sloping * place[SIN_U + i]
-        rows[11 * BLOCK + i], basis[i], basis[BLOCK + i] = edge[i], 1.0, 0.0
+        place, profile, at = place_in(places, i), profile_in(profiles, i), levels_in(levels, i)
+        steep[i] = at.step * profile.by_distance + at.within + at.bend * profile.ramp_by_distance
+        expected = at.inner + at.step * profile.edge + at.within * place.distance + at.bend * profile.ramp
+        residual[i] = level[start + i] - expected
+        rows[5 * BLOCK + i] = at.step * profile.by_sigma + at.bend * profile.ramp_by_sigma
+        rows[6 * BLOCK + i], rows[7 * BLOCK + i] = 1.0 - profile.edge, profile.ramp
+        rows[8 * BLOCK + i] = at.step * profile.by_kurtosis
+        sloping = 1.0 - profile.edge + (place.distance - profile.ramp) * plane
+        rows[9 * BLOCK + i], rows[10 * BLOCK + i] = sloping * place.cos_u, sloping * place.sin_u
+        rows[11 * BLOCK + i], basis[i], basis[BLOCK + i] = profile.edge, 1.0, 0.0
     for j in range(1, numbers.size - 11, 2):
-        turn_harmonics(place, count, basis)
+        turn_harmonics(places, count, basis)
         first, sloping = (11 + j) * BLOCK, plane if j == 1 else 0.0
         for i in range(count):
-            value = edge[i] + sloping * edge[RAMP + i]
+            profile = profile_in(profiles, i)
+            value = profile.edge + sloping * profile.ramp
             rows[first + i], rows[first + BLOCK + i] = basis[i] * value, basis[BLOCK + i] * value
     for i in range(count):
-        c, s, nx, ny = place[COS_T + i], place[SIN_T + i], place[NX + i], place[NY + i]
-        rows[i], rows[BLOCK + i] = (ny * sin - nx * cos) * steep[i], (-nx * sin - ny * cos) * steep[i]
-        rows[2 * BLOCK + i], rows[3 * BLOCK + i] = -nx * c * steep[i], -ny * s * steep[i]
-        rows[4 * BLOCK + i] = (-nx * s - ny * c) * steep[i]
+        by_x, by_y, by_aa, by_bb, by_ab = distance_slopes_at(place_in(places, i), cos, sin)
+        rows[i], rows[BLOCK + i], rows[2 * BLOCK + i] = by_x * steep[i], by_y * steep[i], by_aa * steep[i]
+        rows[3 * BLOCK + i], rows[4 * BLOCK + i] = by_bb * steep[i], by_ab * steep[i]
 
 
 @summing
@@ -201,17 +198,19 @@ def _pixel_sums(
     """Compute the parts of `Sums` for the model with these parameters (see `EdgeModel.numbers`)."""
     ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
     sectors, size = displaced.size, numbers.size
-    matrix, basis, place, edge = np.zeros((size, size)), np.empty(2 * BLOCK), np.empty(8 * BLOCK), np.empty(7 * BLOCK)
-    flat, residual, steep, local = np.empty(size * BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(4 * BLOCK)
+    matrix, basis, places, profiles = np.zeros((size, size)), np.empty(2 * BLOCK), np.empty(PLACES), np.empty(PROFILES)
+    flat, residual, steep, levels = np.empty(size * BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(LEVELS)
     rows, pull, across = flat.reshape(size, BLOCK), np.zeros((size, sectors)), np.zeros((size, sectors))
     along, square, cost = np.zeros(sectors), np.zeros(sectors), 0.0
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
-        places(ellipse, x, y, start, count, place)
+        find_places(ellipse, x, y, start, count, places)
         for i in range(count):
-            place[i] += displaced[index[start + i]]
-        profiles(place, count, numbers[5], numbers[8], edge)
-        _rows(place, edge, level, start, count, numbers, (flat, residual, steep, basis, local))
+            places[i] += displaced[index[start + i]]  # the distance is the first field
+        for i in range(count):
+            place = place_in(places, i)
+            put_profile(profiles, i, profile_at(place.distance, place.curvature, numbers[5], numbers[8]))
+        _rows(places, profiles, level, start, count, numbers, (flat, residual, steep, basis, levels))
         add_products(rows, 0, count, matrix)
         begin = 0
         while begin < count:  # the pixels of a sector are contiguous

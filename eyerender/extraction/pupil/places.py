@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,50 +13,75 @@ from ...optics.ellipse import Ellipse
 
 SECTORS = 48  # equal steps of the ellipse's parameter u
 STEPS = 3  # Newton steps to the nearest point; they reach 1e-6 px up to b / 2 away
-BLOCK = 128  # points whose numbers stay in the first-level cache
-# Columns of a block of places, in the order of `Place`; the distance comes first.
-COS_T, SIN_T, NX, NY, CURVATURE, COS_U, SIN_U = (k * BLOCK for k in range(1, 8))
+# Records of this many points stay in the first-level cache, each field in one piece, so that loops become vectors.
+BLOCK = 128
 # Tangents of the sectors' borders within an eighth of the outline.
 TAN_1, TAN_2, TAN_3, TAN_4, TAN_5 = (math.tan(2.0 * math.pi * k / SECTORS) for k in range(1, 6))
+Value = TypeVar("Value", float, Floats)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Place:
-    """Positions of points (n,) relative to an ellipse.
+class Place(NamedTuple, Generic[Value]):
+    """Position relative to an ellipse: of one point, or of n points as arrays.
 
-    These are the signed distance, the nearest point's parameter (cos t, sin t), the outward normal there in the
-    ellipse's axes (nx, ny), the curvature, and the parameter counted from the image's x axis (cos u, sin u).
+    Attributes:
+        distance: signed distance, px, positive outside.
+        cos_t: cosine of the nearest point's parameter t.
+        sin_t: its sine.
+        nx: outward normal there, in the ellipse's axes.
+        ny: the same.
+        curvature: curvature there, 1/px.
+        cos_u: cosine of u, the parameter counted from the image's x axis.
+        sin_u: its sine.
     """
 
-    distance: Floats
-    cos_t: Floats
-    sin_t: Floats
-    nx: Floats
-    ny: Floats
-    curvature: Floats
-    cos_u: Floats
-    sin_u: Floats
+    distance: Value
+    cos_t: Value
+    sin_t: Value
+    nx: Value
+    ny: Value
+    curvature: Value
+    cos_u: Value
+    sin_u: Value
 
-    @staticmethod
-    def middles(ellipse: Ellipse, count: int = SECTORS) -> Place:
-        """Return the positions on the ellipse in the middle of each of `count` sectors."""
-        (a, b), angle = ellipse.semi_axes_px.tolist(), ellipse.angle_rad
-        u = 2.0 * np.pi * ((np.arange(count) + 0.5) / count - 0.5)
-        cos_t, sin_t = np.cos(u - angle), np.sin(u - angle)
-        nx, ny = b * cos_t, a * sin_t
-        height = np.sqrt(nx * nx + ny * ny)
-        return Place(np.zeros(count), cos_t, sin_t, nx / height, ny / height, a * b / height**3, np.cos(u), np.sin(u))
+
+PLACES = 8 * BLOCK  # numbers in a block of places
 
 
 @inlined
-def places(ellipse: tuple[float, ...], x: Floats, y: Floats, start: int, count: int, out: Floats) -> None:
-    """Write the positions of `count` points, beginning with number `start`, as consecutive columns of out (8 BLOCK,).
+def place_in(block: Floats, i: int) -> Place[float]:
+    """Read place i of a block (PLACES,)."""
+    return Place(
+        block[i], block[BLOCK + i], block[2 * BLOCK + i], block[3 * BLOCK + i],
+        block[4 * BLOCK + i], block[5 * BLOCK + i], block[6 * BLOCK + i], block[7 * BLOCK + i],
+    )  # fmt: skip
+
+
+@inlined
+def put_place(block: Floats, i: int, place: Place[float]) -> None:
+    """Write place i of a block (PLACES,)."""
+    block[i], block[BLOCK + i], block[2 * BLOCK + i], block[3 * BLOCK + i] = place[:4]
+    block[4 * BLOCK + i], block[5 * BLOCK + i], block[6 * BLOCK + i], block[7 * BLOCK + i] = place[4:]
+
+
+def middles(ellipse: Ellipse, count: int = SECTORS) -> Place[Floats]:
+    """Return the places on the ellipse in the middle of each of `count` sectors."""
+    (a, b), angle = ellipse.semi_axes_px.tolist(), ellipse.angle_rad
+    u = 2.0 * np.pi * ((np.arange(count) + 0.5) / count - 0.5)
+    cos_t, sin_t = np.cos(u - angle), np.sin(u - angle)
+    nx, ny = b * cos_t, a * sin_t
+    height = np.sqrt(nx * nx + ny * ny)
+    return Place(np.zeros(count), cos_t, sin_t, nx / height, ny / height, a * b / height**3, np.cos(u), np.sin(u))
+
+
+@inlined
+def find_places(ellipse: tuple[float, ...], x: Floats, y: Floats, start: int, count: int, out: Floats) -> None:
+    """Write the places of `count` points, beginning with number `start`, to a block (PLACES,).
 
     Newton's iteration finds the nearest point's parameter t, from the point's own direction:
 
     f(t) = (a^2 - b^2) cos t sin t - a p sin t + b q cos t = 0.
 
-    The loops are simple sums, which the compiler vectorises.
+    The loops are simple sums, which the compiler vectorises. Until the last one, (cos_u, sin_u) hold (p, q).
     """
     cx, cy, a, b, angle = ellipse
     cos, sin, eccentric = math.cos(angle), math.sin(angle), a * a - b * b
@@ -65,26 +90,37 @@ def places(ellipse: tuple[float, ...], x: Floats, y: Floats, start: int, count: 
         p, q = dx * cos + dy * sin, dy * cos - dx * sin
         c, s = p / a, q / b
         scale = 1.0 / max(math.sqrt(c * c + s * s), 1e-300)
-        out[COS_T + i], out[SIN_T + i], out[COS_U + i], out[SIN_U + i] = c * scale, s * scale, p, q
+        put_place(out, i, Place(0.0, c * scale, s * scale, 0.0, 0.0, 0.0, p, q))
     if eccentric > 1e-9 * a * a:
         for _ in range(STEPS):
             for i in range(count):
-                c, s, ap, bq = out[COS_T + i], out[SIN_T + i], a * out[COS_U + i], b * out[SIN_U + i]
-                value = eccentric * c * s - ap * s + bq * c
-                slope = eccentric * (c * c - s * s) - ap * c - bq * s
+                _, c, s, _, _, _, p, q = place_in(out, i)
+                value = eccentric * c * s - a * p * s + b * q * c
+                slope = eccentric * (c * c - s * s) - a * p * c - b * q * s
                 # Far inside (beyond the evolute) the slope changes sign, but no pixel is used there.
                 turn = min(max(value / min(slope, -1e-9), -0.3), 0.3)
                 c, s = c + turn * s, s - turn * c
                 scale = 1.0 / math.sqrt(c * c + s * s)
-                out[COS_T + i], out[SIN_T + i] = c * scale, s * scale
+                put_place(out, i, Place(0.0, c * scale, s * scale, 0.0, 0.0, 0.0, p, q))
     for i in range(count):
-        c, s, p, q = out[COS_T + i], out[SIN_T + i], out[COS_U + i], out[SIN_U + i]
+        _, c, s, _, _, _, p, q = place_in(out, i)
         nx, ny = b * c, a * s
         scale = 1.0 / math.sqrt(nx * nx + ny * ny)
         nx, ny = nx * scale, ny * scale
-        out[i] = (p - a * c) * nx + (q - b * s) * ny
-        out[NX + i], out[NY + i], out[CURVATURE + i] = nx, ny, a * b * scale * scale * scale
-        out[COS_U + i], out[SIN_U + i] = c * cos - s * sin, s * cos + c * sin
+        distance, curvature = (p - a * c) * nx + (q - b * s) * ny, a * b * scale * scale * scale
+        put_place(out, i, Place(distance, c, s, nx, ny, curvature, c * cos - s * sin, s * cos + c * sin))
+
+
+def distance_slopes(place: Place[Value], cos: float, sin: float) -> tuple[Value, Value, Value, Value, Value]:
+    """Compute derivatives of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes.
+
+    `cos` and `sin` are those of the ellipse's angle.
+    """
+    nx, ny, c, s = place.nx, place.ny, place.cos_t, place.sin_t
+    return ny * sin - nx * cos, -nx * sin - ny * cos, -nx * c, -ny * s, -nx * s - ny * c
+
+
+distance_slopes_at = inlined(distance_slopes)  # for one point, in compiled functions
 
 
 @inlined
@@ -101,12 +137,13 @@ def sector_at(c: float, s: float) -> int:
 @compiled("UniTuple(f8, 5), f8[::1], f8[::1]")
 def sectors_at(ellipse: tuple[float, ...], x: Floats, y: Floats) -> Indices:
     """Return the sector (n,) of each point (x, y) near an ellipse (cx, cy, a, b, angle)."""
-    out, place = np.empty(x.size, dtype=np.int64), np.empty(8 * BLOCK)
+    out, block = np.empty(x.size, dtype=np.int64), np.empty(PLACES)
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
-        places(ellipse, x, y, start, count, place)
+        find_places(ellipse, x, y, start, count, block)
         for i in range(count):
-            out[start + i] = sector_at(place[COS_U + i], place[SIN_U + i])
+            place = place_in(block, i)
+            out[start + i] = sector_at(place.cos_u, place.sin_u)
     return out
 
 

@@ -12,11 +12,11 @@ from ...base.jit import compiled
 from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, Part
 from .algebraic import direct_fits
-from .covariance import SHAPE, distance_slopes, hidden_part, sector_excess, to_axes, towards_round
+from .covariance import SHAPE, hidden_part, outline_slopes, sector_excess, to_axes, towards_round
 from .edge_model import EdgeModel, longest_gap
 from .least_squares import FIXED, Band, Normal, Pixels, Prior, Solution, Sums, fitted
 from .occlusion import clear_of_lids, visible_part
-from .places import SECTORS, Place, sectors_at
+from .places import SECTORS, middles, sectors_at
 
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
 # side of the iris more, by a few hundredths of the step. Noise hides that from a test, but it shifts the centre.
@@ -307,8 +307,7 @@ def _through(start: Ellipse, displaced: Floats) -> tuple[Ellipse, Floats]:
 
     Also returns the derivatives (5, SECTORS) of its centre and shape by the sectors' displacements from `start`.
     """
-    place = Place.middles(start)
-    slopes = distance_slopes(start, place)
+    place, slopes = middles(start), outline_slopes(start)
     outline = start.points_at(place.cos_t, place.sin_t)
     normals = -slopes[:2].T
     fit = direct_fits((outline - displaced[:, None] * normals)[None])[0]
