@@ -215,11 +215,11 @@ def _weights(columns: Array, right: Array, weight: Array, variance: float) -> Ar
 
 
 def table_of(observed: list[Observed], fast: bool) -> dict[str, Any]:
-    """The table of one method; features that never vary are left out."""
+    """The table of one method; features that never vary are left out, and the second of two that are the same."""
     found = [(k, row) for k, one in enumerate(observed) for row in (one.fast if fast else one.pixel)]
     right = np.array([ok for one in observed for ok in (one.right if fast else one.right_refined)], dtype=np.float64)
     group = np.array([k for k, _ in found])
-    names = tuple(found[0][1])
+    names = tuple(name for name in found[0][1] if not (fast and name == "explained"))  # by edges: the support
     rows = np.array([[row[name] for name in names] for _, row in found])
     varying = np.ptp(np.percentile(rows, (1.0, 99.0), axis=0), axis=0) > 0.0
     names, rows = tuple(name for name, kept in zip(names, varying, strict=True) if kept), rows[:, varying]

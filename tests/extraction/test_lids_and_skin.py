@@ -70,7 +70,7 @@ def test_glints_are_gaussian_like(sigma, guess):
     # Widths are guessed from the area above half height, good to some 20 %.
     image, places = _spots(np.random.default_rng(5), sigma, 100.0, 2.0)
     width, height = np.full(7, guess * sigma), np.full(7, 95.0)
-    assert gaussian_like(image, places, width, height, 2.0, 250.0).all()
+    assert gaussian_like(image, places, width, height, 2.0, 250.0, np.arange(width.size)).all()
 
 
 def test_grains_of_skin_are_not_gaussian_like():
@@ -78,14 +78,14 @@ def test_grains_of_skin_are_not_gaussian_like():
     rng = np.random.default_rng(6)
     image = (60.0 + rng.normal(0.0, 15.0, (60, 300))).astype(np.float32)
     places = np.stack([np.arange(30, 300, 40), np.full(7, 30)], axis=-1).astype(float)
-    assert not gaussian_like(image, places, np.full(7, 2.5), np.full(7, 40.0), 1.0, 250.0).any()
+    assert not gaussian_like(image, places, np.full(7, 2.5), np.full(7, 40.0), 1.0, 250.0, np.arange(7)).any()
 
 
 def test_clipped_spots_are_not_judged():
     image, places = _spots(np.random.default_rng(7), 2.0, 600.0, 2.0)
     # Two spots run into each other, and all that is left of the tops is a plateau.
     image = np.minimum(np.maximum(image, np.roll(image, 3, axis=1)), np.float32(255.0))
-    assert gaussian_like(image, places, np.full(7, 4.0), np.full(7, 215.0), 2.0, 250.0).all()
+    assert gaussian_like(image, places, np.full(7, 4.0), np.full(7, 215.0), 2.0, 250.0, np.arange(7)).all()
 
 
 def test_a_highlight_of_bright_skin_is_no_glint():

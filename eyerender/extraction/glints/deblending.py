@@ -57,15 +57,15 @@ def give_edges(fitted: FittedSpots, blur_px: float, widest_px: float, limits: Li
         index = index[(near.sum(axis=1) == 1) & (wide <= LONGEST * widest_px)]
     if index.size == 0:
         return fit
-    pixels, rest = fitted.pixels.taken(index), fitted.rest[fitted.pixels.rows(index)]
-    share, edge = _best_edge(FittedSpots(fit.taken(index), pixels, fitted.theta[index], rest), blur_px)
+    share, edge = _best_edge(fitted.taken(index), blur_px)
     chosen = np.flatnonzero(share >= LEAST_SHARE)
     if chosen.size == 0:
         return fit
-    index, rest, pixels = index[chosen], rest[pixels.rows(chosen)], pixels.taken(chosen)
-    start = np.concatenate([fitted.theta[index], edge[chosen]], axis=1)
-    ended = descend(pixels, start, rest, ALONE, limits, blur_px, 2 * STEPS)
-    again = report(pixels, ended, rest, limits, blur_px)
+    index = index[chosen]
+    beside = fitted.taken(index)
+    start = np.concatenate([beside.theta, edge[chosen]], axis=1)
+    ended = descend(beside.pixels, start, beside.rest, ALONE, limits, blur_px, 2 * STEPS)
+    again = report(beside.pixels, ended, beside.rest, limits, blur_px)
     better = np.flatnonzero(again.converged & (again.residual_dn < 0.7 * fit.residual_dn[index]))
     return fit.replaced(index[better], again.taken(better)) if better.size else fit
 
@@ -86,11 +86,10 @@ def _best_edge(fitted: FittedSpots, blur_px: float) -> tuple[Floats, Floats]:
         (n,) share of the squared residual that the edge explains, to first order; (n, 3) its height, direction, offset.
     """
     pixels, n = fitted.pixels, fitted.theta.shape[0]
-    rows = slopes(pixels, fitted.theta, fitted.rest)
+    rows = slopes(pixels.windows, fitted.theta, fitted.rest, blur_px)
     share, edge = np.zeros(n), np.zeros((n, 3))
-    for i, (part, clip) in enumerate(zip(pixels.parts(rows), pixels.parts(pixels.clip), strict=True)):
-        if clip.any():
-            part = part[:, ~clip]
+    for i in range(n):
+        part = rows[:, (pixels.spot == i) & ~pixels.clip]
         if part.shape[1] < 20:
             continue
         basis, rest = part[:-1].astype(np.float32), part[-1].astype(np.float32)

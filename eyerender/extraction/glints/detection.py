@@ -96,7 +96,8 @@ def detect_spots(
     alone = _above_ring(smooth, xy, width) > RING_SHARE * height
     bell = alone.copy()
     corner = np.array([x0, y0])
-    bell[alone] = gaussian_like(linear, xy + corner, width, height, prepared.noise_dn, prepared.clip_dn, alone)
+    levels = (prepared.noise_dn, prepared.clip_dn)
+    bell[alone] = gaussian_like(linear, xy + corner, width, height, *levels, np.flatnonzero(alone))
     patches = np.concatenate([patches, xy[~bell]])[: settings.max_glints]
     clutter = alone & ~bell
     return Spots(

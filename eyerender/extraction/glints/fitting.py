@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats
+from ...base.arrays import Bools, Floats, Indices
 from ...base.jit import compiled, inlined
 from ..preprocessing import Image
 from ..products import solve
@@ -45,6 +45,11 @@ class FittedSpots:
     pixels: SpotPixels
     theta: Floats
     rest: Floats
+
+    def taken(self, spots: Indices) -> FittedSpots:
+        """Select spots, which are in ascending order."""
+        rows = self.pixels.rows(spots)
+        return FittedSpots(self.fit.taken(spots), self.pixels.taken(spots), self.theta[spots], self.rest[rows])
 
 
 def fit_spots(
@@ -108,7 +113,7 @@ def _start(pixels: SpotPixels, start: Floats, width: Floats, height: Floats, tou
     theta[:, :2] = start
     theta[:, 2] = np.log(1.3 * np.maximum(height, 1.0))
     theta[:, 3] = np.log(width)
-    if pixels.clipped:
+    if pixels.clip.any():
         own = pixels.spot
         at = pixels.centre[own] + np.stack([pixels.dx, pixels.dy], axis=-1)
         away2 = ((at - start[own]) ** 2).sum(axis=1)
@@ -141,13 +146,12 @@ def _ring_level(pixels: SpotPixels, rest: Floats) -> Floats:
     return pixels.total(rest * ring) / np.maximum(pixels.total(ring), 1.0)
 
 
-def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blur_px: float | None = None) -> SpotFit:
+def report(pixels: SpotPixels, ended: Descent, rest: Floats, limits: Limits, blur_px: float = 1.0) -> SpotFit:
     """Convert the end of a descent to a fit; `rest` (P,) is the image minus B and the light of other spots."""
     theta, noise = ended.theta, limits.noise_dn
-    penalty = prior(limits, blur_px is not None)
-    blur = 1.0 if blur_px is None else blur_px
+    penalty = prior(limits, theta.shape[1])
     ended_at = (np.ascontiguousarray(theta), ended.gram, ended.used)
-    covariance, level, misfit, moments = _reported(pixels.windows, *ended_at, rest, noise, penalty, blur)
+    covariance, level, misfit, moments = _reported(pixels.windows, *ended_at, rest, noise, penalty, blur_px)
     return SpotFit(
         xy_px=theta[:, :2].copy(),
         covariance=covariance,

@@ -34,8 +34,7 @@ _FREE = np.inf
 _LEAST = np.array([-_FREE, -_FREE, -5.0, math.log(0.2), math.log(0.2), *[-_FREE] * 6])
 _MOST = np.array([_FREE, _FREE, 15.0, math.log(30.0), math.log(30.0), *[_FREE] * 6])
 _STRIDE = np.array([1.5, 1.5, 0.7, 0.7, 0.7, _FREE, _FREE, _FREE, _FREE, 0.5, 1.5])  # largest step of each parameter
-_EDGE_BOUNDS = np.stack([_LEAST, _MOST, _STRIDE])
-_BOUNDS = {True: _EDGE_BOUNDS, False: _EDGE_BOUNDS[:, :PARAMETERS].copy()}
+_BOUNDS = np.stack([_LEAST, _MOST, _STRIDE])
 ALONE = np.zeros((0, 2), dtype=np.intp)  # no pairs of spots
 
 
@@ -95,21 +94,16 @@ def promising(theta: Floats, gram: Floats, used: Floats, noise: float) -> Bools:
     return out
 
 
-def slopes(pixels: SpotPixels, theta: Floats, rest: Floats, blur_px: float | None = None) -> Floats:
+@compiled(f"{WINDOWS}, f8[:,::1], f8[::1], f8")
+def slopes(windows: Windows, theta: Floats, rest: Floats, blur_px: float) -> Floats:
     """Compute derivatives (K + 1, P) of the model at every pixel and, in the last row, the residual.
 
     Args:
-        pixels: P pixels of n spots.
+        windows: first, plane, centre and radius of `SpotPixels`.
         theta: (n, K) parameters.
         rest: (P,) image minus everything that is not fitted.
         blur_px: blur of the edges, if the model includes edges beside the spots.
     """
-    return _spot_rows(pixels.windows, theta, rest, 1.0 if blur_px is None else blur_px)
-
-
-@compiled(f"{WINDOWS}, f8[:,::1], f8[::1], f8")
-def _spot_rows(windows: Windows, theta: Floats, rest: Floats, blur_px: float) -> Floats:
-    """Compute `slopes` from the parts of `SpotPixels`."""
     first, plane, centre, radius = windows
     n, size = theta.shape
     out = np.empty((size + 1, rest.size))
@@ -146,8 +140,8 @@ def _add_edge(begin: int, end: int, plane: Floats, theta: Floats, blur_px: float
         out[11, i] -= height * out[8, i]
 
 
-def prior(limits: Limits, edge: bool) -> Floats:
-    """Compute the normal matrix (K, K) of the priors, all with mean 0.
+def prior(limits: Limits, size: int) -> Floats:
+    """Compute the normal matrix (K, K) of the priors of K = `size` parameters, all with mean 0.
 
     They favour a nearly round spot, a background that is flat to within its slope, and an edge of at most full scale
     within reach.
@@ -157,7 +151,7 @@ def prior(limits: Limits, edge: bool) -> Floats:
     out[3, 4] = out[4, 3] = -1.0 / ROUND_SD**2
     out[6, 6] = out[7, 7] = 1.0 / limits.slope_dn**2
     out[8, 8], out[10, 10] = 1e-5, 1e-2
-    return out if edge else out[:PARAMETERS, :PARAMETERS].copy()
+    return out[:size, :size].copy()
 
 
 @inlined
@@ -263,7 +257,7 @@ def descend(
     rest: Floats,
     pairs: Indices,
     limits: Limits,
-    blur_px: float | None = None,
+    blur_px: float = 1.0,
     steps: int = STEPS,
 ) -> Descent:
     """Take at most `steps` Levenberg-Marquardt steps on every spot.
@@ -279,9 +273,9 @@ def descend(
         blur_px: blur of the edges, if the model includes edges beside the spots.
         steps: largest number of steps.
     """
-    edge = blur_px is not None
-    clip = pixels.clip if pixels.clipped else pixels.clip[:0]
-    about = ((limits.noise_dn, 1.0 if blur_px is None else blur_px), (prior(limits, edge), _BOUNDS[edge]), steps)
+    size = theta.shape[1]
+    clip = pixels.clip if pixels.clip.any() else pixels.clip[:0]
+    about = ((limits.noise_dn, blur_px), (prior(limits, size), _BOUNDS[:, :size].copy()), steps)
     return Descent(*_descended(pixels.windows, np.ascontiguousarray(theta), rest, clip, pairs, *about))
 
 
@@ -308,7 +302,7 @@ def _descended(
     first, (n, k), (noise, blur_px), (penalty, bounds) = windows[0], theta.shape, optics, limits
     rest, start, theta = rest.copy(), theta, theta.copy()
     middle, cost = theta.copy(), np.empty(n)
-    rows = _spot_rows(windows, theta, rest, blur_px)
+    rows = slopes(windows, theta, rest, blur_px)
     gram, used = _gram(first, clip, rows, theta, noise, penalty)
     damping, step, trial = np.empty(n), np.empty((n, k)), np.empty((n, k))
     for s in range(n):
@@ -328,7 +322,7 @@ def _descended(
         if ended:
             _finish(step, trial, theta)
             break
-        rows = _spot_rows(windows, trial, rest, blur_px)
+        rows = slopes(windows, trial, rest, blur_px)
         new, new_used = _gram(first, clip, rows, trial, noise, penalty)
         for s in range(n):
             better[s] = new[s, k, k] <= gram[s, k, k] * (1.0 + 1e-12)

@@ -23,38 +23,6 @@ PIXEL = 1.0 / 12.0  # variance of a pixel, px^2; without it a spot of one row of
 LONGEST = 2.5  # largest elongation of the bright patch; glints, and two that touch, reach 2.0
 
 
-def gaussian_like(
-    linear: Image,
-    xy: Floats,
-    width: Floats,
-    height: Floats,
-    noise_dn: float,
-    clip_dn: float,
-    which: Bools | None = None,
-) -> Bools:
-    """Return whether the pixels around each spot form a bell (m,); those of skin, lashes and gaps do not.
-
-    The level within 2.2 sigma + 1 px of the peak is fitted by linear least squares. Pixels nearer to another spot are
-    left out. The model is
-
-        c + p dx + q dy + g (h + u dx + v dy + w r^2 / sigma^2),  g = exp(-r^2 / (2 sigma^2)),
-
-    a Gaussian on a plane, to first order in its position and width. For a glint the misfit is a small share of the
-    height and of the pixels' scatter, and the fitted peak is as high as the detected one. Clipped spots are accepted.
-
-    Args:
-        linear: the image, DN.
-        xy: (n, 2) peak pixels.
-        width: (n,) standard deviations, px.
-        height: (n,) DN.
-        noise_dn: standard deviation of a pixel's noise.
-        clip_dn: level at which the sensor clips.
-        which: (n,) spots to judge; None for all. The others only occupy their pixels.
-    """
-    index = np.arange(width.size) if which is None else np.flatnonzero(which)
-    return _gaussian_like(linear, xy, width, height, noise_dn, clip_dn, index)
-
-
 @inlined
 def _owns(xy: Floats, k: int, reach: float, dx: float, dy: float) -> bool:
     """Return whether a pixel near spot k is nearer to it than to any other spot."""
@@ -138,10 +106,28 @@ def _is_bell(pixels: Floats, sigma: float, tall: float, noise_dn: float) -> bool
 
 
 @compiled("f4[:,::1], f8[:,::1], f8[::1], f8[::1], f8, f8, i8[::1]")
-def _gaussian_like(
+def gaussian_like(
     linear: Image, xy: Floats, width: Floats, height: Floats, noise_dn: float, clip_dn: float, index: Indices
 ) -> Bools:
-    """Judge the spots with these indices (m,) (see `gaussian_like`)."""
+    """Return whether the pixels around spots form a bell (m,); those of skin, lashes and gaps do not.
+
+    The level within 2.2 sigma + 1 px of the peak is fitted by linear least squares. Pixels nearer to another spot are
+    left out. The model is
+
+        c + p dx + q dy + g (h + u dx + v dy + w r^2 / sigma^2),  g = exp(-r^2 / (2 sigma^2)),
+
+    a Gaussian on a plane, to first order in its position and width. For a glint the misfit is a small share of the
+    height and of the pixels' scatter, and the fitted peak is as high as the detected one. Clipped spots are accepted.
+
+    Args:
+        linear: the image, DN.
+        xy: (n, 2) peak pixels.
+        width: (n,) standard deviations, px.
+        height: (n,) DN.
+        noise_dn: standard deviation of a pixel's noise.
+        clip_dn: level at which the sensor clips.
+        index: (m,) spots to judge; the others only occupy their pixels.
+    """
     out = np.empty(index.size, dtype=np.bool_)
     for m in range(index.size):
         k = index[m]

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +15,6 @@ from ..preprocessing import Image
 
 Windows = tuple[Indices, Floats, Floats, Floats]  # first, plane, centre and radius of SpotPixels
 WINDOWS = "Tuple((i8[::1], f8[:,::1], f8[:,::1], f8[::1]))"  # type for `compiled`
-_T = TypeVar("_T", bound=np.generic)
 
 _ROOT_HALF, _ROOT_HALF_PI = math.sqrt(0.5), math.sqrt(0.5 * math.pi)
 LARGEST_PX = 20  # radius of a window at most
@@ -42,7 +39,6 @@ class SpotPixels:
         data: (P,) levels of the image.
         known: (P,) background B.
         clip: (P,) whether the sensor clipped the pixel.
-        clipped: whether any pixel is clipped.
     """
 
     centre: Floats
@@ -54,7 +50,6 @@ class SpotPixels:
     data: Floats
     known: Floats
     clip: Bools
-    clipped: bool
 
     @property
     def windows(self) -> Windows:
@@ -71,33 +66,25 @@ class SpotPixels:
         """Vertical offset (P,) from the window's middle."""
         return np.asarray(self.plane[2], dtype=np.float64)
 
-    def parts(self, values: NDArray[_T]) -> list[NDArray[_T]]:
-        """Split values (..., P) by spot."""
-        ends = self.first.tolist()
-        return [values[..., begin:end] for begin, end in pairwise(ends)]
-
     def rows(self, spots: Indices) -> Indices:
-        """Return indices of the pixels of given spots, in the order of the spots."""
-        return _ranges(self.first[spots], self.first[spots + 1] - self.first[spots])
+        """Return indices of the pixels of given spots, which are in ascending order."""
+        chosen = np.zeros(self.radius.size, dtype=bool)
+        chosen[spots] = True
+        return np.flatnonzero(chosen[self.spot])
 
     def taken(self, spots: Indices) -> SpotPixels:
-        """Select the windows of given spots."""
-        if spots.size == self.radius.size and bool((spots == np.arange(spots.size)).all()):
-            return self
-        count = self.first[spots + 1] - self.first[spots]
-        rows = _ranges(self.first[spots], count)
-        clip = self.clip[rows]
+        """Select the windows of given spots, which are in ascending order."""
+        count, rows = np.diff(self.first)[spots], self.rows(spots)
         return SpotPixels(
             centre=self.centre[spots],
             radius=self.radius[spots],
-            first=_starts(count),
+            first=np.append(0, np.cumsum(count)),
             spot=np.arange(spots.size).repeat(count),
             middle_dn=self.middle_dn[spots],
             plane=self.plane.take(rows, axis=1),
             data=self.data[rows],
             known=self.known[rows],
-            clip=clip,
-            clipped=bool(clip.any()),
+            clip=self.clip[rows],
         )
 
     def total(self, values: NDArray[np.generic]) -> Floats:
@@ -109,19 +96,6 @@ class SpotPixels:
         out = np.zeros(self.radius.size)
         np.maximum.at(out, self.spot, values)
         return out
-
-
-def _starts(count: Indices) -> Indices:
-    """Compute the cumulative sums 0, count[0], count[0] + count[1], ..., with the total at the end."""
-    out = np.zeros(count.size + 1, dtype=np.intp)
-    np.cumsum(count, out=out[1:])
-    return out
-
-
-def _ranges(first: Indices, count: Indices) -> Indices:
-    """Concatenate ranges: first[0], first[0] + 1, ... (count[0] of them), first[1], ..."""
-    start = _starts(count)
-    return np.asarray(np.arange(start[-1]) + np.repeat(first - start[:-1], count), dtype=np.intp)
 
 
 def cut(
@@ -140,7 +114,6 @@ def cut(
     first, spot, plane, data = _windows(linear, start, centre, radius)
     at = np.concatenate([centre[spot] + plane[1:].T, centre])
     level = known(at[:, 0], at[:, 1])
-    clip = data >= clip_dn
     return SpotPixels(
         centre=centre,
         radius=radius,
@@ -150,8 +123,7 @@ def cut(
         plane=plane,
         data=data,
         known=level[: data.size],
-        clip=clip,
-        clipped=bool(clip.any()),
+        clip=data >= clip_dn,
     )
 
 
