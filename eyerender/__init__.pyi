@@ -30,6 +30,7 @@ from .extraction import extract as extract
 from .eye.catalogue import load_eye as load_eye
 from .eye.spec import EyeSpec as EyeSpec
 from .folders.imagefolder import ImageFolder as ImageFolder
+from .imaging.autoexposure import auto_exposed as auto_exposed
 from .imaging.capture import EyeImage as EyeImage
 from .imaging.capture import render_windows as render_windows
 from .imaging.causes import budget_steps as budget_steps
@@ -40,12 +41,12 @@ from .imaging.folder import render_folder as render_folder
 from .imaging.imageobserver import ImageObserver as ImageObserver
 from .imaging.imageobserver import detect as detect
 from .imaging.images import LabelledImage as LabelledImage
-from .imaging.images import auto_exposed as auto_exposed
 from .imaging.images import render as render
 from .region.anatomy import Region as Region
 from .region.look import Look as Look
 from .report.comparison import write_report as write_report
 from .rig.camera import Camera as Camera
+from .rig.imaging import Picture as Picture
 from .rig.light import Led as Led
 from .rig.rig import Rig as Rig
 from .rig.screen import Screen as Screen
@@ -60,7 +61,6 @@ from .scene.observer import Observer as Observer
 from .scene.people import Population as Population
 from .scene.spec import Eye as Eye
 from .scene.spec import EyeDirection as EyeDirection
-from .scene.spec import Picture as Picture
 from .scene.spec import SceneSpec as SceneSpec
 from .scene.spec import Targets as Targets
 from .scene.subject import Subject as Subject

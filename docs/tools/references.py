@@ -13,7 +13,10 @@ from eyerender.cli.app import app
 
 # A page of the API: its title, and the beginnings of the modules (below the package) whose names it holds.
 GROUPS = {
-    "api_scenes": ("Scenes, frames and subjects", ("scene", "imaging.capture", "imaging.images", "imaging.folder")),
+    "api_scenes": (
+        "Scenes, frames and subjects",
+        ("scene", "imaging.capture", "imaging.images", "imaging.folder", "imaging.autoexposure"),
+    ),
     "api_eyes": ("Eyes and the eye region", ("eye", "region")),
     "api_rigs": ("Rigs: cameras, lights, screens, sensors", ("rig",)),
     "api_design": ("Rig design: information, noise, fits of eyes", ("design",)),

@@ -37,8 +37,8 @@ def render(
             of full scale (for instance 0.7; a value above 1 clips).
     """
     from ..folders.outfolder import refuse_non_empty
+    from ..imaging.autoexposure import auto_exposed
     from ..imaging.folder import render_folder
-    from ..imaging.images import auto_exposed
     from ..scene import load_scene
 
     heed = Heed(strict)

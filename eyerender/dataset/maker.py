@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ..backends.choose import BackendChoice
 from ..base.errors import InputError
 from ..base.progress import one_behind
+from ..imaging.autoexposure import settled_exposure_ms
 from ..imaging.capture import BegunImage, EyeImage, begin_each, make_renderer, noiseless
-from ..imaging.images import settled_exposure_ms
 from ..imaging.labels import image_labels
 from ..rig.plausibility import is_saturated
 from .plan import Plan

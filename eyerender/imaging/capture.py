@@ -20,8 +20,8 @@ from ..eye.refraction import at_cornea_d
 from ..folders.imagefile import MAX_PIXELS, compressed
 from ..rig.camera import Window
 from ..rig.stray import misses_light
-from ..scene import Frames, Scene, as_frames
 from ..scene.observation import EYES
+from .renderable import RenderableFrames, RenderableScene, RenderableSource, posed_frames
 
 if TYPE_CHECKING:
     from ..rendering.output.window import RenderedWindow
@@ -40,7 +40,7 @@ class EyeImage:
     >>> image.counts.shape  # doctest: +SKIP
 
     Attributes:
-        frame: the row of `Frames` that it shows.
+        frame: the row of frames that it shows.
         row: index of that row among the rendered frames.
         window: (x0, y0, width, height) of the window in full-sensor pixels.
         counts: counts stored by the sensor, (height, width) uint8 or uint16 DN.
@@ -52,7 +52,7 @@ class EyeImage:
         rendered: the renderer's complete result.
     """
 
-    frame: Frames
+    frame: RenderableFrames
     row: int
     window: Window
     counts: NDArray[Any]
@@ -70,7 +70,7 @@ class EyeImage:
         return f"{index.frame[0]:06d}_{EYES[index.eye[0]]}"
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> RenderableScene:
         """Scene that was rendered."""
         return self.frame.scene
 
@@ -81,7 +81,7 @@ class EyeImage:
 
 
 def render_windows(
-    frames: Frames | Scene,
+    frames: RenderableFrames | RenderableSource,
     *,
     backend: BackendChoice = "auto",
     threads: int | None = None,
@@ -103,7 +103,7 @@ def render_windows(
         InputError: the scene's windows cannot be rendered.
         BackendError: no backend renders; the message says how to fix it.
     """
-    frames = as_frames(frames)
+    frames = posed_frames(frames)
     check_windows(frames.scene)
     if renderer is None:
         renderer = make_renderer(backend, threads)
@@ -115,7 +115,7 @@ def render_windows(
 class BegunImage:
     """Image in progress of a traced row of `frames`; a second thread completes it."""
 
-    frames: Frames
+    frames: RenderableFrames
     row: int
     job: RenderJob
     made: Future[RenderedWindow]
@@ -139,7 +139,7 @@ class BegunImage:
 
 
 def begin_each(
-    many: Iterable[Frames], renderer: Renderer, *, highlights: bool = False, geometry: tuple[str, ...] = ()
+    many: Iterable[RenderableFrames], renderer: Renderer, *, highlights: bool = False, geometry: tuple[str, ...] = ()
 ) -> Iterator[BegunImage]:
     """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
 
@@ -175,13 +175,13 @@ def begin_each(
 class _Step:
     """The job of a row of `frames`, and its moments, if it moves."""
 
-    frames: Frames
+    frames: RenderableFrames
     row: int
     job: RenderJob
     moments: tuple[RenderJob, ...]
 
 
-def _steps(many: Iterable[Frames], wanted: dict[str, Any]) -> Iterator[_Step]:
+def _steps(many: Iterable[RenderableFrames], wanted: dict[str, Any]) -> Iterator[_Step]:
     """Make the jobs to trace, one after the other; `wanted` are fields of theirs."""
     for frames in many:
         check_windows(frames.scene)
@@ -190,7 +190,7 @@ def _steps(many: Iterable[Frames], wanted: dict[str, Any]) -> Iterator[_Step]:
             yield _Step(frames, row, job, moments(frames, row, job))
 
 
-def render_job(frames: Frames, row: int) -> RenderJob:
+def render_job(frames: RenderableFrames, row: int) -> RenderJob:
     """Create the renderer's job for one row: the eye in its pose, the rig, the window, the seed."""
     from ..rendering.records.job import RenderJob
 
@@ -221,7 +221,7 @@ def render_job(frames: Frames, row: int) -> RenderJob:
     )
 
 
-def focus_dpt(frames: Frames, row: int) -> float:
+def focus_dpt(frames: RenderableFrames, row: int) -> float:
     """Compute the vergence (D) at which the eye of one row is focused.
 
     If the scene states the accommodation, as for drawn people, the eye is focused that much nearer than its far point.
@@ -236,7 +236,7 @@ def focus_dpt(frames: Frames, row: int) -> float:
     return max(target, far)
 
 
-def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:
+def moments(frames: RenderableFrames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:
     """Return the job at evenly spaced moments of the exposure, with moving eye and head; empty if nothing moves.
 
     An interlaced camera has one exposure for its even rows, and a second one for its odd rows.
@@ -260,7 +260,7 @@ def moments(frames: Frames, row: int, middle: RenderJob) -> tuple[RenderJob, ...
     return tuple(out)
 
 
-def check_windows(scene: Scene) -> None:
+def check_windows(scene: RenderableScene) -> None:
     """Check that the eyes of a scene can be rendered.
 
     Raises:
@@ -313,7 +313,7 @@ def noiseless(image: EyeImage) -> NDArray[Any]:
     return dn.astype(np.uint8) if sensor.bit_depth == 8 else dn
 
 
-def stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
+def stored(scene: RenderableScene, dn: NDArray[np.uint16]) -> NDArray[Any]:
     """Convert counts to the stored type, through the sensor's compression."""
     sensor = scene.spec.sensor
     if sensor.bit_depth != 8:
@@ -322,7 +322,7 @@ def stored(scene: Scene, dn: NDArray[np.uint16]) -> NDArray[Any]:
     return codes if sensor.jpeg_quality is None else compressed(codes, sensor.jpeg_quality)
 
 
-def eye_motion(frames: Frames, row: int) -> tuple[Floats, Floats]:
+def eye_motion(frames: RenderableFrames, row: int) -> tuple[Floats, Floats]:
     """Compute the rigid motion x_world = M x + t of the eye of one row: M (3, 3), t (3,) mm."""
     index, pose = frames.index, frames.pose
     one = slice(row, row + 1)

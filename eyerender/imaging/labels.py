@@ -24,10 +24,10 @@ from ..eye.model import EyeModel
 from ..optics.ellipse import fit_ellipse_direct
 from ..region.limbus import lower
 from ..rig.camera import PinholeCamera, Window, in_window
-from ..scene import Frames, Scene
 from ..scene.observation import EYES, Observations
 from ..scene.parts import IRIS, PUPIL
 from .capture import EyeImage, eye_motion
+from .renderable import RenderableFrames, RenderableScene
 
 _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
@@ -50,7 +50,7 @@ class EyeInWindow:
     t: Floats
 
     @classmethod
-    def of(cls, frames: Frames, row: int) -> EyeInWindow:
+    def of(cls, frames: RenderableFrames, row: int) -> EyeInWindow:
         """Create it for row `row` of frames."""
         index, scene = frames.index, frames.scene
         camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
@@ -108,7 +108,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
     }
 
 
-def known_labels(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> dict[str, Any]:
+def known_labels(scene: RenderableScene, observations: Observations, view: EyeInWindow | EyeImage) -> dict[str, Any]:
     """Compute the labels that follow from pose and parameters, without an image: a part of `image_labels`."""
     camera = scene.rig.cameras[view.camera]
     return {
@@ -192,7 +192,7 @@ def visible_arcs_deg(
     return [[float(angle[a]), float(angle[b - 1])] for a, b in edges.reshape(-1, 2)]
 
 
-def iris_outline(scene: Scene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
+def iris_outline(scene: RenderableScene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
     """Compute the ellipse of the apparent limbus (`limbus_px`), with a status, and a reason if there is none."""
     nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
     pixels, reason = limbus_px(scene, view, _OUTLINE_POINTS)
@@ -210,7 +210,7 @@ def iris_outline(scene: Scene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
     }
 
 
-def limbus_px(scene: Scene, view: EyeInWindow | EyeImage, count: int) -> tuple[Floats, str | None]:
+def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) -> tuple[Floats, str | None]:
     """Project the limbus to points (count, 2) in full-sensor px.
 
     The limbus is the circle of the front cornea whose radius is the limbus radius minus half the limbus' width, made
@@ -269,7 +269,7 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
     }
 
 
-def _glints(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> list[dict[str, Any]]:
+def _glints(scene: RenderableScene, observations: Observations, view: EyeInWindow | EyeImage) -> list[dict[str, Any]]:
     """Compute the position of each lamp's glint centre by ray optics."""
     glints, row = observations.glints, view.row
     out = []
@@ -304,7 +304,7 @@ def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any
 
 
 def _space(
-    scene: Scene, observations: Observations, view: EyeInWindow | EyeImage, camera: PinholeCamera
+    scene: RenderableScene, observations: Observations, view: EyeInWindow | EyeImage, camera: PinholeCamera
 ) -> dict[str, Any]:
     """Return points (mm) and lines in the world and the camera's frame, and rotation centres in the head's frame.
 
@@ -340,7 +340,9 @@ def _space(
     }
 
 
-def _line_of_sight(scene: Scene, observations: Observations, view: EyeInWindow | EyeImage) -> tuple[Floats, Floats]:
+def _line_of_sight(
+    scene: RenderableScene, observations: Observations, view: EyeInWindow | EyeImage
+) -> tuple[Floats, Floats]:
     """Return the line of sight of the unrotated eye: the fixed chief ray, or that of the entrance window."""
     index, row = observations.index, view.row
     if scene.spec.eye.line_of_sight == "entrance_window" and np.isfinite(index.target_mm[row]).all():

@@ -1,4 +1,4 @@
-"""Specification of effects between the eye and the sensor: focus, vignetting, motion, ambient light."""
+"""How pictures are taken: what is rendered of the sensor, focus, vignetting, motion, ambient light."""
 
 from __future__ import annotations
 
@@ -9,6 +9,33 @@ from pydantic import Field, model_validator
 
 from ..base.arrays import Floats
 from ..base.spec import NonNegative, Positive, Spec, Vec2, Vec3
+
+Surfaces = Literal["exact", "mesh"]
+
+
+class Picture(Spec):
+    """The rendered part of the sensor, and the number of samples.
+
+    >>> er.Picture(window_px=(320, 240), spp=32).spp
+    32
+    """
+
+    window_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = Field(
+        default=None, description="width and height of one window per eye, centred on it; default: the whole sensor"
+    )
+    spp: Annotated[int, Field(ge=1, le=65536)] = Field(default=16, description="samples per pixel")
+    surfaces: Surfaces = Field(
+        default="exact",
+        description="the cornea of the picture: `exact` (in closed form) or `mesh` (triangles, interpolated normals)",
+    )
+    mesh_edge_mm: Annotated[float, Field(ge=0.02, le=2)] = Field(
+        default=0.1, description="length of the triangles' edges, with `surfaces: mesh`"
+    )
+    interreflection: bool = Field(
+        default=True,
+        description="whether surfaces send light to each other: iris and cornea, globe, lids, face and background; "
+        "off is faster and darker",
+    )
 
 
 class Opening(Spec):

@@ -136,6 +136,11 @@ class Frame(Frames):
 
     __slots__ = ()
 
+    @property
+    def side(self) -> str:
+        """The eye, right or left."""
+        return EYES[int(self.index.eye[0])]
+
 
 @dataclass(frozen=True, slots=True, init=False)
 class Scene:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from ..base.errors import InputError
 from ..base.spec import read_yaml
+from ..rig.imaging import Surfaces
 from .scene import Scene
-from .spec import DATASET_KIND, NOT_A_SCENE, SceneSpec, Surfaces
+from .spec import DATASET_KIND, NOT_A_SCENE, SceneSpec
 
 
 def shipped_scenes() -> dict[str, Path]:

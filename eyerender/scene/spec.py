@@ -20,7 +20,7 @@ from ..eye.spec import EyeSpec
 from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
-from ..rig.imaging import Ambient, Lens, Motion
+from ..rig.imaging import Ambient, Lens, Motion, Picture
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
 from .observation import MAX_GLINTS
@@ -187,34 +187,6 @@ class EyeDirection(Spec):
         """Create directions from azimuths and elevations, (2,) or (n, 2) degrees."""
         angles = np.asarray(angles_deg, dtype=float).reshape(-1, 2)
         return [cls(azimuth_deg=azimuth, elevation_deg=elevation) for azimuth, elevation in angles]
-
-
-Surfaces = Literal["exact", "mesh"]
-
-
-class Picture(Spec):
-    """The rendered part of the sensor, and the number of samples.
-
-    >>> er.Picture(window_px=(320, 240), spp=32).spp
-    32
-    """
-
-    window_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = Field(
-        default=None, description="width and height of one window per eye, centred on it; default: the whole sensor"
-    )
-    spp: Annotated[int, Field(ge=1, le=65536)] = Field(default=16, description="samples per pixel")
-    surfaces: Surfaces = Field(
-        default="exact",
-        description="the cornea of the picture: `exact` (in closed form) or `mesh` (triangles, interpolated normals)",
-    )
-    mesh_edge_mm: Annotated[float, Field(ge=0.02, le=2)] = Field(
-        default=0.1, description="length of the triangles' edges, with `surfaces: mesh`"
-    )
-    interreflection: bool = Field(
-        default=True,
-        description="whether surfaces send light to each other: iris and cornea, globe, lids, face and background; "
-        "off is faster and darker",
-    )
 
 
 NOT_A_SCENE = (

@@ -11,10 +11,11 @@ import pytest
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.folders.imagefolder import RENDERED_SCHEMA, ImageFolder
+from eyerender.imaging.autoexposure import auto_exposed
 from eyerender.imaging.capture import noiseless, render_job, render_windows
 from eyerender.imaging.folder import render_folder
 from eyerender.imaging.imageobserver import ImageObserver
-from eyerender.imaging.images import auto_exposed, render
+from eyerender.imaging.images import render
 from eyerender.rig.surroundings import paint
 from eyerender.scene import Scene
 from eyerender.scene.parts import FRAME, PUPIL

@@ -1,0 +1,165 @@
+"""What pictures need of a scene and its frames; `Scene` and `Frames` have it, with much else."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, Self, runtime_checkable
+
+from ..analytic.observer import Traceable, TraceableScene
+from ..eye.model import EyeModel
+from ..region.anatomy import Region
+from ..region.look import Look
+from ..rig.camera import Window
+from ..rig.imaging import Ambient, Lens, Motion, Picture
+from ..rig.sensor import Sensor
+
+
+class EyeSettings(Protocol):
+    """Settings of the eye model."""
+
+    @property
+    def line_of_sight(self) -> str:
+        """The line of sight that meets a target: `chief_ray` or `entrance_window`."""
+        ...
+
+
+class PictureSettings(Protocol):
+    """The keys of a scene that its pictures and labels depend on."""
+
+    @property
+    def eye(self) -> EyeSettings:
+        """Settings of the eye model."""
+        ...
+
+    @property
+    def image(self) -> Picture:
+        """The rendered part of the sensor, and its samples."""
+        ...
+
+    @property
+    def sensor(self) -> Sensor:
+        """Aperture, exposure and sensor."""
+        ...
+
+    @property
+    def look(self) -> Look:
+        """Albedos and textures of the eye."""
+        ...
+
+    @property
+    def lens(self) -> Lens:
+        """Defocus and vignetting."""
+        ...
+
+    @property
+    def motion(self) -> Motion | None:
+        """Motion during the exposure."""
+        ...
+
+    @property
+    def wavelength_nm(self) -> float:
+        """Wavelength of the lights."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Seed of the samples and of the sensor's noise."""
+        ...
+
+
+class RenderableScene(TraceableScene, Protocol):
+    """A scene whose frames can be rendered."""
+
+    @property
+    def spec(self) -> PictureSettings:
+        """What the scene's file says."""
+        ...
+
+    @property
+    def region(self) -> Region | None:
+        """The eye region, with paths of its files; None for bare eyes."""
+        ...
+
+    @property
+    def ambient(self) -> Ambient:
+        """Light other than that of the lamps, with paths of its files."""
+        ...
+
+    @property
+    def accommodation_d(self) -> float | None:
+        """Accommodation, D; None if the eye is focused on its target."""
+        ...
+
+    def eye(self, side: str) -> EyeModel:
+        """Return the numeric eye of a side."""
+        ...
+
+    def refraction_d(self, side: str) -> float:
+        """Return the refraction of an eye, D."""
+        ...
+
+    def stop_diameter_mm(self, side: str) -> float:
+        """Return the diameter of an eye's stop."""
+        ...
+
+    def window(self, camera: int, head: int, eye: int) -> Window:
+        """Return the rendered window."""
+        ...
+
+    def window_size_px(self, camera: int) -> tuple[int, int]:
+        """Return the size of a camera's windows."""
+        ...
+
+    def with_(self, *, spp: int | None, **fields: Any) -> Any:
+        """Return the scene with other values of its keys."""
+        ...
+
+
+@runtime_checkable
+class RenderableFrames(Traceable, Protocol):
+    """Frames that can be rendered: a row is one eye in one frame."""
+
+    @property
+    def scene(self) -> RenderableScene:
+        """The scene."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def take(self, rows: Any) -> RenderableFrames:
+        """Select rows."""
+        ...
+
+    def of_scene(self, scene: Any) -> Self:
+        """Keep the eyes and poses in another scene."""
+        ...
+
+
+@runtime_checkable
+class RenderableFrame(RenderableFrames, Protocol):
+    """One row of frames."""
+
+    @property
+    def side(self) -> str:
+        """The eye, right or left."""
+        ...
+
+
+@runtime_checkable
+class RenderableSource(Protocol):
+    """A scene, which poses its eyes in all of its frames."""
+
+    def frames(self) -> RenderableFrames:
+        """Compute the pose of every (frame, eye)."""
+        ...
+
+
+def posed_frames(frames: RenderableFrames | RenderableSource) -> RenderableFrames:
+    """Return the frames of a scene, or the given frames.
+
+    Raises:
+        TypeError: the argument is neither.
+    """
+    found = frames.frames() if isinstance(frames, RenderableSource) else frames
+    if not isinstance(found, RenderableFrames):
+        raise TypeError(f"give frames or a scene, not {type(frames).__name__}")
+    return found
