@@ -290,15 +290,22 @@ class SkinGeometry:
             turned += weight * dr.gather(mi.Vector4f, self.vertices, 2 * vertex + 1)
         return mi.Vector3f(place.x, place.y, place.z), dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
 
+    def _corners(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> list[tuple[mi.Float, mi.UInt32]]:
+        """Return the vertices of triangles with their barycentric weights."""
+        corner = dr.gather(mi.Vector4u, self.faces, face, active)
+        return list(zip((1 - uv.x - uv.y, uv.x, uv.y), (corner.x, corner.y, corner.z), strict=True))
+
+    def _mixed(self, corners: list[tuple[mi.Float, mi.UInt32]], half: int, active: mi.Bool) -> mi.Vector4f:
+        """Interpolate the first or second four numbers of vertices."""
+        mixed = mi.Vector4f(0)
+        for weight, i in corners:
+            mixed += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + half, active)
+        return mixed
+
     def map_place(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Compute coordinates of the map at barycentric coordinates `uv` of triangles."""
-        corner = dr.gather(mi.Vector4u, self.faces, face, active)
-        u, v = mi.Float(0), mi.Float(0)
-        for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), (corner.x, corner.y, corner.z), strict=True):
-            # As in `surface`, so that Dr.Jit gathers them only once.
-            u += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i, active).w
-            v += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active).w
-        return u, v
+        corners = self._corners(face, uv, active)
+        return self._mixed(corners, 0, active).w, self._mixed(corners, 1, active).w
 
     def own_share(self, v: mi.Float) -> mi.Float:
         """Compute how much of the tissue at coordinates v of the map is the sheet's own, as opposed to the globe's.
@@ -332,26 +339,21 @@ class SkinGeometry:
 
     def from_behind(self, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         """Return whether rays along d (scene's frame) meet triangles on their inner side, such as that of a lid."""
-        corner = dr.gather(mi.Vector4u, self.faces, face, active)
-        corners = (corner.x, corner.y, corner.z)
+        corners = self._corners(face, uv, active)
         a, b, c = (
-            mi.Vector3f(p.x, p.y, p.z) for p in (dr.gather(mi.Vector4f, self.vertices, 2 * i, active) for i in corners)
+            mi.Vector3f(p.x, p.y, p.z)
+            for p in (dr.gather(mi.Vector4f, self.vertices, 2 * i, active) for _, i in corners)
         )
-        turned = mi.Vector4f(0)
-        for weight, i in zip((1 - uv.x - uv.y, uv.x, uv.y), corners, strict=True):
-            turned += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active)
+        turned = self._mixed(corners, 1, active)
         n = dr.cross(b - a, c - a)
         behind = dr.dot(n, d) * dr.dot(n, mi.Vector3f(turned.x, turned.y, turned.z)) > 0
         return behind & self.on_sheet(face) if self.is_sheet else behind  # hairs are thin, and some are open tubes
 
     def surface(self, face: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> SkinPoint:
         """Compute the surface at barycentric coordinates `uv` of triangles."""
-        corner = dr.gather(mi.Vector4u, self.faces, face, active)
-        weights = (1 - uv.x - uv.y, uv.x, uv.y)
-        place, turned, received = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
-        for weight, i in zip(weights, (corner.x, corner.y, corner.z), strict=True):
-            place += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i, active)
-            turned += weight * dr.gather(mi.Vector4f, self.vertices, 2 * i + 1, active)
+        corners, received = self._corners(face, uv, active), mi.Vector4f(0)
+        place, turned = self._mixed(corners, 0, active), self._mixed(corners, 1, active)
+        for weight, i in corners:
             received += weight * dr.gather(mi.Vector4f, self.received, i, active)
         albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in self.map.eval(mi.Point2f(place.w, turned.w), active))
         smooth = dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))

@@ -14,6 +14,7 @@ from ..records.frame import upload_array, upload_scalars
 from .chamber import IRIS_RINGS, ROOT_RINGS, Chamber
 from .chamber import TURNS as IRIS_TURNS
 from .patches import GLOBE_COLUMNS, MAP_SIDE, PLANE_FIRST_MM, PLANE_MM, RINGS, TURNS, WIDEST, GlobePatches
+from .tissuegrids import Bilinear
 
 
 @dataclass(kw_only=True)
@@ -129,19 +130,15 @@ def _bilinear(buffer: mi.Float, column: mi.Float, row: mi.Float, columns: int, r
     """Interpolate bilinearly between columns and rows; extrapolate by up to `beyond` rows."""
     column, row = dr.clip(column, 0, columns - 1.001), dr.clip(row, -beyond, rows - 1.001 + beyond)
     i, j = mi.UInt32(column), mi.UInt32(dr.clip(row, 0, rows - 1.001))
-    s, t = column - mi.Float(i), row - mi.Float(j)
     place = j * columns + i
-    a, b, c, d = (dr.gather(mi.Vector4f, buffer, place + k) for k in (0, 1, columns, columns + 1))
-    low, high = a + s * (b - a), c + s * (d - c)
-    return dr.maximum(low + t * (high - low), 0)
+    cells = Bilinear((place, place + 1, place + columns, place + columns + 1), column - mi.Float(i), row - mi.Float(j))
+    return dr.maximum(cells.interpolate(mi.Vector4f, buffer), 0)
 
 
 def _around(buffer: mi.Float, ring: mi.Float, turn: mi.Float, rings: int, turns: int, kind: Any) -> Any:
     """Interpolate between rings, and between the nodes around a ring, whose last node neighbours the first."""
     ring, turn = dr.clip(ring, 0, rings - 1.001), dr.clip(turn, 0, turns - 0.001)
     i, j = mi.UInt32(ring), mi.UInt32(turn)
-    s, t = ring - mi.Float(i), turn - mi.Float(j)
-    after = dr.select(j + 1 < turns, j + 1, 0)
-    a, b, c, d = (dr.gather(kind, buffer, p * turns + q) for p in (i, i + 1) for q in (j, after))
-    near, far = a + t * (b - a), c + t * (d - c)
-    return near + s * (far - near)
+    beside = j, dr.select(j + 1 < turns, j + 1, 0)
+    numbers = tuple(p * turns + q for p in (i, i + 1) for q in beside)
+    return Bilinear(numbers, turn - mi.Float(j), ring - mi.Float(i)).interpolate(kind, buffer)
