@@ -245,11 +245,8 @@ def _lens(eye: Mapping[str, float], table: Table, age: float, accommodation: flo
 def _fovea(eye: Mapping[str, float], relaxed: dict[str, Any], wavelength_nm: float) -> dict[str, Any]:
     """Compute the fovea from the angle kappa of the relaxed eye, with the stop at the table's reference diameter.
 
-    So the fovea does not move when pupil and lens change. Numbers of people drawn with version 0.1 have the angle
-    alpha.
+    So the fovea does not move when pupil and lens change.
     """
-    if "kappa_horizontal_deg" not in eye:
-        return {"field_deg": [eye["alpha_horizontal_deg"], eye["alpha_vertical_deg"]]}
     kappa = (eye["kappa_horizontal_deg"], eye["kappa_vertical_deg"])
     return {"position_mm": list(_fovea_of(json.dumps(relaxed), kappa, wavelength_nm))}
 

@@ -183,8 +183,7 @@ class Person(Spec):
         field = table.constant("field_deg") if field_deg is None else field_deg
         far = far_pupil_mm(table, luminance, field, np.array(self.number("age_years")), self.number("pupil_score"))
         near = float(far) - self.number("miosis_mm_per_d") * self.accommodation_d(demand_d)
-        # People of earlier versions lack this.
-        if side is not None and "anisocoria_mm" in self.numbers:
+        if side is not None:
             near += self.number("anisocoria_mm") * (0.5 if side == "right" else -0.5)
         return float(np.clip(near, table.constant("smallest_pupil_mm"), table.constant("largest_pupil_mm")))
 

@@ -107,10 +107,6 @@ def test_a_fifth_of_people_has_unequal_pupils():
     right, left = both[0]
     assert right - left == pytest.approx(person.number("anisocoria_mm"), abs=1e-12)
     assert (right + left) / 2 == pytest.approx(person.entrance_pupil_mm(1.0), abs=1e-12)
-    # A person of an earlier version has equal pupils.
-    numbers = {name: value for name, value in person.numbers.items() if name != "anisocoria_mm"}
-    old = person.model_copy(update={"numbers": numbers})
-    assert old.entrance_pupil_mm(side="right") == old.entrance_pupil_mm(side="left") == person.entrance_pupil_mm()
 
 
 def test_entrance_pupil_is_what_a_distant_camera_sees(people):
@@ -211,11 +207,3 @@ def test_alpha_of_drawn_eyes_is_that_of_the_literature(people):
     # The standard error of 25 eyes is 0.3 deg.
     assert horizontal == pytest.approx(5.6, abs=1.0)
     assert abs(vertical) < 2.0
-
-
-def test_a_person_drawn_with_alpha_still_has_eyes(people):
-    person = people.person(0)
-    numbers = {k: v for k, v in person.numbers.items() if not k.startswith("kappa")}
-    numbers |= {"alpha_horizontal_deg": (5.0, 6.0), "alpha_vertical_deg": (2.0, 1.0)}
-    old = person.model_copy(update={"numbers": numbers})
-    assert alpha_deg(old.eye("left").build()) == pytest.approx((6.0, 1.0), abs=1e-8)
