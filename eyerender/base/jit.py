@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core import config as numba_config
 from numba.core import sigutils
 from numba.core.dispatcher import Dispatcher
@@ -68,7 +69,7 @@ def used(folder: Path) -> Path:
 
 
 FOLDER = None if (_place := _folder()) is None else str(used(_place))
-FUNCTIONS: dict[Any, str] = {}  # the dispatchers that `compiled` made, and the types of their arguments
+FUNCTIONS: dict[Any, tuple[str, dict[str, np.dtype[Any]]]] = {}  # dispatchers of `compiled`, and argument types
 # Helpers are called by compiled functions only.
 HELPER: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 ABOUT_S = 15  # time of compilation on two cores, for the message
@@ -177,20 +178,22 @@ def functions(program: Program = EXTRACTOR) -> list[Any]:
 
 def argument_types(function: Any) -> tuple[Any, ...]:
     """Return the argument types declared for a compiled function, as in numba's index of machine code."""
-    return tuple(normalize_signature(f"({FUNCTIONS[function]},)")[0])
+    types, records = FUNCTIONS[function]
+    known = {**vars(numba.types), **{name: numba.from_dtype(record) for name, record in records.items()}}
+    return tuple(normalize_signature(eval(f"({types},)", {}, known))[0])
 
 
-def compiled(types: str = "") -> Callable[[Function], Function]:
+def compiled(types: str = "", **records: np.dtype[Any]) -> Callable[[Function], Function]:
     """Decorate a function so that numba compiles it at its first call and keeps the machine code on disk.
 
     Args:
-        types: argument types with which extraction calls the function, in numba's notation, for compilation ahead of
-            time.
+        types: argument types with which the function is called, in numba's notation, for compilation ahead of time.
+        records: types of structured arrays by their names in `types`.
     """
 
     def decorate(function: Function) -> Function:
         made = _dispatcher(function)
-        FUNCTIONS[made] = types
+        FUNCTIONS[made] = types, records
         return cast(Function, made)
 
     return decorate

@@ -129,7 +129,7 @@ def _depth(surface: Surface, grid: Floats) -> Floats:
     """Depth x (mm, eye frame) of the surface over points (y, z), (m, 2) -> (m,); NaN where the line misses it."""
     graphs = graphs_of(surface)
     if graphs is not None and graphs.plain:
-        return np.asarray(graphs.heights(*grid.T)[0])
+        return np.asarray(graphs.jets(*grid.T)[0].x)
     start = np.column_stack([np.full(len(grid), _FAR_MM), grid])
     hit = surface.hit(components(start), components(np.broadcast_to([-1.0, 0.0, 0.0], start.shape)), inward=True)
     return np.where(hit.ok, _FAR_MM - hit.distance, np.nan)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..base.arrays import Floats
 from .surfaces_measured import GridSurface, Measured, ZernikeSurface
-from .topography import outer_biconic, spline_coefficients
+from .topography import outer_biconic, outer_height, spline_coefficients
 from .zernike import order_of, terms
 
 WINDOW = (0.75, 1.15)
@@ -46,7 +46,7 @@ def zernike_surface(
     radius = np.array(radius_mm)
     zone = radius_mm if zone_radius_mm is None else zone_radius_mm
     alone = ZernikeSurface(np.zeros(3), np.eye(3), base, radius, coefficients, _ANY, _FAR)
-    outer = outer_biconic(lambda y, z: alone.measured(y, z, False)[0], _ring(zone))
+    outer = outer_biconic(lambda y, z: alone.measured(y, z), _ring(zone))
     return ZernikeSurface(np.zeros(3), np.eye(3), base, radius, coefficients, outer, _window(zone))
 
 
@@ -82,14 +82,13 @@ def grid_surface(
     # First on a plane (a biconic without curvature), only to fit the biconic.
     flat = np.array([np.inf, np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     raw = on_biconic(flat, heights)
-    outer = outer_biconic(lambda y, z: raw.measured(y, z, False)[0], _ring(zone))
+    outer = outer_biconic(lambda y, z: raw.measured(y, z), _ring(zone))
     place = np.linspace(-half, half, len(heights))
     y, z = np.meshgrid(place, place, indexing="ij")
-    biconic = raw.with_outer(outer)
-    base = biconic.outer_slopes(y, z)
     # Beyond the reach of the biconic there is no residual; those nodes lie far outside the measured zone.
-    surface = on_biconic(outer, np.where(base.inside, heights - base.x, 0.0))
-    apex = surface.measured(np.zeros(1), np.zeros(1), False)[0][0]
+    reached = np.isfinite(raw.with_outer(outer).measured(y, z))
+    surface = on_biconic(outer, np.where(reached, heights - outer_height(outer, y, z), 0.0))
+    apex = surface.measured(np.zeros(1), np.zeros(1))[0]
     return surface.with_outer(outer - apex * np.eye(8)[5])
 
 
@@ -98,7 +97,7 @@ def misfit_mm(surface: Measured) -> float:
     angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
     radius = float(np.mean(surface.window_mm))
     y, z = radius * np.cos(angle), radius * np.sin(angle)
-    away = surface.measured(y, z, False)[0] - surface.outer_slopes(y, z).x
+    away = surface.measured(y, z) - outer_height(surface.outer, y, z)
     return float(np.sqrt(np.mean(away**2)))
 
 

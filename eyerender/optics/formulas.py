@@ -98,6 +98,7 @@ class Formulas(NamedTuple):
     fresnel: Callable[..., Any]
     fresnel_film: Callable[..., Any]
     sheet_height: Callable[..., Any]
+    quadric_jet: Callable[..., Any]
     biconic_jet: Callable[..., Any]
     turn_jet: Callable[..., Any]
     blend_jet: Callable[..., Any]
@@ -118,6 +119,7 @@ def formulas(ops: Ops) -> Formulas:
         fresnel=fresnel(ops),
         fresnel_film=fresnel_film(ops),
         sheet_height=sheet(ops),
+        quadric_jet=quadric(ops),
         biconic_jet=biconic(ops),
         turn_jet=turning(ops),
         blend_jet=blending(ops),
@@ -302,6 +304,41 @@ def sheet(ops: Ops) -> Callable[..., Jet]:
         )
 
     return ops.compile(sheet_height)
+
+
+def quadric(ops: Ops) -> Callable[..., Jet]:
+    """Make the height of a quadric or biconic that is displaced, or turned."""
+    height = sheet(ops)
+
+    def polynomial(c: Any, y: Number, z: Number) -> Jet:
+        return Jet(
+            c[0] + y * (c[1] + c[3] * y + c[4] * z) + z * (c[2] + c[5] * z),
+            c[1] + 2.0 * c[3] * y + c[4] * z,
+            c[2] + c[4] * y + 2.0 * c[5] * z,
+            2.0 * c[3],
+            c[4],
+            2.0 * c[5],
+        )
+
+    polynomial = ops.compile(polynomial)
+
+    def quadric_jet(place: Any, numerator: Any, linear: Any, square: Any, y: Number, z: Number) -> Jet:
+        """Compute x = x_0 + l_y y + l_z z - N / (h + u), u = sqrt(R), with its derivatives.
+
+        Args:
+            place: x_0, l_y and l_z.
+            numerator: six coefficients of N, of 1, y, z, yy, yz and zz.
+            linear: three coefficients of h, of 1, y and z.
+            square: six coefficients of R, as of N.
+            y: coordinate.
+            z: coordinate.
+        """
+        slant = (linear[0] + linear[1] * y + linear[2] * z, linear[1], linear[2])
+        x = height(polynomial(numerator, y, z), slant, polynomial(square, y, z))
+        base = place[0] + place[1] * y + place[2] * z
+        return Jet(base + x.x, place[1] + x.y, place[2] + x.z, x.yy, x.yz, x.zz)
+
+    return ops.compile(quadric_jet)
 
 
 def biconic(ops: Ops) -> Callable[..., Jet]:

@@ -18,8 +18,9 @@ import numpy.typing as npt
 
 from ..base.arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
 from ..base.status import Status
-from .fermat_kernels import END, EXIT, GUESS, LOST, RESIDUAL, RESULTS, WAY, connect_all
-from .graphs import Graphs, graphs_of
+from .fermat_kernels import LOST, connect_all
+from .graphs import graphs_of
+from .sheets import Graphs
 from .shooting import Connection, connect, taken
 from .surfaces import Surface, Xyz, components, join, shift, turn, turn_back
 from .trace import Crossing, outward_path, trace
@@ -146,17 +147,19 @@ def _joined(
     if not graphs.plain:
         viewpoint, target = (turn_back(graphs.rotation, shift(p, graphs.origin_mm, -1.0)) for p in (viewpoint, target))
     state = np.full((full[0], int(np.prod(full[1:], dtype=np.intp))), LOST, dtype=np.int8)
-    out = np.empty((RESULTS, *state.shape))
+    found, residual = np.empty((4, 3, *state.shape)), np.empty(state.shape)
     rims = np.array(np.atleast_1d(rim_mm), dtype=np.float64)
     ends = _rows(viewpoint, full), _rows(target, full)
-    connect_all(graphs.kinds, graphs.numbers, graphs.table, ladder, rims, *ends, reflects, out, state)
-    values = out.reshape(RESULTS, *shape)
-    exits, way, end, guess = ((values[k], values[k + 1], values[k + 2]) for k in (EXIT, WAY, END, GUESS))
+    kinds, sheets, table = graphs.kinds, graphs.sheets, graphs.table
+    connect_all(
+        kinds, sheets, table, ladder, rims, *ends, reflects, found[0], found[1], found[2], found[3], residual, state
+    )
+    guess, exits, way, end = ((x, y, z) for x, y, z in found.reshape(4, 3, *shape))
     if not graphs.plain:
         exits, guess = (shift(turn(graphs.rotation, p), graphs.origin_mm, 1.0) for p in (exits, guess))
         way, end = turn(graphs.rotation, way), turn(graphs.rotation, end)
     status = state.reshape(shape)
-    return Rays(exits, way, end, values[RESIDUAL], status), status != LOST, guess
+    return Rays(exits, way, end, residual.reshape(shape), status), status != LOST, guess
 
 
 def _rows(point: Xyz, full: tuple[int, ...]) -> Floats:

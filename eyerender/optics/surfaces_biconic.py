@@ -7,9 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..base.arrays import FloatLike, Floats
-from .biconic_kernels import Jet, Slopes, biconic_jet, biconic_slopes
-from .surfaces import fit
+from ..base.arrays import Floats
+from .graph_kernels import SMOOTH, Sheets
+from .sheets import write_biconic
 from .surfaces_graph import GraphSurface
 
 
@@ -35,13 +35,10 @@ class Biconic(GraphSurface):
 
     kind: ClassVar[str] = "biconic"
 
-    def slopes(self, y: Floats, z: Floats) -> Slopes:
-        """Compute height and slopes over the local (y, z)."""
-        return biconic_slopes(self._constants(max(y.ndim, z.ndim)), y, z)
-
-    def jet(self, y: Floats, z: Floats) -> Jet:
-        """Compute height, slopes and second derivatives over the local (y, z)."""
-        return biconic_jet(self._constants(max(y.ndim, z.ndim)), y, z)
+    def write(self, sheets: Sheets, table: list[Floats]) -> int:
+        """Write the shape into records that hold its place."""
+        write_biconic(sheets, self.radii_mm, self.conic_constants, sheets["cosine"], sheets["sine"])
+        return SMOOTH
 
     def likeness(self) -> tuple[Floats, Floats]:
         """Return curvature and 1 + Q of the conic with the mean curvature."""
@@ -54,9 +51,3 @@ class Biconic(GraphSurface):
     def _mirrored_shape(self) -> dict[str, Floats]:
         """Change nothing, because the sag is even in y."""
         return {}
-
-    def _constants(self, ndim: int) -> tuple[FloatLike, ...]:
-        curvature = 1.0 / self.radii_mm
-        shape = (1.0 + self.conic_constants) * curvature**2
-        parts = (curvature[..., 0], curvature[..., 1], shape[..., 0], shape[..., 1])
-        return tuple(fit(part, ndim) for part in parts)

@@ -16,15 +16,14 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from ..base.arrays import FloatLike, Floats, Indices
-from .biconic_kernels import Jet, Slopes, biconic_jet, biconic_slopes
-from .surfaces import fit
+from ..base.arrays import Floats, Indices
+from .graph_kernels import GRID, ZERNIKE, Sheets
+from .sheets import write_biconic
 from .surfaces_graph import GraphSurface
 from .transforms import read_only, stacked
-from .zernike import mirrored, order_of, product_basis, products
+from .zernike import at_middle, mirrored, order_of, products, terms
 
-Parts = tuple[Floats, ...]
-"""A height, its slopes by y and z, and perhaps its derivatives by yy, yz and zz."""
+_FAR_MM = 1e6
 
 
 class Measured(GraphSurface):
@@ -41,106 +40,30 @@ class Measured(GraphSurface):
     outer: Floats
     window_mm: Floats
 
+    def write(self, sheets: Sheets, table: list[Floats]) -> int:
+        """Write the shape into records that hold its place, and its coefficients into the table."""
+        outer, (begin, end) = self.outer, (self.window_mm[..., k] for k in (0, 1))
+        c, s = sheets["cosine"], sheets["sine"]
+        own_c, own_s = np.cos(outer[..., 4]), np.sin(outer[..., 4])
+        write_biconic(sheets, outer[..., :2], outer[..., 2:4], c * own_c - s * own_s, s * own_c + c * own_s)
+        place, (_, y, z) = sheets["place"], sheets["origin"].T
+        place[:, 1], place[:, 2] = c * outer[..., 6] - s * outer[..., 7], s * outer[..., 6] + c * outer[..., 7]
+        place[:, 0] += outer[..., 5] - place[:, 1] * y - place[:, 2] * z
+        sheets["begin"], sheets["width"] = begin**2, end**2 - begin**2
+        return self._write_inner(sheets, table)
+
     @abstractmethod
-    def measured(self, y: Floats, z: Floats, second: bool, outer: Parts | None = None) -> Parts:
-        """Compute height, slopes and (if `second`) second derivatives of the measured surface, as in a `Jet`.
+    def _write_inner(self, sheets: Sheets, table: list[Floats]) -> int:
+        """Write the measured surface itself, and return its kind."""
 
-        Args:
-            y: positions inside the end of the transition.
-            z: positions, of the same shape.
-            second: whether to compute second derivatives.
-            outer: the same numbers of the outer biconic, if known.
-        """
-
-    def slopes(self, y: Floats, z: Floats) -> Slopes:
-        """Compute height and slopes over the local (y, z)."""
-        y, z = np.broadcast_arrays(y, z)
-        share, width = self._share(y, z)
-        if not (share > 0.0).any():
-            x, slope_y, slope_z = self.measured(y, z, False)
-            return Slopes(x, slope_y, slope_z, np.ones(share.shape, dtype=bool))
-        outer = self.outer_slopes(y, z)
-        if (share >= 1.0).all():
-            return outer
-        d, dy, dz = self._difference(y, z, share, outer[:3], False)
-        w, w1, _ = _window(share, width)
-        lever = 2.0 * w1 * d
-        return Slopes(outer.x + w * d, outer.y + w * dy + lever * y, outer.z + w * dz + lever * z, outer.inside)
-
-    def jet(self, y: Floats, z: Floats) -> Jet:
-        """Compute height, slopes and second derivatives over the local (y, z)."""
-        y, z = np.broadcast_arrays(y, z)
-        share, width = self._share(y, z)
-        if not (share > 0.0).any():
-            return Jet(*self.measured(y, z, True))
-        outer = self.outer_jet(y, z)
-        if (share >= 1.0).all():
-            return outer
-        d, dy, dz, dyy, dyz, dzz = self._difference(y, z, share, outer, True)
-        w, w1, w2 = _window(share, width)
-        lever, bend = 2.0 * w1 * d, 4.0 * w2 * d
-        return Jet(
-            outer.x + w * d,
-            outer.y + w * dy + lever * y,
-            outer.z + w * dz + lever * z,
-            outer.yy + w * dyy + 4.0 * w1 * y * dy + lever + bend * y * y,
-            outer.yz + w * dyz + 2.0 * w1 * (y * dz + z * dy) + bend * y * z,
-            outer.zz + w * dzz + 4.0 * w1 * z * dz + lever + bend * z * z,
-        )
-
-    def outer_slopes(self, y: Floats, z: Floats) -> Slopes:
-        """Compute height and slopes of the outer biconic."""
-        constants, (c, s, x, ly, lz) = self._outer_constants(y.ndim)
-        h = biconic_slopes(constants, c * y + s * z, c * z - s * y)
-        return Slopes(h.x + x + ly * y + lz * z, c * h.y - s * h.z + ly, s * h.y + c * h.z + lz, h.inside)
-
-    def outer_jet(self, y: Floats, z: Floats) -> Jet:
-        """Compute height, slopes and second derivatives of the outer biconic."""
-        constants, (c, s, x, ly, lz) = self._outer_constants(y.ndim)
-        h = biconic_jet(constants, c * y + s * z, c * z - s * y)
-        return Jet(
-            h.x + x + ly * y + lz * z,
-            c * h.y - s * h.z + ly,
-            s * h.y + c * h.z + lz,
-            c * c * h.yy - 2.0 * c * s * h.yz + s * s * h.zz,
-            c * s * (h.yy - h.zz) + (c * c - s * s) * h.yz,
-            s * s * h.yy + 2.0 * c * s * h.yz + c * c * h.zz,
-        )
+    def measured(self, y: Floats, z: Floats) -> Floats:
+        """Compute the height of the measured surface itself, also outside its window."""
+        far = np.broadcast_to([_FAR_MM, 2.0 * _FAR_MM], self.window_mm.shape)
+        return replace(self, window_mm=far).local_sag(y, z)  # type: ignore[type-var]
 
     def likeness(self) -> tuple[Floats, Floats]:
         """Return curvature (1/mm) and 1 + Q of a similar conic: the means over the outer biconic's meridians."""
         return np.mean(1.0 / self.outer[..., :2], axis=-1), 1.0 + np.mean(self.outer[..., 2:4], axis=-1)
-
-    def _share(self, y: Floats, z: Floats) -> tuple[Floats, FloatLike]:
-        """Compute the position in the transition, 0 where it begins and 1 where it ends, and the width q_o - q_i."""
-        begin, end = (fit(self.window_mm[..., k], y.ndim) for k in (0, 1))
-        width = end * end - begin * begin
-        return np.asarray((y * y + z * z - begin * begin) / width), width
-
-    def _difference(self, y: Floats, z: Floats, share: Floats, outer: Parts, second: bool) -> Parts:
-        """Compute M - B and its derivatives; 0 beyond the window, where the measured shape may be huge."""
-        beyond = share >= 1.0
-        y, z = np.where(beyond, 0.0, y), np.where(beyond, 0.0, z)
-        inner = self.measured(y, z, second, outer)
-        return tuple(np.where(beyond, 0.0, m - b) for m, b in zip(inner, outer, strict=True))
-
-    def _outer_constants(self, ndim: int) -> tuple[tuple[FloatLike, ...], tuple[FloatLike, ...]]:
-        curvature = 1.0 / self.outer[..., :2]
-        shape = (1.0 + self.outer[..., 2:4]) * curvature**2
-        constants = (curvature[..., 0], curvature[..., 1], shape[..., 0], shape[..., 1])
-        angle = self.outer[..., 4]
-        placed = (np.cos(angle), np.sin(angle), *(self.outer[..., k] for k in (5, 6, 7)))
-        return tuple(fit(v, ndim) for v in constants), tuple(fit(v, ndim) for v in placed)
-
-
-def _window(share: Floats, width: FloatLike) -> tuple[Floats, Floats, Floats]:
-    """Compute the weight w over its share s, and its first and second derivatives by the squared radius."""
-    s = np.clip(share, 0.0, 1.0)
-    rest = 1.0 - s
-    w = rest**3 * (1.0 + s * (3.0 + 6.0 * s))
-    w1 = -30.0 * (s * rest) ** 2 / width
-    w2 = -60.0 * s * rest * (1.0 - 2.0 * s) / (width * width)
-    return w, w1, w2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +100,7 @@ class ZernikeSurface(Measured):
             table = -np.einsum("dkj,...j->...dk", products(order), self.coefficients_mm, optimize=True)
             table /= self.radius_mm[..., None, None] ** np.array([0, 1, 1, 2, 2, 2])[:, None]
             # The constant term makes the height 0 on the axis.
-            table[..., 0, 0] -= table[..., 0, :] @ product_basis(order, np.zeros(()), np.zeros(()), 0)
+            table[..., 0, 0] -= table[..., 0, :] @ at_middle(order)
             object.__setattr__(self, "table", read_only(table))
 
     @property
@@ -185,24 +108,14 @@ class ZernikeSurface(Measured):
         """Radial order of the expansion."""
         return order_of(self.coefficients_mm.shape[-1])
 
-    def measured(self, y: Floats, z: Floats, second: bool, outer: Parts | None = None) -> Parts:
-        """Compute the height of the expansion and its derivatives (see `Measured`)."""
-        count = 6 if second else 3
-        radius = fit(self.radius_mm, y.ndim)
-        p, q = y / radius, z / radius
-        # A small matrix product for each row: large products would be spread over cores, which costs more than it
-        # saves.
-        batch = min(max(p.ndim - 1, len(self.batch_shape)), 1)
-        basis = product_basis(self.order, p, q, batch)
-        flat = basis.reshape(*basis.shape[: batch + 1], -1)
-        found = (self.table[..., :count, :] @ flat).reshape(*p.shape[:batch], count, *p.shape[batch:])
-        parts = tuple(np.moveaxis(found, batch, 0))
-        if not self.base[..., 0].any():
-            return parts
-        curvature = self.base[..., 0]
-        c, k = (fit(v, y.ndim) for v in (curvature, (1.0 + self.base[..., 1]) * curvature**2))
-        conic = biconic_jet((c, c, k, k), y, z) if second else biconic_slopes((c, c, k, k), y, z)
-        return tuple(a + b for a, b in zip(parts, conic[:count], strict=True))
+    def _write_inner(self, sheets: Sheets, table: list[Floats]) -> int:
+        """Write the measured surface itself, and return its kind."""
+        curvature, order = self.base[..., 0], self.order
+        sheets["radius"], sheets["curvature"], sheets["size"] = self.radius_mm, curvature, order
+        sheets["shape"] = (1.0 + self.base[..., 1]) * curvature**2
+        sheets["start"] = sum(map(len, table)) + 6 * terms(order) * np.arange(len(sheets))
+        table.append(self.table.ravel())
+        return ZERNIKE
 
     def _scaled_shape(self, factor: float) -> dict[str, Floats]:
         return {
@@ -273,28 +186,13 @@ class GridSurface(Measured):
         """Coefficients c_ij, (..., n, n)."""
         return np.asarray(self.table[self.row])
 
-    def measured(self, y: Floats, z: Floats, second: bool, outer: Parts | None = None) -> Parts:
-        """Compute the height of the bicubic surface on the outer biconic and its derivatives (see `Measured`)."""
-        if outer is None:
-            outer = self.outer_jet(y, z) if second else self.outer_slopes(y, z)[:3]
+    def _write_inner(self, sheets: Sheets, table: list[Floats]) -> int:
+        """Write the measured surface itself, and return its kind."""
         size = self.table.shape[-1]
-        spacing = fit(self.spacing_mm, y.ndim)
-        places = []
-        for k, place in ((0, y), (1, z)):
-            u = (place - fit(self.centre_mm[..., k], y.ndim)) / spacing + 0.5 * (size - 1)
-            first = np.clip(np.floor(np.nan_to_num(u)), 1.0, size - 3.0)
-            places.append((first.astype(np.intp) - 1, splines(u - first, spacing, second)))
-        (i, along_y), (j, along_z) = places
-        row = self.row.reshape(self.row.shape + (1,) * (y.ndim - self.row.ndim)) if self.row.ndim else self.row
-        corner = (row * size + i) * size + j
-        step = np.arange(4)
-        near = self.table.reshape(-1)[corner[..., None, None] + (size * step[:, None] + step)]
-        # rows: sums along z of value, slope and bend; then along y.
-        sums = [np.einsum("...ij,...j->...i", near, w) for w in along_z]
-        wanted = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))[: 6 if second else 3]
-        return tuple(
-            b + np.einsum("...i,...i->...", along_y[p], sums[q]) for b, (p, q) in zip(outer, wanted, strict=True)
-        )
+        sheets["spacing"], sheets["middle"], sheets["size"] = self.spacing_mm, self.centre_mm, size
+        sheets["start"] = sum(map(len, table)) + size * size * self.row
+        table.append(self.table.ravel())
+        return GRID
 
     def take(self, index: Indices) -> Self:
         """Select surfaces of the batch by `index`, with the same table; a single surface is returned unchanged."""
@@ -341,24 +239,6 @@ class GridSurface(Measured):
             row=np.arange(len(surfaces)),
             table=table,
         )
-
-
-def splines(share: Floats, spacing: FloatLike, second: bool) -> tuple[Floats, ...]:
-    """Evaluate the four cubic B-splines over a knot interval, (..., 4), with first and (on request) second derivatives.
-
-    Args:
-        share: position in the interval, from 0 to 1; outside, the cubics are continued.
-        spacing: length of the interval, mm.
-        second: whether to compute second derivatives.
-    """
-    t, r = share, 1.0 - share
-    h = np.asarray(spacing)
-    value = np.stack([r**3, 4.0 - 3.0 * t * t * (1.0 + r), 4.0 - 3.0 * r * r * (1.0 + t), t**3], axis=-1) / 6.0
-    slope = np.stack([-r * r, t * (3.0 * t - 4.0), r * (4.0 - 3.0 * r), t * t], axis=-1) / (2.0 * h[..., None])
-    if not second:
-        return value, slope
-    bend = np.stack([r, 3.0 * t - 2.0, 1.0 - 3.0 * t, t], axis=-1) / (h * h)[..., None]
-    return value, slope, bend
 
 
 def _scaled_outer(outer: Floats, factor: float) -> Floats:

@@ -14,8 +14,7 @@ from scipy.sparse import coo_array, csr_array, diags_array, eye_array, kron, vst
 from scipy.sparse.linalg import spsolve
 
 from ..base.arrays import Floats
-from .biconic_kernels import biconic_slopes
-from .surfaces_measured import splines
+from .formulas import NUMPY
 
 RADII_MM, SHAPES = (3.0, 30.0), (-6.0, 2.0)
 """Bounds of the outer biconic's radii and conic constants."""
@@ -52,7 +51,7 @@ def biconic_through(y: Floats, z: Floats, x: Floats) -> Floats:
     start = np.clip([*(1.0 / np.maximum(curvature[::-1], 1e-6)), -0.2, -0.2], low + 1e-3, high - 1e-3)
 
     def rest(v: Floats) -> Floats:
-        gap = _biconic_height(np.array([*(sign * v[:2]), *v[2:]]), y, z) - x
+        gap = outer_height(np.array([*(sign * v[:2]), *v[2:]]), y, z) - x
         # The square root must be real out to the limbus.
         beyond = (1.0 + v[2:4]) * (REACH_MM / v[:2]) ** 2 - 0.95
         return np.asarray(np.concatenate([gap, 10.0 * np.maximum(beyond, 0.0)]))
@@ -102,7 +101,7 @@ def smooth_heights(
             splines allow.
     """
     base = biconic_through(y, z, x)
-    x = x - _biconic_height(base, y, z)
+    x = x - outer_height(base, y, z)
     half = round(half_mm / spacing_mm)
     count = 2 * half + 1
     size = count + 2
@@ -111,7 +110,7 @@ def smooth_heights(
         u = place / spacing_mm + half
         first = np.clip(np.floor(u), 0.0, count - 2.0)
         columns.append(first.astype(np.intp)[:, None] + np.arange(4))
-        weights.append(splines(u - first, 1.0, False)[0])
+        weights.append(np.stack(NUMPY.cubic_splines(u - first)[0], axis=-1))
     column = columns[0][:, :, None] * size + columns[1][:, None, :]
     weight = weights[0][:, :, None] * weights[1][:, None, :]
     rows = np.broadcast_to(np.arange(len(x))[:, None, None], column.shape)
@@ -125,12 +124,12 @@ def smooth_heights(
     across = (c[:-2] + 4.0 * c[1:-1] + c[2:]) / 6.0
     knots = (across[:, :-2] + 4.0 * across[:, 1:-1] + across[:, 2:]) / 6.0
     nodes = spacing_mm * np.arange(-half, half + 1)
-    return np.asarray(knots + _biconic_height(base, *np.meshgrid(nodes, nodes, indexing="ij")))
+    return np.asarray(knots + outer_height(base, *np.meshgrid(nodes, nodes, indexing="ij")))
 
 
-def _biconic_height(outer: Floats, y: Floats, z: Floats) -> Floats:
-    """Compute the height of an outer biconic (see `Measured.outer`)."""
+def outer_height(outer: Floats, y: Floats, z: Floats) -> Floats:
+    """Compute the height of an outer biconic (see `Measured.outer`), continued beyond its end."""
     curvature, (c, s) = 1.0 / outer[:2], (np.cos(outer[4]), np.sin(outer[4]))
     k = (1.0 + outer[2:4]) * curvature**2
-    sag = biconic_slopes((curvature[0], curvature[1], k[0], k[1]), c * y + s * z, c * z - s * y)
+    sag = NUMPY.biconic_jet((curvature[0], curvature[1], k[0], k[1]), c * y + s * z, c * z - s * y)
     return np.asarray(sag.x + outer[5] + outer[6] * y + outer[7] * z)

@@ -95,23 +95,10 @@ def pairs(order: int) -> tuple[tuple[int, int], ...]:
     return tuple((i, j) for i in range(order + 1) for j in range(order + 1 - i))
 
 
-def product_basis(order: int, p: Floats, q: Floats, axis: int) -> Floats:
-    """Evaluate the products T_i(p) T_j(q) of `pairs` at points of one shape, along a new axis."""
-    first, second = _chebyshev(order, p), _chebyshev(order, q)
-    out = np.empty((*p.shape[:axis], terms(order), *p.shape[axis:]))
-    view = np.moveaxis(out, axis, 0)
-    for k, (i, j) in enumerate(pairs(order)):
-        np.multiply(first[i], second[j], out=view[k, ...])
-    return out
-
-
-def _chebyshev(order: int, x: Floats) -> list[Floats]:
-    """Evaluate T_0 to T_order by T_(k+1) = 2 x T_k - T_(k-1)."""
-    out = [np.ones_like(x), x]
-    double = 2.0 * x
-    for _ in range(order - 1):
-        out.append(double * out[-1] - out[-2])
-    return out[: order + 1]
+def at_middle(order: int) -> Floats:
+    """Evaluate the products T_i(0) T_j(0) of `pairs`, (terms,)."""
+    value = np.cos(0.5 * np.pi * np.arange(order + 1)).round()
+    return np.array([value[i] * value[j] for i, j in pairs(order)])
 
 
 def fitted(order: int, p: Floats, q: Floats, values: Floats) -> Floats:

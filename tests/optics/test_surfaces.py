@@ -10,10 +10,10 @@ from scipy.optimize import brentq
 
 from eyerender.eye.parts import PlacedSpec
 from eyerender.eye.surfaces import surface_of
-from eyerender.optics.graphs import distances, graphs_of
+from eyerender.optics.graphs import graphs_of
 from eyerender.optics.surfaces import components, join
 from eyerender.optics.surfaces_biconic import Biconic
-from eyerender.optics.surfaces_graph import GraphSurface
+from eyerender.optics.surfaces_graph import GraphSurface, distances
 from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.transforms import flip_y, tilt_rotation
 from tests.support.corneas import measured_shapes

@@ -56,7 +56,7 @@ def lattice(surface: Measured, limbus_mm: float) -> Lattice:
     ends = (1.0 + surface.outer[2:4]) / surface.outer[:2] ** 2
     reach = min(half * SPACING_MM, _STEEPEST / np.sqrt(max(float(ends.max()), 1e-9)))
     inside = np.minimum(rho, reach) / rho
-    sag = surface.slopes(inside * y, inside * z)
+    sag = surface.jet(inside * y, inside * z)
     beyond: Floats = (1.0 - inside) * (sag.y * y + sag.z * z)
     height = sag.x + beyond + 0.5 * curvature * (y * y + z * z)
     near = np.lib.stride_tricks.sliding_window_view(spline_coefficients(height), (4, 4))

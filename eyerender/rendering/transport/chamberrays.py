@@ -10,10 +10,9 @@ import numpy as np
 from ...base.arrays import Bools, Floats, Ints, join_rows, take_rows
 from ...eye.meshes import chamber_rim
 from ...optics.formulas import NUMPY
-from ...optics.graphs import distances
 from ...optics.interface import fresnel
 from ...optics.surfaces import Surface, components, join
-from ...optics.surfaces_graph import GraphSurface
+from ...optics.surfaces_graph import GraphSurface, distances
 from ...optics.vectors import dots, lengths
 
 _WEAK, _FEW = 0.25, 4  # one in _FEW is traced for all of the rays that the cornea mirrors less than _WEAK
