@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.jit import HELPER, compiled, njit
+from ..base.jit import compiled
+from ..optics.formula_kernels import COMPILED, inlined
 
-inlined = njit(forceinline=True, **HELPER)
+Point: TypeAlias = tuple[float, float, float]
+dot = COMPILED.dot
 SETTLED_MM, SETTLED_RAD = 1e-11, 1e-9
 LARGEST_STEP_RAD = 0.5
 """Far from the solution a full step can leave the hemisphere in which Listing's law is defined."""
@@ -40,7 +44,7 @@ def move_all(angles: Floats, centres: Floats, turn: Floats, shift: Floats) -> No
 
 
 @inlined
-def seen(c, target, azimuth, elevation):  # type: ignore[no-untyped-def]
+def seen(c: Floats, target: Floats, azimuth: float, elevation: float) -> tuple[Point, Point, Point]:
     """Transform the target into the frame of the turned eye, with its derivatives by azimuth and elevation.
 
     Listing's torsion is included. `c` are the centres of azimuth, elevation and torsion.
@@ -66,12 +70,6 @@ def seen(c, target, azimuth, elevation):  # type: ignore[no-untyped-def]
     by_a = (ax, cos_t * ay + sin_t * az + tau_a * z, cos_t * az - sin_t * ay - tau_a * y)
     by_e = (ex, sin_t * ez + tau_e * z, cos_t * ez - tau_e * y)
     return (x, y + c[7], z + c[8]), by_a, by_e
-
-
-@inlined
-def dot(a, b):  # type: ignore[no-untyped-def]
-    """Compute the scalar product a.b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8, f8[:,::1]")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.jit import HELPER, compiled, njit
+from ..base.jit import compiled
+from .formula_kernels import inlined, summed
 
-inlined = njit(forceinline=True, **HELPER)
-summed = njit(forceinline=True, fastmath={"reassoc", "contract"}, **HELPER)  # sums in any order, as vectors
+Pair: TypeAlias = tuple[float, float]
+Triple: TypeAlias = tuple[float, float, float]
 
 
 @summed
-def moments(x, y, mean_x, mean_y):  # type: ignore[no-untyped-def]
+def moments(x: Floats, y: Floats, mean_x: float, mean_y: float) -> Triple:
     """Compute mean square, mean product and mean square of two coordinates about their means."""
     xx, xy, yy = 0.0, 0.0, 0.0
     for k in range(len(x)):
@@ -22,7 +25,7 @@ def moments(x, y, mean_x, mean_y):  # type: ignore[no-untyped-def]
 
 
 @summed
-def means(x, y):  # type: ignore[no-untyped-def]
+def means(x: Floats, y: Floats) -> Pair:
     """Compute the means of two coordinates."""
     a, b = 0.0, 0.0
     for k in range(len(x)):
@@ -31,7 +34,7 @@ def means(x, y):  # type: ignore[no-untyped-def]
 
 
 @summed
-def lean(basis, u, v):  # type: ignore[no-untyped-def]
+def lean(basis: Floats, u: Floats, v: Floats) -> Pair:
     """Remove the part along u and v from a basis function, in place; return its coefficients."""
     a, b = 0.0, 0.0
     for k in range(len(u)):
@@ -43,16 +46,16 @@ def lean(basis, u, v):  # type: ignore[no-untyped-def]
 
 
 @summed
-def product(a, b):  # type: ignore[no-untyped-def]
+def product(a: Floats, b: Floats) -> float:
     """Compute a mean product."""
     total = 0.0
     for k in range(len(a)):
         total += a[k] * b[k]
-    return total / len(a)
+    return float(total / len(a))
 
 
 @inlined
-def null_vector(pq, pr, qq, qr, rr, value):  # type: ignore[no-untyped-def]
+def null_vector(pq: float, pr: float, qq: float, qr: float, rr: float, value: float) -> Triple:
     """Compute the null vector of M - value diag(1, -1, -1), normalised to w_p > 0.
 
     It is the first column of the adjugate: an ellipse has w_p^2 > w_q^2 + w_r^2, so no other column is longer.
@@ -64,7 +67,7 @@ def null_vector(pq, pr, qq, qr, rr, value):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def positive_eigenvector(pp, pq, pr, qq, qr, rr):  # type: ignore[no-untyped-def]
+def positive_eigenvector(pp: float, pq: float, pr: float, qq: float, qr: float, rr: float) -> Triple:
     """Compute the vector w of M w = lambda diag(1, -1, -1) w for the largest lambda; M is symmetric."""
     # Eigenvalues of diag(1, -1, -1) M, whose characteristic polynomial is x^3 - t x^2 + s x - det = 0.
     t = pp - qq - rr
@@ -86,7 +89,7 @@ def positive_eigenvector(pp, pq, pr, qq, qr, rr):  # type: ignore[no-untyped-def
 
 
 @summed
-def sampson_rms(work, w, quadratic, linear, factor):  # type: ignore[no-untyped-def]
+def sampson_rms(work: Floats, w: Triple, quadratic: Triple, linear: Pair, factor: Triple) -> float:
     """Compute the root mean square sqrt(mean(F^2 / |grad F|^2)), px; L^-T takes the gradient back to pixels."""
     u, v, p, q, r = work[0], work[1], work[2], work[3], work[4]
     total = 0.0
@@ -96,11 +99,11 @@ def sampson_rms(work, w, quadratic, linear, factor):  # type: ignore[no-untyped-
         gv = (2.0 * (quadratic[1] * u[k] + quadratic[2] * v[k]) - linear[1]) / factor[2]
         gx = (gu - factor[1] * gv) / factor[0]
         total += value * value / (gx * gx + gv * gv)
-    return np.sqrt(total / len(u))
+    return float(np.sqrt(total / len(u)))
 
 
 @inlined
-def fit_one(x, y, work, out):  # type: ignore[no-untyped-def]
+def fit_one(x: Floats, y: Floats, work: Floats, out: Floats) -> None:
     """Fit an ellipse to points, with memory `work` (5, k) for their coordinates and basis functions."""
     mean_x, mean_y = means(x, y)
     sxx, sxy, syy = moments(x, y, mean_x, mean_y)
@@ -140,7 +143,7 @@ def fit_one(x, y, work, out):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def axes(g11, g12, g22, out):  # type: ignore[no-untyped-def]
+def axes(g11: float, g12: float, g22: float, out: Floats) -> None:
     """Compute semi-axes and angle of {x : x^T G^-1 x = 1} from the eigenvalues and first eigenvector of G."""
     mean, half = 0.5 * (g11 + g22), 0.5 * (g11 - g22)
     major = mean + np.hypot(half, g12)

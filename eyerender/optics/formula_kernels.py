@@ -26,6 +26,11 @@ def inlined(function: Function) -> Function:
     return cast(Function, njit(forceinline=True, **HELPER)(function))
 
 
+def summed(function: Function) -> Function:
+    """Compile a function as `inlined` whose sums may be taken in any order, as vectors."""
+    return cast(Function, njit(forceinline=True, fastmath={"reassoc", "contract"}, **HELPER)(function))
+
+
 def uncounted(function: Function) -> Function:
     """Compile a function as `inlined` that creates no arrays: counting references would take longer."""
     return cast(Function, njit(forceinline=True, _nrt=False, **HELPER)(function))

@@ -91,21 +91,21 @@ class Formulas(NamedTuple):
     """The formulas for one array library; each is explained at the function of this module that makes it."""
 
     dot: Callable[..., Any]
-    refract: Callable[..., Any]
-    reflect: Callable[..., Any]
+    refract: Callable[..., Bend]
+    reflect: Callable[..., Bend]
     slide: Callable[..., Any]
     bend_differential: Callable[..., Any]
-    fresnel: Callable[..., Any]
-    fresnel_film: Callable[..., Any]
-    sheet_height: Callable[..., Any]
-    quadric_jet: Callable[..., Any]
-    biconic_jet: Callable[..., Any]
-    turn_jet: Callable[..., Any]
-    blend_jet: Callable[..., Any]
-    zernike_jet: Callable[..., Any]
+    fresnel: Callable[..., tuple[Number, Number]]
+    fresnel_film: Callable[..., tuple[Number, Number]]
+    sheet_height: Callable[..., Jet]
+    quadric_jet: Callable[..., Jet]
+    biconic_jet: Callable[..., Jet]
+    turn_jet: Callable[..., Jet]
+    blend_jet: Callable[..., Jet]
+    zernike_jet: Callable[..., Jet]
     cubic_splines: Callable[..., Any]
     monomials: Callable[..., Any]
-    bicubic_jet: Callable[..., Any]
+    bicubic_jet: Callable[..., Jet]
 
 
 def formulas(ops: Ops) -> Formulas:

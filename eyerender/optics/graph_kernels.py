@@ -84,8 +84,7 @@ def measured_jet(kind: int, sheet: Sheet, table: Floats, y: float, z: float, out
         inner = Jet(sheet.origin[0] + found.x, found.y, found.z, found.yy, found.yz, found.zz)
     else:
         inner = _sum(outer, _turn(_on_grid(sheet, table, own_y, own_z), c, s))
-    blended: Jet = inner if share <= 0.0 else _blend(inner, outer, y, z, share, sheet.width)
-    return blended
+    return inner if share <= 0.0 else _blend(inner, outer, y, z, share, sheet.width)
 
 
 @inlined
@@ -101,7 +100,7 @@ def _on_conic(sheet: Sheet, table: Floats, y: float, z: float) -> Jet:
         table[start:], table[start + count :], table[start + 2 * count :],
         table[start + 3 * count :], table[start + 4 * count :], table[start + 5 * count :],
     )  # fmt: skip
-    found: Jet = _zernike(rows, sheet.size, y / sheet.radius, z / sheet.radius)
+    found = _zernike(rows, sheet.size, y / sheet.radius, z / sheet.radius)
     c, k = sheet.curvature, sheet.shape
     return found if c == 0.0 else _sum(found, _biconic((c, c, k, k), y, z))
 

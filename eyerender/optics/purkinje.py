@@ -23,7 +23,7 @@ import numpy.typing as npt
 from ..base.arrays import ArrayValue, Bools, FloatLike, Floats, Indices, Statuses
 from ..base.status import Status
 from .gradient import GradientMedium
-from .shooting import Corrected, correct, taken
+from .shooting import Shot, correct, taken
 from .solve import apex_of
 from .surfaces import Surface, components, join
 from .trace import Crossing, trace
@@ -190,12 +190,12 @@ def _followed(path: Sequence[Crossing], n_outside: float, route: _Route) -> Purk
     before = exits.copy()
     residual, tube, largest = np.zeros(count), np.zeros(count), np.zeros(count)
 
-    def sought(rows: Indices, to: Floats, aim: Floats) -> Corrected:
+    def sought(rows: Indices, to: Floats, aim: Floats) -> Shot:
         viewpoint, source = route.at(to, rows)
         some = path if len(rows) == count else [taken(c, rows) for c in path]
         return correct(some, n_outside, components(viewpoint), components(source), components(aim))
 
-    def accept(rows: Indices, found: Corrected, good: Bools) -> None:
+    def accept(rows: Indices, found: Shot, good: Bools) -> None:
         into = rows[good]
         before[into] = exits[into]
         point[into], exits[into], way[into] = (join(p)[good] for p in (found.turning, found.first, found.start))

@@ -21,9 +21,9 @@ from ..base.status import Status
 from .fermat_kernels import LOST, connect_all
 from .graphs import graphs_of
 from .sheets import Graphs
-from .shooting import Connection, connect, taken
+from .shooting import Shot, connect, taken
 from .surfaces import Surface, Xyz, components, join, shift, turn, turn_back
-from .trace import Crossing, outward_path, trace
+from .trace import Crossing, each, outward_path, trace
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -228,35 +228,22 @@ def _searched(
     path: Sequence[Crossing], n_start: FloatLike, viewpoint: Xyz, target: Xyz, aim: Xyz, rays: Rays, left: Bools
 ) -> Rays:
     """Solve for the rays at `left` by shooting, and keep the other ones."""
-    rows = np.nonzero(left) if left.ndim else (np.zeros(1, dtype=np.intp),)
     shape = left.shape or (1,)
-
-    def pick(point: Xyz) -> Xyz:
-        x, y, z = (np.broadcast_to(axis, shape)[rows] for axis in point)
-        return x, y, z
-
+    rows = np.nonzero(left.reshape(shape))
     few = [taken(crossing, rows[0]) for crossing in path]
     start = n_start if np.ndim(n_start) == 0 else np.asarray(n_start)[rows[0]]
-    found = _from_connection(connect(few, start, pick(viewpoint), pick(target), pick(aim)))
+    ends = each(lambda axis: np.broadcast_to(axis, shape)[rows], (viewpoint, target, aim))
+    found = _from_connection(connect(few, start, *ends))
 
     def put(whole: Floats, part: Floats) -> Floats:
         out = np.array(np.broadcast_to(whole, shape))
         out[rows] = part
         return out.reshape(left.shape)
 
-    def put_all(whole: Xyz, part: Xyz) -> Xyz:
-        return put(whole[0], part[0]), put(whole[1], part[1]), put(whole[2], part[2])
-
-    return Rays(
-        put_all(rays.exit, found.exit),
-        put_all(rays.way, found.way),
-        put_all(rays.end, found.end),
-        put(rays.residual_mm, found.residual_mm),
-        np.asarray(put(rays.status, found.status), dtype=np.int8),  # type: ignore[arg-type]
-    )
+    return each(put, rays, found)
 
 
-def _from_connection(found: Connection) -> Rays:
+def _from_connection(found: Shot) -> Rays:
     return Rays(found.first, found.start, found.end, found.residual_mm, found.status)
 
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.arrays import ArrayValue, Bools, FloatLike, Floats, Statuses
 from ..base.status import Status, mark
+from .formulas import NUMPY
 from .gradient import GradientMedium
-from .interface import dot, moved, reflect, refract, unit
+from .interface import dot, moved
 from .surfaces import Surface, Xyz, components, fit, join
+
+_Nested = TypeVar("_Nested")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -83,44 +88,21 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
         origins_mm: (..., 3) origins.
         directions: (..., 3) unit directions.
     """
-    point, direction = components(origins_mm), components(directions)
-    ndim = max(point[0].ndim, direction[0].ndim)
-    shape = np.broadcast_shapes(point[0].shape, direction[0].shape)
-    points, ways = [point], [direction]
-    status = np.zeros(shape, dtype=np.int8)
-    length = np.zeros(shape)
-    index: FloatLike = n_start if isinstance(n_start, float) else fit(np.asarray(n_start, dtype=np.float64), ndim)
+    point, way = components(origins_mm), components(directions)
+    shape = np.broadcast_shapes(point[0].shape, way[0].shape)
+    points, ways = [point], [way]
+    status, length = np.zeros(shape, dtype=np.int8), np.zeros(shape)
+    index = index_of(n_start, len(shape))
     for crossing in path:
-        if crossing.through is None:
-            # A distant origin loses digits in the quadratic. The foot of the perpendicular from the eye's origin does
-            # not.
-            lead = -dot(point, direction)
-            hit = crossing.surface.hit(moved(point, direction, lead), direction, crossing.inward)
-            step = hit.distance + lead
-            met = hit.ok & (step > -BEHIND_MM)
-        else:
-            passage = crossing.through.cross(crossing.surface, crossing.inward, point, direction)
-            hit, direction, met = passage.hit, passage.way, passage.hit.ok
-            step = hit.distance
-            length = length + passage.optical_path_mm
-        within = met & inside_rim(crossing, hit.point)
-        after, way, passes = cross(crossing, hit.gradient, direction, index)
-        if crossing.beyond_rim is None:
-            step = np.where(within, step, 0.0)
-            passes = passes | ~within
-            there = tuple(np.where(within, new, old) for new, old in zip(hit.point, point, strict=True))
-            turned = tuple(np.where(within, new, old) for new, old in zip(way, direction, strict=True))
-            after = np.where(within, after, index)
-        else:
-            there, turned = hit.point, way
-            mark(status, ~met, Status.MISSED)
-            mark(status, met & ~within, crossing.beyond_rim)
-        mark(status, ~passes, Status.TOTAL_REFLECTION)
-        length = length + index * step
-        point, direction = (there[0], there[1], there[2]), (turned[0], turned[1], turned[2])
-        index = after
+        step = cross(crossing, point, way, index)
+        if crossing.beyond_rim is not None:
+            mark(status, ~step.met, Status.MISSED)
+            mark(status, ~step.within, crossing.beyond_rim)
+        mark(status, step.blocked, Status.TOTAL_REFLECTION)
+        length = length + step.optical_path_mm
+        point, way, index = step.point, step.way, step.n_after
         points.append(point)
-        ways.append(direction)
+        ways.append(way)
     full = (*shape, 3)
     return Traced(
         np.stack([np.broadcast_to(join(p), full) for p in points]),
@@ -130,17 +112,90 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
     )
 
 
-def cross(crossing: Crossing, gradient: Xyz, direction: Xyz, n_before: FloatLike) -> tuple[FloatLike, Xyz, Bools]:
-    """Compute index and direction after a crossing with half gradient `gradient`, and whether light passes."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        normal = unit(gradient)
-        if crossing.reflects:
-            way = reflect(direction, normal)
-            return n_before, way, np.ones(way[0].shape, dtype=bool)
-        n_after = crossing.n_after
-        after = n_after if isinstance(n_after, float) else fit(np.asarray(n_after), direction[0].ndim)
-        way, passes = refract(direction, normal, n_before, after)
-        return after, way, passes
+class Step(NamedTuple):
+    """Rays behind a crossing.
+
+    Attributes:
+        point: point on the surface.
+        way: unit direction behind it.
+        n_after: index behind it.
+        optical_path_mm: optical path from the start of the ray.
+        met: whether the ray meets the surface.
+        within: whether it meets the surface within the rim.
+        blocked: whether the surface reflects the ray totally.
+        moves: differentials of the point on the surface, one for each given one.
+        turns: differentials of the direction.
+    """
+
+    point: Xyz
+    way: Xyz
+    n_after: FloatLike
+    optical_path_mm: Floats
+    met: Bools
+    within: Bools
+    blocked: Bools
+    moves: tuple[Xyz, ...]
+    turns: tuple[Xyz, ...]
+
+
+def cross(
+    crossing: Crossing, point: Xyz, way: Xyz, n_before: FloatLike, moves: Sequence[Xyz] = (), turns: Sequence[Xyz] = ()
+) -> Step:
+    """Trace rays through one crossing, with differentials of their points and directions.
+
+    The differentials follow `formulas.sliding` and `formulas.differential`.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if crossing.through is None:
+            # A distant origin loses digits in the quadratic. The foot of the perpendicular from the eye's origin does
+            # not.
+            lead = -dot(point, way)
+            hit, before = crossing.surface.hit(moved(point, way, lead), way, crossing.inward), way
+            distance = hit.distance + lead
+            met, length = hit.ok & (distance > -BEHIND_MM), n_before * distance
+            carried = [(moved(move, turn, distance), turn) for move, turn in zip(moves, turns, strict=True)]
+        else:
+            passage = crossing.through.cross(crossing.surface, crossing.inward, point, way, moves, turns)
+            hit, before, met, length = passage.hit, passage.way, passage.hit.ok, passage.optical_path_mm
+            carried = list(zip(passage.moves, passage.turns, strict=True))
+        within = met & inside_rim(crossing, hit.point)
+        inverse = 1.0 / np.sqrt(dot(hit.gradient, hit.gradient))
+        normal = (hit.gradient[0] * inverse, hit.gradient[1] * inverse, hit.gradient[2] * inverse)
+        after = n_before if crossing.reflects else index_of(crossing.n_after, before[0].ndim)
+        bend = NUMPY.reflect(before, normal) if crossing.reflects else NUMPY.refract(before, normal, n_before / after)
+        out_moves, out_turns = [], []
+        for move, turn in carried:
+            slid = NUMPY.slide(move, before, normal, bend.cosine)
+            curve = crossing.surface.hessian_at(hit.point).times(slid)
+            out_moves.append(slid)
+            out_turns.append(NUMPY.bend_differential(bend, before, normal, inverse, curve, turn))
+    blocked = np.zeros(met.shape, dtype=bool) if crossing.reflects else ~bend.passes
+    step = Step(hit.point, bend.way, after, length, met, within, blocked, tuple(out_moves), tuple(out_turns))
+    if crossing.beyond_rim is not None:
+        return step
+    # Rays that miss the surface, or meet it beyond its rim, continue straight on.
+    nothing = np.zeros_like(length)
+    past = Step(point, before, n_before, nothing, met, within, nothing > 0.0, tuple(moves), tuple(turns))
+    return choose(within, step, past)
+
+
+def choose(mask: Bools, new: _Nested, old: _Nested) -> _Nested:
+    """Select arrays of nested tuples of one structure: the new ones where the mask holds, else the old ones."""
+    return each(partial(np.where, mask), new, old)
+
+
+def each(function: Callable[..., Any], *values: _Nested) -> _Nested:
+    """Apply a function to each array of nested tuples with the same structure."""
+    first: Any = values[0]
+    if not isinstance(first, tuple):
+        return function(*values)  # type: ignore[no-any-return]
+    parts = [each(function, *some) for some in zip(*values, strict=True)]
+    return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)  # type: ignore[return-value]
+
+
+def index_of(value: FloatLike, ndim: int) -> FloatLike:
+    """Reshape an index of refraction () or (n,) to broadcast with rays that have `ndim` axes."""
+    return value if isinstance(value, float) else fit(np.asarray(value, dtype=np.float64), ndim)
 
 
 def inside_rim(crossing: Crossing, point: Xyz) -> Bools:
