@@ -223,12 +223,12 @@ LARGE = {
     "analytic.features.features": "options of an observation",
     # Kernels take arrays, not records.
     "optics.fermat_kernels.connect_all": "a kernel",
-    "optics.fermat_kernels.mirror_start": "a kernel",
+    "optics.fermat_kernels.store": "a kernel",
+    "optics.graph_kernels.crossings": "a kernel",
     "analytic.view_kernels.project_all": "a kernel",
     "report.eye_section._curve": "a curve and its style",
     "report.overlay.eye_picture": "a picture and its style",
     # Each is one list: of fields of a file, of findings, or of cases of a search.
-    "optics.shooting._shoot": "one search with its cases",
     "population.synteyes.eye_file": "fields of an eye file",
     "gaze.table._observations": "columns of a table",
     "apps.study.findings.guestrin": "a list of findings",
