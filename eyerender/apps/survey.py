@@ -27,7 +27,7 @@ from ..population.table import Source, Table, default_table
 from ..report.overlay import picture
 from ..report.page import Card, Content, Figure, Page, Section, write_page
 from ..report.page import Table as PageTable
-from ..report.style import ANALYTIC, IMAGE, figure, svg
+from ..report.style import ANALYTIC, IMAGE, correlation_map, figure, svg
 from ..scene import Scene
 from ..scene.people import Population
 from ..scene.spec import SceneSpec
@@ -307,21 +307,10 @@ def _matrix(s: Survey) -> str:
     at = [s.names.index(name) for name in names]
     r = s.correlation[np.ix_(at, at)]
     with figure(8.4, 7.2) as (fig, ax):
-        ax.imshow(r, cmap="RdBu_r", vmin=-1, vmax=1)
-        ax.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=8)
-        ax.set_yticks(range(len(names)), names, fontsize=8)
-        ax.grid(False)
-        for i in range(len(names)):
-            for j in range(len(names)):
-                ax.text(
-                    j,
-                    i,
-                    f"{r[i, j]:.2f}",
-                    ha="center",
-                    va="center",
-                    fontsize=7,
-                    color="white" if abs(r[i, j]) > 0.6 else "black",
-                )
+        correlation_map(ax, r, names)
+        for i, j in np.ndindex(r.shape):
+            colour = "white" if abs(r[i, j]) > 0.6 else "black"
+            ax.text(j, i, f"{r[i, j]:.2f}", ha="center", va="center", fontsize=7, color=colour)
         return svg(fig)
 
 

@@ -15,7 +15,7 @@ from ..scene import Scene
 from ..scene.observation import EYES
 from .overlay import eye_picture
 from .page import Card, Content, Figure, Gallery, Key, Listing, Page, Section, Table, number, write_page
-from .style import ANALYTIC, ANALYTIC_ON_DARK, IMAGE, IMAGE_ON_DARK, TARGET, figure, svg
+from .style import ANALYTIC, ANALYTIC_ON_DARK, IMAGE, IMAGE_ON_DARK, TARGET, error_panel, figure, svg
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ def write_report(
             "Feature errors",
             "The figure shows image-derived minus analytic features. The apparent pupil is not exactly an ellipse, "
             "and the image has noise, so the centres of the two fits differ slightly.",
-            Figure(feature_figure(comparison), ""),
+            Figure(feature_figure(comparison), "The cross is the mean."),
         ),
         Section("Gaze errors", *_gaze(scene, comparison)),
         Section("Every image", Table(_HEADER, _rows(comparison))),
@@ -120,24 +120,8 @@ def feature_figure(comparison: Comparison) -> str:
     """Draw error vectors of pupil centre and glint, image-derived minus analytic, as SVG."""
     errors = comparison.features
     with figure(8.4, 3.6, 2) as (fig, axes):
-        panels = ((axes[0], errors.centre_px, "pupil centre"), (axes[1], errors.glint_px.reshape(-1, 2), "glint"))
-        for ax, vectors, name in panels:
-            good = vectors[np.isfinite(vectors).all(axis=-1)]
-            limit = max(0.01, 1.15 * float(np.abs(good).max())) if len(good) else 0.1
-            ax.axhline(0, color="#888888", lw=0.8)
-            ax.axvline(0, color="#888888", lw=0.8)
-            ax.scatter(good[:, 0], good[:, 1], s=22, color=IMAGE, edgecolor="white", linewidth=0.5)
-            if len(good):
-                ax.scatter(*good.mean(axis=0), marker="+", s=110, color=TARGET, label="mean")
-                ax.legend(frameon=False, loc="upper right")
-            ax.set(
-                xlim=(-limit, limit),
-                ylim=(limit, -limit),
-                aspect="equal",
-                title=f"{name} (n = {len(good)})",
-                xlabel="image - analytic, x (px)",
-                ylabel="y (px, down)",
-            )
+        error_panel(axes[0], errors.centre_px, "pupil centre", IMAGE)
+        error_panel(axes[1], errors.glint_px.reshape(-1, 2), "glint", IMAGE)
         return svg(fig)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -63,6 +63,28 @@ def heat_map(
         ax.grid(False)
         ax.set(xlabel=labels[0], ylabel=labels[1])
         return svg(fig)
+
+
+def error_panel(ax: Any, vectors: Floats, title: str, colour: str, marker: str = "o") -> None:
+    """Draw error vectors (n, 2) px in the image's directions, and their mean as a cross; skip those that are NaN."""
+    good = vectors[np.isfinite(vectors).all(axis=-1)]
+    limit = max(0.001, 1.15 * float(np.abs(good).max(initial=0.0))) if len(good) else 0.1
+    ax.axhline(0, color="#888888", lw=0.8)
+    ax.axvline(0, color="#888888", lw=0.8)
+    ax.scatter(*good.T, s=20, color=colour, marker=marker, edgecolor="white", linewidth=0.4)
+    if len(good):
+        ax.scatter(*good.mean(axis=0), marker="+", s=120, color=TARGET)
+    ax.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", title=f"{title} (n = {len(good)})")
+    ax.set(xlabel="x (px)", ylabel="y (px, down)")
+    ax.locator_params(nbins=4)
+
+
+def correlation_map(ax: Any, values: Floats, names: Sequence[str]) -> Any:
+    """Draw a matrix of correlations with the names of its rows and columns; return the image, for a colour bar."""
+    ax.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+    ax.set_yticks(range(len(names)), names, fontsize=8)
+    ax.grid(visible=False)
+    return ax.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1)
 
 
 def svg(fig: Any) -> str:

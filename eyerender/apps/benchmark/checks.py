@@ -14,8 +14,6 @@ from ...base.storage.files import read_json, shown
 from .intervals import mcnemar
 
 RESULTS_SCHEMA = "eyerender/bench-extractors/3"
-# Version 2 has no conditions and fewer results for glints; what --against needs is the same.
-RESULTS_SCHEMAS = (RESULTS_SCHEMA, "eyerender/bench-extractors/2")
 LEVEL = 0.05
 _RESULTS_BYTES = 2**30
 _OPERATORS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
@@ -80,7 +78,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         InputError: the file is not such a result.
     """
     data = read_json(path, limit=_RESULTS_BYTES)
-    if data.get("schema") not in RESULTS_SCHEMAS:
+    if data.get("schema") != RESULTS_SCHEMA:
         raise InputError(f"is {shown(data.get('schema'))}; --against reads {RESULTS_SCHEMA!r}", source=str(path))
     if not isinstance(data.get("extractors"), list) or not isinstance(data.get("image_digests"), dict):
         raise InputError("is not complete", source=str(path))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...optics.ellipse import Ellipse
 from ...report.page import Card, Figure, Page, Section, Table, number, write_page
-from ...report.style import TARGET, figure, legend_above, svg
+from ...report.style import TARGET, error_panel, figure, legend_above, svg
 
 Row = dict[str, Any]
 Format = Callable[[Any], str]
@@ -209,21 +209,9 @@ def vector_figure(names: Sequence[str], everyone: Sequence[str], rows: Sequence[
     """Draw centre errors as vectors, one panel per extractor with its own scale; up to four panels."""
     with figure(11.0, 3.3, _PANELS) as (fig, axes):
         for ax, name in zip(axes, names, strict=False):
-            colour, marker = look(everyone, name)
             mine = [r for r in rows if r["extractor"] == name and r["outcome"] == "right"]
-            xy = np.array([(r["centre_x_px"], r["centre_y_px"]) for r in mine]).reshape(-1, 2)
-            limit = 1.15 * float(np.abs(xy).max()) if len(xy) else 1.0
-            limit = max(limit, 1e-3)
-            ax.axhline(0, color="#888888", lw=0.8)
-            ax.axvline(0, color="#888888", lw=0.8)
-            ax.scatter(*xy.T, s=20, color=colour, marker=marker, edgecolor="white", linewidth=0.4)
-            if len(xy):
-                ax.scatter(*xy.mean(axis=0), marker="+", s=130, color=TARGET)
-            ax.set(
-                xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", title=f"{name} (n = {len(xy)})",
-                xlabel="x (px)", ylabel="y (px, down)",
-            )  # fmt: skip
-            ax.locator_params(nbins=4)
+            xy = np.array([(r["centre_x_px"], r["centre_y_px"]) for r in mine], dtype=np.float64).reshape(-1, 2)
+            error_panel(ax, xy, name, *look(everyone, name))
         for ax in axes[len(names) :]:
             ax.axis("off")  # the layout would ignore invisible axes
         return svg(fig)

@@ -18,7 +18,7 @@ from ...dataset.validation.problems import WRONG
 from ...folders.imagefolder import ImageEntry
 from ...report.overlay import picture
 from ...report.page import Card, Content, Figure, Gallery, Key, Page, Section, Table, write_page
-from ...report.style import ANALYTIC, IMAGE, figure, svg
+from ...report.style import ANALYTIC, IMAGE, correlation_map, figure, svg
 from .comparing import Shift, only_in, shares
 from .faults import KINDS
 from .figures import DRAW, LABEL, PERSON, PICTURE
@@ -316,11 +316,7 @@ def _correlation_figure(found: Inspection) -> str | None:
     chosen = np.sort(np.argsort(-others.max(axis=1), kind="stable")[:_CORRELATED])
     size = 3.4 + 0.19 * len(chosen)
     with figure(size + 2.2, size) as (fig, ax):
-        drawn = ax.imshow(matrix[np.ix_(chosen, chosen)], cmap="RdBu_r", vmin=-1, vmax=1)
-        labels = [names[k] for k in chosen]
-        ax.set_xticks(range(len(chosen)), labels, rotation=90, fontsize=8)
-        ax.set_yticks(range(len(chosen)), labels, fontsize=8)
-        ax.grid(visible=False)
+        drawn = correlation_map(ax, matrix[np.ix_(chosen, chosen)], [names[k] for k in chosen])
         fig.colorbar(drawn, ax=ax, shrink=0.5, label="rank correlation")
         return svg(fig)
 
