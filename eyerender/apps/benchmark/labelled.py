@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...base.arrays import Bytes, Floats
 from ...folders.imagefile import read_any_image, read_image
@@ -109,9 +110,13 @@ class BenchImage:
         width, height = self.size
         return -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
 
-    def grey(self) -> Any:
-        """Read the pixels (h, w) as stored."""
+    def grey(self) -> NDArray[Any]:
+        """Read the grey levels (h, w) as stored."""
         return read_any_image(self.path)[0]
+
+    def pixels(self) -> tuple[NDArray[Any], Bytes | None]:
+        """Read the grey levels and the classes."""
+        return read_any_image(self.path)[0], None if self.mask_path is None else read_image(self.mask_path)[0]
 
     def classes(self) -> Bytes | None:
         """Read the class of each pixel (0 skin, 1 sclera, 2 iris, 3 pupil, 4 a frame); None if unknown."""

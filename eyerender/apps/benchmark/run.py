@@ -96,8 +96,8 @@ def bench_extractors(
         data["against"] = [] if old is None else compare_with(old, data, str(options.against))
         data["problems"] = problems_of(data, gated=bool(required or old))
         rows = [row_of(run, score) for run in runs for score in run.scores]
-        write_text(place / TABLE, csv_text(list(rows[0]), [list(row.values()) for row in rows]))
         write_bench_report(place / REPORT, data, rows, [one for run in runs for one in _thumbnails(run, images)])
+        write_text(place / TABLE, csv_text(list(rows[0]), [list(row.values()) for row in rows]))
         write_json(place / TIMES, times_of(runs))
         write_json(place / RESULTS, data)
     return data
@@ -148,7 +148,7 @@ def _classified(run: Run, images: Sequence[BenchImage]) -> Run:
     scores = []
     for s, image in zip(run.scores, images, strict=True):
         if s.outcome in ("wrong", "false") and s.ellipse is not None and not s.by_centre:
-            s = replace(s, kind=kind_of(s.ellipse, image, image.grey(), image.classes()))
+            s = replace(s, kind=kind_of(s.ellipse, image, *image.pixels()))
         scores.append(s)
     return replace(run, scores=tuple(scores))
 
