@@ -38,6 +38,7 @@ def test_rendered_results_are_those_of_the_version(stored):
 
 
 @pytest.mark.render
+@pytest.mark.slow
 def test_a_skin_that_is_lighter_by_half_a_percent_is_seen(stored):
     plan = Plan.load("dataset_region", count=1)
     scene = deepcopy(dict(plan.spec.scene))
@@ -53,5 +54,4 @@ def test_an_iris_that_is_wider_by_half_a_percent_is_seen(stored):
     eye = deepcopy(dict(plan.eyes["E2"]))
     eye["iris"]["root_radius_mm"] *= 1.005
     wider = golden.first_image(replace(plan, eyes={"E2": eye}))
-    print(golden.changes(wider, stored["images"]["dataset_quick"]))
     assert golden.changes(wider, stored["images"]["dataset_quick"])

@@ -64,7 +64,7 @@ def examine(*, refresh: bool = False) -> Iterator[tuple[Path, Verdict]]:
 
 def find_llvm(*, refresh: bool = False) -> tuple[LibLlvm | None, list[str]]:
     """Return the first candidate that renders (None if there is none), and what is wrong with those before it."""
-    refused = []
+    refused: list[str] = []
     for path, verdict in examine(refresh=refresh):
         if verdict.ok:
             return LibLlvm.probed(path, verdict), refused

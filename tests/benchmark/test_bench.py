@@ -290,7 +290,7 @@ def test_masks_of_classes_need_the_pupil_s_value(tmp_path):
     assert iou(image.pupil, true) > 0.99
 
 
-@pytest.mark.parametrize("hidden", [0.05, 0.16, 0.3, 0.5])
+@pytest.mark.parametrize("hidden", [0.16, 0.5, *(pytest.param(h, marks=pytest.mark.slow) for h in (0.05, 0.3))])
 def test_a_mask_of_the_visible_part_gives_the_whole_pupil(hidden):
     """Lids cut the upper part along slanted lines. The moments of the rest would give an IoU of 0.85 at 0.16 hidden."""
     rng = np.random.default_rng(2)

@@ -86,7 +86,7 @@ def test_damaged_shards_are_made_again(tiny, tmp_path):
     [
         pytest.param(None, id="missing"),
         pytest.param(b"", id="empty"),
-        pytest.param(b"\0" * 100, id="zeros"),
+        pytest.param(b"\0" * 100, id="zeros", marks=pytest.mark.slow),
         pytest.param(b'{"schema": "eyerender/', id="cut-short"),
     ],
 )

@@ -93,7 +93,7 @@ def test_without_features_the_prior_remains(scene):
     assert found.unseen == ()
 
 
-@pytest.mark.parametrize("eye", ["E1", "E2", "E4", "E5"])
+@pytest.mark.parametrize("eye", ["E2", "E5", *(pytest.param(e, marks=pytest.mark.slow) for e in ("E1", "E4"))])
 def test_derivatives_are_those_of_rebuilt_eyes(eye):
     """Richardson's extrapolation over eyes that are built from changed files, and placed and turned anew."""
     scene = er.Scene.of(er.load_scene("head_mounted").spec, eye=eye)

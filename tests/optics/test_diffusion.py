@@ -33,7 +33,7 @@ def test_the_profile_holds_all_light_and_its_shares_are_integrals():
     assert float(diffusion.share_within(80.0)) == pytest.approx(1.0, abs=1e-11)
 
 
-@pytest.mark.parametrize("absorption", [0.02, 0.04, 0.08])
+@pytest.mark.parametrize("absorption", [0.04, *(pytest.param(a, marks=pytest.mark.slow) for a in (0.02, 0.08))])
 def test_shadow_edges_on_skin_agree_with_photons(absorption):
     found = photons(100_000, 2.04, absorption)
     length = diffusion.half_space_length_mm(found.reflectance, 2.04)
@@ -41,14 +41,20 @@ def test_shadow_edges_on_skin_agree_with_photons(absorption):
     assert np.abs(edge(AT_MM, length) - found.edge(AT_MM)).max() < 0.02
 
 
-@pytest.mark.parametrize(("thickness", "scattering"), [(0.6, 2.0), (0.8, 2.5), (1.0, 3.0)])
+@pytest.mark.parametrize(
+    ("thickness", "scattering"),
+    [(0.8, 2.5), pytest.param(0.6, 2.0, marks=pytest.mark.slow), pytest.param(1.0, 3.0, marks=pytest.mark.slow)],
+)
 def test_shadow_edges_on_the_sclera_agree_with_photons(thickness, scattering):
     found = photons(100_000, scattering, 0.03, thickness=thickness, below=0.1)
     length = diffusion.slab_length_mm(found.reflectance, scattering)
     assert np.abs(edge(AT_MM, length) - found.edge(AT_MM)).max() < 0.02
 
 
-@pytest.mark.parametrize(("absorption", "thickness"), [(0.02, 2.0), (0.033, 2.6), (0.08, 1.5)])
+@pytest.mark.parametrize(
+    ("absorption", "thickness"),
+    [(0.033, 2.6), pytest.param(0.02, 2.0, marks=pytest.mark.slow), pytest.param(0.08, 1.5, marks=pytest.mark.slow)],
+)
 def test_lids_transmit_as_photons_do(absorption, thickness):
     albedo = photons(40_000, 2.04, absorption).reflectance
     passed = photons(40_000, 2.04, absorption, thickness=thickness).passed

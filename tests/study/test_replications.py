@@ -177,8 +177,8 @@ def outcome_of(eye, departures, **options):
 # The same independent run, with polynomials about the vectors' mean.
 @pytest.mark.parametrize(
     ("eye", "c5", "c9", "c14", "c135"),
-    [("E1", 0.470, 0.209, 0.056, 0.046), ("E2", 0.275, 0.120, 0.041, 0.032), ("E3", 0.469, 0.210, 0.057, 0.046),
-     ("E4", 0.267, 0.116, 0.040, 0.032)],
+    [pytest.param("E1", 0.470, 0.209, 0.056, 0.046, marks=pytest.mark.slow), ("E2", 0.275, 0.120, 0.041, 0.032),
+     ("E3", 0.469, 0.210, 0.057, 0.046), pytest.param("E4", 0.267, 0.116, 0.040, 0.032, marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_interpolation_against_an_independent_run(eye, c5, c9, c14, c135):
     done = outcome_of(eye, blignaut.CORRECTED, centred=True)

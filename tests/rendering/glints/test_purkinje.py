@@ -16,7 +16,7 @@ from tests.support.render_oracles import centroid, corneal_share
 from tests.support.render_rigs import BLACK, RIGS, eye_of, head_rig, job_of, remote_rig
 
 
-@pytest.mark.parametrize("model", ["E3", "E4", "E5"])
+@pytest.mark.parametrize("model", [pytest.param("E3", marks=pytest.mark.slow), "E4", "E5"])
 @pytest.mark.parametrize("order", [2, 3, 4])
 def test_the_ray_tube_is_the_same_from_the_lamp(model, order):
     # Reciprocity: |d x / d omega| is the same both ways where both ends are in air.

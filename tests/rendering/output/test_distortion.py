@@ -33,7 +33,9 @@ def bent(camera: PinholeCamera, k: tuple[float, ...]) -> PinholeCamera:
     return PinholeCamera.of(camera.K, camera.R, camera.t, camera.resolution_px, k)
 
 
-@pytest.mark.parametrize(("angle_deg", "k"), [(17.0, BARREL), (32.5, BARREL), (32.5, PINCUSHION)])
+@pytest.mark.parametrize(
+    ("angle_deg", "k"), [pytest.param(17.0, BARREL, marks=pytest.mark.slow), (32.5, BARREL), (32.5, PINCUSHION)]
+)
 def test_a_distorted_lens_gathers_the_flux_of_a_plain_one(renderer, angle_deg, k):
     """Each picture shows the whole eye before a black ground, so both hold all of its light: .1 % are pixels' edges."""
     rig = rig_at(angle_deg)

@@ -39,7 +39,7 @@ def in_camera(job, points):
     return (points @ job.M.T + job.t) @ job.camera.sensor_axes.T + job.camera.sensor_offset
 
 
-@pytest.mark.parametrize("model", ["E2", "E5"])
+@pytest.mark.parametrize("model", [pytest.param("E2", marks=pytest.mark.slow), "E5"])
 @pytest.mark.parametrize("kind", ["remote", "headset", "distorted"])
 def test_depth_and_normals_are_those_of_traced_rays(renderer, model, kind):
     rig = remote_rig() if kind == "remote" else head_rig()
@@ -164,10 +164,12 @@ OPAQUE_RIM = Look(limbus_transmittance=0.0, limbus_width_mm=2.0)
 
 @pytest.mark.parametrize(
     ("model", "kinds"),
-    [("E2", ("instances",)), ("E4", ALL)]
+    [("E4", ALL)]
     + [
         pytest.param(model, kinds, marks=pytest.mark.slow)
-        for model, kinds in (("E2", ALL), ("E4", ("instances",)), ("E5", ("instances",)), ("E5", ALL))
+        for model in ("E2", "E4", "E5")
+        for kinds in (("instances",), ALL)
+        if (model, kinds) != ("E4", ALL)
     ],
 )
 @pytest.mark.parametrize(

@@ -136,7 +136,7 @@ def test_both_observers_have_the_margin_of_a_scene(renderer, side):
 
 
 @pytest.mark.parametrize("rig_name", ["blignaut2014", "head_mounted"])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
 def test_the_ellipse_of_the_picture_is_that_of_the_analytic_observer(renderer, rig_name, seed):
     import cv2
     from skimage.measure import find_contours

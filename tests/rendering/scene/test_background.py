@@ -165,7 +165,7 @@ def test_a_dark_run_cannot_be_exposed():
         auto_exposed(scene(lens={"openings": [{"centre": [30.0, 0.0], "half_size": [0.1, 0.1]}]}), 0.7, threads=1)
 
 
-@pytest.mark.parametrize("place", ["office", "car", "outdoors"])
+@pytest.mark.parametrize("place", ["office", *(pytest.param(p, marks=pytest.mark.slow) for p in ("car", "outdoors"))])
 def test_painted_surroundings_are_mirrored_by_the_cornea(place, renderer):
     # The map's values are W/m^2/sr; the pupil shows their mirror image at 2 to 3 % of their radiance.
     dark = picture(renderer)

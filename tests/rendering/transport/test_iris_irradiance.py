@@ -11,7 +11,9 @@ from tests.support import render_rigs as rigs
 pytestmark = pytest.mark.render
 
 
-@pytest.mark.parametrize(("model", "name"), [("E2", "head"), ("E4", "remote"), ("E5", "head")])
+@pytest.mark.parametrize(
+    ("model", "name"), [pytest.param("E2", "head", marks=pytest.mark.slow), ("E4", "remote"), ("E5", "head")]
+)
 def test_the_grid_gives_the_light_of_exact_paths(renderer, model, name):
     import mitsuba as mi
 

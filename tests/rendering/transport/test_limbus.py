@@ -54,7 +54,7 @@ def test_the_rim_is_lit_all_around(renderer, model):
     assert np.all(np.abs(ratio - 1) < 0.3)
 
 
-@pytest.mark.parametrize("model", ["E1", "E2", "E3", "E4", "E5"])
+@pytest.mark.parametrize("model", ["E2", "E5", *(pytest.param(m, marks=pytest.mark.slow) for m in ("E1", "E3", "E4"))])
 def test_all_light_of_the_chamber_arrives_or_leaves(model):
     # Without absorption. Weights are those of radiance, which changes with the square of the index.
     eye = eye_of(model)
