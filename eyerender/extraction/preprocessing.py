@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from ..base.arrays import Singles
 from ..base.errors import InputError
-from .buffers import image_buffer
 from .statistics import median, quantile
 
 Image = Singles
@@ -144,12 +143,9 @@ def _from_integers(array: NDArray[np.generic], bit_depth: int | None, gamma: flo
         if high > full or low < 0:
             raise InputError(f"holds levels {low} to {high}, outside the {bits} bits stated", path="bit_depth")
     if gamma == 1.0:
-        out = image_buffer(array.shape)
         if full == DN:
-            np.copyto(out, array)
-        else:
-            np.multiply(array, np.float32(DN / full), out=out, dtype=np.float32)
-        return out, DN, DN / full
+            return np.ascontiguousarray(array, dtype=np.float32), DN, 1.0
+        return np.multiply(array, np.float32(DN / full), dtype=np.float32, order="C"), DN, DN / full
     table = (DN * (np.arange(full + 1) / full) ** gamma).astype(np.float32)
     linear = table[array.astype(np.intp, copy=False)]
     # This is the decoded step at the median level of the image.
