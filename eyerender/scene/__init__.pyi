@@ -1,7 +1,6 @@
 from .scene import Frame as Frame
 from .scene import Frames as Frames
 from .scene import Scene as Scene
-from .scene import as_frames as as_frames
 from .shipped import is_dataset as is_dataset
 from .shipped import is_shipped_dataset as is_shipped_dataset
 from .shipped import load_scene as load_scene

@@ -114,19 +114,6 @@ class Frames(ArrayValue):
         return replace(self, scene=scene)
 
 
-def as_frames(frames: Frames | Scene) -> Frames:
-    """Convert a scene to its frames; return frames as they are.
-
-    Raises:
-        TypeError: the argument is neither.
-    """
-    if isinstance(frames, Scene):
-        return frames.frames()
-    if not isinstance(frames, Frames):
-        raise TypeError(f"give frames or a scene, not {type(frames).__name__}")
-    return frames
-
-
 class Frame(Frames):
     """One row of `Frames`: one eye in one frame.
 
