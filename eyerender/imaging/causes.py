@@ -99,7 +99,7 @@ def _image_steps(
         for done, image in enumerate(images, 1):
             note(cause, 0, image)
             for seed in range(seeds) if scene is own and sensor.noise else ():
-                note("noise", seed, exposed_again(image, sensor, seed))
+                note("noise", seed, exposed_again(image, scene, sensor, seed))
             notify(progress, k * len(frames) + done, len(scenes) * len(frames), "")
     steps: dict[str, list[Observations]] = {}
     for (cause, _), seen in rows.items():
@@ -127,10 +127,10 @@ def ideal_scene(scene: Scene) -> Scene:
     return scene.replaced(spec.model_copy(update=changes))
 
 
-def exposed_again(image: EyeImage, sensor: Sensor, seed: int) -> EyeImage:
-    """Expose a rendered image with another sensor and other noise; the sensor's fixed pattern stays."""
-    spec, index = image.scene.spec, image.frame.index
-    scene = image.scene.replaced(spec.model_copy(update={"sensor": sensor}))
+def exposed_again(image: EyeImage, scene: Scene, sensor: Sensor, seed: int) -> EyeImage:
+    """Expose a scene's rendered image with another sensor and other noise; the sensor's fixed pattern stays."""
+    spec, index = scene.spec, image.frame.index
+    scene = scene.replaced(spec.model_copy(update={"sensor": sensor}))
     camera = scene.rig.cameras[image.camera]
     draw = np.random.SeedSequence([spec.seed, int(index.frame[0]), int(index.eye[0]), seed])
     dn = recorded(

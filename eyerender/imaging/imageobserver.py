@@ -28,7 +28,7 @@ from ..eye.spec import EyeSpec
 from ..folders.imagefile import image_files, read_any_image, write_png
 from ..folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..rig.camera import PinholeCamera
-from ..rig.rig import RigLike
+from ..rig.rig import RigGeometry, RigLike
 from ..scene import Frames, Scene
 from ..scene.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 from ..scene.spec import SceneSpec
@@ -76,7 +76,7 @@ class ImageObserver:
                     image.window[:2],
                     image.frame.index,
                     np.array([0]),
-                    image.scene,
+                    image.scene.rig,
                     image.scene.spec.sensor.gamma,
                 )
                 for image in images
@@ -109,7 +109,7 @@ class ImageObserver:
             image = entry.image() if exposed is None else exposed(entry.image(), entry)
             rows = np.arange(row, row + len(entry.records))
             depth = int(entry.line.get("bit_depth") or 8 * image.itemsize)
-            few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene, entry.gamma))
+            few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene.rig, entry.gamma))
             if len(few) == _BATCH:
                 parts.append(concatenate(few))
                 few = []
@@ -186,7 +186,7 @@ class ImageObserver:
                 camera = scene.rig.cameras[0]
                 if shape != (camera.resolution_px[1], camera.resolution_px[0]):
                     raise InputError(f"is {shape[1]} x {shape[0]} px, but the scene's sensor is not", source=source)
-                lights, reasons = _lights(one, np.zeros(2), scene, camera, np.full(3, np.nan))
+                lights, reasons = _lights(one, np.zeros(2), scene.rig, camera, np.full(3, np.nan))
             eye = np.array([side if len(found) > 1 else -1])
             parts.append(_observation(one, lights, reasons, np.zeros(2), Index(frame=np.array([frame]), eye=eye)))
         return concatenate(parts)
@@ -198,13 +198,13 @@ class ImageObserver:
         origin: tuple[int, int],
         index: Index,
         rows: Ints,
-        scene: Scene,
+        rig: RigGeometry,
         gamma: float,
     ) -> Observations:
         """Extract the eyes of one image; if there are two, each is searched in its own part of the image."""
         parts = []
         for row in rows:
-            camera = scene.rig.cameras[int(index.camera[row])]
+            camera = rig.cameras[int(index.camera[row])]
             eye_mm = index.eye_position_mm[row] + index.head_mm[row]
             px_per_mm = camera.scale_at(eye_mm)
             cut, corner = image, np.array(origin)
@@ -215,7 +215,7 @@ class ImageObserver:
                 update={"radius_min_px": max(0.6 * px_per_mm, 3.0), "radius_max_px": max(5.0 * px_per_mm, 8.0)}
             )
             found = extract(cut, bit_depth=depth, gamma=gamma if gamma != 1 else self.gamma, settings=settings)
-            lights, reasons = _lights(found, corner, scene, camera, eye_mm)
+            lights, reasons = _lights(found, corner, rig, camera, eye_mm)
             parts.append(_observation(found, lights, reasons, corner, index.take([row])))
         return concatenate(parts)
 
@@ -354,14 +354,14 @@ def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: flo
 
 
 def _lights(
-    found: Extraction, corner: Floats, scene: Scene, camera: PinholeCamera, eye_mm: Floats
+    found: Extraction, corner: Floats, rig: RigGeometry, camera: PinholeCamera, eye_mm: Floats
 ) -> tuple[list[int], Sequence[str | None]]:
     """Assign glints to lights (-1: none, with the reason), from the rig and an approximate position of the eye."""
     if not found.glints or found.pupil.ellipse is None:
         return [-1] * len(found.glints), ["no pupil to place the reflections by"] * len(found.glints)
     spots = np.array([g.xy_px for g in found.glints]) + corner
     pupil = np.asarray(found.pupil.ellipse.centre_px) + corner
-    places = np.array([light.position_mm for light in scene.rig.lights])
+    places = np.array([light.position_mm for light in rig.lights])
     predicted, px_per_mm = predict_glints(
         camera.ideal(pupil),
         K=camera.K,
