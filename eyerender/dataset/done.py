@@ -75,13 +75,8 @@ def _are(value: object, fits: Callable[[Any], bool]) -> bool:
     return isinstance(value, list) and all(map(fits, value))
 
 
-def samples_of(done: Mapping[str, Any]) -> tuple[list[int], list[int] | None]:
-    """Return which samples a shard holds: first and end, plus the list of samples if some in between are missing."""
-    return list(done["samples"]), done.get("chosen")
-
-
 def described(samples: Sequence[int]) -> tuple[list[int], list[int] | None]:
-    """Describe the samples of a shard in the form that `samples_of` reads."""
+    """Describe the samples of a shard: first and end, plus the list of samples if some in between are missing."""
     whole = isinstance(samples, range)
     return [samples[0], samples[-1] + 1], None if whole else list(samples)
 

@@ -11,9 +11,9 @@ from typing import Any
 
 from ..base.errors import EyerenderError, InputError
 from ..base.progress import Progress
-from ..base.storage.files import MAX_FILE_BYTES, make_folder, read_json, sync_folder, sync_tree
+from ..base.storage.files import make_folder, sync_folder, sync_tree
 from ..base.storage.lock import final_lock, run_lock
-from ..folders.imagefolder import DONE, RUN, finished
+from ..folders.imagefolder import DONE, RUN, finished, read_run
 from .assemble import assemble
 from .done import read_done
 from .partial import new_stage, places
@@ -46,7 +46,7 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: Progress | 
     if not parts:
         raise InputError("give the folders of the parts", source="merge")
     folder, places = Path(out), [Path(part) for part in parts]
-    runs = [read_json(place / RUN, limit=MAX_FILE_BYTES, follow=False) for place in places]
+    runs = [read_run(place) for place in places]
     for place, run in zip(places, runs, strict=True):
         if place.resolve() == folder.resolve():
             raise InputError("is the folder to write", source=str(place))

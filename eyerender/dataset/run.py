@@ -19,7 +19,7 @@ from ..folders.imagefolder import DATASET, finished
 from ..folders.outfolder import clear, refuse_non_empty
 from ..rig.plausibility import saturation_warnings
 from .assemble import assemble, damage
-from .done import cpu_family, described, read_done, samples_of
+from .done import cpu_family, described, read_done
 from .environment import environment
 from .estimate import Speed, keep_rate
 from .options import RunOptions
@@ -366,12 +366,13 @@ class Run:
         wanted = set(self.plan.spec.shards)
         reopened, aside = 0, 0
         for shard in sorted(finished(self.folder) & shards):
-            if shard not in wanted:
-                aside += 1
-            elif samples_of(read_done(self.folder, shard)) == described(self.plan.spec.shard_samples(shard)):
-                continue
-            else:
+            if shard in wanted:
+                done = read_done(self.folder, shard)
+                if (done["samples"], done.get("chosen")) == described(self.plan.spec.shard_samples(shard)):
+                    continue
                 reopened += 1
+            else:
+                aside += 1
             reopen(self.folder, shard)
         if reopened or aside:
             self.say(f"{reopened} finished shards get more or fewer samples; {aside} are set aside")

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import InputError
-from ..base.storage.files import MAX_FILE_BYTES, opened, parse_json, read_json
-from ..folders.imagefolder import DATASET, LOG, PACKED_RUN_SCHEMA, RUN, RUN_SCHEMA, finished
+from ..base.storage.files import opened, parse_json
+from ..folders.imagefolder import DATASET, LOG, RUN, finished, read_run
 from .partial import checkpoints
 from .spec import DatasetSpec
 
@@ -112,9 +112,7 @@ def status(path: str | Path) -> dict[str, Any]:
         InputError: the folder holds no run.
     """
     folder = Path(path)
-    run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
-    if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
-        raise InputError("does not describe a run of this version", source=str(folder / RUN))
+    run = read_run(folder)
     try:
         selection = DatasetSpec.from_mapping(run["spec"]).selection
     except (KeyError, InputError) as error:

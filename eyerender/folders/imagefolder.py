@@ -368,9 +368,7 @@ class ImageFolder:
     @classmethod
     def _of_run(cls, folder: Path) -> ImageFolder:
         """Open the folder of an unfinished run, whose finished shards contain the metadata."""
-        run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
-        if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
-            raise InputError("does not describe a run of this version", source=str(folder / RUN))
+        run = read_run(folder)
         shards, packed = sorted(finished(folder)), run["schema"] == PACKED_RUN_SCHEMA
         lines = packed_lines(folder, shards) if packed else _line_files(_shard_file(folder, s, LINES) for s in shards)
         nothing = "holds an unfinished run without a finished shard; start generate again on the folder"
@@ -444,6 +442,18 @@ def opened_entries(path: str) -> Entries:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnfinishedRunWarning)  # the other process has given it
         return ImageFolder.load(path).entries
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """Read run.json.
+
+    Raises:
+        InputError: there is none, or it is damaged or of another version.
+    """
+    run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
+    if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
+        raise InputError("does not describe a run of this version", source=str(folder / RUN))
+    return run
 
 
 def shard_name(shard: int) -> str:
