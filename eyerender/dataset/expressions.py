@@ -1,7 +1,7 @@
 """References to variables in a template, `{var: EXPRESSION}`: arithmetic on drawn values, nothing else.
 
 An expression holds numbers, names of variables, `name.column` of a table's row, `name[k]` of a vector, + - * / **, and
-the functions in `FUNCTIONS`. Python's parser reads it, and this module evaluates it node by node; nothing is executed.
+the functions in `FUNCTIONS`. Python's parser reads it, and this module computes it node by node; nothing is executed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def names_of(text: str) -> set[str]:
     Raises:
         InputError: the text is not such an expression.
     """
-    tree = _parsed(text)
+    tree, _ = _parsed(text)
     functions = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and id(node) not in functions}
 
@@ -62,10 +62,9 @@ def evaluate(text: str, variables: Mapping[str, Any]) -> Any:
     Raises:
         InputError: the value cannot be computed, or is neither a finite number nor a list of such.
     """
+    _, value_of = _parsed(text)
     try:
-        value = _value(_parsed(text).body, variables)
-    except InputError:
-        raise
+        value = value_of(variables)
     except (ArithmeticError, ValueError, TypeError, LookupError) as error:
         raise InputError(f"{text!r} cannot be computed ({type(error).__name__}: {error})") from None
     if not all(_is_number(v) for v in (value if isinstance(value, list | tuple) else [value])):
@@ -74,55 +73,39 @@ def evaluate(text: str, variables: Mapping[str, Any]) -> Any:
 
 
 @lru_cache(maxsize=1024)
-def _parsed(text: str) -> ast.Expression:
+def _parsed(text: str) -> tuple[ast.Expression, Callable[[Mapping[str, Any]], Any]]:
+    """Parse an expression; return its tree, and the function that computes it from the variables."""
     if len(text) > MAX_LENGTH:
         raise InputError(f"has more than {MAX_LENGTH} characters")
     try:
         tree = ast.parse(text.strip(), mode="eval")
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise InputError(f"{text!r} is not an expression") from None
-    _check(tree.body, text)
-    return tree
+    return tree, _function_of(tree.body, text)
 
 
-def _check(node: ast.expr, text: str) -> None:
-    """Check that an expression contains only what `_value` can compute."""
+def _function_of(node: ast.expr, text: str) -> Callable[[Mapping[str, Any]], Any]:
+    """Return the function that computes a node from the variables; refuse what is no arithmetic."""
     match node:
         case ast.Constant(value=value) if _is_number(value):
-            return
-        case ast.Name():
-            return
-        case ast.Attribute(value=ast.Name()) | ast.Subscript(value=ast.Name(), slice=ast.Constant(value=int())):
-            return
+            return lambda _: value
+        case ast.Name(id=name):
+            return lambda variables: variables[name]
+        case ast.Attribute(value=ast.Name(id=name), attr=key):
+            return lambda variables: variables[name][key]
+        case ast.Subscript(value=ast.Name(id=name), slice=ast.Constant(value=int(k))):
+            return lambda variables: variables[name][k]
         case ast.UnaryOp(op=op, operand=inner) if type(op) in _UNARY:
-            _check(inner, text)
-        case ast.BinOp(left=left, op=operation, right=right) if type(operation) in _BINARY:
-            _check(left, text)
-            _check(right, text)
+            operation: Callable[..., float] = _UNARY[type(op)]
+            parts = [inner]
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+            operation, parts = _BINARY[type(op)], [left, right]
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS and arguments:
-            for argument in arguments:
-                _check(argument, text)
+            operation, parts = FUNCTIONS[name], arguments
         case _:
             raise InputError(f"{text!r} is not made of numbers, variables, + - * / ** and {', '.join(FUNCTIONS)}")
-
-
-def _value(node: ast.expr, variables: Mapping[str, Any]) -> Any:
-    match node:
-        case ast.Constant(value=value):
-            return value
-        case ast.Name(id=name):
-            return variables[name]
-        case ast.Attribute(value=ast.Name(id=name), attr=key):
-            return variables[name][key]
-        case ast.Subscript(value=ast.Name(id=name), slice=ast.Constant(value=int(k))):
-            return variables[name][k]
-        case ast.UnaryOp(op=op, operand=inner):
-            return _UNARY[type(op)](_number(_value(inner, variables)))
-        case ast.BinOp(left=left, op=operation, right=right):
-            return _BINARY[type(operation)](_number(_value(left, variables)), _number(_value(right, variables)))
-        case ast.Call(func=ast.Name(id=name), args=arguments):
-            return FUNCTIONS[name](*(_number(_value(argument, variables)) for argument in arguments))
-    raise TypeError(type(node).__name__)
+    functions = [_function_of(part, text) for part in parts]
+    return lambda variables: operation(*(_number(function(variables)) for function in functions))
 
 
 def _number(value: Any) -> float:
