@@ -29,7 +29,7 @@ from ..folders.packed import INDEX, LINES_GZ
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
+class FolderLayout:
     """Names in a dataset's folder: each picture a file, or packed shards.
 
     Attributes:
@@ -49,15 +49,15 @@ class Layout:
     kinds: tuple[str, ...]
 
 
-FILES = Layout(
+FILES = FolderLayout(
     run=RUN_SCHEMA, dataset=DATASET_SCHEMA, shard="eyerender/shard/1", table=METADATA, lines=LINES, kinds=tuple(KINDS)
 )
-PACKED = Layout(
+PACKED = FolderLayout(
     run=PACKED_RUN_SCHEMA, dataset=PACKED_SCHEMA, shard="eyerender/shard/2", table=INDEX, lines=LINES_GZ, kinds=()
 )
 
 
-def layout_of(schema: object) -> Layout | None:
+def layout_of(schema: object) -> FolderLayout | None:
     """Return the layout in which a file of a schema stands; None if it is a file of another version."""
     return next((one for one in (FILES, PACKED) if schema in (one.run, one.dataset, one.shard)), None)
 

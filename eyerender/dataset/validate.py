@@ -20,7 +20,7 @@ from ..folders.imagefolder import FILE_KEYS, Entries, ImageEntry, ImageFolder
 from .assemble import verify_dataset
 from .validation.images import Tally, check_images
 from .validation.lines import Lines, check_records
-from .validation.problems import WRONG, Problems
+from .validation.problems import WRONG, FolderProblems
 from .validation.rendering import render_again
 from .validation.shards import compare_lines
 from .validation.truth import Again, DatasetTruth, NoTruth, SceneTruth, truth_of
@@ -60,7 +60,7 @@ def validate(
     path = Path(path)
     folder = ImageFolder.load(path)
     step = progress or (lambda *_: None)
-    problems, tally, notes = Problems(), Tally(), [folder.unfinished] if folder.unfinished else []
+    problems, tally, notes = FolderProblems(), Tally(), [folder.unfinished] if folder.unfinished else []
     truth = _truth(folder, problems, notes)
     if folder.dataset.get("kind") == "dataset":
         problems.extend(verify_dataset(path, quick=quick, progress=step))
@@ -110,7 +110,7 @@ def validate(
     }
 
 
-def _truth(folder: ImageFolder, problems: Problems, notes: list[str]) -> DatasetTruth | SceneTruth | None:
+def _truth(folder: ImageFolder, problems: FolderProblems, notes: list[str]) -> DatasetTruth | SceneTruth | None:
     """Return the reference for the metadata of a folder; if there is none, add the reason to the notes."""
     try:
         found = truth_of(folder, problems)
@@ -157,7 +157,7 @@ def sampled(total: int, digest: str, count: int = SAMPLE) -> list[int]:
     return rows
 
 
-def _batches(entries: Entries, problems: Problems) -> Iterator[tuple[int, list[ImageEntry]]]:
+def _batches(entries: Entries, problems: FolderProblems) -> Iterator[tuple[int, list[ImageEntry]]]:
     """Yield the metadata of a folder in batches, with the number of the first line; unreadable lines are skipped."""
     row = 0
     while row < len(entries):

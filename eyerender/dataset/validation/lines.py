@@ -16,7 +16,7 @@ from ...base.status import Status
 from ...base.storage.files import shown
 from ...folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ...scene.observation import Observations
-from .problems import WRONG, Problems
+from .problems import WRONG, FolderProblems
 from .shards import hashed
 from .truth import DatasetTruth, SceneTruth
 
@@ -71,7 +71,7 @@ class Lines:
                 yield f"{path} is empty"
         yield from _agree(line)
 
-    def finish(self, problems: Problems) -> None:
+    def finish(self, problems: FolderProblems) -> None:
         """Check properties of all lines: their number, duplicate names, subjects in two splits."""
         entries = self._folder.entries
         statistics = self._folder.dataset.get("statistics")

@@ -13,7 +13,7 @@ MAX_LENGTH = 400
 WRONG = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError)
 
 
-class Problems:
+class FolderProblems:
     """Collector of problems in constant memory."""
 
     def __init__(self) -> None:

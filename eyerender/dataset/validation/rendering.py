@@ -14,7 +14,7 @@ from ...base.storage.files import shown
 from ...folders.imagefolder import ARRAY_KEYS, KINDS, ImageEntry, ImageFolder
 from ..done import cpu_family, read_done, run_versions
 from ..maker import Maker
-from .problems import Problems
+from .problems import FolderProblems
 from .truth import DatasetTruth
 
 
@@ -23,7 +23,7 @@ def render_again(
     truth: DatasetTruth,
     rows: Sequence[int],
     step: Progress,
-    problems: Problems,
+    problems: FolderProblems,
     *,
     backend: BackendChoice = "auto",
     threads: int | None = None,

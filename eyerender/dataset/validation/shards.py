@@ -15,12 +15,12 @@ from ...base.errors import InputError
 from ...base.storage.files import opened, parse_json, shown
 from ...base.storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
 from ...folders.imagefolder import DATASET_SCHEMA, LINES, METADATA, SHARDS, ImageFolder, finished, shard_name
-from .problems import SHOWN, Problems, differences
+from .problems import SHOWN, FolderProblems, differences
 
 _EXACT_INTEGER = 2**53
 
 
-def compare_lines(images: ImageFolder, problems: Problems) -> None:
+def compare_lines(images: ImageFolder, problems: FolderProblems) -> None:
     """Compare metadata.jsonl with the shards' lines as values; the order of lines and of keys does not matter.
 
     A folder of packed shards, or of an unfinished run, has no metadata.jsonl.

@@ -31,7 +31,7 @@ from ..done import picture_file
 from ..ownscenes import GivenScene
 from ..plan import Plan, plan_digest
 from ..realise import Realised, frames_of, image_line, image_name, realise
-from .problems import WRONG, Problems, differences
+from .problems import WRONG, FolderProblems, differences
 
 # Rays are traced to 1e-9 mm, and mathematical functions of other machines change the last digits: 1e-8 px at the
 # sharpest of the shipped cameras. A number may differ by this times 1 + its size.
@@ -91,7 +91,7 @@ class DatasetTruth:
 
     @classmethod
     def of(
-        cls, dataset: Mapping[str, Any], problems: Problems, first: Mapping[str, Any] | None = None
+        cls, dataset: Mapping[str, Any], problems: FolderProblems, first: Mapping[str, Any] | None = None
     ) -> DatasetTruth | None:
         """Read the plan in dataset.json, whose first line is `first`; what is wrong is added to the problems."""
         try:
@@ -171,7 +171,7 @@ class SceneTruth:
     stale: None = None
 
     @classmethod
-    def of(cls, dataset: Mapping[str, Any], problems: Problems) -> SceneTruth:
+    def of(cls, dataset: Mapping[str, Any], problems: FolderProblems) -> SceneTruth:
         """Read the scene in dataset.json.
 
         Raises:
@@ -228,7 +228,7 @@ class SceneTruth:
         return Again(tuple(problems), _limbus(scene, view))
 
 
-def truth_of(folder: ImageFolder, problems: Problems) -> DatasetTruth | SceneTruth | None:
+def truth_of(folder: ImageFolder, problems: FolderProblems) -> DatasetTruth | SceneTruth | None:
     """Return the reference for a folder's metadata; None if dataset.json is damaged. Raises `NoTruth`."""
     if folder.dataset.get("kind") == "dataset":
         return DatasetTruth.of(folder.dataset, problems, folder.entries[0].line)
