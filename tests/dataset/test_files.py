@@ -319,25 +319,6 @@ def test_eye_files_are_files_of_the_run(tmp_path, monkeypatch):
     assert Plan.load("dataset_quick").files == {}
 
 
-@pytest.mark.packaging
-@pytest.mark.render
-def test_an_eye_file_that_changes_while_a_run_is_at_work_ends_it(tmp_path, monkeypatch):
-    load_eye("E2").dump(tmp_path / "mine.yaml")
-    spec = write(tmp_path / "spec.yaml", eye_parameters={}, **{"scene.eye.model": "mine.yaml"})
-    plan = Plan.load(spec)
-    maker = Maker(plan, frames_of(plan), threads=1)
-
-    def sample(samples: int, images: int) -> None:
-        if samples == 2:
-            (tmp_path / "mine.yaml").unlink()
-
-    with pytest.raises(InputError, match=r"mine\.yaml: no such file"):
-        write_shard(maker, tmp_path, 0, sample)
-    # A slow machine has kept a checkpoint of the first state, which is not continued with the second one.
-    with pytest.raises(InputError, match=r"mine\.yaml: no such file"):
-        write_shard(maker, tmp_path, 0, lambda *_: None)
-
-
 @pytest.mark.render
 def test_no_shard_holds_two_states_of_a_file(made, tmp_path):
     shutil.copytree(made / "spec", tmp_path / "spec")
