@@ -44,12 +44,10 @@ def budget(
     """
     from ..gaze.budget import budget as split
     from ..imaging.causes import SEEDS, budget_steps
-    from ..scene import load_scene
 
     chosen, calibration = options.choose(estimator), options.fixation_list()
     heed = Heed(strict)
-    loaded = load_scene(scene, eye=eye)
-    heed(loaded.warnings())
+    loaded = heed.scene(scene, eye=eye)
     frames = loaded.frames()
     unknown = sorted(set(calibration or ()) - set(frames.index.fixation.tolist()))
     if unknown:

@@ -33,11 +33,9 @@ def export_scene(
         spp: Samples per pixel requested in the file; the stock path integrator needs many.
     """
     from ..imaging.folder import export_scene as write
-    from ..scene import load_scene
 
     heed = Heed(strict)
-    loaded = load_scene(scene, eye=eye)
-    heed(loaded.warnings())
+    loaded = heed.scene(scene, eye=eye)
     data = write(loaded, output, frame=frame, side=side, spp=spp, overwrite=overwrite)
     name = data["scene"]
     emit(

@@ -64,11 +64,8 @@ def view(
         fig = eye_section(load_eye(name).build())
     else:
         from ..report.scene_view import scene_view
-        from ..scene import load_scene
 
-        loaded = load_scene(name, eye=eye)
-        Heed(strict)(loaded.warnings())
-        fig = scene_view(loaded)
+        fig = scene_view(Heed(strict).scene(name, eye=eye))
     with written(output) as file:
         fig.savefig(file, format=output.suffix[1:].lower(), dpi=150)
     print(output)

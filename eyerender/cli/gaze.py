@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
 from .app import app
 from .options import EstimatorFlags, EstimatorName, OutputFile, Result, Strict
 from .output import Heed, emit
-
-if TYPE_CHECKING:
-    from ..scene import Scene
 
 UNITS = ["mm", "px", "deg"]
 PLACES = {
@@ -60,7 +57,9 @@ def fit(
 
     chosen, targets = options.choose(estimator), options.fixation_list()
     heed = Heed(strict)
-    observations, built = load_observations(records, _scene(scene, heed), rig=rig, columns=columns)
+    observations, built = load_observations(
+        records, None if scene is None else heed.scene(scene), rig=rig, columns=columns
+    )
     fitted, summary = fit_estimator(chosen, observations, built, targets, source=str(records), warn=heed)
     save_estimator(output, fitted, built)
     summary = {**summary, "path": str(output)}
@@ -109,7 +108,9 @@ def predict(
 
     heed = Heed(strict)
     fitted, calibrated = load_calibration(calibration, estimator)
-    observations, built = load_observations(records, _scene(scene, heed), rig=rig, columns=columns)
+    observations, built = load_observations(
+        records, None if scene is None else heed.scene(scene), rig=rig, columns=columns
+    )
     if calibrated is not None:
         heed(rig_warnings(built, calibrated, scene or rig or str(records)))
     if screen_px is None and columns is not None:
@@ -117,16 +118,6 @@ def predict(
     data = predictions(fitted, observations, built, screen_px)
     emit(data, _gaze_table(data), json, heed)
     return 0
-
-
-def _scene(name: str | None, heed: Heed) -> Scene | None:
-    if name is None:
-        return None
-    from ..scene import load_scene
-
-    scene = load_scene(name)
-    heed(scene.warnings())
-    return scene
 
 
 def _gaze_table(data: dict[str, Any]) -> str:

@@ -39,11 +39,9 @@ def render(
     from ..folders.outfolder import refuse_non_empty
     from ..imaging.autoexposure import auto_exposed
     from ..imaging.folder import render_folder
-    from ..scene import load_scene
 
     heed = Heed(strict)
-    loaded = load_scene(scene, eye=eye, spp=spp, seed=seed, surfaces=surfaces)
-    heed(loaded.warnings())
+    loaded = heed.scene(scene, eye=eye, spp=spp, seed=seed, surfaces=surfaces)
     refuse_non_empty(output, overwrite)
     if auto_exposure is not None:
         loaded = auto_exposed(loaded, auto_exposure, backend=backend, threads=threads)

@@ -32,10 +32,8 @@ def live(
     if find_spec("nicegui") is None:
         raise InputError("needs NiceGUI (the extra 'live'); run: pip install nicegui", source="live")
     from ..apps.live.server import serve
-    from ..scene import load_scene
 
-    loaded = load_scene(scene, eye=eye)
-    Heed(strict)(loaded.warnings())
+    loaded = Heed(strict).scene(scene, eye=eye)
 
     def announce(address: str) -> None:
         print(f"{address}\nCtrl-C ends it.", flush=True)

@@ -39,15 +39,13 @@ def features(
     """
     # `observers` would load OpenCV, which is not needed here.
     from ..analytic.observer import AnalyticObserver, purkinje_records
-    from ..scene import load_scene
 
     if points < 6:
         raise InputError("must be >= 6", source="--points")
     if points > MAX_BOUNDARY_POINTS:
         raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", source="--points")
     heed = Heed(strict)
-    loaded = load_scene(scene, eye=eye)
-    heed(loaded.warnings())
+    loaded = heed.scene(scene, eye=eye)
     observed, seen = AnalyticObserver(points).observe_in_detail(loaded.frames(), purkinje=purkinje or (1,))
     data: dict[str, Any] = {
         "schema": "eyerender/features/1",
@@ -95,7 +93,6 @@ def extract(
     from ..extraction.video import is_video
     from ..imaging.imageobserver import ImageObserver, files_of
     from ..imaging.videoobserver import VideoOutput, observe_video
-    from ..scene import load_scene
 
     if not images:
         raise InputError("give at least one image", source="extract")
@@ -104,8 +101,7 @@ def extract(
     if eyes not in (1, 2):
         raise InputError("must be 1 or 2", source="--eyes")
     heed = Heed(strict)
-    loaded = load_scene(scene) if scene is not None else None
-    heed(loaded.warnings() if loaded is not None else ())
+    loaded = None if scene is None else heed.scene(scene)
     observer = ImageObserver(gamma=gamma, settings=ExtractionSettings(method=method))
     if output is not None:
         refuse_special(output)

@@ -8,11 +8,14 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..base.errors import InputWarning
 from ..base.progress import Progress
 from ..base.storage.files import write_json
+
+if TYPE_CHECKING:
+    from ..scene import Scene
 
 
 def say(text: str) -> None:
@@ -38,6 +41,14 @@ class Heed:
         for warning in new:
             say(f"warning: {warning}")
         self.found += new
+
+    def scene(self, name: str, **changes: Any) -> Scene:
+        """Load a scene with changes, as `load_scene` does, and report its warnings."""
+        from ..scene import load_scene
+
+        scene = load_scene(name, **changes)
+        self(scene.warnings())
+        return scene
 
 
 def emit(data: dict[str, Any], text: str, target: str | None, heed: Heed | None = None) -> None:
