@@ -206,45 +206,48 @@ class GuestrinEizenman(BuiltIn):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Goals:
-    """Targets (n) as points on planes.
+    """Targets (n) as points on planes: on the screen, or each on its own plane if there is no screen.
 
     Attributes:
-        origin_mm: a point of the plane, (3,) for a screen, else (n, 3).
-        axes: right, up and normal of the plane in the columns, (3, 3) for a screen, else (n, 3, 3).
+        origin_mm: (n, 3) a point of the plane.
+        axes: (n, 3, 3) right, up and normal of the plane in the columns.
         wanted: (n, 2) the targets on their planes, mm.
         off_plane: (n,) their distances from the planes, mm.
-        weight: (n, 1) factor of a miss; None: 1.
+        weight: (n, 1) factor of a miss.
     """
 
     origin_mm: Floats
     axes: Floats
     wanted: Floats
     off_plane: Floats
-    weight: Floats | None
+    weight: Floats
 
     @classmethod
     def of(cls, observations: Observations, screen: ScreenPlane | None) -> _Goals:
-        """Express targets on the screen's plane, or each on its own plane if there is no screen."""
+        """Express the targets of observations."""
         index, targets = observations.index, observations.index.target_mm
+        n = len(targets)
         if screen is not None:
             axes = np.stack([screen.right, screen.up, screen.normal], axis=-1)
             off = -((targets - screen.centre_mm) @ screen.normal)
-            wanted = targets_on_screen(observations, screen)
-            # Targets farther from the screen than this have been projected onto it.
-            off = np.where(np.abs(off) <= OFF_PLANE_MM * (1 + 1e-9), off, 0.0 * off)
-            return cls(origin_mm=screen.centre_mm, axes=axes, wanted=wanted, off_plane=off, weight=None)
+            return cls(
+                origin_mm=np.broadcast_to(screen.centre_mm, (n, 3)),
+                axes=np.broadcast_to(axes, (n, 3, 3)),
+                wanted=targets_on_screen(observations, screen),
+                # Targets farther from the screen than this have been projected onto it.
+                off_plane=np.where(np.abs(off) <= OFF_PLANE_MM * (1 + 1e-9), off, 0.0 * off),
+                weight=np.ones((n, 1)),
+            )
         line = targets - index.eye_position_mm - index.head_mm
         ahead = unit(line)
         right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
-        axes = np.stack([right, np.cross(right, ahead), -ahead], axis=-1)
         distance = np.linalg.norm(line, axis=1, keepdims=True)
-        weight = np.nanmean(distance) / distance
         return cls(
             origin_mm=targets,
-            axes=axes,
-            wanted=np.zeros((len(targets), 2)),
+            axes=np.stack([right, np.cross(right, ahead), -ahead], axis=-1),
+            wanted=np.zeros((n, 2)),
             off_plane=0.0 * distance[:, 0],
-            weight=weight,
+            weight=np.nanmean(distance) / distance,
         )
 
     @property
@@ -254,18 +257,11 @@ class _Goals:
 
     def take(self, rows: Ints) -> _Goals:
         """Select rows."""
-        of_screen = self.weight is None
-        return _Goals(
-            origin_mm=self.origin_mm if of_screen else self.origin_mm[rows],
-            axes=self.axes if of_screen else self.axes[rows],
-            wanted=self.wanted[rows],
-            off_plane=self.off_plane[rows],
-            weight=None if self.weight is None else self.weight[rows],
-        )
+        return replace(self, **{name: getattr(self, name)[rows] for name in self.__slots__})
 
     def local(self, vectors: Floats) -> Floats:
         """Rotate vectors (P, n, 3) into the planes' axes."""
-        return vectors @ self.axes if self.axes.ndim == 2 else np.einsum("pni,nij->pnj", vectors, self.axes)
+        return np.asarray(np.einsum("pni,nij->pnj", vectors, self.axes))
 
 
 class _Model:
@@ -301,7 +297,7 @@ class _Model:
         out = np.empty((*shape, 3))
         out[..., :2] = np.where(np.isfinite(flat) & (reach > 0)[..., None], flat, _OFF_SCREEN_MM)
         out[..., 2] = goals.off_plane
-        return out if goals.weight is None else out * goals.weight
+        return out * goals.weight
 
     def calibrate(self, start: EyeParameters) -> Calibration:
         if not self.estimator.free_index:
