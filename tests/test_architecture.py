@@ -230,7 +230,6 @@ LARGE = {
     "report.overlay.eye_picture": "a picture and its style",
     # Each is one list: of fields of a file, of findings, or of cases of a search.
     "population.synteyes.eye_file": "fields of an eye file",
-    "gaze.table._observations": "columns of a table",
     "apps.study.findings.guestrin": "a list of findings",
 }
 # Records that are rebuilt from a tuple of their fields (batches of surfaces, results of compiled functions), or whose

@@ -204,17 +204,13 @@ def _observations(table: _Table, columns: CsvColumns, screen: ScreenPlane | None
     which = which.reshape(-1)
     lights = np.broadcast_to(np.arange(width), (len(rows), width))
     if columns.light is None:
-        for k in np.flatnonzero(first[which] != np.arange(len(line))).tolist():
-            named = f"frame {frame[k]}" + (f", {EYES[eye[k]]} eye," if eye[k] >= 0 else "")
-            earlier = table.lines[line[first[which[k]]]]
-            table.problems.add(f"{named} is in line {earlier} already", f"line {table.lines[line[k]]}")
-        table.problems.check()
+        _refuse_repeats(table, keys, line, first[which])
         found = {key: value[first] for key, value in values.items()}
     else:
         glints, lights = _listed_glints(table, columns.light, values.pop("glints"), light, which, len(rows))
         found = {key: _merged(table, key, value, which, len(rows)) for key, value in values.items()}
         found["glints"] = glints
-        table.problems.check()
+    table.problems.check()
 
     numbers = fixation[first]
     if columns.fixation is None:
@@ -244,6 +240,14 @@ def _observations(table: _Table, columns: CsvColumns, screen: ScreenPlane | None
             xy_px=np.where(seen[..., None], found["glints"], np.nan),
         ),
     )
+
+
+def _refuse_repeats(table: _Table, keys: Ints, line: Ints, first: Ints) -> None:
+    """Report entries (n,) with the frame, camera and eye of an earlier one, the `first` of their kind."""
+    for k in np.flatnonzero(first != np.arange(len(line))).tolist():
+        frame, _, eye = keys[k]
+        named = f"frame {frame}" + (f", {EYES[eye]} eye," if eye >= 0 else "")
+        table.problems.add(f"{named} is in line {table.lines[line[first[k]]]} already", f"line {table.lines[line[k]]}")
 
 
 def _parts(table: _Table, columns: CsvColumns) -> list[tuple[EyeColumns, Ints]]:
