@@ -64,6 +64,9 @@ make_venv() {
 }
 
 find_pip() {
+    # Settings that would send the packages elsewhere than into .venv; all others stay as the machine has them.
+    unset PIP_TARGET PIP_PREFIX PIP_ROOT PYTHONHOME
+    export PIP_USER=0 PIP_DISABLE_PIP_VERSION_CHECK=1
     if "$python" -m pip --python "$venv/bin/python" --version >/dev/null 2>&1; then
         pip() { "$python" -m pip --python "$venv/bin/python" "$@"; }
     elif "$venv/bin/python" -m pip --version >/dev/null 2>&1 || "$venv/bin/python" -m ensurepip >/dev/null 2>&1; then
@@ -155,9 +158,6 @@ set_up() {
         say "setting up $venv (about $size; later runs start at once) ..."
     fi
     find_pip
-    # Settings that would send the packages elsewhere than into .venv; all others stay as the machine has them.
-    unset PIP_TARGET PIP_PREFIX PIP_ROOT PYTHONHOME
-    export PIP_USER=0 PIP_DISABLE_PIP_VERSION_CHECK=1
     done_=
     for pause in 3 10 0; do
         start_ticker

@@ -291,7 +291,9 @@ def test_a_missing_shard_is_a_problem(copy):
 
 @pytest.mark.usefixtures("one_line")
 @pytest.mark.parametrize("key", ["spec", "eyes", "digest", "statistics", "versions"])
-@pytest.mark.parametrize("value", [None, {"a": 1}, *(pytest.param(v, marks=pytest.mark.slow) for v in (5, []))])
+@pytest.mark.parametrize(
+    "value", [None, {"a": 1}, pytest.param(5, marks=pytest.mark.slow), pytest.param([], marks=pytest.mark.slow)]
+)
 def test_a_damaged_dataset_json_is_a_problem_and_no_traceback(copy, key, value):
     path = copy / "dataset.json"
     dataset = json.loads(path.read_text())
