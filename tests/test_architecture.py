@@ -68,6 +68,7 @@ class Facts(NamedTuple):
     sizes: list[tuple[str, int, int]]  # (name, lines of the body without docstring, parameters) of every function
     positional_records: list[str]  # dataclasses with more than four fields whose fields may be given in order
     aliases: list[tuple[str, str]]  # (name, definition) of the type aliases at the top
+    classes: list[tuple[str, list[str]]]  # (name, names of its bases) of every class at the top
 
 
 @cache
@@ -82,6 +83,7 @@ def facts(path: Path) -> Facts:
         sizes=[size for node in nodes for size in size_of(module, node)],
         positional_records=[node.name for node in nodes if isinstance(node, ast.ClassDef) and is_positional(node)],
         aliases=[alias for node in tree.body for alias in alias_of(node)],
+        classes=[(c.name, [ast.unparse(b) for b in c.bases]) for c in tree.body if isinstance(c, ast.ClassDef)],
     )
 
 
@@ -212,6 +214,47 @@ def test_no_circle_of_imports_inside_packages():
         graph[name] = {u for u in used if u in names and u != name}
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == [("b", "c")]
     assert [c for c in circles(graph) if not all(m.startswith("eyerender.cli") for m in c)] == []
+
+
+def lines_of(package: str = "") -> int:
+    kinds = (".py", ".pyi", ".js", ".j2")
+    return sum(
+        len(p.read_text(encoding="utf-8").splitlines()) for p in (PACKAGE / package).rglob("*") if p.suffix in kinds
+    )
+
+
+# Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
+# commit that brings a capability, with a sentence here that says for whom.
+BOUNDS: dict[str, int] = {}
+
+
+@pytest.mark.parametrize("package", BOUNDS)
+def test_growth_pays(package):
+    assert lines_of(package) <= BOUNDS[package]
+
+
+def test_every_package_has_a_bound():
+    assert {p.name for p in PACKAGE.iterdir() if (p / "__init__.py").is_file()} == BOUNDS.keys() - {""}
+
+
+def test_names_of_classes_have_one_meaning():
+    """A class name stands for one thing in the whole package; private ones, which no other module sees, may repeat."""
+    names = [name for path in modules() for name, _ in facts(path).classes if not name.startswith("_")]
+    assert {n for n in names if names.count(n) > 1} == set()
+
+
+def test_authored_types_alone_end_in_spec():
+    bases = {name: bases for path in modules() for name, bases in facts(path).classes}
+
+    def is_authored(name: str) -> bool:
+        return name == "Spec" or any(is_authored(base) for base in bases.get(name, []))
+
+    assert [name for name in bases if name.endswith("Spec") and not is_authored(name)] == []
+
+
+def test_every_function_has_types():
+    found = [p.name for p in modules() if re.search(r"no-untyped-def", p.read_text(encoding="utf-8"))]
+    assert found == []
 
 
 # Why a function or a record may be larger than the limits of `test_functions_and_records_are_of_a_size_to_read`.
